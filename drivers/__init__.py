@@ -1,0 +1,1 @@
+"""Drivers: one file a device, behind the interfaces in drivers.interfaces."""

@@ -1,0 +1,36 @@
+"""How a driver announces itself: one DriverSpec behind an entry point of the group `orthocapture.drivers`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from drivers.interfaces import Device
+
+
+class DriverConfig(BaseModel):
+    """Base of a driver's section in rig.yaml."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@dataclass(frozen=True, slots=True)
+class DriverSpec:
+    """What the station needs to know to open a device.
+
+    Attributes:
+        kind: robot, camera, scanner, ct or lightbox.
+        config: the pydantic model of the driver's section in rig.yaml (without the key `driver`).
+        build: makes the driver object from a validated config; connects to nothing yet.
+        hosted: whether the driver must run in a supervised child process (native libraries).
+        call_timeout_s: longest time that one call may take before the child is restarted.
+    """
+
+    kind: str
+    config: type[DriverConfig]
+    build: Callable[[Any], Device]
+    hosted: bool = False
+    call_timeout_s: float = 60.0

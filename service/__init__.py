@@ -1,0 +1,1 @@
+"""The acquisition service: protocol, state machine, evidence, registration, command line."""

@@ -1,0 +1,71 @@
+"""The pinhole camera with two radial and two tangential distortion terms (OpenCV conventions)."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from service.core.geometry import Array
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """Intrinsics in pixels for images of width × height; pixel centres lie at integer coordinates."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+    @property
+    def matrix(self) -> Array:
+        """K (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def distortion(self) -> Array:
+        """(4,) k1, k2, p1, p2."""
+        return np.array([self.k1, self.k2, self.p1, self.p2])
+
+    def project(self, points_camera: Array) -> Array:
+        """Distorted pixels (N, 2) of points (N, 3) in the camera frame."""
+        xy = points_camera[:, :2] / points_camera[:, 2:]
+        r2 = np.sum(xy**2, axis=1)
+        radial = 1.0 + r2 * (self.k1 + r2 * self.k2)
+        x, y = xy[:, 0], xy[:, 1]
+        xd = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
+        yd = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
+        return np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=1)
+
+    def normalise(self, pixels: Array) -> Array:
+        """Undistorted normalised coordinates (N, 2), z = 1, of distorted pixels (N, 2)."""
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
+        points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
+        out = cv2.undistortPointsIter(points, self.matrix, self.distortion, np.eye(3), np.eye(3), criteria)
+        return np.asarray(out, dtype=np.float64).reshape(-1, 2)
+
+    def undistort(self, pixels: Array) -> Array:
+        """Pixels (N, 2) an ideal pinhole with the same K would have seen."""
+        return self.normalise(pixels) * [self.fx, self.fy] + [self.cx, self.cy]
+
+    def scaled(self, width: int, height: int) -> CameraModel:
+        """The same camera at another image size; centres stay at integers, so c' = (c + ½) s − ½."""
+        sx, sy = width / self.width, height / self.height
+        return dataclasses.replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+        )

@@ -1,0 +1,1 @@
+"""Pure core: records, lifecycle, decisions, recovery, geometry. No input or output here."""

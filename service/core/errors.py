@@ -1,0 +1,66 @@
+"""The root of the one error tree: every error says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class OrthocaptureError(Exception):
+    """Base of all errors of this project.
+
+    Args:
+        what: what is wrong, one sentence without a full stop.
+        where: file, line, field, device or record that it concerns.
+        remedy: what the person should do about it.
+    """
+
+    def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.where = where
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        place = f" [{self.where}]" if self.where else ""
+        advice = f". {self.remedy}" if self.remedy else ""
+        return f"{self.what}{place}{advice}"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Keyword arguments are lost by the default reduction; errors cross process borders in drivers.host.
+        return _rebuild, (type(self), self.what, self.where, self.remedy)
+
+
+def _rebuild(cls: type[OrthocaptureError], what: str, where: str, remedy: str) -> OrthocaptureError:
+    return cls(what, where=where, remedy=remedy)
+
+
+class ProtocolError(OrthocaptureError):
+    """A protocol file is wrong; `where` is file:line and field."""
+
+
+class ConfigurationError(OrthocaptureError):
+    """A rig file or a command's arguments are wrong."""
+
+
+class IllegalTransitionError(OrthocaptureError):
+    """The lifecycle does not allow this action in this state."""
+
+
+class GateError(OrthocaptureError):
+    """A measured value is outside its limit."""
+
+
+class StoreError(OrthocaptureError):
+    """The evidence could not be written or read."""
+
+
+class IntegrityError(StoreError):
+    """Evidence does not verify: a hash, a chain link or a file is wrong."""
+
+
+class DataError(OrthocaptureError):
+    """Input data (image, mesh, DICOM series, pose file) cannot be used."""
+
+
+class ComputeError(OrthocaptureError):
+    """A computation has no trustworthy answer on this data, and says why."""

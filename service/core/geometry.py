@@ -1,0 +1,71 @@
+"""Rigid transforms as (4, 4) float64, named T_a_b: p_a = T_a_b @ p_b."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+Transform = Array  # (4, 4), last row 0 0 0 1
+
+
+def transform(rotation: Array | Rotation, translation_m: Array) -> Transform:
+    """Build T_a_b from the rotation of b's axes in a and the position of b's origin in a (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation.as_matrix() if isinstance(rotation, Rotation) else rotation
+    T[:3, 3] = translation_m
+    return T
+
+
+def inverse(T_a_b: Transform) -> Transform:
+    """T_b_a, exactly rigid (no general matrix inverse)."""
+    R = T_a_b[:3, :3]
+    return transform(R.T, -R.T @ T_a_b[:3, 3])
+
+
+def apply(T_a_b: Transform, points_b: Array) -> Array:
+    """Map points (..., 3) from frame b to frame a."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def from_rotation_vector(pose: Array) -> Transform:
+    """T_a_b from (6,) x, y, z in metres and rotation vector in radians: Universal Robots' pose."""
+    return transform(Rotation.from_rotvec(pose[3:]), pose[:3])
+
+
+def to_rotation_vector(T_a_b: Transform) -> Array:
+    """(6,) x, y, z, rx, ry, rz of T_a_b."""
+    return np.concatenate([T_a_b[:3, 3], Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec()])
+
+
+def from_quaternion(translation_m: Array, quaternion_xyzw: Array) -> Transform:
+    """T_a_b from (3,) position and (4,) scalar-last quaternion."""
+    return transform(Rotation.from_quat(quaternion_xyzw), translation_m)
+
+
+def look_at(eye: Array, target: Array, up: Array) -> Transform:
+    """T_world_camera (x right, y down, z forward) at `eye`, looking at `target`, image top towards `up`."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    return transform(np.stack([x, np.cross(z, x), z], axis=1), eye)
+
+
+def rotation_angle_rad(T: Transform) -> float:
+    """Angle of the rotation part, 0..pi."""
+    return float(Rotation.from_matrix(T[:3, :3]).magnitude())
+
+
+def align_points(a: Array, b: Array, *, with_scale: bool = False) -> tuple[Transform, float]:
+    """Least-squares T_a_b and scale s with a ≈ R (s b) + t, for corresponding points (N, 3).
+
+    Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
+    PAMI 13(4), 1991.
+    """
+    ca, cb = a.mean(axis=0), b.mean(axis=0)
+    U, S, Vt = np.linalg.svd((a - ca).T @ (b - cb))
+    D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U @ D @ Vt
+    s = float(np.trace(np.diag(S) @ D) / np.sum((b - cb) ** 2)) if with_scale else 1.0
+    return transform(R, ca - s * R @ cb), s

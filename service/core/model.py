@@ -1,0 +1,321 @@
+"""Records of a run: the event envelope and every event's payload, as frozen pydantic models."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+
+Matrix4 = tuple[tuple[float, float, float, float], ...]  # T_a_b row-major, metres
+
+
+class Record(BaseModel):
+    """Base of everything that is written down: frozen, no unknown fields."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+# --- artefacts ---------------------------------------------------------------------------------------
+
+
+class ArtefactRef(Record):
+    """A content-addressed file, as events refer to it."""
+
+    sha256: str
+    kind: str  # image, raw, board_image, scan, ct_slice, ct_mesh, pose_log, result, report, protocol, rig …
+    media_type: str
+    size_bytes: int
+    original_name: str
+
+
+# --- operator ------------------------------------------------------------------------------------------
+
+OperatorVerb = Literal["confirm", "sign", "redo", "skip", "pause", "resume", "abort"]
+
+
+class OperatorAction(Record):
+    """What a person did. `automatic` marks a confirmation given by --auto-confirm on a simulated rig."""
+
+    kind: Literal["operator_action"] = "operator_action"
+    action: OperatorVerb
+    step: str | None = None
+    viewpoint: str | None = None  # redo of a single viewpoint
+    reason: str = ""
+    checklist: tuple[str, ...] = ()  # items ticked
+    meaning: str = ""  # of a signature
+    signed_sha256: str = ""  # hash of the event that was signed
+    via: Literal["cli", "web", "pedal", "auto"] = "cli"
+    automatic: bool = False
+
+
+class ActionRefused(Record):
+    """An action that the lifecycle or the protocol does not allow now; recorded, without effect."""
+
+    kind: Literal["action_refused"] = "action_refused"
+    action: OperatorVerb
+    step: str | None
+    why: str
+
+
+# --- run -------------------------------------------------------------------------------------------------
+
+
+class RunStarted(Record):
+    """Root of the chain."""
+
+    kind: Literal["run_started"] = "run_started"
+    protocol_id: str
+    protocol_version: str
+    protocol_sha256: str
+    protocol: ArtefactRef
+    rig: ArtefactRef
+    simulated: bool
+    auto_confirm: bool
+    operator: str
+    software: dict[str, str]  # distribution → version
+
+
+class SessionStarted(Record):
+    """The runner's process started (first start or resume): versions again, and the clocks."""
+
+    kind: Literal["session_started"] = "session_started"
+    resumed: bool
+    software: dict[str, str]
+    host: str
+    pid: int
+
+
+class DeviceOpened(Record):
+    """A device answered; `report` is its DeviceReport as plain data."""
+
+    kind: Literal["device_opened"] = "device_opened"
+    device: str  # name in rig.yaml
+    report: dict[str, Any]
+
+
+class DeviceTrouble(Record):
+    """A device failed, stopped or was restarted."""
+
+    kind: Literal["device_trouble"] = "device_trouble"
+    device: str
+    error: str
+    message: str
+    data_safe: bool = True
+
+
+# --- steps -----------------------------------------------------------------------------------------------
+
+
+class StepStarted(Record):
+    """The work of a step begins (ready → running)."""
+
+    kind: Literal["step_started"] = "step_started"
+    step: str
+    attempt: int
+
+
+class StepNote(Record):
+    """Something that a step found out and that the record should hold (station entered, timer started, …)."""
+
+    kind: Literal["step_note"] = "step_note"
+    step: str
+    attempt: int
+    note: str
+    data: dict[str, Any] = Field(default_factory=dict)
+
+
+class ViewpointCaptured(Record):
+    """One exposure, complete: files, pose, settings, environment."""
+
+    kind: Literal["viewpoint_captured"] = "viewpoint_captured"
+    step: str
+    attempt: int
+    viewpoint: str
+    station: str
+    artefacts: tuple[ArtefactRef, ...]  # the JPEG first; pose log beside it
+    T_base_flange: Matrix4  # mean over the exposure
+    pose_sigma_m: float  # standard deviation of the position over the exposure
+    pose_sigma_rad: float
+    joints_rad: tuple[float, ...]
+    pose_samples: int
+    trigger_monotonic_s: float
+    arrival_monotonic_s: float
+    controller_time_s: float
+    clock_offset_s: float  # controller time minus host monotonic
+    camera: dict[str, Any]  # EXIF settings, counter, time, lens
+    environment: dict[str, float] = Field(default_factory=dict)  # light_lux, temperature_c
+    verdicts: dict[str, bool] = Field(default_factory=dict)  # still, settings, sharp …
+
+
+class ViewpointFailed(Record):
+    """A viewpoint could not be captured this time."""
+
+    kind: Literal["viewpoint_failed"] = "viewpoint_failed"
+    step: str
+    attempt: int
+    viewpoint: str
+    error: str
+    message: str
+    skipped: bool = False  # given up, goes on with the next (a deviation)
+
+
+class StepMeasured(Record):
+    """The work of a step is done: its numbers, before any gate (running → checking)."""
+
+    kind: Literal["step_measured"] = "step_measured"
+    step: str
+    attempt: int
+    measures: dict[str, float]
+    artefacts: tuple[ArtefactRef, ...] = ()
+    result: dict[str, Any] = Field(default_factory=dict)  # the step kind's Result as plain data
+
+
+class StepFailed(Record):
+    """The work of a step ended with an error; recovery says what happens next (running → recovering)."""
+
+    kind: Literal["step_failed"] = "step_failed"
+    step: str
+    attempt: int
+    error: str
+    message: str
+    recovery: Literal["retry", "ask", "abort"]
+
+
+class StepRetried(Record):
+    """The recovery policy tries the step again without asking (recovering → running)."""
+
+    kind: Literal["step_retried"] = "step_retried"
+    step: str
+    attempt: int
+    why: str
+
+
+class GateVerdict(Record):
+    """One measured number against its limit."""
+
+    measure: str
+    value: float | None  # None when the step did not measure it: a fail
+    minimum: float | None
+    maximum: float | None
+    unit: str
+    passed: bool
+
+
+class GatesEvaluated(Record):
+    """All gates of a step (checking → awaiting_operator or recovering)."""
+
+    kind: Literal["gates_evaluated"] = "gates_evaluated"
+    step: str
+    attempt: int
+    verdicts: tuple[GateVerdict, ...]
+    passed: bool
+
+
+class StepPassed(Record):
+    """The step is done and the next one becomes ready (awaiting_operator → passed)."""
+
+    kind: Literal["step_passed"] = "step_passed"
+    step: str
+    attempt: int
+
+
+# --- jobs ---------------------------------------------------------------------------------------------------
+
+
+class JobEnqueued(Record):
+    """Work for the registration worker."""
+
+    kind: Literal["job_enqueued"] = "job_enqueued"
+    job: str
+    job_kind: str
+    step: str
+    attempt: int
+    idempotency_key: str
+    arguments: dict[str, Any]
+
+
+class JobFinished(Record):
+    """The worker's result."""
+
+    kind: Literal["job_finished"] = "job_finished"
+    job: str
+    job_kind: str
+    step: str
+    attempt: int
+    worker: str
+    measures: dict[str, float]
+    artefacts: tuple[ArtefactRef, ...] = ()
+    result: dict[str, Any] = Field(default_factory=dict)
+    duration_s: float
+
+
+class JobFailed(Record):
+    """The worker gave up on a job."""
+
+    kind: Literal["job_failed"] = "job_failed"
+    job: str
+    job_kind: str
+    step: str
+    attempt: int
+    worker: str
+    error: str
+    message: str
+
+
+# --- end -----------------------------------------------------------------------------------------------------
+
+
+class RunCompleted(Record):
+    """Every step passed or was skipped by the protocol's leave."""
+
+    kind: Literal["run_completed"] = "run_completed"
+    deviations: int
+
+
+class RunAborted(Record):
+    """A person, or a step's recovery policy, ended the run; what was captured stays."""
+
+    kind: Literal["run_aborted"] = "run_aborted"
+    reason: str
+
+
+Payload = Annotated[
+    OperatorAction
+    | ActionRefused
+    | RunStarted
+    | SessionStarted
+    | DeviceOpened
+    | DeviceTrouble
+    | StepStarted
+    | StepNote
+    | ViewpointCaptured
+    | ViewpointFailed
+    | StepMeasured
+    | StepFailed
+    | StepRetried
+    | GatesEvaluated
+    | StepPassed
+    | JobEnqueued
+    | JobFinished
+    | JobFailed
+    | RunCompleted
+    | RunAborted,
+    Field(discriminator="kind"),
+]
+PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)
+
+
+class Event(Record):
+    """One link of a run's chain.
+
+    `sha256` is SHA-256 over the RFC 8785 canonical JSON of every other field, `previous_sha256` included.
+    """
+
+    seq: int  # 1, 2, 3 … within the run
+    run_id: str
+    at_utc: str  # ISO 8601 with microseconds and Z
+    monotonic_s: float
+    actor: str  # person, or device, or process
+    payload: Payload
+    previous_sha256: str  # 64 zeros for the root
+    sha256: str

@@ -1,0 +1,1 @@
+"""What leaves the house: the report and the registered data set, made from what was recorded."""
