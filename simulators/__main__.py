@@ -1,0 +1,79 @@
+"""The simulators' command line: `python -m simulators NAME …` prints one ready line and serves until SIGTERM."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import logging
+import sys
+from collections.abc import Sequence
+from typing import Protocol, cast
+
+from simulators.faults import FaultPlan
+from simulators.serve import SimulatorError
+
+
+class SimulatorModule(Protocol):
+    """What each simulator's module or package offers."""
+
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare its options."""
+        ...
+
+    def serve(self, args: argparse.Namespace) -> None:
+        """Announce and serve until SIGTERM."""
+        ...
+
+
+SIMULATORS = {
+    "ur": ("simulators.ur_controller", "a Universal Robots controller: RTDE, dashboard, script port"),
+    "camera": ("simulators.sony_camera", "a Sony ILCE-7RM5 over PTP/IP"),
+    "scanner": ("simulators.scan_station", "an Artec export folder"),
+    "ct": ("simulators.ct_suite", "a CT scanner that writes a DICOM series"),
+    "lightbox": ("simulators.lightbox", "the light and environment box on a pseudo-terminal"),
+    "rig": ("simulators.rig", "all of them around one scene"),
+}
+
+
+def _load(name: str) -> SimulatorModule:
+    # Imported when asked for: most of them need half a second of libraries that the others do not.
+    return cast(SimulatorModule, importlib.import_module(SIMULATORS[name][0]))
+
+
+def _parser(chosen: str | None) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="simulators", description=__doc__)
+    commands = parser.add_subparsers(dest="simulator", required=True, metavar="NAME")
+    for name, (_, what) in SIMULATORS.items():
+        command = commands.add_parser(name, help=what, description=what, conflict_handler="resolve")
+        command.add_argument("--faults", metavar="FILE|JSON", default="[]", help="fault plan: a JSON list or a file")
+        command.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
+        command.add_argument("--log-level", default="WARNING", help="of the log on stderr")
+        if name == chosen:
+            _load(name).add_arguments(command)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one simulator; 0 after SIGTERM, 1 with a reason on stderr, 2 for wrong usage."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    chosen = words[0] if words and words[0] in SIMULATORS else None
+    try:
+        args = _parser(chosen).parse_args(words)
+    except SimulatorError as error:
+        sys.stderr.write(f"simulators: {error}\n")
+        return 1
+    logging.basicConfig(
+        level=args.log_level.upper(), format=f"%(asctime)s {args.simulator} %(levelname)s %(message)s"
+    )
+    try:
+        if isinstance(args.faults, str):
+            args.faults = FaultPlan.parse(args.faults)
+        _load(args.simulator).serve(args)
+    except SimulatorError as error:
+        sys.stderr.write(f"simulators {args.simulator}: {error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""FaultPlan: which message to which simulated device goes wrong, and how."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from simulators.serve import SimulatorError
+
+ANY = "*"
+
+
+class Fault(BaseModel):
+    """One planned fault: the `nth` (from 1) message `on` to `device`, and the `times` - 1 after it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    device: str
+    on: str = Field(description="name of the message or operation; * counts every message of the device")
+    kind: str = Field(description="drop, stall, truncate, corrupt, reject, protective_stop, disk_full, …")
+    nth: int = Field(default=1, ge=1)
+    times: int = Field(default=1, ge=1)
+    value: float | int | str | bool | None = Field(default=None, description="what the kind needs: seconds, bytes")
+
+    def due(self, count: int) -> bool:
+        """Whether the count-th (from 1) matching message is one of those to go wrong."""
+        return self.nth <= count < self.nth + self.times
+
+
+_FAULTS = TypeAdapter(tuple[Fault, ...])
+
+
+class FaultPlan:
+    """The faults of a simulator, with its own counters; safe to use from several threads."""
+
+    def __init__(self, faults: tuple[Fault, ...] = ()) -> None:
+        self.faults = faults
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._lock = threading.Lock()
+
+    @classmethod
+    def parse(cls, text: str) -> FaultPlan:
+        """Read a JSON list of faults, or the file of that name. Raises SimulatorError naming what is wrong."""
+        source = text.strip()
+        if not source:
+            return cls()
+        if not source.startswith(("[", "{")):
+            try:
+                source = Path(source).read_text(encoding="utf-8").strip()
+            except OSError as error:
+                raise SimulatorError(f"the fault plan {text} cannot be read: {error.strerror}") from error
+        if source.startswith("{"):
+            source = f"[{source}]"
+        try:
+            return cls(_FAULTS.validate_json(source))
+        except ValidationError as error:
+            first = error.errors()[0]
+            field = ".".join(str(part) for part in first["loc"])
+            raise SimulatorError(f"the fault plan is wrong at {field or 'its start'}: {first['msg']}") from error
+
+    def to_json(self) -> str:
+        """The plan as parse() reads it (counters are not part of it)."""
+        return _FAULTS.dump_json(self.faults).decode()
+
+    def for_device(self, *devices: str) -> FaultPlan:
+        """A fresh plan with the faults of these devices only."""
+        return FaultPlan(tuple(fault for fault in self.faults if fault.device in devices))
+
+    def check(self, device: str, message: str) -> Fault | None:
+        """Count this message and return the fault due for it; None means that all goes well."""
+        with self._lock:
+            self._counts[device, message] += 1
+            self._counts[device, ANY] += 1
+            for fault in self.faults:
+                if (
+                    fault.device == device
+                    and fault.on in (message, ANY)
+                    and fault.due(self._counts[device, fault.on])
+                ):
+                    return fault
+        return None

@@ -1,0 +1,57 @@
+"""What every simulator process shares: the ready line, SIGTERM, ending with its parent, its error."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import threading
+from types import FrameType
+
+Json = None | bool | int | float | str | list["Json"] | dict[str, "Json"]
+
+
+class SimulatorError(Exception):
+    """A simulator cannot start or go on; the message says why. Simulators do not share the service's error tree."""
+
+
+def announce(**fields: object) -> None:
+    """Write the one ready line (JSON, `"ready": true` first) to stdout."""
+    sys.stdout.write(json.dumps({"ready": True, **fields}) + "\n")
+    sys.stdout.flush()
+
+
+class Termination:
+    """Set by SIGTERM or SIGINT, or, if asked to, by the death of the parent process. Create it in the main thread."""
+
+    def __init__(self, *, with_parent: bool = False) -> None:
+        self._event = threading.Event()
+        self._parent = os.getppid() if with_parent else None
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._handle)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        self._event.set()
+
+    def set(self) -> None:
+        """End the process as SIGTERM would."""
+        self._event.set()
+
+    def is_set(self) -> bool:
+        """Whether the process should end."""
+        if self._parent is not None and os.getppid() != self._parent:
+            self._event.set()
+        return self._event.is_set()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Block until the process should end (True) or the time is over (False)."""
+        remaining_s = float("inf") if timeout_s is None else timeout_s
+        while not self.is_set():
+            if remaining_s <= 0:
+                return False
+            slice_s = min(0.5, remaining_s)
+            self._event.wait(slice_s)
+            remaining_s -= slice_s
+        return True
