@@ -1,0 +1,45 @@
+# The commands of the project; `make demo` and `make test` need nothing but Python 3.11+.
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.installed
+
+.PHONY: demo test lint format docs bench lock clean
+
+demo: $(READY)
+	$(BIN)/orthocapture demo
+
+test: $(READY)
+	$(BIN)/pytest
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# What docs/ holds that is made from the code: protocol schema and state diagram.
+docs: $(READY)
+	$(BIN)/python -m service.cli.docs
+
+bench: $(READY)
+	$(BIN)/python bench/demo_accuracy.py
+
+# A new lock: needs uv (pip install uv).
+lock:
+	uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \
+		--python-version 3.11 pyproject.toml --extra dev -o constraints.txt
+	sed -i '1i # Locked versions and hashes of everything orthocapture installs; made by `make lock`.' constraints.txt
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "orthocapture needs Python 3.11 or newer; say which: make PYTHON=python3.12")'
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r constraints.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	touch $(READY)
+
+clean:
+	rm -rf .venv build *.egg-info
