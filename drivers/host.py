@@ -1,0 +1,353 @@
+"""Runs a driver in a supervised child process: call timeout, heartbeat, restart; native crashes stay over there."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import importlib
+import logging
+import os
+import pickle
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar, cast
+
+from pydantic import BaseModel
+
+from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, DeviceUnavailableError
+from drivers.interfaces import Device, DeviceIdentity
+from drivers.plugin import DriverSpec
+from service.core.errors import ConfigurationError, OrthocaptureError
+
+T = TypeVar("T")
+
+START_TIMEOUT_S = 60.0  # import of the driver and its vendor library on a busy machine
+CLOSE_TIMEOUT_S = 10.0
+PING_TIMEOUT_S = 15.0
+SELF_DESTRUCT_GRACE_S = 5.0
+
+_LOG = logging.getLogger(__name__)
+_LEVELS = logging.getLevelNamesMapping()
+
+
+def hosted(interface: type[T], spec_path: str, config: BaseModel, *, call_timeout_s: float, name: str) -> T:
+    """Make a stand-in with exactly the public methods of `interface`; each call runs in the driver's own process.
+
+    Args:
+        interface: RobotArm, Camera, … (a Protocol derived from Device).
+        spec_path: entry point of the driver, "module:ATTRIBUTE" naming a DriverSpec.
+        config: the validated configuration; the child validates its JSON once more.
+        call_timeout_s: longest time that one call may take before the child is killed.
+        name: the device's name in rig.yaml, for messages and logs.
+
+    The child starts with `open()`, and again with an `open()` after it died. Methods raise errors of our tree only.
+    """
+    device = HostedDevice(spec_path, config, call_timeout_s=call_timeout_s, name=name)
+    methods: dict[str, Any] = {"__init__": _keep_device, "__doc__": f"{interface.__name__} in a process of its own."}
+    for base in reversed(interface.__mro__):
+        for method, function in vars(base).items():
+            if not method.startswith("_") and callable(function):
+                methods[method] = _forwarder(method, function)
+    return cast("T", type(f"Hosted{interface.__name__}", (), methods)(device))
+
+
+def _keep_device(proxy: Any, device: HostedDevice) -> None:
+    proxy.hosted_device = device
+
+
+def _forwarder(method: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def forward(proxy: Any, *args: Any, **kwargs: Any) -> Any:
+        device: HostedDevice = proxy.hosted_device
+        if method == "open":
+            return device.open()
+        if method == "close":
+            return device.close()
+        return device.call(method, *args, **kwargs)
+
+    forward.__name__ = method
+    forward.__doc__ = function.__doc__
+    return forward
+
+
+@dataclass(frozen=True, slots=True)
+class _Child:
+    """A running child process and the parent's end of everything that connects to it."""
+
+    process: subprocess.Popen[str]
+    connection: Connection
+    log_reader: threading.Thread
+
+
+class HostedDevice:
+    """The parent's side: starts the child, talks to it, kills it when it does not answer, says what became of it."""
+
+    def __init__(
+        self,
+        spec_path: str,
+        config: BaseModel,
+        *,
+        call_timeout_s: float,
+        name: str,
+        heartbeat_s: float = 5.0,
+    ) -> None:
+        self._spec_path = spec_path
+        self._config_json = config.model_dump_json()
+        self._call_timeout_s = call_timeout_s
+        self._name = name
+        self._heartbeat_s = heartbeat_s
+        self._lock = threading.RLock()
+        self._child: _Child | None = None
+        self._sequence = 0
+        self._obituary = "not opened yet"
+        self._watch_stop = threading.Event()
+        self._watcher: threading.Thread | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child, None when none is running."""
+        child = self._child
+        return child.process.pid if child else None
+
+    def open(self) -> DeviceIdentity:
+        """Start the child unless one is alive, and open the device in it."""
+        with self._lock:
+            if self._child is not None and self._child.process.poll() is not None:
+                self._bury()
+            if self._child is None:
+                self._start()
+            return cast("DeviceIdentity", self.call("open"))
+
+    def close(self) -> None:
+        """Close the device and end the child; never raises for a device or child that is already gone."""
+        with self._lock:
+            if self._child is None:
+                return
+            try:
+                self._exchange("close", (), {}, CLOSE_TIMEOUT_S)
+            except DeviceError as error:
+                _LOG.warning("%s: closing: %s", self._name, error)
+            self._bury()
+            self._obituary = "closed"
+        self._watch_stop.set()
+
+    def call(self, method: str, *args: Any, **kwargs: Any) -> Any:
+        """Run one method of the driver in the child.
+
+        Raises what the driver raised, when it is of our tree; DeviceFaultError for any other exception;
+        DeviceTimeoutError (child killed) when no answer came in time; DeviceUnavailableError when the child is gone.
+        """
+        with self._lock:
+            return self._exchange(method, args, kwargs, self._call_timeout_s)
+
+    def ping(self) -> float:
+        """Ask the child for a sign of life; returns the round trip in seconds, raises as `call` does."""
+        start = time.monotonic()
+        with self._lock:
+            self._exchange("", (), {}, PING_TIMEOUT_S)
+        return time.monotonic() - start
+
+    # --- conversation --------------------------------------------------------------------------------
+
+    def _exchange(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], timeout_s: float) -> Any:
+        child = self._child
+        if child is None:
+            raise self._unavailable()
+        self._sequence += 1
+        try:
+            child.connection.send((self._sequence, method, args, kwargs))
+            ok, value = self._receive(child, timeout_s)
+        except TimeoutError:
+            child.process.kill()
+            self._bury()
+            self._obituary = f"killed after {method or 'ping'} did not return within {timeout_s:g} s"
+            raise DeviceTimeoutError(
+                f"driver call {method or 'ping'} did not return within {timeout_s:g} s; its process was ended",
+                where=self._name,
+                remedy="Check the device and its cable, then open it again",
+            ) from None
+        except (EOFError, OSError) as error:
+            self._bury()
+            raise self._unavailable() from error
+        if not ok:
+            raise value
+        return value
+
+    def _receive(self, child: _Child, timeout_s: float) -> tuple[bool, Any]:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            if not child.connection.poll(max(0.0, deadline - time.monotonic())):
+                raise TimeoutError
+            sequence, ok, value = cast("tuple[int, bool, Any]", child.connection.recv())
+            if sequence == self._sequence:  # anything older answers a call that was interrupted by the keyboard
+                return ok, value
+
+    def _unavailable(self) -> DeviceUnavailableError:
+        return DeviceUnavailableError(
+            f"driver process is not running: {self._obituary}", where=self._name, remedy="Open the device again"
+        )
+
+    # --- birth and death -----------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        ours, theirs = socket.socketpair()
+        path = os.pathsep.join(p for p in sys.path if p)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "drivers.host", str(theirs.fileno())],
+            stdin=subprocess.DEVNULL,  # libgphoto2 closes descriptor 0
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            pass_fds=[theirs.fileno()],
+            env={**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"},
+            start_new_session=True,  # Ctrl-C is for the parent, which then closes the device in order
+            text=True,
+            errors="replace",
+        )
+        theirs.close()
+        reader = threading.Thread(target=_log_output, args=(process, self._name), daemon=True)
+        reader.start()
+        self._child = _Child(process, Connection(ours.detach()), reader)
+        start = (self._spec_path, self._config_json, self._call_timeout_s)
+        try:
+            self._exchange("start", start, {}, START_TIMEOUT_S)
+        except OrthocaptureError:
+            self._bury()
+            raise
+        self._watch_stop = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, args=(self._watch_stop,), daemon=True)
+        self._watcher.start()
+
+    def _bury(self) -> None:
+        child, self._child = self._child, None
+        if child is None:
+            return
+        child.connection.close()  # the child exits at the end of its connection
+        try:
+            status = child.process.wait(CLOSE_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            child.process.kill()
+            status = child.process.wait()
+        child.log_reader.join(CLOSE_TIMEOUT_S)
+        if child.process.stdout is not None:
+            child.process.stdout.close()
+        self._obituary = f"died of {signal.Signals(-status).name}" if status < 0 else f"exited with status {status}"
+        if status != 0:
+            _LOG.error("%s: driver process %d %s", self._name, child.process.pid, self._obituary)
+        self._watch_stop.set()
+
+    def _watch(self, stop: threading.Event) -> None:
+        """Heartbeat: find a child that died or hangs between calls, so that the log has the moment."""
+        while not stop.wait(self._heartbeat_s):
+            if not self._lock.acquire(blocking=False):
+                continue  # a call is under way and has its own timeout
+            try:
+                if not stop.is_set():
+                    self._exchange("", (), {}, PING_TIMEOUT_S)
+            except DeviceError as error:
+                _LOG.error("%s: heartbeat: %s", self._name, error)
+                return
+            finally:
+                self._lock.release()
+
+
+def _log_output(process: subprocess.Popen[str], name: str) -> None:
+    log = logging.getLogger(f"{__name__}.{name}")
+    assert process.stdout is not None
+    for line in process.stdout:
+        level, separator, message = line.rstrip().partition("|")
+        if separator and level in _LEVELS:
+            log.log(_LEVELS[level], "%s", message)
+        elif line.strip():
+            log.info("%s", line.rstrip())
+
+
+# --- the child's side -----------------------------------------------------------------------------------
+
+
+class _Server:
+    """Runs the driver's methods one after the other in the main thread; a second thread watches the connection."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._requests: queue.SimpleQueue[tuple[int, str, tuple[Any, ...], dict[str, Any]] | None]
+        self._requests = queue.SimpleQueue()
+        self._device: Device | None = None
+        self._call_timeout_s = START_TIMEOUT_S
+
+    def serve(self) -> None:
+        """Until the parent closes the connection or dies."""
+        threading.Thread(target=self._read, daemon=True).start()
+        while (request := self._requests.get()) is not None:
+            sequence, method, args, kwargs = request
+            # A vendor call may hold the GIL for ever, and the parent may be gone: the default action of
+            # SIGALRM ends this process without any help from Python.
+            signal.setitimer(signal.ITIMER_REAL, self._call_timeout_s + SELF_DESTRUCT_GRACE_S)
+            reply = self._answer(sequence, method, args, kwargs)
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the reader sees it and ends us
+                self._connection.send_bytes(reply)
+        if self._device is not None:
+            self._device.close()
+
+    def _read(self) -> None:
+        try:
+            while True:
+                self._requests.put(self._connection.recv())
+        except (EOFError, OSError):
+            self._requests.put(None)
+        time.sleep(CLOSE_TIMEOUT_S)
+        os._exit(1)  # the main thread is stuck in the driver
+
+    def _answer(self, sequence: int, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bytes:
+        try:
+            return pickle.dumps((sequence, True, self._run(method, args, kwargs)))
+        except OrthocaptureError as error:
+            return pickle.dumps((sequence, False, error))
+        except Exception as error:  # noqa: BLE001 - the one place where vendor exceptions of any type must stop
+            _LOG.warning("%s raised", method, exc_info=True)
+            what = f"driver raised {type(error).__name__} in {method}: {error}"
+            fault = DeviceFaultError(
+                what, where=type(self._device).__name__, remedy="See the log of the driver process"
+            )
+            return pickle.dumps((sequence, False, fault))
+
+    def _run(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        if method == "":
+            return None
+        if method == "start":
+            spec_path, config_json, self._call_timeout_s = cast("tuple[str, str, float]", args)
+            spec = load_spec(spec_path)
+            self._device = spec.build(spec.config.model_validate_json(config_json))
+            return None
+        return getattr(self._device, method)(*args, **kwargs)
+
+
+def load_spec(spec_path: str) -> DriverSpec:
+    """The DriverSpec behind "module:ATTRIBUTE"; ConfigurationError when there is none."""
+    module_name, _, attribute = spec_path.partition(":")
+    try:
+        spec = getattr(importlib.import_module(module_name), attribute, None)
+    except ImportError as error:
+        raise ConfigurationError(f"driver cannot be imported: {error}", where=spec_path) from error
+    if not isinstance(spec, DriverSpec):
+        raise ConfigurationError("this is not a DriverSpec", where=spec_path, remedy="See drivers/plugin.py")
+    return spec
+
+
+def main() -> None:
+    """Entry point of the child: the descriptor of the connection is the only argument."""
+    faulthandler.enable()
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s|%(name)s: %(message)s")
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    _Server(Connection(int(sys.argv[1]))).serve()
+
+
+if __name__ == "__main__":
+    main()

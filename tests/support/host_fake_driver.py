@@ -1,0 +1,97 @@
+"""A driver that misbehaves on request, for the tests of drivers.host."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from drivers.errors import SafetyStopError
+from drivers.interfaces import Array, Device, DeviceIdentity, DeviceReport
+from drivers.plugin import DriverConfig, DriverSpec
+
+
+class FakeConfig(DriverConfig):
+    """Where `close` leaves a trace, and the word that `report` gives back."""
+
+    word: str = "hello"
+    trace: Path | None = None
+    die_on_open: bool = False
+
+
+class Fake(Device, Protocol):
+    """The misbehaviours."""
+
+    def double(self, values: Array, *, offset: float = 0.0) -> Array: ...
+    def crash(self, signal_number: int) -> None: ...
+    def crash_later(self, delay_s: float) -> None: ...
+    def hang(self, seconds: float) -> None: ...
+    def refuse(self) -> None: ...
+    def blunder(self) -> None: ...
+    def unpicklable(self) -> object: ...
+    def talk(self) -> None: ...
+    def stdin_target(self) -> str: ...
+
+
+class FakeDriver:
+    """Implements Fake."""
+
+    def __init__(self, config: FakeConfig) -> None:
+        self._config = config
+        self._opened = 0
+
+    def open(self) -> DeviceIdentity:
+        if self._config.die_on_open:
+            os._exit(3)
+        self._opened += 1
+        return DeviceIdentity("fake", self._config.word, str(os.getpid()), str(self._opened), "fake", "1", "here")
+
+    def close(self) -> None:
+        if self._config.trace is not None:
+            self._config.trace.write_text("closed")
+
+    def report(self) -> DeviceReport:
+        return DeviceReport(self.open())
+
+    def double(self, values: Array, *, offset: float = 0.0) -> Array:
+        return np.asarray(2 * values + offset)
+
+    def crash(self, signal_number: int) -> None:
+        os.kill(os.getpid(), signal_number)
+        time.sleep(5)
+
+    def crash_later(self, delay_s: float) -> None:
+        subprocess.Popen([sys.executable, "-c", f"import os,time; time.sleep({delay_s}); os.kill({os.getpid()}, 11)"])
+
+    def hang(self, seconds: float) -> None:
+        time.sleep(seconds)
+
+    def refuse(self) -> None:
+        raise SafetyStopError("protective stop", where="joint 3", remedy="Clear the cause")
+
+    def blunder(self) -> None:
+        class VendorError(Exception):
+            pass
+
+        raise VendorError("the vendor says -7")
+
+    def unpicklable(self) -> object:
+        return lambda: None
+
+    def talk(self) -> None:
+        os.write(1, b"vendor chatter on stdout\n")
+        logging.getLogger("fake").warning("the driver warns")
+
+    def stdin_target(self) -> str:
+        return os.readlink("/proc/self/fd/0")
+
+
+DRIVER = DriverSpec(kind="fake", config=FakeConfig, build=FakeDriver, hosted=True)
+NOT_A_DRIVER = signal.SIGTERM

@@ -1,0 +1,172 @@
+"""drivers.host: a driver in a child process that may crash, hang, blunder or lose its parent."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from drivers.errors import DeviceFaultError, DeviceTimeoutError, DeviceUnavailableError, SafetyStopError
+from drivers.host import HostedDevice, hosted
+from service.core.errors import ConfigurationError
+from tests.support.host_fake_driver import Fake, FakeConfig
+
+SPEC = "tests.support.host_fake_driver:DRIVER"
+
+
+def eventually(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return condition()
+
+
+@pytest.fixture
+def fake(tmp_path: Path) -> Iterator[Fake]:
+    device = hosted(Fake, SPEC, FakeConfig(trace=tmp_path / "trace"), call_timeout_s=20.0, name="fake one")
+    device.open()
+    yield device
+    device.close()
+
+
+def test_calls_run_in_another_process_and_arrays_cross(fake: Fake) -> None:
+    identity = fake.open()
+    assert int(identity.serial) != os.getpid()
+    assert identity.model == "hello"
+    assert identity.firmware == "2", "the second open must reach the same driver object"
+    np.testing.assert_array_equal(fake.double(np.arange(6.0), offset=1.0), 2 * np.arange(6.0) + 1)
+
+
+def test_proxy_has_the_methods_of_the_interface_and_no_others(fake: Fake) -> None:
+    public = {n for n in dir(type(fake)) if not n.startswith("_")}
+    expected = {n for n in dir(Fake) if not n.startswith("_")}
+    assert public == expected
+
+
+def test_stdin_is_dev_null(fake: Fake) -> None:
+    assert fake.stdin_target() == os.devnull
+
+
+def test_errors_of_our_tree_cross_unchanged(fake: Fake) -> None:
+    with pytest.raises(SafetyStopError) as caught:
+        fake.refuse()
+    assert (caught.value.what, caught.value.where) == ("protective stop", "joint 3")
+    assert caught.value.remedy == "Clear the cause"
+
+
+def test_any_other_exception_is_wrapped(fake: Fake) -> None:
+    with pytest.raises(DeviceFaultError, match="VendorError in blunder: the vendor says -7"):
+        fake.blunder()
+    with pytest.raises(DeviceFaultError, match="unpicklable"):
+        fake.unpicklable()
+    np.testing.assert_array_equal(fake.double(np.ones(2)), [2, 2])
+
+
+def test_segfault_names_the_signal_and_open_restarts(fake: Fake) -> None:
+    before = fake.open().serial
+    with pytest.raises(DeviceUnavailableError, match="SIGSEGV"):
+        fake.crash(signal.SIGSEGV)
+    with pytest.raises(DeviceUnavailableError, match="SIGSEGV"):
+        fake.double(np.ones(1))
+    assert fake.open().serial != before
+    np.testing.assert_array_equal(fake.double(np.ones(1)), [2])
+
+
+def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=0.5, name="slow")
+    pid = int(device.open().serial)
+    start = time.monotonic()
+    with pytest.raises(DeviceTimeoutError, match=r"hang did not return within 0\.5 s"):
+        device.hang(60)
+    assert time.monotonic() - start < 3
+    assert not psutil.pid_exists(pid)
+    with pytest.raises(DeviceUnavailableError, match="killed after hang"):
+        device.double(np.ones(1))
+    assert int(device.open().serial) != pid
+    device.close()
+
+
+def test_heartbeat_finds_a_child_that_died_between_calls(caplog: pytest.LogCaptureFixture) -> None:
+    device = HostedDevice(SPEC, FakeConfig(), call_timeout_s=5, name="mortal", heartbeat_s=0.1)
+    device.open()
+    assert device.ping() < 5
+    device.call("crash_later", 0.1)
+    assert eventually(lambda: device.pid is None)
+    assert eventually(lambda: any("SIGSEGV" in r.message for r in caplog.records if r.levelno == logging.ERROR))
+    device.close()
+
+
+def test_output_of_the_child_goes_to_logging(
+    fake: Fake, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    caplog.set_level(logging.INFO)
+    fake.talk()
+    assert eventually(lambda: "vendor chatter on stdout" in caplog.messages)
+    assert eventually(lambda: "fake: the driver warns" in caplog.messages)
+    assert {r.levelname for r in caplog.records if r.message == "fake: the driver warns"} == {"WARNING"}
+    out, err = capfd.readouterr()
+    assert "chatter" not in out + err
+
+
+def test_close_closes_the_device_and_ends_the_child(tmp_path: Path) -> None:
+    trace = tmp_path / "trace"
+    device = hosted(Fake, SPEC, FakeConfig(trace=trace), call_timeout_s=5, name="tidy")
+    pid = int(device.open().serial)
+    device.close()
+    assert trace.read_text() == "closed"
+    assert not psutil.pid_exists(pid)
+    device.close()
+    with pytest.raises(DeviceUnavailableError, match="closed"):
+        device.double(np.ones(1))
+
+
+def test_calls_before_open_are_refused() -> None:
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=5, name="early")
+    with pytest.raises(DeviceUnavailableError, match="not opened yet"):
+        device.report()
+
+
+@pytest.mark.parametrize("spec", ["tests.support.nowhere:DRIVER", "tests.support.host_fake_driver:NOT_A_DRIVER"])
+def test_wrong_spec_is_a_configuration_error(spec: str) -> None:
+    device = hosted(Fake, spec, FakeConfig(), call_timeout_s=5, name="wrong")
+    with pytest.raises(ConfigurationError, match=spec):
+        device.open()
+
+
+def test_child_that_dies_while_opening() -> None:
+    device = hosted(Fake, SPEC, FakeConfig(die_on_open=True), call_timeout_s=5, name="stillborn")
+    with pytest.raises(DeviceUnavailableError, match="exited with status 3"):
+        device.open()
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_child_exits_when_its_parent_is_killed(tmp_path: Path, busy: bool) -> None:
+    trace = tmp_path / "trace"
+    program = (
+        "import sys, threading, time\n"
+        "from pathlib import Path\n"
+        "from drivers.host import hosted\n"
+        "from tests.support.host_fake_driver import Fake, FakeConfig\n"
+        f"d = hosted(Fake, {SPEC!r}, FakeConfig(trace=Path({str(trace)!r})), call_timeout_s=1, name='orphan')\n"
+        "print(d.open().serial, flush=True)\n"
+        f"d.hang(0.8) if {busy} else None\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        time.sleep(0.2)
+        parent.kill()
+    assert eventually(lambda: not psutil.pid_exists(pid))
+    assert trace.read_text() == "closed", "an orphaned driver must still let go of its device"
