@@ -1,0 +1,228 @@
+"""The lifecycle of a run: a table of states and transitions generated from the protocol's steps.
+
+The only import of `transitions`. The hierarchical machine is built from data, checked by the library, and flattened
+once into the pure function (state, trigger) → state that the fold uses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple
+
+from transitions.extensions.nesting import HierarchicalMachine, NestedState
+
+from service.core.errors import IllegalTransitionError
+
+Phase = Literal["ready", "running", "checking", "awaiting_operator", "recovering", "passed"]
+PHASES: tuple[Phase, ...] = ("ready", "running", "checking", "awaiting_operator", "recovering", "passed")
+SEPARATOR = "."  # step identifiers contain underscores
+PAUSED, COMPLETED, ABORTED = "paused", "completed", "aborted"
+RESERVED_STEP_IDS = frozenset({PAUSED, COMPLETED, ABORTED})
+
+
+class Rule(NamedTuple):
+    """One row of the table: within a step, `trigger` leads from `source` to `target`."""
+
+    trigger: str
+    source: Phase
+    target: Phase
+
+
+# Within every step. `advance`, `redo`, `pause`, `resume` and `abort` lead out of a step and are added below.
+STEP_RULES: tuple[Rule, ...] = (
+    Rule("begin", "ready", "running"),
+    Rule("measured", "running", "checking"),
+    Rule("failed", "running", "recovering"),
+    Rule("gates_passed", "checking", "awaiting_operator"),
+    Rule("gates_failed", "checking", "recovering"),
+    Rule("accept", "awaiting_operator", "passed"),
+    Rule("retry", "recovering", "running"),
+    Rule("skip", "ready", "passed"),
+    Rule("skip", "recovering", "passed"),
+    Rule("skip", "awaiting_operator", "passed"),
+)
+
+
+@dataclass(frozen=True)
+class Place:
+    """A state of the machine, taken apart."""
+
+    step: str
+    phase: Phase
+    paused: bool
+
+
+def redo(step: str) -> str:
+    """The trigger that leads back to `step`."""
+    return f"redo_{step}"
+
+
+def state_name(step: str, phase: Phase, *, paused: bool = False) -> str:
+    """The machine's name of a state."""
+    return SEPARATOR.join((*((PAUSED,) if paused else ()), step, phase))
+
+
+class Lifecycle:
+    """The compiled table of one protocol."""
+
+    def __init__(
+        self,
+        initial: str,
+        targets: Mapping[tuple[str, str], str],
+        places: Mapping[str, Place],
+        steps: tuple[str, ...],
+    ) -> None:
+        self.initial = initial
+        self.steps = steps
+        self._targets = targets
+        self._places = places
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Every state that a run can be in."""
+        return (*self._places, COMPLETED, ABORTED)
+
+    @property
+    def table(self) -> Mapping[tuple[str, str], str]:
+        """(state, trigger) → state, all of it."""
+        return self._targets
+
+    def may(self, state: str, trigger: str) -> bool:
+        """Whether the table has this transition."""
+        return (state, trigger) in self._targets
+
+    def next(self, state: str, trigger: str) -> str:
+        """The state after `trigger`. Raises IllegalTransitionError where the table has none."""
+        try:
+            return self._targets[state, trigger]
+        except KeyError:
+            raise IllegalTransitionError(
+                f"{trigger!r} is not possible in this state",
+                where=state,
+                remedy=f"Possible here: {', '.join(self.triggers(state)) or 'nothing, the run has ended'}",
+            ) from None
+
+    def triggers(self, state: str) -> tuple[str, ...]:
+        """The triggers that the table has for a state."""
+        return tuple(trigger for source, trigger in self._targets if source == state)
+
+    def place(self, state: str) -> Place | None:
+        """Step, phase and whether paused; None once the run has ended."""
+        return self._places.get(state)
+
+
+class _State(NestedState):
+    """A state whose full name is joined with a character that identifiers cannot contain."""
+
+    separator = SEPARATOR
+
+
+class _Machine(HierarchicalMachine):
+    """The library's machine with our separator."""
+
+    state_cls = _State
+
+
+class _Probe:
+    """The machine's model while the table is flattened.
+
+    A throw-away: the library hangs its convenience methods on it (its `model_override` fails with nested states and
+    a separator other than "_" in 0.9.3), and nobody but `_compile` ever sees it.
+    """
+
+    state: str
+    trigger: Callable[[str], bool]
+
+
+def lifecycle(steps: Iterable[str]) -> Lifecycle:
+    """The machine for these step identifiers, in the protocol's order (cached)."""
+    return _compile(tuple(steps))
+
+
+def transition_table(steps: tuple[str, ...]) -> list[tuple[str, str, str]]:
+    """(trigger, source, target) as the machine is given them; a source may be a whole step or the whole pause."""
+    rows: list[tuple[str, str, str]] = []
+    for index, step in enumerate(steps):
+        # Work in flight still reports while paused, and operators correct what they see: the same rules hold there.
+        for paused in (False, True):
+            rows += [
+                (
+                    rule.trigger,
+                    state_name(step, rule.source, paused=paused),
+                    state_name(step, rule.target, paused=paused),
+                )
+                for rule in STEP_RULES
+            ]
+            passed = state_name(step, "passed", paused=paused)
+            last = index == len(steps) - 1
+            rows.append(
+                ("advance", passed, COMPLETED if last else state_name(steps[index + 1], "ready", paused=paused))
+            )
+            prefix = f"{PAUSED}{SEPARATOR}" if paused else ""
+            rows += [
+                (redo(step), f"{prefix}{later}", state_name(step, "ready", paused=paused)) for later in steps[index:]
+            ]
+        for phase in PHASES:
+            rows.append(("pause", state_name(step, phase), state_name(step, phase, paused=True)))
+            rows.append(("resume", state_name(step, phase, paused=True), state_name(step, phase)))
+        rows.append(("abort", step, ABORTED))
+    rows.append(("abort", PAUSED, ABORTED))
+    return rows
+
+
+@lru_cache(maxsize=32)
+def _compile(steps: tuple[str, ...]) -> Lifecycle:
+    nested: list[dict[str, Any]] = [{"name": step, "initial": "ready", "children": list(PHASES)} for step in steps]
+    rows = transition_table(steps)
+    probe = _Probe()
+    machine = _Machine(
+        model=probe,
+        states=[*nested, {"name": PAUSED, "children": nested}, COMPLETED, ABORTED],
+        transitions=[{"trigger": trigger, "source": source, "dest": target} for trigger, source, target in rows],
+        initial=state_name(steps[0], "ready"),
+        auto_transitions=False,
+        ignore_invalid_triggers=True,
+    )
+    places = {
+        state_name(step, phase, paused=paused): Place(step, phase, paused)
+        for paused in (False, True)
+        for step in steps
+        for phase in PHASES
+    }
+    # Which triggers concern a state: those whose row starts at it or at a state around it.
+    sources: dict[str, list[str]] = {}
+    for trigger, source, _ in rows:
+        sources.setdefault(source, []).append(trigger)
+    targets: dict[tuple[str, str], str] = {}
+    for state in places:
+        parts = state.split(SEPARATOR)
+        for depth in range(len(parts), 0, -1):
+            for trigger in sources.get(SEPARATOR.join(parts[:depth]), ()):
+                machine.set_state(state, probe)
+                if probe.trigger(trigger):
+                    targets.setdefault((state, trigger), probe.state)
+    return Lifecycle(state_name(steps[0], "ready"), targets, places, steps)
+
+
+def diagram(steps: Iterable[str]) -> str:
+    """Mermaid text of the same table: each step with its phases once, the pause as one state."""
+    order = tuple(steps)
+    lines = ["stateDiagram-v2", f"    [*] --> {order[0]}"]
+    for step in order:
+        lines.append(f"    state {step} {{")
+        lines.append(f"        [*] --> {step}_ready")
+        lines += [f'        state "{phase}" as {step}_{phase}' for phase in PHASES]
+        lines += [f"        {step}_{r.source} --> {step}_{r.target}: {r.trigger}" for r in STEP_RULES]
+        lines.append("    }")
+    arrows: dict[tuple[str, str, str], None] = {}  # a set that keeps its order
+    for trigger, source, target in transition_table(order):
+        source_step, target_step = source.split(SEPARATOR)[0], target.split(SEPARATOR)[0]
+        leaves = source_step != target_step and trigger != "abort"
+        if leaves and not (source_step == PAUSED and trigger != "resume"):
+            arrows[source_step, target_step, "redo" if trigger.startswith("redo_") else trigger] = None
+    lines += [f"    {source} --> {target}: {trigger}" for source, target, trigger in arrows]
+    lines += [f"    {step} --> {ABORTED}: abort" for step in (*order, PAUSED)]
+    lines += [f"    {COMPLETED} --> [*]", f"    {ABORTED} --> [*]"]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,124 @@
+"""YAML text as plain data that remembers on which line every field stands."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import yaml
+from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+
+from service.core.errors import ProtocolError
+
+Path = tuple[str | int, ...]  # ("steps", 3, "gates", 0, "max")
+Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
+
+# The core schema of YAML 1.2 (section 10.3): unlike YAML 1.1, "on" and "12:30" stay text and 1e-3 is a number.
+_SCALARS: tuple[tuple[re.Pattern[str], Callable[[str], Plain]], ...] = (
+    (re.compile(r"(null|Null|NULL|~|)"), lambda _: None),
+    (re.compile(r"(true|True|TRUE|false|False|FALSE)"), lambda text: text.lower() == "true"),
+    (re.compile(r"[-+]?[0-9]+"), int),
+    (re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"), float),
+)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong in a file."""
+
+    line: int  # from 1
+    field: str  # steps[3].gates[0].max, or empty for the file as a whole
+    message: str
+
+
+@dataclass(frozen=True)
+class YamlTree:
+    """A document: its data, the line of every field, and what is wrong with it as YAML."""
+
+    data: Plain
+    lines: Mapping[Path, int]
+    problems: tuple[Problem, ...]
+
+    def line(self, path: Path) -> int:
+        """The line of a field, or of the nearest field around it that is in the file."""
+        while path not in self.lines:
+            path = path[:-1]
+        return self.lines[path]
+
+
+def field_name(path: Path) -> str:
+    """`steps[3].gates[0].max` for ("steps", 3, "gates", 0, "max")."""
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")
+
+
+def parse_yaml(text: str, *, name: str) -> YamlTree:
+    """Read one YAML document. Raises ProtocolError with `name`:line where the text is not YAML."""
+    try:
+        root = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = mark.line + 1 if mark else 1
+        raise ProtocolError(
+            f"not valid YAML: {error.problem or error.context}",
+            where=f"{name}:{line}",
+            remedy="Look for a missing colon, wrong indentation or a tab on this line or the one above it",
+        ) from error
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise ProtocolError(
+            f"not valid YAML: {error.reason}", where=f"{name}:{line}", remedy="Remove the unprintable character"
+        ) from error
+    builder = _Builder()
+    data = None if root is None else builder.build(root, (), ())
+    return YamlTree(data=data, lines=builder.lines, problems=tuple(builder.problems))
+
+
+class _Builder:
+    """Walks the compose tree once."""
+
+    def __init__(self) -> None:
+        self.lines: dict[Path, int] = {(): 1}
+        self.problems: list[Problem] = []
+
+    def build(self, node: Node, path: Path, around: tuple[Node, ...]) -> Plain:
+        if any(node is outer for outer in around):
+            self._problem(node, path, "an alias that contains itself")
+            return None
+        around = (*around, node)
+        if isinstance(node, MappingNode):
+            return self._mapping(node, path, around)
+        if isinstance(node, SequenceNode):
+            items: list[Plain] = []
+            for index, item in enumerate(node.value):
+                self.lines[(*path, index)] = item.start_mark.line + 1
+                items.append(self.build(item, (*path, index), around))
+            return items
+        assert isinstance(node, ScalarNode)
+        return _scalar(node)
+
+    def _mapping(self, node: MappingNode, path: Path, around: tuple[Node, ...]) -> dict[str, Plain]:
+        data: dict[str, Plain] = {}
+        for key, value in node.value:
+            name = _scalar(key) if isinstance(key, ScalarNode) else None
+            if not isinstance(name, str):
+                self._problem(key, path, f"the key {key.value!r} is not text")
+            elif name in data:
+                first = self.lines[(*path, name)]
+                self._problem(key, (*path, name), f"duplicate key, first given on line {first}")
+            else:
+                self.lines[(*path, name)] = key.start_mark.line + 1
+                data[name] = self.build(value, (*path, name), around)
+        return data
+
+    def _problem(self, node: Node, path: Path, message: str) -> None:
+        self.problems.append(Problem(node.start_mark.line + 1, field_name(path), message))
+
+
+def _scalar(node: ScalarNode) -> Plain:
+    text: str = node.value
+    if node.style is None:  # plain: not quoted, not a block
+        for pattern, convert in _SCALARS:
+            if pattern.fullmatch(text):
+                return convert(text)
+    return text
