@@ -1,0 +1,144 @@
+"""Registers two sets of sphere centres (two meshes of one scene) without known correspondences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, align_points, apply
+
+_MIRROR = np.array([-1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class ConstellationMatch:
+    """Two constellations in register.
+
+    Attributes:
+        T_a_b: maps frame b to frame a.
+        pairs: (index in a, index in b), sorted.
+        residuals_m: (P,) distance of each pair after registration.
+        missing_a: indices of a without a partner in b.
+        missing_b: indices of b without a partner in a.
+    """
+
+    T_a_b: Transform
+    pairs: tuple[tuple[int, int], ...]
+    residuals_m: Array
+    missing_a: tuple[int, ...]
+    missing_b: tuple[int, ...]
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the residuals."""
+        return float(np.sqrt(np.mean(self.residuals_m**2)))
+
+
+def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> ConstellationMatch:
+    """Rigid T_a_b between sphere centres a (M, 3) and b (N, 3) in metres, whatever their order.
+
+    Triangles whose sides agree propose a pose, the pose that brings most spheres within `tolerance_m` wins.
+    Spheres missing from either set are reported. Handedness is checked: a mirrored copy (an axis negated by a
+    DICOM tool) must not be explained away.
+
+    Raises:
+        ComputeError: fewer than four spheres agree, all of them lie in a plane (so that a mirror image cannot be
+            told), the sets are mirror images, or two different assignments fit equally well.
+    """
+    proper = _best(a, b, tolerance_m)
+    mirrored = _best(a, b * _MIRROR, tolerance_m)
+    count, count_mirrored = _count(proper), _count(mirrored)
+    if count_mirrored >= 4 and count_mirrored > count:
+        raise ComputeError(
+            f"the two sphere constellations are mirror images ({count_mirrored} spheres agree only when mirrored)",
+            remedy="one mesh has an axis negated: export it again, or correct the orientation of the CT series",
+        )
+    if count < 4:
+        raise ComputeError(
+            f"only {count} of {len(a)} and {len(b)} spheres agree within {tolerance_m * 1e3:.1f} mm, 4 are needed",
+            remedy="check the units of both meshes, and that the spheres did not move between the scans",
+        )
+    best, rival = proper[0], proper[1:]
+    rows = np.array([i for i, _ in best])
+    spread = np.linalg.svd(a[rows] - a[rows].mean(axis=0), compute_uv=False)
+    if spread[2] < 2 * tolerance_m:
+        raise ComputeError(
+            "the matched spheres lie in a plane, so that a mirrored mesh could not be told from a true one",
+            remedy="mount at least one sphere at another height",
+        )
+    if any(len(other) == len(best) for other in rival):
+        raise ComputeError(
+            f"the sphere constellation is symmetric: {len(best)} spheres agree in more than one way",
+            remedy="move one sphere so that no rotation maps the arrangement onto itself",
+        )
+    columns = np.array([j for _, j in best])
+    T_a_b, _ = align_points(a[rows], b[columns])
+    residuals = np.linalg.norm(a[rows] - apply(T_a_b, b[columns]), axis=1)
+    return ConstellationMatch(
+        T_a_b,
+        best,
+        residuals,
+        tuple(sorted(set(range(len(a))) - set(rows.tolist()))),
+        tuple(sorted(set(range(len(b))) - set(columns.tolist()))),
+    )
+
+
+Pairs = tuple[tuple[int, int], ...]
+
+
+def _count(solutions: list[Pairs]) -> int:
+    return len(solutions[0]) if solutions else 0
+
+
+def _best(a: Array, b: Array, tolerance: float) -> list[Pairs]:
+    """The largest consistent assignment, and every different one that is as large (maximal ones only)."""
+    found: dict[Pairs, float] = {}
+    size = 3
+    for ta, tb in _triangles(a, b, tolerance):
+        T, _ = align_points(a[ta], b[tb])
+        pairs, _ = _assign(a, apply(T, b), 2 * tolerance)
+        if len(pairs) < max(size, 4):
+            continue
+        # The proposing triangle's noise is levered over the whole scene: refit before judging.
+        rows, columns = (np.array(side) for side in zip(*pairs, strict=True))
+        refitted, _ = align_points(a[rows], b[columns])
+        pairs, error = _assign(a, apply(refitted, b), tolerance)
+        if len(pairs) >= max(size, 4):
+            if len(pairs) > size:
+                found.clear()
+            size = len(pairs)
+            found[pairs] = error
+            if size == min(len(a), len(b)) and len(found) > 1:
+                break
+    return sorted(found, key=found.__getitem__)
+
+
+def _assign(a: Array, b_in_a: Array, tolerance: float) -> tuple[Pairs, float]:
+    distance = np.linalg.norm(a[:, None] - b_in_a[None], axis=2)
+    rows, columns = linear_sum_assignment(np.minimum(distance, 2 * tolerance))
+    near = distance[rows, columns] < tolerance
+    pairs = tuple((int(i), int(j)) for i, j in zip(rows[near], columns[near], strict=True))
+    return pairs, float(np.sum(distance[rows[near], columns[near]] ** 2))
+
+
+def _triangles(a: Array, b: Array, tolerance: float) -> list[tuple[list[int], list[int]]]:
+    """Index triples of a and b whose three sides agree; triples of a are taken in one order only."""
+    da = np.linalg.norm(a[:, None] - a[None], axis=2)
+    db = np.linalg.norm(b[:, None] - b[None], axis=2)
+    out: list[tuple[list[int], list[int]]] = []
+    for i in range(len(a)):
+        for j in range(i + 1, len(a)):
+            k, m = np.nonzero(np.abs(db - da[i, j]) < tolerance)
+            distinct = k != m
+            for p, q in zip(k[distinct], m[distinct], strict=True):
+                # (third of a) × (third of b): both remaining sides must agree.
+                agree = (np.abs(da[i][:, None] - db[p][None]) < tolerance) & (
+                    np.abs(da[j][:, None] - db[q][None]) < tolerance
+                )
+                agree[: j + 1] = False
+                agree[:, [p, q]] = False
+                out += [([i, j, int(t)], [int(p), int(q), int(s)]) for t, s in zip(*np.nonzero(agree), strict=True)]
+    return out
