@@ -1,0 +1,353 @@
+"""The lab procedure as typed data: the protocol file's models, its loader and its JSON Schema."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, cast
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    SerializeAsAny,
+    TypeAdapter,
+    ValidationError,
+    WithJsonSchema,
+    create_model,
+)
+from pydantic_core import ErrorDetails
+
+from service.core.errors import ProtocolError
+from service.core.lifecycle import RESERVED_STEP_IDS
+from service.core.model import Record
+from service.core.protocol_rules import rule_violations
+from service.core.yaml_tree import Path, Plain, Problem, YamlTree, field_name, parse_yaml
+
+ParamsT = TypeVar("ParamsT", bound=BaseModel)
+
+
+def _fraction(value: Any) -> Any:
+    """Shutter speeds are written as photographers write them: `1/15`."""
+    if not isinstance(value, str):
+        return value
+    numerator, slash, denominator = value.partition("/")
+    try:
+        return float(numerator) / (float(denominator) if slash else 1.0)
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(f"{value!r} is neither a number of seconds nor a fraction such as 1/15") from None
+
+
+def _not_reserved(value: str) -> str:
+    if value in RESERVED_STEP_IDS:
+        raise ValueError(f"{value!r} is the name of a state of the run; choose another")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Text = Annotated[str, Field(min_length=1)]
+StepId = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$"), AfterValidator(_not_reserved)]
+Exposure = Annotated[
+    float,
+    Field(gt=0, allow_inf_nan=False),
+    BeforeValidator(_fraction),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "number", "exclusiveMinimum": 0},
+                {"type": "string", "pattern": r"^[0-9.]+/[0-9.]+$", "examples": ["1/15"]},
+            ]
+        }
+    ),
+]
+
+
+class Spheres(Record):
+    """The reference spheres on and around the specimen."""
+
+    radius_mm: Positive
+    registration: Annotated[int, Field(ge=4)]  # how many
+    control: Annotated[int, Field(ge=0)] = 0
+
+
+class Board(Record):
+    """The calibration checkerboard, counted in inner corners."""
+
+    columns: Annotated[int, Field(ge=3)]
+    rows: Annotated[int, Field(ge=3)]
+    square_mm: Positive
+
+
+class CameraSection(Record):
+    """The camera settings that stay fixed through the run."""
+
+    aperture_f: Positive
+    exposure_s: Exposure
+    iso: Annotated[int, Field(gt=0)]
+    focus_mode: Text = "Manual"
+    image_quality: Literal["JPEG", "RAW", "RAW+JPEG"] = "JPEG"
+
+
+class Motion(Record):
+    """How the arm moves between viewpoints."""
+
+    speed_rad_s: Positive = 0.5
+    acceleration_rad_s2: Positive = 0.5
+    dwell_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5  # after standing still, before the exposure
+
+
+class Settle(Record):
+    """When the arm counts as standing still, and how long to wait for it."""
+
+    window_s: Positive = 0.5
+    joint_speed_rad_s: Positive = 0.001
+    tcp_speed_m_s: Positive = 0.0002
+    position_peak_to_peak_m: Positive = 0.00002
+    rotation_peak_to_peak_rad: Positive = 0.0000873
+    timeout_s: Positive = 20.0
+
+
+class Gate(Record):
+    """A measured number and its limits; a step passes only within all of them."""
+
+    measure: Text
+    min: Finite | None = None
+    max: Finite | None = None
+    unit: str = ""
+    why: str = ""
+
+
+class Recovery(Record):
+    """What happens when the work of a step fails: see service.core.recovery."""
+
+    retries: Annotated[int, Field(ge=0, le=20)] = 2  # of passing troubles of a device, without progress in between
+    wait_s: Annotated[float, Field(ge=0, le=600)] = 1.0  # before a retry
+    on_failure: Literal["ask", "abort"] = "ask"
+
+
+class StepFields(Record):
+    """Everything of a step but its params."""
+
+    id: StepId
+    kind: Text
+    title: Text
+    why: str = ""
+    instructions: str = ""
+    checklist: tuple[Text, ...] = ()
+    gates: tuple[Gate, ...] = ()
+    sign: bool = False
+    confirm: bool = True
+    skippable: bool = False
+    irreversible: bool = False
+    requires: tuple[str, ...] = ()
+    recovery: Recovery = Recovery()
+
+
+class Step(StepFields):
+    """One step of the procedure; `params` is of the step kind's own model."""
+
+    params: SerializeAsAny[BaseModel]
+
+    def params_as(self, model: type[ParamsT]) -> ParamsT:
+        """The params, typed. Raises ProtocolError when the step is of another kind."""
+        if not isinstance(self.params, model):
+            raise ProtocolError(f"the params of this step are not {model.__qualname__}", where=f"step {self.id}")
+        return self.params
+
+
+class ProtocolFields(Record):
+    """Everything of a protocol but its steps."""
+
+    id: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    version: Text
+    title: Text
+    source: str = ""
+    spheres: Spheres
+    board: Board | None = None
+    camera: CameraSection
+    motion: Motion = Motion()
+    settle: Settle = Settle()
+
+
+class Protocol(ProtocolFields):
+    """A lab procedure."""
+
+    steps: tuple[Step, ...]
+
+    @property
+    def step_ids(self) -> tuple[str, ...]:
+        """Identifiers in order."""
+        return tuple(step.id for step in self.steps)
+
+    def step(self, step_id: str) -> Step:
+        """The step of this identifier. Raises ProtocolError if there is none."""
+        return self.steps[self.index(step_id)]
+
+    def index(self, step_id: str) -> int:
+        """The step's position. Raises ProtocolError if there is none."""
+        try:
+            return self.step_ids.index(step_id)
+        except ValueError:
+            raise ProtocolError(
+                f"no step {step_id!r}", where=self.id, remedy=f"Steps: {', '.join(self.step_ids)}"
+            ) from None
+
+
+@dataclass(frozen=True)
+class LoadedProtocol:
+    """A protocol, the hash of its file's bytes, and its text."""
+
+    protocol: Protocol
+    sha256: str
+    source: str
+
+
+class _FileStep(StepFields):
+    params: dict[str, Any] = Field(default_factory=dict)
+
+
+class _FileProtocol(ProtocolFields):
+    steps: Annotated[tuple[_FileStep, ...], Field(min_length=1)]
+
+
+def load_protocol(path: FilePath, params_models: Mapping[str, type[BaseModel]]) -> LoadedProtocol:
+    """Read a protocol file; `params_models` gives the Params of every known step kind.
+
+    Raises ProtocolError naming file:line and field of everything that is wrong, all of it at once.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ProtocolError(
+            f"cannot read the protocol: {error.strerror}", where=str(path), remedy="Check the path"
+        ) from error
+    return parse_protocol(content, params_models, name=str(path))
+
+
+def parse_protocol(content: bytes, params_models: Mapping[str, type[BaseModel]], *, name: str) -> LoadedProtocol:
+    """The same for a file's bytes (a recorded artefact, an editor's buffer); `name` stands for the file in errors."""
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise ProtocolError("not UTF-8 text", where=f"{name}:{line}", remedy="Save the file as UTF-8") from error
+    tree = parse_yaml(text, name=name)
+    problems = list(tree.problems)
+    data = tree.data if isinstance(tree.data, dict) else {}
+    if not isinstance(tree.data, dict):
+        problems.append(Problem(1, "", "not a protocol: the file must hold fields such as id, version and steps"))
+        _raise(problems, name)
+    parsed, params = None, {}
+    try:
+        parsed = _FileProtocol.model_validate_json(json.dumps(data), strict=True)
+    except ValidationError as error:
+        problems += [_problem(details, (), tree) for details in error.errors()]
+    problems += [Problem(tree.line(at), field_name(at), message) for at, message in rule_violations(data)]
+    params = _validate_params(data, params_models, tree, problems)
+    if problems or parsed is None:
+        _raise(problems, name)
+    steps = tuple(
+        Step(params=params[index], **{field: getattr(step, field) for field in StepFields.model_fields})
+        for index, step in enumerate(parsed.steps)
+    )
+    fields = {field: getattr(parsed, field) for field in ProtocolFields.model_fields}
+    return LoadedProtocol(Protocol(steps=steps, **fields), hashlib.sha256(content).hexdigest(), text)
+
+
+def _validate_params(
+    data: Mapping[str, Plain], models: Mapping[str, type[BaseModel]], tree: YamlTree, problems: list[Problem]
+) -> dict[int, BaseModel]:
+    """The params of every step by its index, judged by the model of its kind; appends to `problems`."""
+    params: dict[int, BaseModel] = {}
+    steps = data.get("steps")
+    for index, step in enumerate(steps if isinstance(steps, list) else []):
+        if not isinstance(step, dict) or not isinstance(step.get("kind"), str):
+            continue
+        kind, at = str(step["kind"]), ("steps", index)
+        if kind not in models:
+            message = f"unknown kind {kind!r}{_did_you_mean(kind, models)}; kinds: {', '.join(sorted(models))}"
+            problems.append(Problem(tree.line((*at, "kind")), field_name((*at, "kind")), message))
+            continue
+        given = step.get("params", {})
+        if not isinstance(given, dict):
+            continue  # the structure's own check has said so
+        try:
+            params[index] = models[kind].model_validate_json(json.dumps(given), strict=True)
+        except ValidationError as error:
+            problems += [_problem(details, (*at, "params"), tree, models[kind]) for details in error.errors()]
+    return params
+
+
+def _problem(details: ErrorDetails, prefix: Path, tree: YamlTree, model: type[BaseModel] | None = None) -> Problem:
+    """Say in a technician's words what pydantic found, and where it stands in the file."""
+    at: Path = prefix
+    for part in details["loc"]:
+        if (*at, part) in tree.lines:  # parts that are not in the file are names of union members
+            at = (*at, part)
+    kind, last = details["type"], details["loc"][-1] if details["loc"] else ""
+    if kind == "missing":
+        return Problem(tree.line(at), field_name((*at, last)), "missing field")
+    if kind == "extra_forbidden":
+        known = model.model_fields if model else _known_fields(at)
+        return Problem(tree.line(at), field_name(at), f"unknown field{_did_you_mean(str(last), known)}")
+    message = details["msg"].removeprefix("Value error, ")
+    given = details["input"]
+    shown = "" if isinstance(given, (dict, list)) else f" (it is {json.dumps(given)})"
+    quote = '; put it in quotes: "…"' if kind == "string_type" and isinstance(given, (int, float)) else ""
+    return Problem(tree.line(at), field_name(at), f"{message}{shown}{quote}")
+
+
+_SECTIONS: Mapping[str, type[BaseModel]] = {
+    "spheres": Spheres,
+    "board": Board,
+    "camera": CameraSection,
+    "motion": Motion,
+    "settle": Settle,
+    "gates": Gate,
+    "recovery": Recovery,
+    "steps": _FileStep,
+}
+
+
+def _known_fields(at: Path) -> Mapping[str, object]:
+    section = next((part for part in reversed(at[:-1]) if isinstance(part, str)), "")
+    return _SECTIONS.get(section, _FileProtocol).model_fields
+
+
+def _did_you_mean(word: str, known: Mapping[str, object]) -> str:
+    near = difflib.get_close_matches(word, known, n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def _raise(problems: list[Problem], name: str) -> NoReturn:
+    ordered = sorted(set(problems), key=lambda p: (p.line, p.field))
+    places = [f"{name}:{p.line}" + (f" {p.field}" if p.field else "") for p in ordered]
+    remedy = "See docs/protocol.schema.json for what a protocol may hold"
+    if len(ordered) == 1:
+        raise ProtocolError(ordered[0].message, where=places[0], remedy=remedy)
+    listed = "\n".join(f"  {place}: {p.message}" for place, p in zip(places, ordered, strict=True))
+    raise ProtocolError(f"{len(ordered)} things are wrong in this protocol:\n{listed}\n", where=name, remedy=remedy)
+
+
+def protocol_json_schema(params_models: Mapping[str, type[BaseModel]]) -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of a protocol file, with the params of every step kind; for editors."""
+    kinds: list[type[BaseModel]] = []
+    for kind, model in sorted(params_models.items()):
+        needed = any(field.is_required() for field in model.model_fields.values())
+        default: Any = ... if needed else Field(default_factory=model)
+        fields: dict[str, Any] = {"kind": (Literal[kind], ...), "params": (model, default)}
+        kinds.append(create_model(f"Step_{kind}", __base__=StepFields, __doc__=f"A step of kind {kind}.", **fields))
+    # A union built at run time: the type checker cannot follow, pydantic can.
+    step = cast(Any, Union)[tuple(kinds)]
+    if len(kinds) > 1:
+        step = Annotated[step, Field(discriminator="kind")]
+    steps: Any = (Annotated[tuple[step, ...], Field(min_length=1)], ...)
+    whole = create_model("Protocol", __base__=ProtocolFields, __doc__="An orthocapture protocol.", steps=steps)
+    schema = TypeAdapter(whole).json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

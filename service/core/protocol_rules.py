@@ -1,0 +1,84 @@
+"""What a protocol must obey beyond the types of its fields; works on plain data, so that every fault is reported."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import cast
+
+from service.core.yaml_tree import Path, Plain
+
+
+def rule_violations(data: dict[str, Plain]) -> Iterator[tuple[Path, str]]:
+    """(field, what is wrong) for a protocol file's data, which may be malformed in any way."""
+    steps = data.get("steps")
+    seen: dict[str, int] = {}
+    for index, step in enumerate(steps if isinstance(steps, list) else []):
+        if isinstance(step, dict):
+            at: Path = ("steps", index)
+            yield from _identity(step, at, seen)
+            yield from _requires(step, at, seen, _all_ids(cast(list[Plain], steps)))
+            yield from _irreversible(step, at)
+            yield from _gates(step, at)
+            if isinstance(step.get("id"), str):
+                seen.setdefault(str(step["id"]), index)
+
+
+def _all_ids(steps: list[Plain]) -> set[str]:
+    return {str(step["id"]) for step in steps if isinstance(step, dict) and isinstance(step.get("id"), str)}
+
+
+def _identity(step: dict[str, Plain], at: Path, seen: dict[str, int]) -> Iterator[tuple[Path, str]]:
+    step_id = step.get("id")
+    if isinstance(step_id, str) and step_id in seen:
+        yield (*at, "id"), f"duplicate step id {step_id!r}, first used by steps[{seen[step_id]}]"
+
+
+def _requires(
+    step: dict[str, Plain], at: Path, seen: dict[str, int], everyone: set[str]
+) -> Iterator[tuple[Path, str]]:
+    required = step.get("requires")
+    for index, name in enumerate(required if isinstance(required, list) else []):
+        if not isinstance(name, str) or name in seen:
+            continue
+        if name == step.get("id"):
+            message = "a step cannot require itself"
+        elif name in everyone:
+            message = f"step {name!r} comes later; only earlier steps can be required"
+        else:
+            message = f"there is no step {name!r}"
+        yield (*at, "requires", index), message
+
+
+def _irreversible(step: dict[str, Plain], at: Path) -> Iterator[tuple[Path, str]]:
+    if step.get("irreversible") is not True:
+        return
+    where: Path = (*at, "irreversible")
+    if not step.get("requires"):
+        yield where, "an irreversible step needs `requires`: the captures that must have passed before it"
+    if step.get("sign") is not True:
+        yield where, "an irreversible step needs `sign: true`: a person releases it"
+    if step.get("confirm") is False:
+        yield (*at, "confirm"), "an irreversible step is always confirmed by a person"
+
+
+def _gates(step: dict[str, Plain], at: Path) -> Iterator[tuple[Path, str]]:
+    gates = step.get("gates")
+    measures: set[str] = set()
+    for index, gate in enumerate(gates if isinstance(gates, list) else []):
+        if not isinstance(gate, dict):
+            continue
+        where: Path = (*at, "gates", index)
+        low, high = gate.get("min"), gate.get("max")
+        if low is None and high is None:
+            yield where, "a gate needs limits: min, max or both"
+        if _number(low) and _number(high) and cast(float, low) > cast(float, high):
+            yield (*where, "max"), f"min {low} is above max {high}: nothing could pass"
+        measure = gate.get("measure")
+        if isinstance(measure, str):
+            if measure in measures:
+                yield (*where, "measure"), f"a second gate on {measure!r}; give min and max in one gate"
+            measures.add(measure)
+
+
+def _number(value: Plain) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
