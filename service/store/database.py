@@ -1,0 +1,215 @@
+"""The SQLite database of a data folder: opening, migrating, and the two kinds of transaction."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from alembic import command
+from alembic.config import Config
+from alembic.script import ScriptDirectory
+from sqlalchemy import Connection, Engine, create_engine, event, inspect, text
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+from sqlalchemy.pool import ConnectionPoolEntry
+
+from service.core.errors import StoreError
+from service.store.errors import StoreVersionError
+from service.store.seam import Files
+
+DATABASE_NAME = "orthocapture.sqlite"
+BUSY_TIMEOUT_S = 30.0
+_MIGRATIONS = Path(__file__).with_name("migrations")
+
+
+def database_path(data_dir: Path) -> Path:
+    """Where the database of a data folder lies."""
+    return data_dir / DATABASE_NAME
+
+
+class Database:
+    """Connections to one database. Writers begin IMMEDIATE, so a transaction never has to be upgraded and retried."""
+
+    def __init__(self, engine: Engine, path: Path, files: Files) -> None:
+        self._engine = engine
+        self._path = path
+        self._files = files
+
+    @contextmanager
+    def reading(self) -> Generator[Connection]:
+        """One consistent snapshot. Raises StoreError."""
+        with _store_errors(self._path), self._engine.connect() as connection, connection.begin():
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Generator[Connection]:
+        """One transaction: commits through the seam at the end, rolls back on any exception. Raises StoreError."""
+        with _store_errors(self._path), self._engine.connect() as plain:
+            connection = plain.execution_options(writes=True)
+            with connection.begin() as transaction:
+                yield connection
+                self._files.commit(transaction.commit)
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._engine.dispose()
+
+
+def open_database(data_dir: Path, files: Files) -> Database:
+    """Open for writing; creates and upgrades. Raises StoreVersionError when a newer software has written it."""
+    path = database_path(data_dir)
+    engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
+    database = Database(engine, path, files)
+    try:
+        with database.writing() as connection:
+            _upgrade(connection, path)
+    except BaseException:
+        database.close()
+        raise
+    files.sync_directory(data_dir)
+    return database
+
+
+def open_read_only(data_dir: Path, files: Files) -> Database:
+    """Open an existing database without the means to change it. Raises StoreError, StoreVersionError."""
+    path = database_path(data_dir)
+    if not path.is_file():
+        raise StoreError(
+            "there is no run data here",
+            where=str(path),
+            remedy="Name the data folder with --data DIR, or with the environment variable ORTHOCAPTURE_DATA",
+        )
+    address = f"file:{quote(str(path.absolute()))}?uri=true&mode=ro"
+    try:
+        return _checked_read_only(_engine(address, writable=False), path, files)
+    except StoreVersionError:
+        raise
+    except StoreError:
+        # On read-only media SQLite cannot make its shared-memory file; nobody can be writing there either.
+        if path.with_name(path.name + "-wal").exists():
+            raise
+        return _checked_read_only(_engine(f"{address}&immutable=1", writable=False), path, files)
+
+
+def _checked_read_only(engine: Engine, path: Path, files: Files) -> Database:
+    database = Database(engine, path, files)
+    try:
+        with database.reading() as connection:
+            present = _revision(connection)
+            _refuse_unknown(present, path)
+            _refuse_old(present, path)
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def _engine(address: str, *, writable: bool) -> Engine:
+    engine = create_engine(f"sqlite:///{address}", connect_args={"timeout": BUSY_TIMEOUT_S})
+
+    def on_connect(connection: sqlite3.Connection, _record: ConnectionPoolEntry) -> None:
+        # The driver's own BEGIN comes too late and is never IMMEDIATE; on_begin below sends it.
+        connection.isolation_level = None
+        connection.execute("PRAGMA foreign_keys = ON")
+        connection.execute("PRAGMA recursive_triggers = ON")
+        if writable:
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = FULL")
+        else:
+            connection.execute("PRAGMA query_only = ON")
+
+    def on_begin(connection: Connection) -> None:
+        writes = connection.get_execution_options().get("writes", False)
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+    event.listen(engine, "connect", on_connect)
+    event.listen(engine, "begin", on_begin)
+    return engine
+
+
+def _alembic() -> Config:
+    config = Config()
+    config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
+    config.set_main_option("path_separator", "os")
+    return config
+
+
+def _head() -> str:
+    head = ScriptDirectory.from_config(_alembic()).get_current_head()
+    if head is None:
+        raise StoreError("the installation has no database migrations", where=str(_MIGRATIONS), remedy="Reinstall it")
+    return head
+
+
+def _revision(connection: Connection) -> str | None:
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    revision: str | None = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
+    return revision
+
+
+def _refuse_unknown(present: str | None, path: Path) -> None:
+    known = {script.revision for script in ScriptDirectory.from_config(_alembic()).walk_revisions()}
+    if present is not None and present not in known:
+        raise StoreVersionError(
+            f"this database was written by a newer version of orthocapture (its revision {present} is unknown here)",
+            where=str(path),
+            remedy="Install the version that wrote it, or a newer one; nothing was changed",
+        )
+
+
+def _refuse_old(present: str | None, path: Path) -> None:
+    if present != _head():
+        raise StoreVersionError(
+            "this database was written by an older version of orthocapture and has not been upgraded"
+            if present
+            else "this is not a database of orthocapture",
+            where=str(path),
+            remedy="Open it once with `orthocapture status`, or use the version that wrote it",
+        )
+
+
+def _upgrade(connection: Connection, path: Path) -> None:
+    present = _revision(connection)
+    _refuse_unknown(present, path)
+    if present is None and inspect(connection).get_table_names():
+        raise StoreVersionError(
+            "this is not a database of orthocapture", where=str(path), remedy="Choose another data folder"
+        )
+    if present != _head():
+        config = _alembic()
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
+
+
+@contextmanager
+def _store_errors(path: Path) -> Generator[None]:
+    try:
+        yield
+    except DBAPIError as error:
+        raise StoreError(_explain(error), where=str(path), remedy=_advise(error)) from error
+    except SQLAlchemyError as error:
+        raise StoreError(f"the database refused: {error}", where=str(path)) from error
+    except OSError as error:
+        raise StoreError(
+            f"the data folder refused: {error.strerror or error}", where=str(error.filename or path)
+        ) from error
+
+
+def _explain(error: DBAPIError) -> str:
+    return f"the database refused: {error.orig}"
+
+
+def _advise(error: DBAPIError) -> str:
+    code: Any = getattr(error.orig, "sqlite_errorname", "")
+    return {
+        "SQLITE_BUSY": "Another process holds the database for too long; look for one that hangs",
+        "SQLITE_FULL": "Free space on this disk; what was recorded before is safe",
+        "SQLITE_CORRUPT": "Restore the data folder from a copy; run `orthocapture audit verify` on the copy",
+        "SQLITE_NOTADB": "Restore the data folder from a copy; run `orthocapture audit verify` on the copy",
+        "SQLITE_READONLY": "Check the permissions of the data folder",
+        "SQLITE_CANTOPEN": "Check that the data folder exists and its permissions",
+    }.get(str(code), "Nothing of this action was recorded")

@@ -1,0 +1,184 @@
+"""The chain of events: canonical form, hash, append within a transaction, read back."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, cast
+
+import rfc8785
+from pydantic_core import PydanticSerializationError, ValidationError
+from sqlalchemy import Connection, Row, insert, select, update
+
+from service.core.errors import IntegrityError, StoreError
+from service.core.model import PAYLOAD, ArtefactRef, Event, Payload
+from service.store.seam import Clock, utc_text
+from service.store.tables import events, heads
+
+ROOT = "0" * 64  # previous_sha256 of the first event
+_SAFE = 2**53 - 1
+_REF_FIELDS: set[str] = set(ArtefactRef.model_fields)
+
+
+def canonical(value: object) -> str:
+    """RFC 8785 canonical JSON. Raises StoreError for NaN, infinity, integers beyond 2^53, lone surrogates."""
+    try:
+        return rfc8785.dumps(cast("dict[str, Any]", value)).decode()
+    except (rfc8785.CanonicalizationError, UnicodeEncodeError, RecursionError) as error:
+        raise StoreError(
+            f"this cannot be written as canonical JSON: {error}",
+            remedy="Record finite numbers, integers within 2^53 and valid text; bulk data belongs in an artefact",
+        ) from error
+
+
+def parse_canonical(text: str) -> Any:
+    """Read canonical JSON back; canonical(parse_canonical(t)) == t. Raises ValueError."""
+    return json.loads(text, parse_int=_integer)
+
+
+def _integer(digits: str) -> int | float:
+    # The canonical form of 1e20 has no exponent: beyond the safe range the number can only have been a float.
+    value = int(digits)
+    return value if -_SAFE <= value <= _SAFE else float(digits)
+
+
+def sha256_text(text: str) -> str:
+    """SHA-256 of the UTF-8 bytes, as 64 hexadecimal digits."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def event_sha256(fields: Mapping[str, Any]) -> str:
+    """Hash of an event from its fields as plain data; `sha256` itself is left out."""
+    return sha256_text(canonical({name: value for name, value in fields.items() if name != "sha256"}))
+
+
+def payload_text(payload: Payload) -> str:
+    """Canonical JSON of a payload. Raises StoreError naming the field that has no canonical form."""
+    # In JSON mode pydantic writes NaN within untyped fields as null: evidence must not change silently.
+    for path, number in _numbers(payload.model_dump(mode="python"), payload.kind):
+        if not math.isfinite(number):
+            raise StoreError(
+                f"{number} cannot be recorded",
+                where=path,
+                remedy="Leave the value out, or say in words why it is missing",
+            )
+    try:
+        return canonical(payload.model_dump(mode="json"))
+    except PydanticSerializationError as error:
+        raise StoreError(
+            f"this is not plain data: {error}", where=payload.kind, remedy="Convert arrays to lists"
+        ) from error
+
+
+def _numbers(value: object, path: str) -> Iterator[tuple[str, float]]:
+    if isinstance(value, float):
+        yield path, value
+    elif isinstance(value, Mapping):
+        for key, item in cast("Mapping[object, object]", value).items():
+            yield from _numbers(item, f"{path}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(cast("Sequence[object]", value)):
+            yield from _numbers(item, f"{path}[{index}]")
+
+
+def references(payload: object) -> tuple[ArtefactRef, ...]:
+    """Every ArtefactRef anywhere within a payload's plain data, in order, repetitions left out."""
+    return tuple(dict.fromkeys(_references(payload)))
+
+
+def _references(value: object) -> Iterator[ArtefactRef]:
+    if isinstance(value, Mapping):
+        fields = cast("Mapping[str, object]", value)
+        if set(fields) == _REF_FIELDS:
+            yield _reference(fields)
+        else:
+            for item in fields.values():
+                yield from _references(item)
+    elif isinstance(value, list | tuple):
+        for item in cast("Sequence[object]", value):
+            yield from _references(item)
+
+
+def _reference(fields: Mapping[str, object]) -> ArtefactRef:
+    try:
+        return ArtefactRef.model_validate(fields)
+    except ValidationError as error:
+        raise StoreError(f"a reference to an artefact is malformed: {error}") from error
+
+
+def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence[Payload], actor: str) -> list[Event]:
+    """Append to a run's chain within the caller's IMMEDIATE transaction, so that nobody comes between.
+
+    Raises:
+        IntegrityError: the end of the chain is not where it was left.
+        StoreError: a payload has no canonical form.
+    """
+    seq, previous = read_head(connection, run_id)
+    appended: list[Event] = []
+    for payload in payloads:
+        seq += 1
+        text = payload_text(payload)
+        fields: dict[str, Any] = {
+            "seq": seq,
+            "run_id": run_id,
+            "at_utc": utc_text(clock.utc_now()),
+            "monotonic_s": clock.monotonic_s(),
+            "actor": actor,
+            "payload": parse_canonical(text),
+            "previous_sha256": previous,
+        }
+        previous = event_sha256(fields)
+        connection.execute(
+            insert(events).values(**fields | {"kind": payload.kind, "payload": text, "sha256": previous})
+        )
+        appended.append(Event.model_validate(fields | {"sha256": previous}))
+    if appended:
+        connection.execute(update(heads).where(heads.c.run_id == run_id).values(seq=seq, sha256=previous))
+    return appended
+
+
+def read_head(connection: Connection, run_id: str) -> tuple[int, str]:
+    """Sequence number and hash of a run's last event; (0, 64 zeros) before the first. Raises IntegrityError."""
+    head = connection.execute(select(heads.c.seq, heads.c.sha256).where(heads.c.run_id == run_id)).one_or_none()
+    last = connection.execute(
+        select(events.c.seq, events.c.sha256).where(events.c.run_id == run_id).order_by(events.c.seq.desc()).limit(1)
+    ).one_or_none()
+    expected = (0, ROOT) if last is None else (last.seq, last.sha256)
+    if head is None or (head.seq, head.sha256) != expected:
+        raise IntegrityError(
+            f"the chain of run {run_id} does not end where it was left",
+            where=f"event {expected[0]}",
+            remedy="Run `orthocapture audit verify`; nothing is appended to a chain that was tampered with",
+        )
+    return expected
+
+
+def read_events(connection: Connection, run_id: str, after_seq: int) -> list[Event]:
+    """The events after a sequence number, in order. Raises IntegrityError for a row that is no event."""
+    rows = connection.execute(
+        select(events).where(events.c.run_id == run_id, events.c.seq > after_seq).order_by(events.c.seq)
+    )
+    return [to_event(row) for row in rows]
+
+
+def to_event(row: Row[Any]) -> Event:
+    """A row as a record; does not check the hash. Raises IntegrityError."""
+    try:
+        return Event(
+            seq=row.seq,
+            run_id=row.run_id,
+            at_utc=row.at_utc,
+            monotonic_s=row.monotonic_s,
+            actor=row.actor,
+            payload=PAYLOAD.validate_python(parse_canonical(row.payload)),
+            previous_sha256=row.previous_sha256,
+            sha256=row.sha256,
+        )
+    except (ValidationError, ValueError) as error:
+        raise IntegrityError(
+            f"event {row.seq} cannot be read: {error}",
+            where=f"run {row.run_id}, event {row.seq}",
+            remedy="Run `orthocapture audit verify`; a newer version of the software may have written it",
+        ) from error

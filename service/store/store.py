@@ -1,0 +1,287 @@
+"""The store of a data folder, as the runner, the worker and the command line use it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from sqlalchemy import Connection, insert, select
+
+from service.core.errors import IntegrityError, OrthocaptureError, StoreError
+from service.core.model import ArtefactRef, Event, JobFinished, Payload, RunStarted
+from service.store import jobs as queue
+from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, read_artefacts
+from service.store.database import Database, database_path, open_database
+from service.store.errors import UnknownRunError
+from service.store.events import ROOT, append, read_events
+from service.store.leases import RunLease, acquire, check_lease
+from service.store.records import Artefact, Job, NewArtefact, NewJob, RunRow
+from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock, utc_text
+from service.store.tables import heads, runs
+
+_OWN_KINDS = frozenset({"run_started", "job_enqueued", "job_finished", "job_failed"})
+
+
+class Store:
+    """Events, artefacts and jobs of all runs in one data folder. Safe for several processes and threads at once.
+
+    Methods raise StoreError (or a leaf of it) and nothing else; after a raise, nothing of the call was recorded.
+    """
+
+    def __init__(self, database: Database, folder: ArtefactFiles, clock: Clock, ids: Ids, path: Path) -> None:
+        self._database = database
+        self._folder = folder
+        self._clock = clock
+        self._ids = ids
+        self.database_path = path
+
+    @classmethod
+    def open(
+        cls,
+        data_dir: Path,
+        clock: Clock | None = None,
+        ids: Ids | None = None,
+        files: Files | None = None,
+        *,
+        create: bool = True,
+    ) -> Store:
+        """Open a data folder, and make it when `create`. StoreVersionError for a newer database."""
+        files = files or DurableFiles()
+        ids = ids or RandomIds()
+        if not create and not database_path(data_dir).is_file():
+            raise StoreError(
+                "there is no run data here",
+                where=str(database_path(data_dir)),
+                remedy="Name the data folder with --data DIR, or with the environment variable ORTHOCAPTURE_DATA",
+            )
+        folder = ArtefactFiles(data_dir / "artefacts", files, ids)
+        try:
+            for directory in (*reversed(data_dir.absolute().parents), data_dir.absolute()):
+                if not directory.exists():
+                    files.make_directory(directory)
+                    files.sync_directory(directory.parent)
+            folder.prepare()
+        except OSError as error:
+            raise StoreError(
+                f"the data folder cannot be made: {error.strerror or error}",
+                where=str(error.filename or data_dir),
+                remedy="Check the path and its permissions, or choose another folder with --data DIR",
+            ) from error
+        return cls(open_database(data_dir, files), folder, clock or SystemClock(), ids, database_path(data_dir))
+
+    def close(self) -> None:
+        """Close the database."""
+        self._database.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # --- files ---
+
+    def put_file(
+        self, path: Path, *, kind: str, media_type: str, original_name: str | None = None, sha256: str | None = None
+    ) -> ArtefactRef:
+        """Copy a file into the store, durably. Nothing refers to it before `record`.
+
+        Args:
+            path: the file; it stays where it is.
+            kind: image, raw, scan …, see ArtefactRef.
+            media_type: such as image/jpeg.
+            original_name: as the device called it; the file's own name unless given.
+            sha256: what the driver hashed at arrival; refused when the copy differs.
+        """
+        digest, size = self._folder.put(chunks_of(path), expected_sha256=sha256)
+        name = original_name or path.name
+        return ArtefactRef(sha256=digest, kind=kind, media_type=media_type, size_bytes=size, original_name=name)
+
+    def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Write bytes into the store, durably. Nothing refers to them before `record`."""
+        digest, size = self._folder.put([data])
+        return ArtefactRef(
+            sha256=digest, kind=kind, media_type=media_type, size_bytes=size, original_name=original_name
+        )
+
+    def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
+        """The read-only file of an artefact. Raises IntegrityError when missing or, with `verify`, altered."""
+        return self._folder.verified_path(sha256) if verify else self._folder.path(sha256)
+
+    # --- runs and events ---
+
+    def create_run(self, payload: RunStarted, actor: str, artefacts: Sequence[NewArtefact]) -> str:
+        """Begin a run: its first event, with protocol and rig among the artefacts. Returns the run's name."""
+        now = self._clock.utc_now()
+        run_id = self._ids.new_run(now)
+        with self._database.writing() as connection:
+            # The run's row holds the hash of the root event, which refers to the row: keys are checked at commit.
+            connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
+            connection.execute(insert(heads).values(run_id=run_id, seq=0, sha256=ROOT))
+            (root,) = append(connection, self._clock, run_id, [payload], actor)
+            connection.execute(
+                insert(runs).values(
+                    run_id=run_id,
+                    created_utc=utc_text(now),
+                    simulated=int(payload.simulated),
+                    root_sha256=root.sha256,
+                )
+            )
+            insert_artefacts(connection, self._folder, [root], artefacts)
+        return run_id
+
+    def runs(self) -> list[RunRow]:
+        """All runs, oldest first."""
+        with self._database.reading() as connection:
+            return read_runs(connection)
+
+    def find_run(self, name: str) -> str:
+        """The run that `name` means: its full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
+        return resolve_run(self.runs(), name)
+
+    def record(
+        self,
+        run_id: str,
+        payloads: Sequence[Payload],
+        *,
+        actor: str,
+        artefacts: Sequence[NewArtefact] = (),
+        jobs: Sequence[NewJob] = (),
+        lease: RunLease | None = None,
+    ) -> list[Event]:
+        """Append events, artefact rows and jobs in one transaction: all of it is durable on return, or none of it.
+
+        A job also appends JobEnqueued after the payloads; one whose key the run has already is left out.
+        With `lease`, a runner that has lost its run is refused (LeaseLostError).
+        """
+        for payload in payloads:
+            if payload.kind in _OWN_KINDS:
+                raise StoreError(
+                    f"{payload.kind} is written by the store itself", remedy="Call the method of that name"
+                )
+        with self._database.writing() as connection:
+            self._require_run(connection, run_id)
+            if lease is not None:
+                check_lease(connection, lease)
+            events = append(connection, self._clock, run_id, payloads, actor)
+            events += queue.enqueue(connection, self._clock, self._ids, run_id, jobs, actor=actor)
+            insert_artefacts(connection, self._folder, events, artefacts)
+        return events
+
+    def events(self, run_id: str, after_seq: int = 0) -> list[Event]:
+        """A run's events after a sequence number, in order. Does not verify the chain: see audit.verify."""
+        with self._database.reading() as connection:
+            self._require_run(connection, run_id)
+            return read_events(connection, run_id, after_seq)
+
+    def artefacts(self, run_id: str) -> list[Artefact]:
+        """All recorded artefacts of a run, in the order of its events."""
+        with self._database.reading() as connection:
+            self._require_run(connection, run_id)
+            return read_artefacts(connection, run_id)
+
+    def lease(self, run_id: str, holder: str, seconds: float) -> RunLease:
+        """The sole right to drive a run. Raises LeaseHeldError while a living process has it."""
+        with self._database.reading() as connection:
+            self._require_run(connection, run_id)
+        return acquire(self._database, self._clock, self._ids, run_id=run_id, holder=holder, seconds=seconds)
+
+    def _require_run(self, connection: Connection, run_id: str) -> None:
+        if connection.execute(select(runs.c.run_id).where(runs.c.run_id == run_id)).first() is None:
+            raise UnknownRunError(f"there is no run {run_id!r}", where=str(self.database_path))
+
+    # --- jobs ---
+
+    def jobs(self, run_id: str) -> list[Job]:
+        """All jobs of a run, oldest first."""
+        with self._database.reading() as connection:
+            self._require_run(connection, run_id)
+            return queue.read_jobs(connection, run_id)
+
+    def enqueue_job(self, run_id: str, job: NewJob, *, actor: str) -> Job:
+        """Enqueue a job, or return the one that has its key already."""
+        self.record(run_id, [], actor=actor, jobs=[job])
+        with self._database.reading() as connection:
+            found = queue.find_by_key(connection, run_id, job.idempotency_key)
+        if found is None:
+            raise IntegrityError(f"the job just enqueued is not there: {job.idempotency_key}", where=run_id)
+        return found
+
+    def claim_job(
+        self, worker: str, lease_s: float, kinds: Collection[str] | None = None, *, run_id: str | None = None
+    ) -> Job | None:
+        """The oldest open job, now this worker's for `lease_s` seconds; None when there is nothing to do."""
+        with self._database.writing() as connection:
+            return queue.claim(
+                connection, self._clock, self._ids, worker=worker, lease_s=lease_s, kinds=kinds, run_id=run_id
+            )
+
+    def renew_job(self, job: Job, lease_s: float) -> Job:
+        """Keep a job for another `lease_s` seconds. Raises LeaseLostError."""
+        with self._database.writing() as connection:
+            return queue.renew(connection, self._clock, job, lease_s)
+
+    def finish_job(
+        self,
+        job: Job,
+        *,
+        measures: Mapping[str, float],
+        duration_s: float,
+        result: Mapping[str, Any] | None = None,
+        artefacts: Sequence[NewArtefact] = (),
+    ) -> Event:
+        """Append JobFinished with its artefacts and close the job. Raises LeaseLostError."""
+        payload = JobFinished(
+            job=job.job_id,
+            job_kind=job.kind,
+            step=job.step,
+            attempt=job.attempt,
+            worker=job.worker or "",
+            measures=dict(measures),
+            artefacts=tuple(artefact.ref for artefact in artefacts),
+            result=dict(result or {}),
+            duration_s=duration_s,
+        )
+        with self._database.writing() as connection:
+            event = queue.finish(connection, self._clock, job, payload)
+            insert_artefacts(connection, self._folder, [event], artefacts)
+        return event
+
+    def fail_job(self, job: Job, error: Exception, *, retry: bool) -> list[Event]:
+        """Try a job again later, or fail it for good when not `retry` or no tries are left. Raises LeaseLostError."""
+        name, message = type(error).__name__, str(error) if isinstance(error, OrthocaptureError) else repr(error)
+        with self._database.writing() as connection:
+            return queue.fail(connection, self._clock, job, name, message, retry=retry)
+
+
+def read_runs(connection: Connection) -> list[RunRow]:
+    """All runs, oldest first."""
+    statement = (
+        select(runs, heads.c.seq, heads.c.sha256)
+        .outerjoin(heads, heads.c.run_id == runs.c.run_id)
+        .order_by(runs.c.created_utc, runs.c.run_id)
+    )
+    return [
+        RunRow(row.run_id, row.created_utc, bool(row.simulated), row.root_sha256, row.seq or 0, row.sha256 or ROOT)
+        for row in connection.execute(statement)
+    ]
+
+
+def resolve_run(known: Sequence[RunRow], name: str) -> str:
+    """The run that a full name, an unambiguous beginning, or `latest` means. Raises UnknownRunError."""
+    if not known:
+        raise UnknownRunError("there is no run in this data folder yet", remedy="Start one with `orthocapture run`")
+    if name == "latest":
+        return known[-1].run_id
+    matches = [run.run_id for run in known if run.run_id == name] or [
+        run.run_id for run in known if name and run.run_id.startswith(name)
+    ]
+    if len(matches) != 1:
+        newest = ", ".join(run.run_id for run in known[-3:])
+        what = f"no run is called {name!r}" if not matches else f"{name!r} is the beginning of {len(matches)} runs"
+        raise UnknownRunError(what, remedy=f"The newest are: {newest}; or say `latest`")
+    return matches[0]
