@@ -1,0 +1,82 @@
+"""A Universal Robots controller on its real wires: RTDE 30004, dashboard 29999, script port 30003."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from simulators.serve import SimulatorError, Termination, announce
+from simulators.ur_controller.controller import Controller
+from simulators.ur_controller.kinematics import MODELS
+from simulators.ur_controller.server import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, Server, WorldLink
+
+HOME_RAD = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `simulators ur`."""
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on; the ports are UR's")
+    parser.add_argument("--model", default="UR10e", choices=sorted(MODELS))
+    parser.add_argument("--version", default="5.12", help="of Polyscope: 3.15 for CB3, 5.12 or 5.25 for e-Series")
+    parser.add_argument("--serial", default="", help="serial number (digits); made from the address by default")
+    parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="motions take 1/N of their time")
+    parser.add_argument("--initial-joints", default="", metavar="Q1,…,Q6", help="joints at start-up in radians")
+    parser.add_argument("--world", default="", metavar="HOST:PORT", help="world socket that is told the joints")
+    parser.add_argument("--arm", default="robot", help="name of the arm in the world and in fault plans")
+
+
+def serve(args: argparse.Namespace) -> None:
+    """Listen, announce, serve until SIGTERM. Raises SimulatorError."""
+    termination = Termination(with_parent=args.with_parent)
+    model = MODELS[args.model]
+    controller = Controller(
+        model,
+        _version(args.version),
+        joints=_joints(args.initial_joints),
+        serial=args.serial or f"2023{'5' if model.e_series else '3'}{_last_number(args.host):05d}",
+        faults=args.faults,
+        device=args.arm,
+        speed_up=args.speed_up,
+    )
+    world = None
+    if args.world:
+        host, _, port = args.world.rpartition(":")
+        world = WorldLink((host, int(port)), args.arm)
+    server = Server(controller, args.host, world)
+    announce(
+        host=args.host,
+        rtde=f"{args.host}:{RTDE_PORT}",
+        dashboard=f"{args.host}:{DASHBOARD_PORT}",
+        script=f"{args.host}:{SCRIPT_PORT}",
+        model=args.model,
+        version=args.version,
+        serial=controller.serial,
+    )
+    try:
+        server.run(termination)
+    finally:
+        server.close()
+
+
+def _version(text: str) -> tuple[int, int]:
+    try:
+        major, minor = (int(part) for part in text.split(".")[:2])
+    except ValueError:
+        raise SimulatorError(f"version {text!r} is not MAJOR.MINOR") from None
+    return major, minor
+
+
+def _joints(text: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    try:
+        joints = [float(part) for part in text.split(",")] if text else list(HOME_RAD)
+    except ValueError:
+        joints = []
+    if len(joints) != 6:
+        raise SimulatorError(f"initial joints {text!r} are not six numbers")
+    return np.array(joints)
+
+
+def _last_number(host: str) -> int:
+    last = host.rpartition(".")[2]
+    return int(last) if last.isdigit() else 0

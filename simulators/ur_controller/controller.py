@@ -1,0 +1,331 @@
+"""The controller's state: modes, safety, joints, registers, inputs and outputs, advanced cycle by cycle."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+
+from simulators.faults import Fault, FaultPlan
+from simulators.ur_controller import fields, kinematics
+from simulators.ur_controller.kinematics import Array, Model
+from simulators.ur_controller.motion import Motion, MotionError
+
+_LOG = logging.getLogger(__name__)
+
+PROTECTIVE_UNLOCK_S = 5.0
+RING_FREQUENCY_HZ, RING_DECAY_S, RING_AMPLITUDE_S2 = 12.0, 0.06, 4e-5  # the arm swings a little when it stops
+
+
+class RobotMode(IntEnum):
+    """robot_mode of the RTDE guide."""
+
+    POWER_OFF = 3
+    POWER_ON = 4
+    IDLE = 5
+    RUNNING = 7
+
+
+class SafetyMode(IntEnum):
+    """safety_mode of the RTDE guide."""
+
+    NORMAL = 1
+    REDUCED = 2
+    PROTECTIVE_STOP = 3
+    ROBOT_EMERGENCY_STOP = 7
+
+
+class Runtime(IntEnum):
+    """runtime_state of the RTDE guide."""
+
+    STOPPED = 1
+    PLAYING = 2
+    PAUSED = 4
+
+
+_SAFETY_BITS = {
+    SafetyMode.NORMAL: 1 << 0,
+    SafetyMode.REDUCED: (1 << 1),
+    SafetyMode.PROTECTIVE_STOP: (1 << 2) | (1 << 10),
+    SafetyMode.ROBOT_EMERGENCY_STOP: (1 << 6) | (1 << 7) | (1 << 10),
+}
+
+
+@dataclass
+class Registers:
+    """Integer and double registers of one direction."""
+
+    ints: list[int] = field(default_factory=lambda: [0] * 48)
+    doubles: list[float] = field(default_factory=lambda: [0.0] * 48)
+
+
+class Controller:
+    """One controller with its arm. Time is in seconds since start-up; `speed_up` shortens motions and waiting."""
+
+    def __init__(
+        self,
+        model: Model,
+        version: fields.Version,
+        *,
+        joints: Array,
+        serial: str,
+        faults: FaultPlan,
+        device: str,
+        speed_up: float = 1.0,
+    ) -> None:
+        self.model, self.version, self.serial, self.speed_up = model, version, serial, speed_up
+        self.faults, self.device = faults, device
+        self.step_s = 0.002 if version[0] >= 5 else 0.008
+        self.time_s = 0.0
+        self.robot_mode = RobotMode.RUNNING
+        self.safety = SafetyMode.NORMAL
+        self.runtime = Runtime.STOPPED
+        self.program_name = ""
+        self.inputs, self.outputs = Registers(), Registers()
+        self.payload_kg, self.payload_cog_m, self.payload_inertia = 0.0, [0.0] * 3, [0.0] * 6
+        self.tcp_pose_m = np.zeros(6)
+        self.speed_fraction = 1.0
+        self.digital_outputs = 0
+        self.analog_outputs = [0.0, 0.0]
+        self.operational_since_s = 0.0
+        self.target_q, self.target_qd, self.target_qdd = joints.copy(), np.zeros(6), np.zeros(6)
+        self.actual_q, self.actual_qd = joints.copy(), np.zeros(6)
+        self.T_base_flange = kinematics.forward(model, joints)
+        self.tcp_pose, self.target_tcp_pose = np.zeros(6), np.zeros(6)
+        self.tcp_speed = np.zeros(6)
+        self.generation = 0  # rises whenever anything but the clock changed
+        self.motion: Motion | None = None
+        self._stopped_at_s = -math.inf
+        self._button_released_s = -math.inf
+        self._pending_fault: tuple[float, Fault] | None = None
+        self._ring: tuple[float, Array] | None = None
+        self._place_tool()
+
+    # --- cycle -------------------------------------------------------------------------------------------
+
+    def advance(self, dt_s: float) -> None:
+        """Move on by dt_s of real time."""
+        self.time_s += dt_s
+        if self._pending_fault is not None and self.time_s >= self._pending_fault[0]:
+            fault, self._pending_fault = self._pending_fault[1], None
+            self.emergency_stop(fault) if fault.kind == "emergency_stop" else self.protective_stop(fault.kind)
+        if self.motion is not None:
+            self._move(dt_s)
+        elif self._ring is not None:
+            self._swing()
+
+    def _move(self, dt_s: float) -> None:
+        assert self.motion is not None
+        scale = self.speed_up * self.speed_fraction
+        try:
+            self.motion.advance(dt_s * scale)
+        except MotionError as error:
+            self.protective_stop(str(error))
+            return
+        if self.motion.done and np.any(self.target_qdd):
+            self._ring = (self.time_s, -RING_AMPLITUDE_S2 * self.target_qdd)
+        self.target_q = self.motion.q
+        self.target_qd, self.target_qdd = self.motion.qd * scale, self.motion.qdd * scale
+        self.actual_q, self.actual_qd = self.target_q, self.target_qd
+        if self.motion.done:
+            self.motion = None
+        self._place_tool()
+
+    def _swing(self) -> None:
+        assert self._ring is not None
+        start_s, amplitude = self._ring
+        t = (self.time_s - start_s) * self.speed_up
+        if t > 12 * RING_DECAY_S:
+            self._ring = None
+            self.actual_q, self.actual_qd = self.target_q, np.zeros(6)
+        else:
+            w = 2 * math.pi * RING_FREQUENCY_HZ
+            envelope = math.exp(-t / RING_DECAY_S)
+            self.actual_q = self.target_q + amplitude * (envelope * math.sin(w * t))
+            rate = envelope * (w * math.cos(w * t) - math.sin(w * t) / RING_DECAY_S) * self.speed_up
+            self.actual_qd = amplitude * rate
+        self._place_tool()
+
+    def _place_tool(self) -> None:
+        chain = kinematics.frames(self.model, self.actual_q)
+        self.T_base_flange = chain[6]
+        T_base_tcp = chain[6] @ kinematics.from_pose(self.tcp_pose_m)
+        self.tcp_pose = kinematics.to_pose(T_base_tcp)
+        self.target_tcp_pose = self.tcp_pose
+        moving = bool(np.any(self.actual_qd))
+        self.tcp_speed = kinematics.jacobian(chain, T_base_tcp[:3, 3]) @ self.actual_qd if moving else np.zeros(6)
+        self.generation += 1
+
+    # --- what programs and clients do ------------------------------------------------------------------
+
+    @property
+    def may_move(self) -> bool:
+        """Brakes released and no stop active."""
+        return self.robot_mode is RobotMode.RUNNING and self.safety in (SafetyMode.NORMAL, SafetyMode.REDUCED)
+
+    @property
+    def steady(self) -> bool:
+        """is_steady(): the target stands still; it sees nothing of the arm's swinging."""
+        return self.motion is None
+
+    def start(self, motion: Motion) -> bool:
+        """Begin a motion, replacing the present one; False when a fault plan refuses it."""
+        fault = self.faults.check(self.device, "move")
+        if fault is not None and fault.kind == "reject":
+            return False
+        if fault is not None:
+            delay_s = float(fault.value) if isinstance(fault.value, (int, float)) else 0.15
+            self._pending_fault = (self.time_s + delay_s, fault)
+        self.motion = motion
+        self._ring = None
+        return True
+
+    def replace(self, motion: Motion) -> None:
+        """Change the present motion (stop, new speed target): not counted as a motion by fault plans."""
+        self.motion = motion
+        self._ring = None
+
+    def halt(self) -> None:
+        """Stand still within this cycle."""
+        self.motion = None
+        if np.any(self.target_qd):
+            self._ring = (self.time_s, -RING_AMPLITUDE_S2 * 5 * np.sign(self.target_qd))
+        self.target_qd, self.target_qdd = np.zeros(6), np.zeros(6)
+        self.actual_qd = np.zeros(6)
+        self._place_tool()
+
+    def set_tcp(self, pose: Array) -> None:
+        """Tool centre point in the flange frame, as a pose."""
+        self.tcp_pose_m = pose.copy()
+        self._place_tool()
+
+    def set_payload(self, mass_kg: float, cog_m: list[float]) -> bool:
+        """Mass and centre of gravity; False beyond the model's rating."""
+        if not 0.0 <= mass_kg <= self.model.payload_kg:
+            return False
+        self.payload_kg, self.payload_cog_m = mass_kg, cog_m
+        self.generation += 1
+        return True
+
+    def within_limits(self, q: Array) -> bool:
+        """All joints within ±360°."""
+        return bool(np.all(np.isfinite(q)) and np.max(np.abs(q)) <= kinematics.JOINT_LIMIT_RAD + 1e-9)
+
+    def inverse(self, pose: Array, near: Array) -> Array | None:
+        """Joints that bring the tool centre point to a pose."""
+        T = kinematics.from_pose(pose) @ kinematics.rigid_inverse(kinematics.from_pose(self.tcp_pose_m))
+        return kinematics.inverse(self.model, T, near)
+
+    # --- safety --------------------------------------------------------------------------------------------
+
+    def protective_stop(self, why: str) -> None:
+        """Stop at once; the program dies; a person has to unlock."""
+        _LOG.warning("protective stop: %s", why)
+        self._stop(SafetyMode.PROTECTIVE_STOP)
+
+    def emergency_stop(self, fault: Fault | None = None) -> None:
+        """Stop and cut the power; the button is released after the fault's value in seconds (2)."""
+        hold_s = float(fault.value) if fault is not None and isinstance(fault.value, (int, float)) else 2.0
+        _LOG.warning("emergency stop")
+        self._stop(SafetyMode.ROBOT_EMERGENCY_STOP)
+        self.robot_mode = RobotMode.POWER_OFF
+        self._button_released_s = self.time_s + hold_s / self.speed_up
+
+    def _stop(self, mode: SafetyMode) -> None:
+        self.halt()
+        self.safety, self.runtime = mode, Runtime.STOPPED
+        self._stopped_at_s = self.time_s
+        self.generation += 1
+
+    def unlock_protective_stop(self) -> bool:
+        """Possible 5 s after the stop; True when unlocked."""
+        if self.safety is not SafetyMode.PROTECTIVE_STOP:
+            return True
+        if self.time_s - self._stopped_at_s < PROTECTIVE_UNLOCK_S / self.speed_up:
+            return False
+        self.safety = SafetyMode.NORMAL
+        self.generation += 1
+        return True
+
+    def power_on(self) -> None:
+        """Power without brakes released. Ends an emergency stop when its button was released."""
+        if self.safety is SafetyMode.ROBOT_EMERGENCY_STOP:
+            if self.time_s < self._button_released_s:
+                return
+            self.safety = SafetyMode.NORMAL
+        if self.robot_mode is RobotMode.POWER_OFF:
+            self.robot_mode = RobotMode.IDLE
+        self.generation += 1
+
+    def power_off(self) -> None:
+        """Brakes on, power off, program dead."""
+        self.halt()
+        self.robot_mode, self.runtime = RobotMode.POWER_OFF, Runtime.STOPPED
+        self.generation += 1
+
+    def brake_release(self) -> None:
+        """To RUNNING, powering on if need be."""
+        self.power_on()
+        if self.robot_mode is RobotMode.IDLE:
+            self.robot_mode = RobotMode.RUNNING
+        self.generation += 1
+
+    # --- RTDE fields -----------------------------------------------------------------------------------------
+
+    def apply(self, written: dict[str, tuple[float, ...]]) -> None:
+        """Take the fields of a client's data package."""
+        for name, value in written.items():
+            if name.startswith("input_int_register_"):
+                self.inputs.ints[int(name[19:])] = int(value[0])
+            elif name.startswith("input_double_register_"):
+                self.inputs.doubles[int(name[22:])] = value[0]
+        if written.get("speed_slider_mask", (0,))[0]:
+            self.speed_fraction = min(1.0, max(0.0, written.get("speed_slider_fraction", (1.0,))[0]))
+        for group, shift, width in (("standard", 0, 8), ("configurable", 8, 8), ("tool", 16, 2)):
+            mask = int(written.get(f"{group}_digital_output_mask", (0,))[0]) & ((1 << width) - 1)
+            bits = int(written.get(f"{group}_digital_output", (0,))[0])
+            self.digital_outputs = (self.digital_outputs & ~(mask << shift)) | ((bits & mask) << shift)
+        analog = int(written.get("standard_analog_output_mask", (0,))[0])
+        for i in range(2):
+            if analog >> i & 1:
+                self.analog_outputs[i] = written.get(f"standard_analog_output_{i}", (0.0,))[0]
+        self.generation += 1
+
+    def values(self) -> dict[str, tuple[float, ...]]:
+        """The present numbers of the fields that are not zero throughout; registers are looked up apart."""
+        powered = self.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING)
+        joint_mode = 253 if self.robot_mode is RobotMode.RUNNING else 255 if powered else 239
+        return {
+            "target_q": tuple(self.target_q),
+            "target_qd": tuple(self.target_qd),
+            "target_qdd": tuple(self.target_qdd),
+            "actual_q": tuple(self.actual_q),
+            "actual_qd": tuple(self.actual_qd),
+            "actual_TCP_pose": tuple(self.tcp_pose),
+            "target_TCP_pose": tuple(self.target_tcp_pose),
+            "actual_TCP_speed": tuple(self.tcp_speed),
+            "target_TCP_speed": tuple(self.tcp_speed),
+            "actual_digital_output_bits": (self.digital_outputs,),
+            "joint_temperatures": (28.0,) * 6,
+            "robot_mode": (int(self.robot_mode),),
+            "joint_mode": (joint_mode,) * 6,
+            "safety_mode": (int(self.safety),),
+            "safety_status": (int(self.safety),),
+            "actual_tool_accelerometer": (0.0, 0.0, 9.81),
+            "speed_scaling": (self.speed_fraction,),
+            "target_speed_fraction": (self.speed_fraction,),
+            "actual_main_voltage": (48.0,),
+            "actual_robot_voltage": (48.0 if powered else 0.0,),
+            "actual_joint_voltage": (48.0 if powered else 0.0,) * 6,
+            "standard_analog_output0": (self.analog_outputs[0],),
+            "standard_analog_output1": (self.analog_outputs[1],),
+            "runtime_state": (int(self.runtime),),
+            "robot_status_bits": (int(powered) | int(self.runtime is Runtime.PLAYING) << 1,),
+            "safety_status_bits": (_SAFETY_BITS[self.safety],),
+            "payload": (self.payload_kg,),
+            "payload_cog": tuple(self.payload_cog_m),
+            "payload_inertia": tuple(self.payload_inertia),
+        }

@@ -1,0 +1,108 @@
+"""RTDE frames as bytes, apart from sockets: u16 size with header, u8 type, payload; everything big-endian."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+
+REQUEST_PROTOCOL_VERSION = ord("V")
+GET_CONTROL_VERSION = ord("v")
+TEXT_MESSAGE = ord("M")
+DATA_PACKAGE = ord("U")
+SETUP_OUTPUTS = ord("O")
+SETUP_INPUTS = ord("I")
+START = ord("S")
+PAUSE = ord("P")
+
+PROTOCOL_VERSION = 2
+HEADER = struct.Struct(">HB")
+
+# Field types of the RTDE guide and how each is packed.
+FORMATS = {
+    "BOOL": "?",
+    "UINT8": "B",
+    "UINT32": "I",
+    "UINT64": "Q",
+    "INT32": "i",
+    "DOUBLE": "d",
+    "VECTOR3D": "3d",
+    "VECTOR6D": "6d",
+    "VECTOR6INT32": "6i",
+    "VECTOR6UINT32": "6I",
+}
+LENGTHS = {name: int(code[0]) if len(code) > 1 else 1 for name, code in FORMATS.items()}
+
+
+class FrameError(ValueError):
+    """The bytes are no RTDE frame; the connection cannot be resynchronised."""
+
+
+def frame(kind: int, payload: bytes = b"") -> bytes:
+    """One frame."""
+    return HEADER.pack(HEADER.size + len(payload), kind) + payload
+
+
+class FrameReader:
+    """Cuts a byte stream into frames."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """Add bytes; yields (type, payload) of every frame that is complete. Raises FrameError."""
+        self._buffer += data
+        while len(self._buffer) >= HEADER.size:
+            size, kind = HEADER.unpack_from(self._buffer)
+            if size < HEADER.size:
+                raise FrameError(f"frame of {size} bytes")
+            if len(self._buffer) < size:
+                return
+            payload = bytes(self._buffer[HEADER.size : size])
+            del self._buffer[:size]
+            yield kind, payload
+
+
+class Recipe:
+    """An ordered choice of fields: packs and unpacks the data packages that carry it."""
+
+    def __init__(self, number: int, names: Sequence[str], types: Sequence[str]) -> None:
+        self.number = number
+        self.names = tuple(names)
+        self.types = tuple(types)
+        self._struct = struct.Struct(">B" + "".join(FORMATS[t] for t in types))
+        self._lengths = tuple(LENGTHS[t] for t in types)
+        self._head = HEADER.pack(HEADER.size + self._struct.size, DATA_PACKAGE)
+
+    def pack(self, flat: Sequence[float]) -> bytes:
+        """A whole data package from the fields' numbers, vectors laid flat."""
+        return self._head + self._struct.pack(self.number, *flat)
+
+    def unpack(self, payload: bytes) -> dict[str, tuple[float, ...]]:
+        """Field name → numbers, of a payload that begins with the recipe's number. Raises FrameError."""
+        if len(payload) != self._struct.size:
+            raise FrameError(f"recipe {self.number} takes {self._struct.size} bytes, not {len(payload)}")
+        flat = self._struct.unpack(payload)[1:]
+        fields: dict[str, tuple[float, ...]] = {}
+        at = 0
+        for name, length in zip(self.names, self._lengths, strict=True):
+            fields[name] = flat[at : at + length]
+            at += length
+        return fields
+
+
+def parse_setup_outputs(payload: bytes) -> tuple[float, list[str]]:
+    """Frequency in Hz and field names of a set-up of outputs (protocol version 2)."""
+    if len(payload) < 8:
+        raise FrameError("set-up of outputs without a frequency")
+    (frequency_hz,) = struct.unpack_from(">d", payload)
+    return float(frequency_hz), parse_names(payload[8:])
+
+
+def parse_names(payload: bytes) -> list[str]:
+    """Comma-separated field names."""
+    return [name.strip() for name in payload.decode("ascii", "replace").split(",") if name.strip()]
+
+
+def setup_reply(kind: int, number: int, types: Sequence[str]) -> bytes:
+    """Answer to a set-up: the recipe's number (0: refused) and one type, NOT_FOUND or IN_USE for each field."""
+    return frame(kind, bytes([number]) + ",".join(types).encode())
