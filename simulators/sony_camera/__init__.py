@@ -1,0 +1,45 @@
+"""Simulated Sony ILCE-7RM5 over PTP/IP: its options, and its service until SIGTERM."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from simulators.serve import Termination, announce
+from simulators.sony_camera.body import BodyOptions, CameraBody
+from simulators.sony_camera.scene import ImageSource, PictureFiles, StillLife, WorldSource
+from simulators.sony_camera.server import CameraServer
+
+DEFAULT_WIDTH = 1536
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the camera's options."""
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on")
+    parser.add_argument("--port", type=int, default=15740, help="port of both connections; 0 takes a free one")
+    parser.add_argument("--world", metavar="HOST:PORT", help="take pictures of the rig's world")
+    parser.add_argument("--image-width", type=int, metavar="W", help=f"pixels (up to 9504; default {DEFAULT_WIDTH})")
+    parser.add_argument("--image", nargs="+", type=Path, metavar="FILE", help="serve these pictures in turn")
+    parser.add_argument("--exposures-log", type=Path, metavar="FILE", help="write one JSON line an exposure")
+    parser.add_argument("--first-counter", type=int, default=1, help="number of the first file")
+    parser.add_argument("--announce", choices=("event", "property", "both"), default="both", help="of a new file")
+    parser.add_argument("--fast", action="store_true", help="exposures take no time")
+
+
+def _source(args: argparse.Namespace) -> ImageSource:
+    if args.world:
+        return WorldSource(args.world, args.image_width or DEFAULT_WIDTH)
+    if args.image:
+        return PictureFiles(args.image, args.image_width)
+    return StillLife(args.image_width or DEFAULT_WIDTH)
+
+
+def serve(args: argparse.Namespace) -> None:
+    """Announce the address and serve until SIGTERM."""
+    termination = Termination(with_parent=args.with_parent)
+    options = BodyOptions(args.fast, args.first_counter, args.exposures_log, args.announce)
+    body = CameraBody(_source(args), args.faults, options)
+    with CameraServer(args.host, args.port, body, args.faults) as server:
+        host, port = server.address
+        announce(simulator="camera", host=host, port=port, gphoto_port=f"ptpip:{host}:{port}:{port}")
+        termination.wait()

@@ -1,0 +1,221 @@
+"""The camera behind the wire: buttons, exposures that take their time, files waiting to be fetched, the card."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import cv2
+
+from simulators.faults import Fault, FaultPlan
+from simulators.serve import SimulatorError
+from simulators.sony_camera.exif import Shot, encode_jpeg, encode_raw
+from simulators.sony_camera.properties import (
+    FILE_JPEG,
+    FILE_RAW,
+    TARGET_COMPUTER,
+    Code,
+    ExposureSettings,
+    PropertyTable,
+)
+from simulators.sony_camera.scene import ImageSource, Moment
+
+FORMAT_JPEG, FORMAT_ARW = 0x3801, 0xB101
+HANDLING_S = 0.2  # shutter lag, read-out and processing of a real body
+CARD_BYTES = 128_000_000_000
+FOCUSED, NOT_FOCUSED = 2, 1
+_PRESSED = 2
+_LOG = logging.getLogger(__name__)
+
+
+class BusyError(Exception):
+    """The camera is still exposing."""
+
+
+class CardFullError(Exception):
+    """No space for another picture."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFile:
+    """A finished file in the camera's memory."""
+
+    name: str
+    format: int
+    data: bytes
+    width: int
+    height: int
+    captured: str
+
+
+@dataclass(frozen=True, slots=True)
+class BodyOptions:
+    """How this body behaves."""
+
+    fast: bool = False  # no exposure time, no handling time
+    first_counter: int = 1
+    exposures_log: Path | None = None
+    announce: str = "both"  # event, property, both: how the client learns of a file
+
+
+class CameraBody:
+    """State that outlives connections. `on_object` is called once for each file that becomes ready."""
+
+    def __init__(self, source: ImageSource, faults: FaultPlan, options: BodyOptions) -> None:
+        self.properties = PropertyTable()
+        self.options = options
+        self.on_object: Callable[[], None] = lambda: None
+        self.free_bytes = CARD_BYTES * 3 // 4
+        self._source = source
+        self._faults = faults
+        self._counter = options.first_counter
+        self._waiting: deque[CameraFile] = deque()
+        self._previous: list[CameraFile] = []
+        self._lock = threading.Lock()
+        self._half_pressed = False
+        self._exposing = threading.Event()
+        self._log_lock = threading.Lock()
+
+    @property
+    def exposing(self) -> bool:
+        """Whether an exposure is under way."""
+        return self._exposing.is_set()
+
+    def button(self, code: int, state: int) -> None:
+        """Half or full press (2) and release (1). Raises BusyError or CardFullError on a full press."""
+        if code == Code.HALF_PRESS:
+            self._half_pressed = state == _PRESSED
+            self.properties.put(Code.FOCUS_STATUS, FOCUSED if self._half_pressed else NOT_FOCUSED)
+        elif code == Code.FULL_PRESS and state == _PRESSED:
+            self._shoot()
+
+    def _shoot(self) -> None:
+        settings = self.properties.exposure_settings()
+        if self._exposing.is_set():
+            raise BusyError
+        if self.free_bytes <= 0 or (settings.capture_target != TARGET_COMPUTER and self.free_bytes < 200_000_000):
+            raise CardFullError
+        self._exposing.set()
+        fault = self._faults.check("camera", "image")
+        counter = self._counter
+        self._counter += 1
+        threading.Thread(target=self._expose, args=(counter, settings, fault), name="exposure", daemon=True).start()
+
+    def _expose(self, counter: int, settings: ExposureSettings, fault: Fault | None) -> None:
+        started = time.monotonic()
+        try:
+            moment = self._source.freeze(counter)
+            taken = datetime.now().astimezone()
+            files = self._develop(moment, settings, Shot(settings, counter, taken))
+            if not self.options.fast:
+                time.sleep(max(0.0, settings.exposure_s + HANDLING_S - (time.monotonic() - started)))
+            self._finish(files, fault, moment, settings, taken)
+        except SimulatorError:
+            # A camera whose processor fails delivers nothing; the client must notice by itself.
+            _LOG.exception("exposure %d gave no picture", counter)
+        finally:
+            self._exposing.clear()
+
+    def _develop(self, moment: Moment, settings: ExposureSettings, shot: Shot) -> list[CameraFile]:
+        picture = self._source.develop(moment, settings)
+        captured = f"{shot.taken:%Y%m%dT%H%M%S}"
+        height, width = picture.shape[:2]
+        stem = f"DSC{(moment.counter - 1) % 99999 + 1:05d}"
+        files: list[CameraFile] = []
+        if settings.file_format != FILE_RAW:
+            jpeg = encode_jpeg(picture, shot)
+            files.append(CameraFile(f"{stem}.JPG", FORMAT_JPEG, jpeg, width, height, captured))
+        if settings.file_format != FILE_JPEG:
+            raw = encode_raw(picture, shot)
+            files.append(CameraFile(f"{stem}.ARW", FORMAT_ARW, raw, width, height, captured))
+        return files
+
+    def _finish(
+        self,
+        files: list[CameraFile],
+        fault: Fault | None,
+        moment: Moment,
+        settings: ExposureSettings,
+        taken: datetime,
+    ) -> None:
+        kind = fault.kind if fault else ""
+        if kind == "no_image":
+            return
+        if kind == "stale" and self._previous:
+            files = self._previous
+        elif kind in ("truncate", "corrupt"):
+            files = [_damaged(file, kind) for file in files]
+        self._previous = files
+        if settings.capture_target != TARGET_COMPUTER:
+            self.free_bytes = max(0, self.free_bytes - sum(len(file.data) for file in files))
+        self._write_log(files, moment, settings, taken)
+        with self._lock:
+            self._waiting.extend(files)
+            self._count()
+        if self.options.announce != "property":
+            for _ in files:
+                self.on_object()
+
+    def _write_log(
+        self, files: list[CameraFile], moment: Moment, settings: ExposureSettings, taken: datetime
+    ) -> None:
+        if self.options.exposures_log is None or not files:
+            return
+        first = files[0]
+        line = {
+            "counter": moment.counter,
+            "name": first.name,
+            "sha256": hashlib.sha256(first.data).hexdigest(),
+            "size": len(first.data),
+            "T_world_camera": moment.T_world_camera,
+            "settings": {"aperture_f": settings.aperture_f, "exposure_s": settings.exposure_s, "iso": settings.iso},
+            "time": taken.isoformat(),
+        }
+        with self._log_lock, self.options.exposures_log.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(line) + "\n")
+
+    def _count(self) -> None:
+        waiting = len(self._waiting)
+        self.properties.put(Code.OBJECTS_IN_MEMORY, 0x8000 + waiting if waiting else 0)
+
+    def next_file(self) -> CameraFile | None:
+        """The file that GetObjectInfo on FFFFC001 describes."""
+        with self._lock:
+            return self._waiting[0] if self._waiting else None
+
+    def pop_file(self) -> CameraFile | None:
+        """The same file, which is then gone from the memory."""
+        with self._lock:
+            file = self._waiting.popleft() if self._waiting else None
+            self._count()
+            return file
+
+    def live_view(self) -> bytes:
+        """A frame of live view: offset and size of the JPEG, padding, JPEG."""
+        picture = cv2.cvtColor(self._source.preview(), cv2.COLOR_RGB2BGR)
+        done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
+        if not done:
+            raise SimulatorError("the live-view frame could not be encoded")
+        jpeg = encoded.tobytes()
+        offset = 136
+        head = offset.to_bytes(4, "little") + len(jpeg).to_bytes(4, "little")
+        return head.ljust(offset, b"\0") + jpeg
+
+
+def _damaged(file: CameraFile, kind: str) -> CameraFile:
+    if kind == "truncate":
+        data = file.data[: len(file.data) * 6 // 10]
+    else:
+        middle = len(file.data) // 2
+        data = (
+            file.data[:middle] + bytes(b ^ 0x5A for b in file.data[middle : middle + 64]) + file.data[middle + 64 :]
+        )
+    return CameraFile(file.name, file.format, data, file.width, file.height, file.captured)

@@ -1,0 +1,141 @@
+"""Camera files: a JPEG with the EXIF of an ILCE-7RM5, and a small raw file beside it."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from datetime import datetime
+
+import cv2
+import exiv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.serve import SimulatorError
+from simulators.sony_camera.properties import ExposureSettings
+
+MAKE, MODEL, LENS = "SONY", "ILCE-7RM5", "FE 24-70mm F2.8 GM"
+BODY_SERIAL, FIRMWARE = "05318008", "ILCE-7RM5 v3.00"
+FOCAL_LENGTH_MM = 50
+# JPEG level of the property table → (quality, chroma subsampling)
+_LEVELS = {
+    1: (97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422),
+    2: (94, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420),
+    3: (88, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420),
+    4: (80, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """What a file says about its exposure."""
+
+    settings: ExposureSettings
+    counter: int
+    taken: datetime  # with a time zone
+
+
+def encode_jpeg(picture: NDArray[np.uint8], shot: Shot) -> bytes:
+    """JPEG bytes of an RGB picture (H, W, 3), with EXIF."""
+    quality, sampling = _LEVELS[shot.settings.jpeg_quality]
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
+    done, encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
+    if not done:
+        raise SimulatorError("the picture could not be encoded as JPEG")
+    return _with_exif(encoded.tobytes(), picture.shape[1], picture.shape[0], shot)
+
+
+def _with_exif(jpeg: bytes, width: int, height: int, shot: Shot) -> bytes:
+    image = exiv2.ImageFactory.open(jpeg)
+    image.readMetadata()
+    exif = image.exifData()
+    settings = shot.settings
+    taken = shot.taken.strftime("%Y:%m:%d %H:%M:%S")
+    offset = shot.taken.strftime("%z")
+    text = {
+        "Exif.Image.Make": MAKE,
+        "Exif.Image.Model": MODEL,
+        "Exif.Image.Software": FIRMWARE,
+        "Exif.Image.DateTime": taken,
+        "Exif.Photo.DateTimeOriginal": taken,
+        "Exif.Photo.DateTimeDigitized": taken,
+        "Exif.Photo.SubSecTimeOriginal": f"{shot.taken.microsecond // 1000:03d}",
+        "Exif.Photo.OffsetTimeOriginal": f"{offset[:3]}:{offset[3:5]}",
+        "Exif.Photo.LensModel": LENS,
+        "Exif.Photo.BodySerialNumber": BODY_SERIAL,
+        "Exif.Photo.ImageUniqueID": f"{shot.taken:%Y%m%d%H%M%S%f}{shot.counter:012d}",
+    }
+    for key, value in text.items():
+        exif[key] = exiv2.AsciiValue(value)
+    exif["Exif.Photo.FNumber"] = exiv2.URationalValue((round(settings.aperture_f * 10), 10))
+    exif["Exif.Photo.ExposureTime"] = exiv2.URationalValue(settings.exposure_fraction)
+    exif["Exif.Photo.FocalLength"] = exiv2.URationalValue((FOCAL_LENGTH_MM * 10, 10))
+    numbers = {
+        "Exif.Image.Orientation": 1,
+        "Exif.Photo.ExposureProgram": 1,
+        "Exif.Photo.ISOSpeedRatings": settings.iso,
+        "Exif.Photo.FocalLengthIn35mmFilm": FOCAL_LENGTH_MM,
+    }
+    for key, value in numbers.items():
+        exif[key] = exiv2.UShortValue(value)
+    exif["Exif.Photo.PixelXDimension"] = exiv2.ULongValue(width)
+    exif["Exif.Photo.PixelYDimension"] = exiv2.ULongValue(height)
+    image.writeMetadata()
+    return bytes(image.io())
+
+
+def encode_raw(picture: NDArray[np.uint8], shot: Shot) -> bytes:
+    """A file in the manner of an ARW: TIFF header, camera tags, an RGGB mosaic of 14 bits in 16, a quarter wide.
+
+    It is no real ARW: no Sony maker notes, no tiled lossless compression, no embedded preview, no black level or
+    white-balance tags, and a sixteenth of the pixels. It is a valid TIFF with the CFA tags of TIFF/EP, enough to
+    travel through a capture and be paired, hashed and recognised.
+    """
+    small = cv2.resize(picture, (picture.shape[1] // 8 * 2, picture.shape[0] // 8 * 2), interpolation=cv2.INTER_AREA)
+    linear = ((small / 255.0) ** 2.2 * 16383.0).astype("<u2")
+    mosaic = linear[..., 1].copy()
+    mosaic[0::2, 0::2] = linear[0::2, 0::2, 0]
+    mosaic[1::2, 1::2] = linear[1::2, 1::2, 2]
+    pixels = mosaic.tobytes()
+    height, width = mosaic.shape
+    short, long, ascii_ = 3, 4, 2
+
+    def number(tag: int, kind: int, value: int) -> tuple[int, int, int, bytes]:
+        return tag, kind, 1, struct.pack("<H" if kind == short else "<I", value)
+
+    def words(tag: int, value: str) -> tuple[int, int, int, bytes]:
+        data = value.encode("ascii") + b"\0"
+        return tag, ascii_, len(data), data
+
+    entries = [
+        number(254, long, 0),
+        number(256, long, width),
+        number(257, long, height),
+        number(258, short, 16),
+        number(259, short, 1),
+        number(262, short, 32803),
+        words(271, MAKE),
+        words(272, MODEL),
+        number(273, long, 0),
+        number(274, short, 1),
+        number(277, short, 1),
+        number(278, long, height),
+        number(279, long, len(pixels)),
+        words(305, FIRMWARE),
+        words(306, shot.taken.strftime("%Y:%m:%d %H:%M:%S")),
+        (33421, short, 2, struct.pack("<HH", 2, 2)),
+        (33422, 1, 4, bytes([0, 1, 1, 2])),
+    ]
+    directory_bytes = 2 + 12 * len(entries) + 4
+    extra_at = 8 + directory_bytes
+    pixels_at = extra_at + sum(len(data) + len(data) % 2 for *_, data in entries if len(data) > 4)
+    directory, extra = struct.pack("<H", len(entries)), b""
+    for tag, kind, count, plain in entries:
+        data = struct.pack("<I", pixels_at) if tag == 273 else plain
+        if len(data) > 4:
+            field = struct.pack("<I", extra_at + len(extra))
+            extra += data + b"\0" * (len(data) % 2)
+        else:
+            field = data.ljust(4, b"\0")
+        directory += struct.pack("<HHI", tag, kind, count) + field
+    return b"II*\0" + struct.pack("<I", 8) + directory + struct.pack("<I", 0) + extra + pixels

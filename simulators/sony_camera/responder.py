@@ -1,0 +1,184 @@
+"""What each PTP operation does to the camera and what it answers; knows nothing of sockets."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from simulators.faults import Fault, FaultPlan
+from simulators.serve import SimulatorError
+from simulators.sony_camera import codec
+from simulators.sony_camera.body import CARD_BYTES, FORMAT_ARW, FORMAT_JPEG, BusyError, CameraBody, CardFullError
+from simulators.sony_camera.properties import CONTROLS, Code, NotWritableError, RefusedValueError
+
+STORAGE = 0x00010001
+SHOT_HANDLE, LIVE_VIEW_HANDLE = 0xFFFFC001, 0xFFFFC002
+OBJECT_ADDED = 0xC201
+OK, GENERAL_ERROR, SESSION_NOT_OPEN, NOT_SUPPORTED = 0x2001, 0x2002, 0x2003, 0x2005
+INVALID_STORAGE, INVALID_HANDLE, STORE_FULL, ACCESS_DENIED = 0x2008, 0x2009, 0x200C, 0x200F
+DEVICE_BUSY, INVALID_VALUE = 0x2019, 0x201C
+_REJECTIONS = {"busy": DEVICE_BUSY, "disk_full": STORE_FULL, "reject": ACCESS_DENIED, "error": GENERAL_ERROR}
+# A real body answers a poll in milliseconds while its processor exposes; the client would ask a thousand times a second.
+_POLL_WHILE_EXPOSING_S = 0.005
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The answer: response code, its parameters, a data phase; `wire_fault` is for the socket to carry out."""
+
+    code: int = OK
+    parameters: tuple[int, ...] = ()
+    data: bytes | None = None
+    wire_fault: Fault | None = None
+
+
+class Responder:
+    """One session's operations on the camera body."""
+
+    def __init__(self, body: CameraBody, faults: FaultPlan) -> None:
+        self._body = body
+        self._faults = faults
+        self._operations: dict[int, tuple[str, Callable[[codec.Request, bytes], Reply]]] = {
+            0x1001: ("get_device_info", self._device_info),
+            0x1002: ("open_session", self._ok),
+            0x1003: ("close_session", self._ok),
+            0x1004: ("get_storage_ids", self._storage_ids),
+            0x1005: ("get_storage_info", self._storage_info),
+            0x1006: ("get_num_objects", self._object_count),
+            0x1007: ("get_object_handles", self._object_handles),
+            0x1008: ("get_object_info", self._object_info),
+            0x1009: ("get_object", self._object),
+            0x9201: ("connect", self._connect),
+            0x9202: ("get_extension_info", self._extension_info),
+            0x9205: ("set", self._set),
+            0x9207: ("button", self._button),
+            0x9209: ("get_properties", self._all_properties),
+        }
+
+    def expects_data(self, request: codec.Request) -> bool:
+        """Whether the client's data phase follows."""
+        return request.sends_data
+
+    def handle(self, request: codec.Request, data: bytes) -> Reply:
+        """Carry out one operation. Planned faults of the kinds busy, disk_full, reject, error and ignore act here."""
+        known = self._operations.get(request.operation)
+        if known is None:
+            return Reply(NOT_SUPPORTED)
+        name, operation = known
+        fault = self._faults.check("camera", self._message(name, request, data))
+        if fault is not None:
+            if fault.kind == "disk_full":
+                self._body.free_bytes = 0
+            if fault.kind in _REJECTIONS:
+                return Reply(_REJECTIONS[fault.kind])
+            if fault.kind == "ignore":
+                return Reply()
+        try:
+            reply = operation(request, data)
+        except BusyError:
+            return Reply(DEVICE_BUSY)
+        except CardFullError:
+            return Reply(STORE_FULL)
+        except NotWritableError:
+            return Reply(ACCESS_DENIED)
+        except RefusedValueError:
+            return Reply(INVALID_VALUE)
+        except SimulatorError:
+            return Reply(GENERAL_ERROR)
+        return Reply(reply.code, reply.parameters, reply.data, fault)
+
+    def _message(self, name: str, request: codec.Request, data: bytes) -> str:
+        """Name that a fault plan uses: presses of the shutter and live-view frames have names of their own."""
+        first = request.parameters[0] if request.parameters else 0
+        if name == "button" and first == Code.FULL_PRESS and data[:1] == b"\x02":
+            return "shutter"
+        if name == "get_object" and first == LIVE_VIEW_HANDLE:
+            return "preview"
+        return name
+
+    def _ok(self, request: codec.Request, data: bytes) -> Reply:
+        del request, data
+        return Reply()
+
+    def _device_info(self, request: codec.Request, data: bytes) -> Reply:
+        del request, data
+        info = codec.DeviceInfo(
+            manufacturer="Sony Corporation",
+            model="ILCE-7RM5",
+            firmware="3.00",
+            serial="00000000000000003282933005318008",
+            operations=tuple(self._operations),
+            events=(OBJECT_ADDED, 0xC202, 0xC203),
+            properties=(),
+            image_formats=(0x3001, FORMAT_JPEG, FORMAT_ARW),
+        )
+        return Reply(data=info.encode())
+
+    def _storage_ids(self, request: codec.Request, data: bytes) -> Reply:
+        del request, data
+        return Reply(data=codec.array_u32((STORAGE,)))
+
+    def _storage_info(self, request: codec.Request, data: bytes) -> Reply:
+        del data
+        if request.parameters[:1] != (STORAGE,):
+            return Reply(INVALID_STORAGE)
+        free = self._body.free_bytes
+        return Reply(data=codec.StorageInfo(CARD_BYTES, free, free // 60_000_000).encode())
+
+    def _object_count(self, request: codec.Request, data: bytes) -> Reply:
+        del request, data
+        return Reply(parameters=(0,))
+
+    def _object_handles(self, request: codec.Request, data: bytes) -> Reply:
+        # In PC Remote mode the card's files are not listed; only the fictitious handles exist.
+        del request, data
+        return Reply(data=codec.array_u32(()))
+
+    def _object_info(self, request: codec.Request, data: bytes) -> Reply:
+        del data
+        handle = request.parameters[0] if request.parameters else 0
+        if handle == LIVE_VIEW_HANDLE:
+            return Reply(data=codec.ObjectInfo(STORAGE, FORMAT_JPEG, 0, 640, 424, "LIVEVIEW.JPG", "").encode())
+        file = self._body.next_file() if handle == SHOT_HANDLE else None
+        if file is None:
+            return Reply(INVALID_HANDLE)
+        size = len(file.data)
+        return Reply(
+            data=codec.ObjectInfo(
+                STORAGE, file.format, size, file.width, file.height, file.name, file.captured
+            ).encode()
+        )
+
+    def _object(self, request: codec.Request, data: bytes) -> Reply:
+        del data
+        handle = request.parameters[0] if request.parameters else 0
+        if handle == LIVE_VIEW_HANDLE:
+            return Reply(data=self._body.live_view())
+        file = self._body.pop_file() if handle == SHOT_HANDLE else None
+        return Reply(INVALID_HANDLE) if file is None else Reply(data=file.data)
+
+    def _connect(self, request: codec.Request, data: bytes) -> Reply:
+        del request, data
+        return Reply(data=bytes(8))
+
+    def _extension_info(self, request: codec.Request, data: bytes) -> Reply:
+        del request, data
+        return Reply(data=self._body.properties.extension_info())
+
+    def _set(self, request: codec.Request, data: bytes) -> Reply:
+        self._body.properties.set_from_client(request.parameters[0] if request.parameters else 0, data)
+        return Reply()
+
+    def _button(self, request: codec.Request, data: bytes) -> Reply:
+        code = request.parameters[0] if request.parameters else 0
+        if code not in CONTROLS or len(data) < 2:
+            return Reply(INVALID_VALUE)
+        self._body.button(code, int.from_bytes(data[:2], "little"))
+        return Reply()
+
+    def _all_properties(self, request: codec.Request, data: bytes) -> Reply:
+        del request, data
+        if self._body.exposing:
+            time.sleep(_POLL_WHILE_EXPOSING_S)
+        return Reply(data=self._body.properties.encode_all())

@@ -1,0 +1,197 @@
+"""Where the simulated camera's pictures come from: the rig's world, picture files, or a built-in still life."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from simulators.serve import SimulatorError
+from simulators.sony_camera.properties import ExposureSettings
+
+Rgb = NDArray[np.uint8]  # (H, W, 3)
+_REFERENCE = (22.0, 1.0 / 15.0, 100.0)  # f-number, seconds, ISO at which a grey card comes out grey
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """What lay before the lens when the shutter opened; develop() may take its time afterwards."""
+
+    counter: int
+    T_world_camera: list[list[float]] | None
+    view: Mapping[str, Any]
+
+
+class ImageSource(Protocol):
+    """Supplies pictures; freeze() is quick and is called at the exposure, develop() renders."""
+
+    def freeze(self, counter: int) -> Moment:
+        """Record what the camera sees now."""
+        ...
+
+    def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
+        """The picture of that moment, (H, W, 3) RGB."""
+        ...
+
+    def preview(self) -> Rgb:
+        """A small live-view frame."""
+        ...
+
+
+def exposure_gain(settings: ExposureSettings) -> float:
+    """Light on the sensor relative to the reference exposure: (22 / f)² · t / (1/15 s) · ISO / 100."""
+    aperture_f, exposure_s, iso = _REFERENCE
+    return (aperture_f / settings.aperture_f) ** 2 * settings.exposure_s / exposure_s * settings.iso / iso
+
+
+def expose(picture: Rgb, gain: float) -> Rgb:
+    """The same picture with `gain` times the light, through a gamma of 2.2."""
+    if abs(gain - 1.0) < 0.02:
+        return picture
+    linear = (np.arange(256) / 255.0) ** 2.2 * gain
+    table = np.round(np.clip(linear, 0.0, 1.0) ** (1 / 2.2) * 255.0).astype(np.uint8)
+    return cast(Rgb, cv2.LUT(picture, table))
+
+
+class StillLife:
+    """A procedural picture: a lit bowl of fruit-like discs on a grained table, with the counter in a corner."""
+
+    def __init__(self, image_width: int) -> None:
+        self._size = (image_width, round(image_width * 2 / 3))
+        self._plain: Rgb | None = None
+
+    def _picture(self, width: int, height: int) -> Rgb:
+        rng = np.random.default_rng(7)
+        x = np.linspace(-1.5, 1.5, width, dtype=np.float32)[None, :]
+        y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
+        grain = cv2.resize(rng.random((64, 8), dtype=np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+        light = 0.25 + 0.45 * np.exp(-((x + 0.4) ** 2 + (y + 0.3) ** 2) / 1.5)
+        wood = np.asarray(light * (0.75 + 0.35 * grain), dtype=np.float32)
+        picture = np.stack([wood * 0.8, wood * 0.62, wood * 0.42], axis=2)
+        for _ in range(9):
+            cx, cy, radius = rng.uniform(-1.1, 1.1), rng.uniform(-0.7, 0.7), rng.uniform(0.12, 0.3)
+            distance2 = ((x - cx) ** 2 + (y - cy) ** 2) / radius**2
+            inside = distance2 < 1.0
+            facing = np.sqrt(np.clip(1.0 - distance2, 0.0, 1.0)) * 0.7 + 0.2
+            colour = rng.uniform(0.25, 0.9, 3)
+            for channel in range(3):
+                picture[..., channel] = np.where(inside, facing * colour[channel], picture[..., channel])
+        noisy = picture + rng.normal(0.0, 0.008, (height, width, 1)).astype(np.float32)
+        return (np.clip(noisy, 0.0, 1.0) ** (1 / 2.2) * 255.0).astype(np.uint8)
+
+    def freeze(self, counter: int) -> Moment:
+        """The still life stands still; only the counter changes."""
+        return Moment(counter, None, {})
+
+    def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
+        """The scene at the settings' brightness, with the counter's digits."""
+        if self._plain is None:
+            self._plain = self._picture(*self._size)
+        picture = expose(self._plain, exposure_gain(settings)).copy()
+        height = picture.shape[0]
+        corner = (height // 20, height - height // 20)
+        thickness = max(1, height // 150)
+        cv2.putText(picture, f"{moment.counter:05d}", corner, 0, height / 300, (255, 255, 255), thickness)
+        return picture
+
+    def preview(self) -> Rgb:
+        """A frame of 640 × 424."""
+        return self._picture(640, 424)
+
+
+class PictureFiles:
+    """Pictures from files, in turn, scaled to the image width where one is asked for."""
+
+    def __init__(self, files: list[Path], image_width: int | None) -> None:
+        self._files = files
+        self._width = image_width
+        for file in files:
+            if not file.is_file():
+                raise SimulatorError(f"the picture {file} does not exist")
+
+    def _load(self, counter: int) -> Rgb:
+        file = self._files[(counter - 1) % len(self._files)]
+        picture = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+        if picture is None:
+            raise SimulatorError(f"the picture {file} cannot be read")
+        if self._width is not None and picture.shape[1] != self._width:
+            height = round(picture.shape[0] * self._width / picture.shape[1])
+            picture = cv2.resize(picture, (self._width, height), interpolation=cv2.INTER_AREA)
+        return cast(Rgb, picture)
+
+    def freeze(self, counter: int) -> Moment:
+        """Files do not move."""
+        return Moment(counter, None, {})
+
+    def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
+        """The counter's file, lit as the settings say."""
+        return expose(self._load(moment.counter), exposure_gain(settings))
+
+    def preview(self) -> Rgb:
+        """The first file, small."""
+        picture = self._load(1)
+        return cast(Rgb, cv2.resize(picture, (640, round(640 * picture.shape[0] / picture.shape[1]))))
+
+
+class _Renderer(Protocol):
+    def render(self, view: Mapping[str, Any], camera_settings: Mapping[str, float], seed: int) -> Rgb: ...
+
+    def preview(self, view: Mapping[str, Any]) -> Rgb: ...
+
+
+class WorldSource:
+    """What the rig's world shows: the pose at the moment of exposure, rendered."""
+
+    def __init__(self, address: str, image_width: int, timeout_s: float = 10.0) -> None:
+        host, _, port = address.rpartition(":")
+        if not host or not port.isdigit():
+            raise SimulatorError(f"--world takes HOST:PORT, not {address}")
+        self._address = (host, int(port))
+        self._width = image_width
+        self._timeout_s = timeout_s
+        self._built: _Renderer | None = None
+
+    @property
+    def _renderer(self) -> _Renderer:
+        if self._built is None:
+            from simulators.render import Renderer  # noqa: PLC0415  (heavy, and needed with a world only)
+
+            self._built = cast(_Renderer, Renderer(self._width))
+        return self._built
+
+    def _view(self) -> dict[str, Any]:
+        try:
+            with socket.create_connection(self._address, self._timeout_s) as link, link.makefile("rwb") as stream:
+                stream.write(b'{"op":"view"}\n')
+                stream.flush()
+                line = stream.readline()
+        except OSError as error:
+            raise SimulatorError(f"the world at {self._address[0]}:{self._address[1]} is silent: {error}") from error
+        try:
+            answer = json.loads(line)
+        except ValueError as error:
+            raise SimulatorError(f"the world answered {line[:80]!r}") from error
+        if "T_world_camera" not in answer:
+            raise SimulatorError(f"the world refused a view: {answer.get('error', line[:80])}")
+        return answer
+
+    def freeze(self, counter: int) -> Moment:
+        """Ask the world what is before the lens now."""
+        view = self._view()
+        return Moment(counter, view["T_world_camera"], view)
+
+    def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
+        """Render that view."""
+        lens = {"aperture_f": settings.aperture_f, "exposure_s": settings.exposure_s, "iso": float(settings.iso)}
+        return self._renderer.render(moment.view, lens, moment.counter)
+
+    def preview(self) -> Rgb:
+        """Render a small frame of now."""
+        return self._renderer.preview(self._view())
