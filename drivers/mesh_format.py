@@ -1,0 +1,311 @@
+"""What tells a finished OBJ, PLY or STL file from one that is still being written, without parsing the mesh."""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from drivers.errors import IncompleteExportError, UnreadableFileError
+
+_PLY_SIZES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+_AGAIN = "Wait until the export has finished; if it has, export the scan again"
+_HEAD_BYTES = 64 * 1024
+_TEXTURE = re.compile(rb"^\s*(?:map_\w+|bump|disp|decal|norm|refl)\s+(.+?)\s*$", re.MULTILINE | re.IGNORECASE)
+_MTLLIB = re.compile(rb"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
+_COUNT = re.compile(
+    rb"^#.*?\b(vert(?:ices|exes|ex count|s)|faces)\b\s*[:=]?\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE
+)
+
+
+def check_complete(path: Path) -> None:
+    """Raise IncompleteExportError for a file that was cut short, UnreadableFileError for one without faces.
+
+    OSError (missing, locked) is left to the caller.
+    """
+    size = path.stat().st_size
+    if size == 0:
+        raise IncompleteExportError("the file is empty", where=str(path), remedy=_AGAIN)
+    match path.suffix.lower():
+        case ".ply":
+            _check_ply(path, size)
+        case ".stl":
+            _check_stl(path, size)
+        case ".obj":
+            _check_obj(path)
+        case _:
+            pass
+
+
+def file_has_normals(path: Path) -> bool:
+    """Whether a PLY or OBJ file carries vertex normals (an OBJ is judged by its first megabytes)."""
+    if path.suffix.lower() == ".ply":
+        header = _ply_header(path)
+        return any(element.name == "vertex" and "nx" in element.names for element in header.elements)
+    with path.open("rb") as stream:
+        # Exporters write vn lines between the vertices or after them; a face with a//c refers to one.
+        for line in stream:
+            if line.startswith(b"vn "):
+                return True
+            if line.startswith(b"f "):
+                return line.split()[1].count(b"/") == 2
+    return False
+
+
+def companions(path: Path) -> tuple[Path, ...]:
+    """The MTL file of an OBJ and the textures it names, found case-insensitively beside it.
+
+    Raises:
+        IncompleteExportError: a companion is not there (yet).
+        UnreadableFileError: a name leads out of the folder.
+    """
+    if path.suffix.lower() != ".obj":
+        return ()
+    found: list[Path] = []
+    with path.open("rb") as stream:
+        names = [match.group(1) for match in _MTLLIB.finditer(stream.read(_HEAD_BYTES))]
+    for raw in names:
+        library = _beside(path, raw.decode("utf-8", "replace"))
+        found.append(library)
+        for texture in _TEXTURE.finditer(library.read_bytes()):
+            name = _texture_name(texture.group(1).decode("utf-8", "replace"))
+            found.append(_beside(path, name, named_in=library))
+    return tuple(dict.fromkeys(found))
+
+
+def _texture_name(arguments: str) -> str:
+    """The file name of a map statement, behind its options (-bm 1.0 -s 1 1 1 …)."""
+    words = arguments.split()
+    while words and words[0].startswith("-"):
+        words.pop(0)
+        while len(words) > 1 and re.fullmatch(r"[-+.\deE]+|on|off", words[0]):
+            words.pop(0)
+    return " ".join(words)
+
+
+def _beside(path: Path, name: str, named_in: Path | None = None) -> Path:
+    """The file `name` in the folder of `path` or below it, whatever the case of its letters."""
+    source = named_in or path
+    cleaned = name.strip().strip('"')
+    windows, posix = PureWindowsPath(cleaned), PurePosixPath(cleaned)
+    if windows.is_absolute() or windows.drive or posix.is_absolute() or ".." in windows.parts or not windows.parts:
+        raise UnreadableFileError(
+            f"it names the companion {cleaned!r}, which lies outside the export's folder",
+            where=str(source),
+            remedy="Export into a folder of its own, with the textures beside the mesh",
+        )
+    here = path.parent
+    for part in windows.parts:
+        try:
+            entries = {entry.casefold(): entry for entry in sorted(os.listdir(here))}
+        except NotADirectoryError:
+            entries = {}
+        match = part if part in entries.values() else entries.get(part.casefold())
+        if match is None:
+            raise IncompleteExportError(
+                f"its companion {cleaned!r} is missing",
+                where=str(source),
+                remedy="Wait until the export has finished; if it has, export again with materials and textures",
+            )
+        here = here / match
+    if not here.resolve().is_relative_to(path.parent.resolve()):
+        raise UnreadableFileError(
+            f"its companion {cleaned!r} is a link that leads out of the export's folder",
+            where=str(source),
+            remedy="Put a copy of the file itself beside the mesh",
+        )
+    return here
+
+
+# --- PLY -----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    fixed_bytes: int = 0
+    lists: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])  # sizes of count and item
+    names: list[str] = field(default_factory=list[str])
+
+    @property
+    def least_bytes(self) -> int:
+        """The fewest bytes that one row can have: a face has three corners at least."""
+        corners = 3 if self.name == "face" else 0
+        first, *rest = self.lists or [(0, 0)]
+        return self.fixed_bytes + first[0] + corners * first[1] + sum(size for size, _ in rest)
+
+
+@dataclass(frozen=True)
+class _PlyHeader:
+    binary: bool
+    elements: list[_Element]
+    data_at: int
+
+
+def _ply_header(path: Path) -> _PlyHeader:
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    if not head.startswith(b"ply"):
+        if b"ply".startswith(head[:3]):
+            raise IncompleteExportError("the PLY header is cut short", where=str(path), remedy=_AGAIN)
+        raise UnreadableFileError(
+            "it does not begin as a PLY file does", where=str(path), remedy="Export the scan again as PLY"
+        )
+    end = re.search(rb"end_header\r?\n", head)
+    if end is None:
+        raise IncompleteExportError("the PLY header is cut short", where=str(path), remedy=_AGAIN)
+    elements: list[_Element] = []
+    binary = False
+    try:
+        for line in head[: end.start()].decode("ascii", "replace").splitlines():
+            words = line.split()
+            if words[:1] == ["format"]:
+                binary = words[1] != "ascii"
+            elif words[:1] == ["element"]:
+                elements.append(_Element(words[1], int(words[2])))
+            elif words[:2] == ["property", "list"]:
+                elements[-1].lists.append((_PLY_SIZES[words[2]], _PLY_SIZES[words[3]]))
+            elif words[:1] == ["property"]:
+                elements[-1].fixed_bytes += _PLY_SIZES[words[1]]
+                elements[-1].names.append(words[2])
+    except (IndexError, KeyError, ValueError) as error:
+        raise UnreadableFileError(
+            f"the PLY header is wrong ({error})", where=str(path), remedy="Export the scan again as PLY"
+        ) from error
+    return _PlyHeader(binary, elements, end.end())
+
+
+def _check_ply(path: Path, size: int) -> None:
+    header = _ply_header(path)
+    counts = {element.name: element.count for element in header.elements}
+    if not counts.get("face"):
+        strips = "tristrips" in counts
+        raise UnreadableFileError(
+            "the file holds triangle strips and no faces" if strips else "the file has no faces, only points",
+            where=str(path),
+            remedy="Export a triangle mesh (faces, not strips or a point cloud)",
+        )
+    if header.binary:
+        # A lower bound: for a triangle mesh, which scanners write, it is the exact size.
+        least = header.data_at + sum(element.count * element.least_bytes for element in header.elements)
+        if size < least:
+            raise IncompleteExportError(
+                f"the file is cut short: {size} bytes of at least {least} that its header announces",
+                where=str(path),
+                remedy=_AGAIN,
+            )
+        return
+    rows = sum(element.count for element in header.elements)
+    lines, ended = _count_lines(path, header.data_at)
+    if lines < rows or (lines == rows and not ended and _last_row_short(path, header.elements[-1])):
+        raise IncompleteExportError(
+            f"the file is cut short: {lines} lines of {rows} that its header announces",
+            where=str(path),
+            remedy=_AGAIN,
+        )
+
+
+def _last_row_short(path: Path, element: _Element) -> bool:
+    """Whether the last line of an ASCII PLY, which has no newline, lacks values."""
+    words = _tail(path).splitlines()[-1].split()
+    if element.lists and words and words[0].isdigit():
+        return len(words) < 1 + int(words[0]) + len(element.names)
+    return len(words) < len(element.names)
+
+
+def _count_lines(path: Path, start: int) -> tuple[int, bool]:
+    """Lines with content behind `start`, and whether the last one ends with a newline."""
+    lines, last = 0, b"\n"
+    with path.open("rb") as stream:
+        stream.seek(start)
+        while chunk := stream.read(1 << 22):
+            lines += chunk.count(b"\n")
+            last = chunk[-1:]
+    ended = last == b"\n"
+    return lines + (not ended), ended
+
+
+def _tail(path: Path, size: int = 4096) -> bytes:
+    with path.open("rb") as stream:
+        stream.seek(max(0, path.stat().st_size - size))
+        return stream.read()
+
+
+# --- STL -----------------------------------------------------------------------------------------------
+
+
+def _check_stl(path: Path, size: int) -> None:
+    with path.open("rb") as stream:
+        head = stream.read(1024)
+    # Some binary files begin with "solid" too: the size decides first.
+    count = struct.unpack("<I", head[80:84])[0] if len(head) >= 84 else None
+    expected = None if count is None else 84 + 50 * count
+    text = head.lstrip()[:5].lower() == b"solid" and b"\0" not in head
+    if expected == size or not text:
+        if expected is None or size < expected:
+            raise IncompleteExportError(
+                f"the file is cut short: {size} bytes of {expected or 'at least 84'} that its header announces",
+                where=str(path),
+                remedy=_AGAIN,
+            )
+        if size > expected:
+            raise UnreadableFileError(
+                f"its size ({size} bytes) does not agree with the {count} triangles that its header announces",
+                where=str(path),
+                remedy="Export the scan again as binary STL",
+            )
+        if count == 0:
+            raise UnreadableFileError("the file has no faces", where=str(path), remedy="Export a mesh with triangles")
+        return
+    if b"endsolid" not in _tail(path).lower():
+        raise IncompleteExportError(
+            "the file is cut short: an ASCII STL ends with 'endsolid'", where=str(path), remedy=_AGAIN
+        )
+
+
+# --- OBJ -----------------------------------------------------------------------------------------------
+
+
+def _check_obj(path: Path) -> None:
+    """An OBJ has no length and no end mark: judge its last line, and counts that the exporter wrote as comments."""
+    tail = _tail(path)
+    last = tail.splitlines()[-1].strip() if tail.strip() else b""
+    if not tail.endswith(b"\n") and not last.startswith(b"#"):
+        raise IncompleteExportError(
+            f"the file ends in the middle of a line ({last[:40].decode('utf-8', 'replace')!r})",
+            where=str(path),
+            remedy=_AGAIN,
+        )
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    announced = {name[:1].lower(): int(number) for name, number in _COUNT.findall(head + b"\n" + tail)}
+    vertices = faces = 0
+    with path.open("rb") as stream:
+        while block := stream.readlines(1 << 22):
+            joined = b"".join([b"\n", *block])
+            vertices += joined.count(b"\nv ") + joined.count(b"\nv\t")
+            faces += joined.count(b"\nf ") + joined.count(b"\nf\t")
+    for name, have in ((b"v", vertices), (b"f", faces)):
+        want = announced.get(name)
+        if want is not None and have < want:
+            what = "vertices" if name == b"v" else "faces"
+            raise IncompleteExportError(
+                f"the file is cut short: {have} {what} of {want} that it announces", where=str(path), remedy=_AGAIN
+            )
+    if faces == 0:
+        if last.startswith((b"v ", b"vn ", b"vt ")) and vertices:
+            # A point cloud and an export that has not come to its faces yet look alike.
+            raise UnreadableFileError(
+                "the file has no faces, only points",
+                where=str(path),
+                remedy="Wait if the export is still running; otherwise export a triangle mesh, not a point cloud",
+            )
+        raise UnreadableFileError("the file has no faces", where=str(path), remedy="Export a triangle mesh")

@@ -1,0 +1,106 @@
+"""The hand scanner, seen through the folder into which its software exports OBJ, PLY or STL."""
+
+from __future__ import annotations
+
+import shutil
+from importlib.metadata import version
+from pathlib import Path
+
+from pydantic import Field
+
+from drivers.errors import DeviceUnavailableError, IncompleteExportError
+from drivers.export_watch import ExportWatch
+from drivers.interfaces import DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
+from drivers.mesh_file import MeshUnit, read_mesh_file
+from drivers.plugin import DriverConfig, DriverSpec
+
+
+class ScanFolderConfig(DriverConfig):
+    """Section of rig.yaml."""
+
+    folder: Path = Field(description="where the scanner's software exports to")
+    unit: MeshUnit = Field(default="auto", description="of the exported coordinates: mm, m, or auto (from the size)")
+    stable_s: float = Field(default=10.0, ge=0, description="how long an export must stay unchanged; 10 s on a share")
+
+
+class ScanFolder:
+    """drivers.interfaces.Scanner on a folder; polls, reads, and never writes or deletes there."""
+
+    def __init__(self, config: ScanFolderConfig) -> None:
+        self._config = config
+        self._watch = ExportWatch(config.folder, config.stable_s)
+
+    def open(self) -> DeviceIdentity:
+        """Check that the folder is there and begin to observe it."""
+        require_folder(self._config.folder)
+        self._watch.poll()
+        return self._identity()
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def report(self) -> DeviceReport:
+        """Free space, number of exports, and what is pending."""
+        require_folder(self._config.folder)
+        exports, pending = self._watch.poll()
+        return DeviceReport(
+            identity=self._identity(),
+            free_bytes=free_bytes(self._config.folder),
+            details={
+                "exports": str(len(exports)),
+                "unit": self._config.unit,
+                "stable_s": f"{self._config.stable_s:g}",
+            },
+            problems=pending,
+        )
+
+    def exports(self) -> tuple[ScanExport, ...]:
+        """Complete exports that stayed unchanged for `stable_s` of this driver's observation, oldest first."""
+        require_folder(self._config.folder)
+        return self._watch.poll()[0]
+
+    def pending(self) -> tuple[str, ...]:
+        """What is in the folder and cannot be taken yet, with the reason."""
+        require_folder(self._config.folder)
+        return self._watch.poll()[1]
+
+    def read(self, export: ScanExport) -> ScannedMesh:
+        """Parse one export, in metres; errors as drivers.mesh_file.read_mesh_file."""
+        for path in export.files:
+            if not path.is_file():
+                raise IncompleteExportError(
+                    "a file of the export has gone", where=str(path), remedy="Export the scan again and let it lie"
+                )
+        return read_mesh_file(export.files[0], self._config.unit, export=export)
+
+    def _identity(self) -> DeviceIdentity:
+        return DeviceIdentity(
+            kind="scanner",
+            model="export folder",
+            serial="",
+            firmware="",
+            driver="scan_folder",
+            driver_version=f"trimesh {version('trimesh')}",
+            address=str(self._config.folder),
+        )
+
+
+def require_folder(folder: Path) -> None:
+    """Raise DeviceUnavailableError unless the folder is there."""
+    if not folder.is_dir():
+        raise DeviceUnavailableError(
+            "there is no such folder",
+            where=str(folder),
+            remedy="Mount the share, or correct the folder in rig.yaml",
+        )
+
+
+def free_bytes(folder: Path) -> int | None:
+    """Free space where the folder lies; None where the file system does not tell."""
+    try:
+        return shutil.disk_usage(folder).free
+    except OSError:
+        return None
+
+
+DRIVER = DriverSpec(kind="scanner", config=ScanFolderConfig, build=ScanFolder, hosted=False, call_timeout_s=300.0)
