@@ -131,6 +131,13 @@ class Recovery(Record):
     on_failure: Literal["ask", "abort"] = "ask"
 
 
+class HandAction(Record):
+    """What the technician's hands do when confirming this step; a simulated rig does it by itself."""
+
+    action: Text
+    station: str | None = None
+
+
 class StepFields(Record):
     """Everything of a step but its params."""
 
@@ -147,6 +154,7 @@ class StepFields(Record):
     irreversible: bool = False
     requires: tuple[str, ...] = ()
     recovery: Recovery = Recovery()
+    simulated_hands: tuple[HandAction, ...] = ()  # without effect on a real rig
 
 
 class Step(StepFields):

@@ -1,0 +1,184 @@
+"""RunState → what happens next, as a value. The runner executes it and appends the outcome; it decides nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from service.core.actions import (
+    allowed_actions,
+    check_action,
+    needs_signature_now,
+    record_to_sign,
+    redoable_steps,
+    unmet_requirements,
+)
+from service.core.errors import IntegrityError
+from service.core.fold import advance, fold, initial_state
+from service.core.gates import describe, evaluate_gates
+from service.core.model import OperatorVerb
+from service.core.protocol import Protocol
+from service.core.run_state import Deviation, JobState, Note, RunState, StepState, Superseded
+
+__all__ = [
+    "AbortRun",
+    "Accept",
+    "AskOperator",
+    "Decision",
+    "Deviation",
+    "EvaluateGates",
+    "FinishRun",
+    "Halt",
+    "JobState",
+    "Note",
+    "Retry",
+    "RunState",
+    "RunStep",
+    "StepState",
+    "Superseded",
+    "advance",
+    "allowed_actions",
+    "check_action",
+    "decide",
+    "evaluate_gates",
+    "fold",
+    "initial_state",
+    "record_to_sign",
+    "redoable_steps",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class AskOperator:
+    """Wait for a person; `options` are the verbs that can be accepted now."""
+
+    step: str
+    for_: Literal["confirm", "sign", "recovery"]
+    text: str
+    checklist: tuple[str, ...]  # to be ticked with a confirm
+    options: tuple[OperatorVerb, ...]
+    sign_sha256: str = ""  # what a signature binds (OperatorAction.signed_sha256)
+
+
+@dataclass(frozen=True, slots=True)
+class RunStep:
+    """Do the work of a step, or go on with it. With `begin`, append StepStarted first."""
+
+    step: str
+    attempt: int
+    begin: bool
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateGates:
+    """Append evaluate_gates(step, attempt, measures)."""
+
+    step: str
+    attempt: int
+    measures: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Accept:
+    """Append StepPassed."""
+
+    step: str
+    attempt: int
+
+
+@dataclass(frozen=True, slots=True)
+class Retry:
+    """Wait, then append StepRetried with this attempt number; what was captured is kept."""
+
+    step: str
+    attempt: int
+    why: str
+    wait_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class FinishRun:
+    """Append RunCompleted."""
+
+    deviations: int
+
+
+@dataclass(frozen=True, slots=True)
+class AbortRun:
+    """Append RunAborted: the step's recovery policy ends the run."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Halt:
+    """Nothing to do: no motion, no work, until an operator resumes (paused) or for good."""
+
+    status: Literal["paused", "completed", "aborted"]
+
+
+Decision = AskOperator | RunStep | EvaluateGates | Accept | Retry | FinishRun | AbortRun | Halt
+
+
+def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - one return a phase
+    """What the runner does next. Raises IntegrityError for a run of which nothing is recorded."""
+    if not state.started:
+        raise IntegrityError("nothing is recorded of this run", remedy="Append run_started first")
+    if state.status != "active":
+        return Halt(state.status)
+    now = state.step
+    match state.phase:
+        case "ready":
+            return _decide_ready(protocol, state)
+        case "running":
+            return RunStep(now.step, now.attempt, begin=False)
+        case "checking":
+            return EvaluateGates(now.step, now.attempt, now.measures)
+        case "awaiting_operator":
+            if needs_signature_now(protocol, state):
+                figures = "; ".join(describe(verdict) for verdict in now.verdicts) or "this step has no gates"
+                return _ask(protocol, state, "sign", f"Passed its gates: {figures}. Check the figures and sign")
+            return Accept(now.step, now.attempt)
+        case "recovering":
+            return _decide_recovering(protocol, state)
+        case "passed":
+            return FinishRun(state.deviation_count)
+
+
+def _decide_ready(protocol: Protocol, state: RunState) -> Decision:
+    step, now = protocol.step(state.current), state.step
+    unmet = unmet_requirements(step, state)
+    if unmet:
+        return _ask(protocol, state, "recovery", f"Required before it and not passed: {', '.join(unmet)}")
+    if needs_signature_now(protocol, state):
+        text = (
+            f"{step.title} cannot be undone. Its captures have passed: {', '.join(step.requires)}. Sign to release it"
+        )
+        return _ask(protocol, state, "sign", text)
+    if step.confirm and not now.confirmed:
+        return _ask(protocol, state, "confirm", step.instructions or step.title)
+    return RunStep(now.step, now.attempt, begin=True)
+
+
+def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
+    step, now = protocol.step(state.current), state.step
+    if now.retry_granted:
+        return Retry(now.step, now.attempt + 1, "the operator asked for it", 0.0)
+    if now.failure is None:
+        failed = "; ".join(describe(verdict) for verdict in now.verdicts if not verdict.passed)
+        return _ask(protocol, state, "recovery", f"Outside its limits: {failed}")
+    why = f"{now.failure.error}: {now.failure.message}"
+    match now.failure.recovery:
+        case "retry":
+            return Retry(now.step, now.attempt + 1, why, step.recovery.wait_s)
+        case "abort":
+            return AbortRun(why)
+        case "ask":
+            return _ask(protocol, state, "recovery", why)
+
+
+def _ask(protocol: Protocol, state: RunState, for_: Literal["confirm", "sign", "recovery"], text: str) -> AskOperator:
+    checklist = protocol.step(state.current).checklist if for_ == "confirm" else ()
+    options = allowed_actions(protocol, state)
+    return AskOperator(state.current, for_, text, checklist, options, record_to_sign(protocol, state))

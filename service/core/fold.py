@@ -1,0 +1,328 @@
+"""Events → RunState. A pure reduction: the same events always give the same state, after any restart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from service.core.actions import unmet_requirements
+from service.core.errors import IllegalTransitionError, IntegrityError
+from service.core.gates import evaluate_gates
+from service.core.lifecycle import lifecycle
+from service.core.model import (
+    ActionRefused,
+    DeviceOpened,
+    DeviceTrouble,
+    Event,
+    GatesEvaluated,
+    JobEnqueued,
+    JobFailed,
+    JobFinished,
+    OperatorAction,
+    RunAborted,
+    RunCompleted,
+    RunStarted,
+    SessionStarted,
+    StepFailed,
+    StepMeasured,
+    StepNote,
+    StepPassed,
+    StepRetried,
+    StepStarted,
+    ViewpointCaptured,
+    ViewpointFailed,
+)
+from service.core.moves import UNMEASURED, change, deviate, go, pass_on, supersede
+from service.core.operator_effects import apply_action
+from service.core.protocol import Protocol
+from service.core.run_state import (
+    Failure,
+    JobState,
+    Note,
+    RunState,
+    StepState,
+    Trouble,
+)
+
+
+def initial_state(protocol: Protocol) -> RunState:
+    """The state before any event."""
+    machine = lifecycle(protocol.step_ids)
+    steps = {step: StepState(step) for step in protocol.step_ids}
+    first = protocol.step_ids[0]
+    steps[first] = replace(steps[first], phase="ready")
+    return RunState(machine_state=machine.initial, current=first, steps=steps)
+
+
+def fold(protocol: Protocol, events: Iterable[Event]) -> RunState:
+    """The state of a run after these events, from the first on.
+
+    Raises IntegrityError for a system event that cannot have happened (the evidence was tampered with, or a bug);
+    never for an operator's action: one that was not allowed is listed as refused and has no effect.
+    """
+    state = initial_state(protocol)
+    for event in events:
+        state = advance(protocol, state, event)
+    return state
+
+
+def advance(protocol: Protocol, state: RunState, event: Event) -> RunState:
+    """The state after one more event; `fold` is the reduction by this function."""
+    if event.seq != state.seq + 1:
+        raise _impossible(event, f"follows event {state.seq}: events are missing or repeated")
+    if (event.seq == 1) != isinstance(event.payload, RunStarted):
+        raise _impossible(event, "a run begins with run_started, once")
+    if state.started and event.run_id != state.run_id:
+        raise _impossible(event, f"belongs to another run than {state.run_id}")
+    handler = _HANDLERS[type(event.payload)]
+    return replace(handler(protocol, state, event, event.payload), seq=event.seq)
+
+
+def _impossible(event: Event, why: str) -> IntegrityError:
+    return IntegrityError(
+        f"{event.payload.kind} cannot have happened here: {why}",
+        where=f"run {event.run_id} event {event.seq}",
+        remedy="Run `orthocapture audit verify` on this run; do not continue it",
+    )
+
+
+# --- moving through the lifecycle ------------------------------------------------------------------------
+
+
+def _system(protocol: Protocol, state: RunState, event: Event, trigger: str, **changes: Any) -> RunState:
+    try:
+        return go(protocol, state, trigger, **changes)
+    except IllegalTransitionError as error:
+        raise _impossible(event, str(error)) from error
+
+
+def _void(state: RunState, event: Event) -> RunState:
+    return replace(state, overtaken=(*state.overtaken, event.seq))
+
+
+def _is_void(state: RunState, event: Event, step: str, attempt: int) -> bool:
+    """Whether an operator's redo, skip or abort came between the work and its record.
+
+    The web and the command line append actions while the runner works, so such events are in order; they stay in
+    the evidence without effect. Raises IntegrityError for work that was never due.
+    """
+    if step not in state.steps:
+        raise _impossible(event, f"the protocol has no step {step!r}")
+    there = state.steps[step]
+    if attempt < there.attempt or state.terminal or (there.skipped and attempt == there.attempt):
+        return True
+    if attempt > there.attempt:
+        raise _impossible(event, f"attempt {attempt} of {step} has not begun; it is at {there.attempt}")
+    return False
+
+
+def _is_void_now(state: RunState, event: Event, step: str, attempt: int) -> bool:
+    """The same for events that only the current step can produce."""
+    if _is_void(state, event, step, attempt):
+        return True
+    if step != state.current:
+        raise _impossible(event, f"the run is at {state.current}")
+    return False
+
+
+def _require_running(state: RunState, event: Event) -> None:
+    if state.phase != "running":
+        raise _impossible(event, f"{state.current} is {state.phase}, not running")
+
+
+# --- run and devices ---------------------------------------------------------------------------------------
+
+
+def _run_started(protocol: Protocol, state: RunState, event: Event, p: RunStarted) -> RunState:
+    if (p.protocol_id, p.protocol_version) != (protocol.id, protocol.version):
+        raise _impossible(event, f"the run is of protocol {p.protocol_id} {p.protocol_version}, not of the given one")
+    return replace(
+        state, run_id=event.run_id, operator=p.operator, simulated=p.simulated, auto_confirm=p.auto_confirm
+    )
+
+
+def _session_started(protocol: Protocol, state: RunState, event: Event, p: SessionStarted) -> RunState:
+    return replace(state, sessions=state.sessions + 1)
+
+
+def _device_opened(protocol: Protocol, state: RunState, event: Event, p: DeviceOpened) -> RunState:
+    return state
+
+
+def _device_trouble(protocol: Protocol, state: RunState, event: Event, p: DeviceTrouble) -> RunState:
+    return replace(state, troubles=(*state.troubles, Trouble(event.seq, p.device, p.error, p.message)))
+
+
+def _run_completed(protocol: Protocol, state: RunState, event: Event, p: RunCompleted) -> RunState:
+    done = state.current == protocol.step_ids[-1] and state.phase == "passed"
+    if state.terminal or not done:
+        redone_just_before = state.last_redo_seq == state.seq
+        if state.status == "aborted" or redone_just_before:
+            return _void(state, event)
+        raise _impossible(event, f"the run is {state.status} at {state.current}, {state.phase}")
+    return _system(protocol, state, event, "advance")
+
+
+def _run_aborted(protocol: Protocol, state: RunState, event: Event, p: RunAborted) -> RunState:
+    if state.status == "aborted":  # the runner's own record of an operator's abort
+        return replace(state, stop_reason=state.stop_reason or p.reason)
+    return replace(_system(protocol, state, event, "abort"), stop_reason=p.reason)
+
+
+# --- the work of a step --------------------------------------------------------------------------------------
+
+
+def _step_started(protocol: Protocol, state: RunState, event: Event, p: StepStarted) -> RunState:
+    if _is_void_now(state, event, p.step, p.attempt):
+        return _void(state, event)
+    step, now = protocol.step(p.step), state.step
+    if step.confirm and not now.confirmed:
+        raise _impossible(event, "the operator has not confirmed")
+    if unmet_requirements(step, state) or (step.irreversible and not now.signed):
+        raise _impossible(event, "what it requires has not passed, or nobody has signed")
+    return _system(protocol, state, event, "begin", failures=0, started_utc=event.at_utc)
+
+
+def _step_note(protocol: Protocol, state: RunState, event: Event, p: StepNote) -> RunState:
+    if _is_void(state, event, p.step, p.attempt):
+        return _void(state, event)
+    note = Note(event.seq, event.at_utc, p.note, p.data)
+    return change(state, p.step, notes=(*state.steps[p.step].notes, note))
+
+
+def _viewpoint_captured(protocol: Protocol, state: RunState, event: Event, p: ViewpointCaptured) -> RunState:
+    if _is_void_now(state, event, p.step, p.attempt):
+        return _void(state, event)
+    _require_running(state, event)
+    now = state.step
+    if p.viewpoint in now.captured:  # taken again within the attempt: the later one counts
+        earlier = {p.viewpoint: now.captured[p.viewpoint]}
+        state = supersede(state, event, p.step, "captured again", p.viewpoint, earlier)
+    return change(
+        state,
+        p.step,
+        captured={**now.captured, p.viewpoint: event.seq},
+        skipped_viewpoints=tuple(name for name in now.skipped_viewpoints if name != p.viewpoint),
+        failures=0,
+    )
+
+
+def _viewpoint_failed(protocol: Protocol, state: RunState, event: Event, p: ViewpointFailed) -> RunState:
+    if _is_void_now(state, event, p.step, p.attempt):
+        return _void(state, event)
+    _require_running(state, event)
+    now = state.step
+    counts = {**now.viewpoint_failures, p.viewpoint: now.viewpoint_failures.get(p.viewpoint, 0) + 1}
+    given_up = now.skipped_viewpoints
+    if p.skipped and p.viewpoint not in given_up:
+        given_up = (*given_up, p.viewpoint)
+        state = deviate(state, event, "viewpoint_skipped", p.step, f"{p.viewpoint} given up: {p.message}")
+    return change(state, p.step, viewpoint_failures=counts, skipped_viewpoints=given_up)
+
+
+def _step_measured(protocol: Protocol, state: RunState, event: Event, p: StepMeasured) -> RunState:
+    if _is_void_now(state, event, p.step, p.attempt):
+        return _void(state, event)
+    return _system(
+        protocol, state, event, "measured", measures=p.measures, artefacts=p.artefacts, result=p.result, failures=0
+    )
+
+
+def _step_failed(protocol: Protocol, state: RunState, event: Event, p: StepFailed) -> RunState:
+    if _is_void_now(state, event, p.step, p.attempt):
+        return _void(state, event)
+    failure = Failure(event.seq, p.error, p.message, p.recovery)
+    return _system(protocol, state, event, "failed", failure=failure, failures=state.step.failures + 1)
+
+
+def _step_retried(protocol: Protocol, state: RunState, event: Event, p: StepRetried) -> RunState:
+    if _is_void_now(state, event, p.step, p.attempt - 1):  # a retry opens the attempt that it names
+        return _void(state, event)
+    now = state.step
+    if not (now.retry_granted or (now.failure is not None and now.failure.recovery == "retry")):
+        raise _impossible(event, "neither the policy nor the operator allowed a retry")
+    changes: dict[str, Any] = {**UNMEASURED, "attempt": p.attempt, "retry_granted": False}
+    if protocol.step(p.step).irreversible:  # its signature is the release to begin, and still holds
+        changes |= {"signed": now.signed, "signed_by": now.signed_by}
+    if now.retry_granted:  # what was given up gets another chance
+        changes |= {"failures": 0, "viewpoint_failures": {}, "skipped_viewpoints": ()}
+    return _system(protocol, state, event, "retry", **changes)
+
+
+def _gates_evaluated(protocol: Protocol, state: RunState, event: Event, p: GatesEvaluated) -> RunState:
+    if _is_void_now(state, event, p.step, p.attempt):
+        return _void(state, event)
+    if p != evaluate_gates(protocol.step(p.step), p.attempt, state.step.measures):
+        raise _impossible(event, "the verdicts do not follow from the measures and the protocol's limits")
+    trigger = "gates_passed" if p.passed else "gates_failed"
+    changes = {"verdicts": p.verdicts, "gates_passed": p.passed, "gates_sha256": event.sha256}
+    return _system(protocol, state, event, trigger, **changes)
+
+
+def _step_passed(protocol: Protocol, state: RunState, event: Event, p: StepPassed) -> RunState:
+    if _is_void_now(state, event, p.step, p.attempt):
+        return _void(state, event)
+    if protocol.step(p.step).sign and not state.step.signed:
+        raise _impossible(event, "nobody has signed")
+    changes = {"passed_sha256": event.sha256, "passed_seq": event.seq, "ended_utc": event.at_utc}
+    return pass_on(protocol, _system(protocol, state, event, "accept", **changes))
+
+
+# --- jobs -----------------------------------------------------------------------------------------------------
+
+
+def _job_enqueued(protocol: Protocol, state: RunState, event: Event, p: JobEnqueued) -> RunState:
+    if _is_void(state, event, p.step, p.attempt):
+        return _void(state, event)
+    jobs = state.steps[p.step].jobs
+    if p.job in jobs:
+        raise _impossible(event, f"job {p.job} is enqueued already")
+    job = JobState(p.job, p.job_kind, p.attempt, event.seq, p.idempotency_key, p.arguments)
+    return change(state, p.step, jobs={**jobs, p.job: job})
+
+
+def _job_ended(protocol: Protocol, state: RunState, event: Event, p: JobFinished | JobFailed) -> RunState:
+    job = state.steps[p.step].jobs.get(p.job) if p.step in state.steps else None
+    if job is None:
+        if _is_void(state, event, p.step, p.attempt):
+            return _void(state, event)
+        raise _impossible(event, f"job {p.job} was never enqueued")
+    if job.status == "finished":  # a second worker after a lost lease: the first answer counts
+        return _void(state, event)
+    if isinstance(p, JobFinished):
+        job = replace(job, status="finished", measures=p.measures, artefacts=p.artefacts, result=p.result)
+    else:
+        job = replace(job, status="failed", error=p.error, message=p.message)
+    return change(state, p.step, jobs={**state.steps[p.step].jobs, p.job: job})
+
+
+# --- operators ------------------------------------------------------------------------------------------------
+
+
+def _action_refused(protocol: Protocol, state: RunState, event: Event, p: ActionRefused) -> RunState:
+    return deviate(state, event, "refused", p.step, f"{p.action} refused: {p.why}")
+
+
+_HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunState]] = {
+    RunStarted: _run_started,
+    SessionStarted: _session_started,
+    DeviceOpened: _device_opened,
+    DeviceTrouble: _device_trouble,
+    StepStarted: _step_started,
+    StepNote: _step_note,
+    ViewpointCaptured: _viewpoint_captured,
+    ViewpointFailed: _viewpoint_failed,
+    StepMeasured: _step_measured,
+    StepFailed: _step_failed,
+    StepRetried: _step_retried,
+    GatesEvaluated: _gates_evaluated,
+    StepPassed: _step_passed,
+    JobEnqueued: _job_enqueued,
+    JobFinished: _job_ended,
+    JobFailed: _job_ended,
+    RunCompleted: _run_completed,
+    RunAborted: _run_aborted,
+    ActionRefused: _action_refused,
+    OperatorAction: apply_action,
+}

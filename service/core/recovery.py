@@ -1,0 +1,34 @@
+"""What to do about a failed step: a pure policy from (step's recovery, error class, failures so far)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from service.core.protocol import Recovery
+
+Policy = Literal["retry", "ask", "abort"]
+
+# Names, not classes: core does not know the drivers, and the events hold names.
+# Passing troubles: the same call may succeed in a moment.
+PASSING = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "DeviceBusyError", "StaleImageError"})
+# Only a person at the table can put these right, whatever the protocol says.
+NEEDS_A_PERSON = frozenset({"SafetyStopError", "DeviceStorageFullError"})
+# The evidence itself is in doubt: going on would build on it.
+FATAL = frozenset({"IntegrityError"})
+
+
+def recovery_policy(recovery: Recovery, error: str, failures: int) -> Policy:
+    """Retry, ask the operator, or abort.
+
+    Args:
+        recovery: the step's policy from the protocol.
+        error: class name of the error that ended the work.
+        failures: how often the step has failed in a row, this failure included (StepState.failures + 1).
+    """
+    if error in FATAL:
+        return "abort"
+    if error in NEEDS_A_PERSON:
+        return "ask"
+    if error in PASSING and failures <= recovery.retries:
+        return "retry"
+    return recovery.on_failure

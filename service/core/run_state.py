@@ -1,0 +1,185 @@
+"""What a run's events add up to, as frozen records: RunState and its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from service.core.lifecycle import Phase
+from service.core.model import ArtefactRef, GateVerdict
+
+StepPhase = Literal["pending", "ready", "running", "checking", "awaiting_operator", "recovering", "passed"]
+Status = Literal["active", "paused", "completed", "aborted"]
+DeviationKind = Literal[
+    "skip", "gate_overridden", "redo", "redo_viewpoint", "reset_by_redo", "viewpoint_skipped", "refused", "automatic"
+]
+
+
+@dataclass(frozen=True, slots=True)
+class JobState:
+    """A job of the registration worker, as the events tell."""
+
+    job: str
+    kind: str
+    attempt: int
+    enqueued_seq: int
+    idempotency_key: str
+    arguments: Mapping[str, Any]
+    status: Literal["enqueued", "finished", "failed"] = "enqueued"
+    measures: Mapping[str, float] = field(default_factory=dict[str, float])
+    artefacts: tuple[ArtefactRef, ...] = ()
+    result: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    error: str = ""
+    message: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A StepNote with its time."""
+
+    seq: int
+    at_utc: str
+    note: str
+    data: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """The last StepFailed of a step that has not been recovered yet."""
+
+    seq: int
+    error: str
+    message: str
+    recovery: Literal["retry", "ask", "abort"]
+
+
+@dataclass(frozen=True, slots=True)
+class StepState:
+    """Where a step stands. `attempt` counts from 1 and is the one under way or to come next."""
+
+    step: str
+    attempt: int = 1
+    phase: StepPhase = "pending"
+    confirmed: bool = False
+    ticked: tuple[str, ...] = ()  # checklist items of the confirmation
+    signed: bool = False
+    signed_by: str = ""
+    skipped: bool = False
+    retry_granted: bool = False  # an operator confirmed in recovering
+    measures: Mapping[str, float] = field(default_factory=dict[str, float])  # of this attempt
+    artefacts: tuple[ArtefactRef, ...] = ()  # of this attempt's step_measured
+    result: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    verdicts: tuple[GateVerdict, ...] = ()
+    gates_passed: bool = False
+    gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds
+    passed_sha256: str = ""  # of the step_passed event: what the release of an irreversible step binds
+    passed_seq: int = 0
+    failure: Failure | None = None
+    failures: int = 0  # failures in a row without a viewpoint captured or an operator's leave in between
+    # Viewpoints, notes and jobs survive a retry and end with a redo.
+    captured: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → seq of its event
+    viewpoint_failures: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → times
+    skipped_viewpoints: tuple[str, ...] = ()  # given up
+    notes: tuple[Note, ...] = ()
+    jobs: Mapping[str, JobState] = field(default_factory=dict[str, JobState])
+    started_utc: str = ""
+    ended_utc: str = ""
+
+    @property
+    def passed_its_gates(self) -> bool:
+        """Passed, and not merely skipped."""
+        return self.phase == "passed" and self.gates_passed and not self.skipped
+
+
+@dataclass(frozen=True, slots=True)
+class Superseded:
+    """An attempt, or one viewpoint of it, that a later one replaces. Its evidence stays."""
+
+    seq: int  # of the event that superseded it
+    step: str
+    attempt: int
+    reason: str
+    viewpoint: str | None = None
+    captured: Mapping[str, int] = field(default_factory=dict[str, int])
+    began: bool = True  # whether its work had begun
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """Something that departed from the protocol; a note (automatic confirmation) is listed but not counted."""
+
+    seq: int
+    kind: DeviationKind
+    step: str | None
+    text: str
+    actor: str = ""
+
+    @property
+    def is_note(self) -> bool:
+        """Whether this is for the record only."""
+        return self.kind == "automatic"
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """A DeviceTrouble."""
+
+    seq: int
+    device: str
+    error: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunState:
+    """The fold of a run's events."""
+
+    machine_state: str  # of service.core.lifecycle
+    current: str  # identifier of the step that the run is at (of the last one, once it has ended)
+    steps: Mapping[str, StepState]
+    status: Status = "active"
+    seq: int = 0  # of the last event; 0: nothing recorded yet
+    run_id: str = ""
+    operator: str = ""
+    simulated: bool = False
+    auto_confirm: bool = False
+    sessions: int = 0
+    stop_reason: str = ""
+    deviations: tuple[Deviation, ...] = ()
+    superseded: tuple[Superseded, ...] = ()
+    overtaken: tuple[int, ...] = ()  # seq of events that arrived after an operator's action had made them void
+    troubles: tuple[Trouble, ...] = ()
+    last_redo_seq: int = 0
+
+    @property
+    def step(self) -> StepState:
+        """The current step."""
+        return self.steps[self.current]
+
+    @property
+    def phase(self) -> Phase:
+        """Phase of the current step."""
+        phase = self.step.phase
+        assert phase != "pending"  # the current step is never pending
+        return phase
+
+    @property
+    def started(self) -> bool:
+        """Whether run_started has been recorded."""
+        return self.seq > 0
+
+    @property
+    def paused(self) -> bool:
+        """Whether an operator has paused the run."""
+        return self.status == "paused"
+
+    @property
+    def terminal(self) -> bool:
+        """Whether the run has ended, one way or the other."""
+        return self.status in ("completed", "aborted")
+
+    @property
+    def deviation_count(self) -> int:
+        """Deviations without the notes."""
+        return sum(not deviation.is_note for deviation in self.deviations)
