@@ -1,0 +1,1 @@
+"""Spheres in images: from pixels to outlines on the viewing sphere."""

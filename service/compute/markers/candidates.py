@@ -1,0 +1,122 @@
+"""Coarse search: where circles may be, by votes of edge pixels along their gradient, at several scales."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_LEAST_RADIUS = (
+    11  # pixels at the scale at which a circle is searched: small enough to be quick, large enough to tell
+)
+_OCTAVE = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A circle in pixels of the coarse image: the bounding box and the first rough outline in one."""
+
+    x: float
+    y: float
+    radius: float
+    vote: float  # part of the circumference that votes for it
+
+
+def colour_gradient(image: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
+    """Sobel derivatives (H, W) of the channel that changes most at each pixel of a BGR image."""
+    smooth = cv2.GaussianBlur(image, (5, 5), 1.1)
+    dx = cv2.Sobel(smooth, cv2.CV_16S, 1, 0)
+    dy = cv2.Sobel(smooth, cv2.CV_16S, 0, 1)
+    best = np.abs(dx[..., 0]) + np.abs(dy[..., 0])
+    gx, gy = dx[..., 0].copy(), dy[..., 0].copy()
+    for channel in (1, 2):
+        size = np.abs(dx[..., channel]) + np.abs(dy[..., channel])
+        more = size > best
+        np.copyto(best, size, where=more)
+        np.copyto(gx, dx[..., channel], where=more)
+        np.copyto(gy, dy[..., channel], where=more)
+    return gx.astype(np.int16), gy.astype(np.int16)
+
+
+def edges(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> NDArray[np.bool_]:
+    """Thin edge pixels, with thresholds from the image's own median gradient, not from its maximum."""
+    size = np.abs(gx[::3, ::3].astype(np.int32)) + np.abs(gy[::3, ::3])
+    low = float(np.clip(2.5 * np.median(size), 24, 80))
+    return np.asarray(cv2.Canny(gx, gy, low, 2.2 * low) > 0)
+
+
+def find_candidates(
+    image: NDArray[np.uint8], least_radius: float, greatest_radius: float, min_vote: float, limit: int
+) -> list[Candidate]:
+    """Circles of the radii given (pixels of this image), the best voted first, one for each place and size.
+
+    Each octave of radii is searched on a copy on which its smallest radius is about eleven pixels.
+    """
+    found: list[Candidate] = []
+    radius = least_radius
+    while radius < greatest_radius:
+        scale = min(1.0, _LEAST_RADIUS / radius)
+        top = min(radius * _OCTAVE, greatest_radius)
+        size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+        level = image if scale == 1.0 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        found += _search(np.asarray(level, dtype=np.uint8), radius * scale, top * scale, min_vote, 1 / scale)
+        radius = top
+    found.sort(key=lambda c: -c.vote)
+    kept: list[Candidate] = []
+    for c in found:
+        if all(_apart(c, k) for k in kept):
+            kept.append(c)
+            if len(kept) == limit:
+                break
+    return kept
+
+
+def _apart(a: Candidate, b: Candidate) -> bool:
+    near = 0.35 * min(a.radius, b.radius)
+    return abs(a.x - b.x) > near or abs(a.y - b.y) > near or not 0.72 < a.radius / b.radius < 1.39
+
+
+def _search(
+    image: NDArray[np.uint8], least: float, greatest: float, min_vote: float, to_input: float
+) -> list[Candidate]:
+    h, w = image.shape[:2]
+    gx, gy = colour_gradient(image)
+    ys, xs = np.nonzero(edges(gx, gy))
+    if len(xs) == 0:
+        return []
+    dx, dy = gx[ys, xs].astype(np.float32), gy[ys, xs].astype(np.float32)
+    norm = np.hypot(dx, dy)
+    dx, dy = dx / norm, dy / norm
+    radii = np.arange(max(3, int(least) - 1), int(np.ceil(greatest)) + 2)
+    margin = int(radii[-1])  # a centre may lie outside the image
+    rows, columns = h + 2 * margin, w + 2 * margin
+    votes = np.zeros((len(radii), rows, columns), dtype=np.float32)
+    for i, r in enumerate(radii):
+        total: NDArray[np.int64] | None = None
+        for sign in (1, -1):
+            cx = np.rint(xs + sign * r * dx).astype(np.int64) + margin
+            cy = np.rint(ys + sign * r * dy).astype(np.int64) + margin
+            count = np.bincount(cy * columns + cx, minlength=rows * columns).astype(np.int64)
+            total = count if total is None else total + count
+        assert total is not None
+        plane = total.reshape(rows, columns).astype(np.float32) / (2 * np.pi * float(r))
+        votes[i] = cv2.boxFilter(plane, -1, (5, 5), normalize=False)
+    summed = votes.copy()
+    summed[1:] += votes[:-1]
+    summed[:-1] += votes[1:]
+    best_index = np.argmax(summed, axis=0)
+    best = np.take_along_axis(summed, best_index[None], axis=0)[0]
+    peak = (best >= cv2.dilate(best, np.ones((7, 7), np.uint8))) & (best > min_vote)
+    py, px = np.nonzero(peak)
+    strongest = np.argsort(-best[py, px])[:150]
+    return [
+        Candidate(
+            (float(px[k]) - margin + 0.5) * to_input - 0.5,
+            (float(py[k]) - margin + 0.5) * to_input - 0.5,
+            float(radii[best_index[py[k], px[k]]]) * to_input,
+            float(best[py[k], px[k]]),
+        )
+        for k in strongest
+    ]

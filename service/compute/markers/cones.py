@@ -1,0 +1,180 @@
+"""A sphere seen by a camera is a circular cone of rays: three numbers, whatever the position in the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.core.geometry import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Cone:
+    """All rays that touch a sphere: `axis` (3,) is the unit vector to the sphere's centre, in the camera frame."""
+
+    axis: Array
+    half_angle_rad: float
+
+    @property
+    def conic(self) -> Array:
+        """(3, 3) E with x^T E x = 0 for x = (x, y, 1) normalised, of unit Frobenius norm, negative inside.
+
+        With E^-1 = P Q^-1 P^T for a sphere c, r in the camera frame: E ~ (|c|^2 - r^2) I - c c^T, which is
+        cos^2(a) I - u u^T for u = c / |c| and sin(a) = r / |c|.
+        """
+        E = np.cos(self.half_angle_rad) ** 2 * np.eye(3) - np.outer(self.axis, self.axis)
+        return E / float(np.linalg.norm(E))
+
+    def frame(self) -> Array:
+        """(3, 3) columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""
+        e1 = np.array([1.0, 0.0, 0.0]) - self.axis[0] * self.axis
+        e1 /= np.linalg.norm(e1)
+        return np.stack([e1, np.cross(self.axis, e1), self.axis], axis=1)
+
+    def rays(self, azimuth_rad: Array, angle_rad: Array) -> Array:
+        """Unit rays (..., 3) at `angle_rad` from the axis and `azimuth_rad` about it (broadcast)."""
+        local = np.stack(
+            np.broadcast_arrays(
+                np.sin(angle_rad) * np.cos(azimuth_rad), np.sin(angle_rad) * np.sin(azimuth_rad), np.cos(angle_rad)
+            ),
+            axis=-1,
+        )
+        return local @ self.frame().T
+
+
+def cone_of_sphere(centre_camera_m: Array, radius_m: float) -> Cone:
+    """The cone of a sphere whose centre is (3,) in the camera frame."""
+    distance = float(np.linalg.norm(centre_camera_m))
+    return Cone(centre_camera_m / distance, float(np.arcsin(radius_m / distance)))
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipse:
+    """An ellipse in normalised coordinates."""
+
+    centre: Array  # (2,)
+    semi_major: float
+    semi_minor: float
+    angle_rad: float
+
+    def equidistant(self, n: int) -> Array:
+        """(n, 2) points at equal arc length, the first one not repeated."""
+        t = np.linspace(0.0, 2 * np.pi, 1441)
+        local = np.stack([self.semi_major * np.cos(t), self.semi_minor * np.sin(t)], axis=1)
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(local, axis=0), axis=1))])
+        at = np.interp(np.arange(n) * length[-1] / n, length, t)
+        c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
+        x, y = self.semi_major * np.cos(at), self.semi_minor * np.sin(at)
+        return np.stack([c * x - s * y, s * x + c * y], axis=1) + self.centre
+
+
+def cone_ellipse(cone: Cone) -> Ellipse:
+    """The ellipse in which the cone meets the plane z = 1 (the cone must lie in front of the camera)."""
+    E = cone.conic
+    A, b, c = E[:2, :2], E[:2, 2], E[2, 2]
+    centre = -np.linalg.solve(A, b).astype(np.float64)
+    level = -(c + b @ centre)
+    values, vectors = np.linalg.eigh(A / level)  # ascending: the first is the major axis
+    return Ellipse(
+        centre,
+        float(1 / np.sqrt(values[0])),
+        float(1 / np.sqrt(values[1])),
+        float(np.arctan2(vectors[1, 0], vectors[0, 0])),
+    )
+
+
+def angles_to(cone: Cone, rays: Array) -> Array:
+    """Angular distance (N,) of unit rays (N, 3) from the cone's surface, positive outside."""
+    along = rays @ cone.axis
+    across = np.linalg.norm(rays - along[:, None] * cone.axis, axis=1)
+    return np.arctan2(across, along) - cone.half_angle_rad
+
+
+def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> Cone:
+    """Least squares of the angular (geometric) distance of unit rays (N, 3) to the cone, by Gauss–Newton."""
+    cone = start
+    w = np.sqrt(weights)
+    for _ in range(iterations):
+        frame = cone.frame()
+        local = rays @ frame
+        azimuth = np.arctan2(local[:, 1], local[:, 0])
+        residual = angles_to(cone, rays)
+        # Tilting the axis by t towards azimuth p shortens the distance of a ray at azimuth q by t cos(p - q).
+        J = np.stack([-np.cos(azimuth), -np.sin(azimuth), -np.ones(len(rays))], axis=1)
+        step = np.linalg.lstsq(J * w[:, None], -residual * w, rcond=None)[0]
+        axis = cone.axis + frame[:, :2] @ step[:2]
+        cone = Cone(axis / np.linalg.norm(axis), cone.half_angle_rad + float(step[2]))
+        if float(np.abs(step).max()) < 1e-12:
+            break
+    return cone
+
+
+def cones_through(triples: Array) -> tuple[Array, Array]:
+    """Cones through triples of unit rays (K, 3, 3): axes (K, 3) and half angles (K,); NaN where degenerate."""
+    normal = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    length = np.linalg.norm(normal, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        axis = normal / np.where(length > 1e-15, length, np.nan)[:, None]
+    cosine = np.einsum("kj,kj->k", axis, triples[:, 0])
+    axis = axis * np.sign(cosine)[:, None]
+    return axis, np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+
+
+def ransac_cone(
+    rays: Array,
+    strengths: Array,
+    slots: NDArray[np.int64],
+    bounds: tuple[float, float],
+    tolerance_rad: float,
+    rng: np.random.Generator,
+    trials: int = 400,
+) -> tuple[Cone, NDArray[np.bool_]] | None:
+    """The cone that most edge points agree with, and the points (N,) that do.
+
+    Args:
+        rays: (N, 3) unit rays of edge points.
+        strengths: (N,) weight of a point's vote, 0..1.
+        slots: (N,) azimuth slot of each point; a slot votes once, with its strongest agreeing point.
+        bounds: least and largest half angle allowed.
+        tolerance_rad: angular distance at which a point agrees.
+        rng: generator of the samples.
+        trials: number of triples drawn.
+
+    Returns None when no triple gives a cone within the bounds.
+    """
+    n_slots = int(slots.max()) + 1 if len(slots) else 0
+    if len(rays) < 8:
+        return None
+    order = np.argsort(slots, kind="stable")
+    rays, strengths, sorted_slots = rays[order], strengths[order], slots[order]
+    # Triples spread around the outline: one point from each third of the azimuth, chosen by strength.
+    first = rng.integers(0, len(rays), trials)
+    shift = (len(rays) * np.array([[0.0, 1 / 3, 2 / 3]]) + rng.uniform(-0.14, 0.14, (trials, 3)) * len(rays)).astype(
+        int
+    )
+    picks = (first[:, None] + shift) % len(rays)
+    axis, half = cones_through(rays[picks])
+    good = np.isfinite(half) & (half > bounds[0]) & (half < bounds[1])
+    if not np.any(good):
+        return None
+    axis, half = axis[good], half[good]
+    cosine = np.clip(rays @ axis.T, -1.0, 1.0)
+    agree = np.abs(np.arccos(cosine) - half) < tolerance_rad  # (N, K)
+    votes = np.where(agree, strengths[:, None], 0.0)
+    starts = np.searchsorted(sorted_slots, np.unique(sorted_slots))
+    total = np.maximum.reduceat(votes, starts, axis=0).sum(axis=0) / max(n_slots, 1)
+    best = int(np.argmax(total))
+    cone = Cone(axis[best], float(half[best]))
+    inlier_sorted = agree[:, best]
+    for _ in range(3):
+        if inlier_sorted.sum() < 8:
+            return None
+        cone = fit_cone(rays[inlier_sorted], strengths[inlier_sorted], cone)
+        inlier_sorted = np.abs(angles_to(cone, rays)) < tolerance_rad
+    if not bounds[0] < cone.half_angle_rad < bounds[1]:
+        return None
+    inlier = np.zeros(len(rays), dtype=bool)
+    inlier[order] = inlier_sorted
+    return cone, inlier

@@ -1,0 +1,267 @@
+"""The whole way from image files and poses to a registration and its evaluation, without a run or a store."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.images import read_image
+from service.compute.markers.detect import detect_spheres
+from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.registration.cost import Cost
+from service.compute.registration.evaluation import Evaluation, evaluate
+from service.compute.registration.hypotheses import match, sightings
+from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform, apply, inverse
+
+_CONTROL_GATE = 0.5  # of the radius: a control sphere is where the registration says, or the registration is wrong
+_CONTROL_SIZE_GATE = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Detection:
+    """One outline of one image, with what became of it."""
+
+    outline: SphereOutline
+    marker: int | None  # registration sphere, index into the list given
+    control: int | None  # control sphere, index into the list given
+    rms_px: float | None  # against the prediction of the registration
+    excluded: str = ""  # the reason, when the registration left it out
+
+
+@dataclass(frozen=True, slots=True)
+class ImageDetections:
+    """All outlines of one image."""
+
+    image: str
+    detections: tuple[Detection, ...]
+    T_scan_camera: Transform = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class PipelineResult:
+    """Everything that result.json and the report need. Errors of control spheres are None where there are none."""
+
+    registration: RegistrationResult
+    evaluation: Evaluation | None
+    images: tuple[ImageDetections, ...]
+    markers: tuple[int, ...]  # registration spheres used
+    assignments: tuple[Assignment, ...] = field(repr=False)
+    control_assignments: tuple[Assignment, ...] = field(repr=False)
+
+    def as_json(self, camera: CameraModel) -> dict[str, object]:
+        """Plain data of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
+        r = self.registration
+        return {
+            "T_world_scan": r.T_world_scan.tolist(),
+            "scale": r.scale,
+            "covariance": r.covariance.tolist(),
+            "covariance_order": ["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad", "ln_scale"][: len(r.covariance)],
+            "T_world_group": {str(g): T.tolist() for g, T in r.T_world_group.items()},
+            "rms_px": r.rms_px,
+            "mean_radial_error_mm": None if self.evaluation is None else self.evaluation.mean_radial_error_mm,
+            "mean_reprojection_error_px": None
+            if self.evaluation is None
+            else self.evaluation.mean_reprojection_error_px,
+            "n_images": r.n_images,
+            "markers": [
+                {
+                    "index": m,
+                    "n_images": len(mine),
+                    "rms_px": float(np.sqrt(np.mean([x.rms_px**2 for x in mine]))) if mine else None,
+                }
+                for m in self.markers
+                for mine in [[x for x in r.residuals if x.marker == m and not x.excluded]]
+            ],
+            "control_spheres": []
+            if self.evaluation is None
+            else [
+                {"index": s, "radial_error_mm": radial, "reprojection_error_px": px, "n_images": n}
+                for s, (radial, px, n) in self.evaluation.per_sphere().items()
+            ],
+            "images": [
+                {
+                    "image": entry.image,
+                    "T_scan_camera": entry.T_scan_camera.tolist()
+                    if np.all(np.isfinite(entry.T_scan_camera))
+                    else None,
+                    "detections": [_detection_json(d) for d in entry.detections],
+                }
+                for entry in self.images
+            ],
+        }
+
+
+def _detection_json(d: Detection) -> dict[str, object]:
+    o = d.outline
+    return {
+        "marker": d.marker,
+        "control": d.control,
+        "centre_px": list(o.centre_px),
+        "semi_axes_px": list(o.semi_axes_px),
+        "angle_rad": o.angle_rad,
+        "coverage": o.coverage,
+        "outline_rms_px": o.rms_px,
+        "registration_rms_px": d.rms_px,
+        "excluded": d.excluded,
+    }
+
+
+def detect_file(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
+    """The outlines in one image file.
+
+    Raises:
+        DataError: the file is missing, truncated, no image, or not of the camera's size; `where` names it.
+    """
+    image = read_image(path)
+    try:
+        return detect_spheres(image, camera, options)
+    except DataError as error:
+        raise DataError(error.what, where=str(path), remedy=error.remedy) from error
+
+
+def detect_all(
+    image_paths: Sequence[Path],
+    camera: CameraModel,
+    options: DetectionOptions = DEFAULTS,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[tuple[SphereOutline, ...], ...]:
+    """The outlines in all images, in the order given.
+
+    Args:
+        image_paths: JPEG or PNG files of the camera's size.
+        camera: intrinsics.
+        options: of the detector.
+        workers: processes; 1 computes here.
+        progress: called with (done, all) after each image.
+
+    Raises:
+        DataError: an image cannot be used; the first one is named.
+    """
+    work = partial(detect_file, camera=camera, options=options)
+    out: list[tuple[SphereOutline, ...]] = []
+    if workers <= 1:
+        for path in image_paths:
+            out.append(work(path))
+            if progress is not None:
+                progress(len(out), len(image_paths))
+        return tuple(out)
+    context = multiprocessing.get_context("spawn")  # forking a process that runs threads may deadlock
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
+        for found in pool.map(work, image_paths):
+            out.append(found)
+            if progress is not None:
+                progress(len(out), len(image_paths))
+    return tuple(out)
+
+
+def _one_thread() -> None:
+    cv2.setNumThreads(1)
+
+
+def register_images(
+    outlines: Sequence[Sequence[SphereOutline]],
+    poses: Array,
+    camera: CameraModel,
+    registration_centres_m: Array,
+    radius_m: float,
+    *,
+    control_centres_m: Array | None = None,
+    groups: Sequence[int] | NDArray[np.int64] | None = None,
+    estimate_scale: bool = False,
+    cost: Cost = "sampson",
+    names: Sequence[str] = (),
+) -> PipelineResult:
+    """Identity, registration and evaluation of detected outlines.
+
+    Args:
+        outlines: per image, from `detect_all`.
+        poses: (N, 4, 4) T_world_camera, or T_base_camera of each image's group.
+        camera: intrinsics.
+        registration_centres_m: (M, 3) in the scan frame.
+        radius_m: of all spheres.
+        control_centres_m: (C, 3) spheres that only serve the evaluation, or None.
+        groups: (N,) station of each image; None: all one.
+        estimate_scale: the poses are not metric.
+        cost: of the registration.
+        names: of the images.
+
+    Raises:
+        DataError: lengths do not agree.
+        ComputeError: too few spheres, ambiguous, or contradictory.
+    """
+    n = len(outlines)
+    stations = np.zeros(n, dtype=np.int64) if groups is None else np.asarray(groups, dtype=np.int64)
+    if poses.shape != (n, 4, 4) or len(stations) != n:
+        raise DataError(f"{n} images, but {len(poses)} poses and {len(stations)} stations")
+    if not np.all(np.isfinite(poses)):
+        raise DataError("a camera pose holds a number that is not finite")
+    labels = list(names) or [f"image {i}" for i in range(n)]
+    assignments = identify(
+        outlines, registration_centres_m, camera, poses,
+        radius_m=radius_m, groups=stations, metric=not estimate_scale, names=labels,
+    )  # fmt: skip
+    registration = register(
+        outlines, assignments, poses, stations, registration_centres_m, radius_m, camera,
+        estimate_scale=estimate_scale, cost=cost,
+    )  # fmt: skip
+    controls = np.zeros((0, 3)) if control_centres_m is None else np.asarray(control_centres_m, dtype=np.float64)
+    control = _find_controls(outlines, assignments, registration, controls, radius_m, camera)
+    evaluation = None
+    if any(a.markers for a in control):
+        evaluation = evaluate(outlines, control, registration.T_scan_camera, controls, radius_m, camera)
+    records = {(r.image, r.outline): r for r in registration.residuals}
+    images = tuple(
+        ImageDetections(
+            labels[i],
+            tuple(_detection(o, j, records.get((i, j)), control[i]) for j, o in enumerate(found)),
+            registration.T_scan_camera[i],
+        )
+        for i, found in enumerate(outlines)
+    )
+    used = tuple(sorted({r.marker for r in registration.residuals if not r.excluded}))
+    return PipelineResult(registration, evaluation, images, used, assignments, control)
+
+
+def _detection(outline: SphereOutline, index: int, record: OutlineResidual | None, control: Assignment) -> Detection:
+    return Detection(
+        outline,
+        None if record is None else record.marker,
+        control.markers.get(index),
+        None if record is None else record.rms_px,
+        "" if record is None else record.reason,
+    )
+
+
+def _find_controls(
+    outlines: Sequence[Sequence[SphereOutline]],
+    assignments: Sequence[Assignment],
+    registration: RegistrationResult,
+    controls: Array,
+    radius_m: float,
+    camera: CameraModel,
+) -> tuple[Assignment, ...]:
+    """Control spheres by their predicted places; outlines that serve the registration are not asked."""
+    out: list[Assignment] = []
+    for i, found in enumerate(outlines):
+        T = registration.T_scan_camera[i]
+        free = [j for j in range(len(found)) if j not in assignments[i].markers]
+        if len(controls) == 0 or not free or not np.all(np.isfinite(T)):
+            out.append(Assignment())
+            continue
+        seen = sightings([found[j] for j in free], radius_m, camera)
+        pairs = match(seen, apply(inverse(T), controls), radius_m, _CONTROL_GATE, _CONTROL_SIZE_GATE)
+        out.append(Assignment({free[d]: m for d, m, _ in pairs}, inverse(T), registration.scale))
+    return tuple(out)

@@ -1,0 +1,1 @@
+"""From outlines and camera poses to the pose of the scan: identity, solution, evaluation."""
