@@ -121,9 +121,18 @@ class HostedDevice:
         with self._lock:
             if self._child is not None and self._child.process.poll() is not None:
                 self._bury()
-            if self._child is None:
+            fresh = self._child is None
+            if fresh:
                 self._start()
-            return cast("DeviceIdentity", self.call("open"))
+            try:
+                return cast("DeviceIdentity", self.call("open"))
+            except DeviceError as error:
+                if fresh or self._child is not None:
+                    raise
+                # What was left of the old connection took the child with it: a new one knows nothing of it.
+                _LOG.warning("%s: %s; trying once more", self._name, error)
+                self._start()
+                return cast("DeviceIdentity", self.call("open"))
 
     def close(self) -> None:
         """Close the device and end the child; never raises for a device or child that is already gone."""

@@ -116,8 +116,7 @@ def follow(model: Model, T_base_flange: Array, q: Array) -> Array | None:
         if float(np.max(np.abs(step))) > 0.5:
             return None
         q = q + step
-    T = forward(model, q)
-    return q if float(np.max(np.abs(T - T_base_flange))) < 1e-8 else None
+    return q if float(np.max(np.abs(forward(model, q) - T_base_flange))) < 1e-8 else None
 
 
 def _postures(model: Model, T: Array, near: Array) -> Iterator[Array]:

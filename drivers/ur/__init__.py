@@ -1,0 +1,31 @@
+"""Universal Robots arms through ur_rtde: configuration and entry point; the library loads in the child only."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, cast
+
+from pydantic import Field
+
+from drivers.plugin import DriverConfig, DriverSpec
+
+if TYPE_CHECKING:
+    from drivers.interfaces import Device
+
+
+class UrConfig(DriverConfig):
+    """A robot's section in rig.yaml."""
+
+    host: str = Field(description="address of the controller; its ports are fixed: 30004, 29999, 30003")
+    connect_timeout_s: float = Field(default=5.0, gt=0, description="for each port to answer before connecting")
+    stale_after_s: float = Field(
+        default=1.0, gt=0, description="age of the newest sample beyond which the link is dead"
+    )
+    stop_deceleration_rad_s2: float = Field(default=2.0, gt=0)
+
+
+def _build(config: UrConfig) -> Device:
+    return cast("Device", importlib.import_module("drivers.ur.robot").UrRobot(config))
+
+
+DRIVER = DriverSpec(kind="robot", config=UrConfig, build=_build, hosted=True, call_timeout_s=30.0)

@@ -1,0 +1,104 @@
+"""Reaching a controller: probes that cannot hang, what its dashboard says, the vendor's exceptions wrapped."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+import struct
+from collections.abc import Generator
+from dataclasses import dataclass
+
+from drivers.errors import DeviceFaultError, DeviceUnavailableError
+from drivers.ur import vendor as library
+
+RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
+VENDOR_ERRORS = (RuntimeError, ValueError, TypeError)
+MINIMUM_VERSION = {3: (3, 15), 5: (5, 10)}  # get_inverse_kin_has_solution() came with these
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerFacts:
+    """What the dashboard says of a controller."""
+
+    model: str
+    serial: str
+    software: str
+    version: tuple[int, int]
+    remote_control: bool
+
+
+@contextlib.contextmanager
+def vendor(where: str, doing: str) -> Generator[None]:
+    """Turn the vendor library's exceptions into DeviceUnavailableError."""
+    try:
+        yield
+    except VENDOR_ERRORS as error:
+        raise DeviceUnavailableError(
+            f"{doing} failed: {error}", where=where, remedy="Check the controller and its network, then reconnect"
+        ) from error
+
+
+def probe(host: str, timeout_s: float) -> None:
+    """Make sure that all three servers answer: the vendor's constructors wait for ever on a mute one.
+
+    Raises DeviceUnavailableError naming the port that refuses or keeps silent.
+    """
+    _ask(host, RTDE_PORT, struct.pack(">HBH", 5, ord("V"), 2), timeout_s, "RTDE")
+    _ask(host, DASHBOARD_PORT, b"", timeout_s, "dashboard")
+    _ask(host, SCRIPT_PORT, None, timeout_s, "script")
+
+
+def _ask(host: str, port: int, question: bytes | None, timeout_s: float, name: str) -> None:
+    where = f"{host}:{port}"
+    try:
+        with socket.create_connection((host, port), timeout=timeout_s) as connection:
+            if question is None:
+                return
+            connection.sendall(question)
+            if not connection.recv(64):
+                raise DeviceUnavailableError(f"the {name} server closed the connection", where=where)
+    except TimeoutError:
+        remedy = "Restart the controller; check that no firewall swallows the answer"
+        raise DeviceUnavailableError(
+            f"the {name} server did not answer within {timeout_s:g} s", where=where, remedy=remedy
+        ) from None
+    except OSError as error:
+        remedy = "Check that the controller is on, its address is right, and the service is enabled on the pendant"
+        raise DeviceUnavailableError(
+            f"the {name} server cannot be reached: {error.strerror or error}", where=where, remedy=remedy
+        ) from error
+
+
+def connect_dashboard(host: str) -> library.Dashboard:
+    """A connected dashboard client."""
+    client = library.dashboard(host)
+    with vendor(host, "connecting to the dashboard"):
+        client.connect(2000)
+    return client
+
+
+def read_facts(dashboard: library.Dashboard, host: str) -> ControllerFacts:
+    """Version, serial number and model. Raises DeviceFaultError for software that is too old."""
+    with vendor(host, "reading version and serial number"):
+        software = dashboard.polyscopeVersion()
+        serial = dashboard.getSerialNumber().strip()
+        model = dashboard.getRobotModel().strip()
+    match = re.search(r"(\d+)\.(\d+)", software)
+    if match is None or not serial:
+        raise DeviceFaultError(
+            f"the controller names no version or serial number: {software!r} {serial!r}", where=host
+        )
+    version = (int(match.group(1)), int(match.group(2)))
+    minimum = MINIMUM_VERSION.get(version[0], (0, 0))
+    if version < minimum:
+        raise DeviceFaultError(
+            f"Polyscope {version[0]}.{version[1]} cannot say whether a pose is reachable",
+            where=host,
+            remedy=f"Update the controller to {minimum[0]}.{minimum[1]} or later",
+        )
+    remote = True
+    if version[0] >= 5:  # CB3 has no local mode
+        with vendor(host, "asking for remote control"):
+            remote = dashboard.isInRemoteControl()
+    return ControllerFacts(f"{model}{'e' if version[0] >= 5 else ''}", serial, software, version, remote)

@@ -1,0 +1,412 @@
+"""RobotArm over ur_rtde: receive, control, io and dashboard; runs in the child of drivers.host."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import logging
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+from drivers.errors import (
+    DeviceError,
+    DeviceFaultError,
+    DeviceRefusedError,
+    DeviceTimeoutError,
+    DeviceUnavailableError,
+    SafetyStopError,
+    UnreachablePoseError,
+)
+from drivers.interfaces import (
+    Array,
+    DeviceIdentity,
+    DeviceReport,
+    Payload,
+    RobotSample,
+    RobotState,
+    SettleCriteria,
+    SettleReport,
+    Transform,
+)
+from drivers.ur import UrConfig
+from drivers.ur import vendor as library
+from drivers.ur.link import VENDOR_ERRORS, ControllerFacts, connect_dashboard, probe, read_facts, vendor
+from drivers.ur.stream import STREAM_HZ, PoseStream, judge, safety_state
+from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
+
+DRIVER_VERSION = "1"
+ROBOT_MODES = {
+    -1: "NO_CONTROLLER",
+    0: "DISCONNECTED",
+    1: "CONFIRM_SAFETY",
+    2: "BOOTING",
+    3: "POWER_OFF",
+    4: "POWER_ON",
+    5: "IDLE",
+    6: "BACKDRIVE",
+    7: "RUNNING",
+}
+PLAYING = 2  # runtime_state
+VARIABLES = (
+    "timestamp",
+    "actual_q",
+    "actual_qd",
+    "target_qd",
+    "actual_TCP_pose",
+    "actual_TCP_speed",
+    "safety_status_bits",
+    "robot_mode",
+    "runtime_state",
+    "target_speed_fraction",
+    "actual_digital_output_bits",
+)
+READ_BACK_S = 1.0
+SCRIPT_START_S = 5.0
+MOTION_START_S = 0.06  # for the target velocity to show in the stream
+
+_LOG = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+class UrRobot:
+    """One arm. Motions are asynchronous: only so can `stop` interrupt them."""
+
+    def __init__(self, config: UrConfig) -> None:
+        self._config = config
+        self._where = config.host
+        self._facts: ControllerFacts | None = None
+        self._dashboard: library.Dashboard | None = None
+        self._receive: library.Receive | None = None
+        self._io: library.InputOutput | None = None
+        self._control: library.Control | None = None
+        self._stream: PoseStream | None = None
+        self._T_flange_tcp: Transform = np.eye(4)
+        self._controller_time_s = -1.0
+        self._motion_started_s = -np.inf
+
+    # --- device ------------------------------------------------------------------------------------------
+
+    def open(self) -> DeviceIdentity:
+        """Connect; in a safety stop the arm can be watched but not moved until a person has cleared it."""
+        self.close()
+        probe(self._config.host, self._config.connect_timeout_s)
+        self._dashboard = dashboard = connect_dashboard(self._config.host)
+        self._facts = facts = read_facts(dashboard, self._where)
+        # A script of an earlier client in another register range would block the control constructor for minutes.
+        with vendor(self._where, "stopping the running program"):
+            dashboard.stop()
+        variables = [*VARIABLES, *(["payload"] if facts.version >= (5, 6) else [])]
+        with vendor(self._where, "connecting the receive interface"):
+            self._receive = library.receive(self._config.host, STREAM_HZ, variables)
+        self._controller_time_s = -1.0
+        self._stream = PoseStream(
+            self._read_sample,
+            stale_after_s=self._config.stale_after_s,
+            where=self._where,
+            vendor_errors=VENDOR_ERRORS,
+        )
+        with vendor(self._where, "connecting the input/output interface"):
+            self._io = library.input_output(self._config.host)
+        if not self._obstacle():
+            self._connect_control()
+        return self._identity()
+
+    def close(self) -> None:
+        """End a motion that is under way, then the script and the connections; a dead link is no error."""
+        stream, self._stream = self._stream, None
+        control, self._control = self._control, None
+        if stream is not None:
+            stream.close()
+        with contextlib.suppress(*VENDOR_ERRORS):
+            if control is not None and control.isConnected():
+                if control.isProgramRunning():
+                    control.stopJ(self._config.stop_deceleration_rad_s2)
+                    control.stopScript()
+                control.disconnect()
+        for client in (self._io, self._receive, self._dashboard):
+            with contextlib.suppress(*VENDOR_ERRORS):
+                if client is not None and client.isConnected():
+                    client.disconnect()
+        self._io = self._receive = self._dashboard = None
+
+    def report(self) -> DeviceReport:
+        """Versions, clock offset, and what keeps the arm from moving."""
+        state = self.state()
+        problems: list[str] = []
+        if obstacle := self._obstacle():
+            problems.append(str(obstacle))
+        elif self._control is None or not state.program_running:
+            problems.append("The control script does not run. Reconnect")
+        if state.speed_fraction < 1.0:
+            problems.append(
+                f"The speed slider stands at {100 * state.speed_fraction:.0f} %: motions take longer. "
+                "Set it to 100 % on the pendant"
+            )
+        tcp = to_rotation_vector(self._T_flange_tcp)
+        return DeviceReport(
+            identity=self._identity(),
+            clock_offset_s=self._streaming().clock_offset_s(),
+            details={
+                "robot mode": state.robot_mode,
+                "safety": state.sample.safety.value,
+                "speed slider": f"{100 * state.speed_fraction:.0f} %",
+                "tool centre point (m, rad)": " ".join(f"{v:.4f}" for v in tcp),
+                "joints (rad)": " ".join(f"{v:.4f}" for v in state.sample.joints_rad),
+            },
+            problems=tuple(problems),
+        )
+
+    def _identity(self) -> DeviceIdentity:
+        facts = _opened(self._facts, self._where)
+        library = f"ur_rtde {importlib.metadata.version('ur-rtde')}"
+        version = f"{DRIVER_VERSION} ({library})"
+        return DeviceIdentity("robot", facts.model, facts.serial, facts.software, "ur", version, self._where)
+
+    # --- arm -----------------------------------------------------------------------------------------------
+
+    def configure(self, payload: Payload, T_flange_tcp: Transform) -> None:
+        """See RobotArm. DeviceRefusedError when not taken, DeviceFaultError when read back differently."""
+        control = self._ready()
+        pose = to_rotation_vector(np.asarray(T_flange_tcp, dtype=np.float64))
+        with vendor(self._where, "setting payload and tool"):
+            if not control.setTcp(pose.tolist()):
+                raise self._refusal("the tool centre point was not taken")
+            if not control.setPayload(payload.mass_kg, list(payload.centre_of_gravity_m)):
+                raise self._refusal(f"the payload of {payload.mass_kg:g} kg was not taken")
+        self._read_tool()
+        self._streaming().clear()
+        difference = inverse(self._T_flange_tcp) @ T_flange_tcp - np.eye(4)
+        if float(np.max(np.abs(difference))) > 1e-6:
+            raise DeviceFaultError(
+                "the tool centre point reads back differently from what was set", where=self._where
+            )
+        if _opened(self._facts, self._where).version >= (5, 6):
+            receive = _opened(self._receive, self._where)
+            self._read_back(
+                lambda: abs(receive.getPayload() - payload.mass_kg) < 1e-6, f"payload of {payload.mass_kg:g} kg"
+            )
+
+    def state(self) -> RobotState:
+        """See RobotArm."""
+        sample = self._streaming().latest()
+        receive = _opened(self._receive, self._where)
+        with vendor(self._where, "reading the state"):
+            mode = receive.getRobotMode()
+            return RobotState(
+                sample=sample,
+                robot_mode=ROBOT_MODES.get(mode, str(mode)),
+                program_running=receive.getRuntimeState() == PLAYING,
+                speed_fraction=receive.getTargetSpeedFraction(),
+            )
+
+    def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
+        """See RobotArm."""
+        return self._streaming().between(start_monotonic_s, end_monotonic_s)
+
+    def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
+        """See RobotArm. Asks first whether there is a solution: an unreachable pose kills the control script."""
+        control = self._ready()
+        pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
+        near = _joints(near_rad, self._where)
+        with vendor(self._where, "inverse kinematics"):
+            if not control.getInverseKinematicsHasSolution(pose, near):
+                self._raise_unless_running(control)
+                x, y, z = T_base_flange[:3, 3]
+                raise UnreachablePoseError(
+                    f"the arm cannot reach the flange pose at ({x:.3f}, {y:.3f}, {z:.3f}) m in its base frame",
+                    where=self._where,
+                    remedy="Choose another viewpoint or move the station",
+                )
+            joints = control.getInverseKinematics(pose, near)
+            if len(joints) != 6:
+                raise DeviceFaultError("inverse kinematics returned no joints", where=self._where)
+            if not control.isJointsWithinSafetyLimits(joints):
+                raise UnreachablePoseError("the pose lies beyond the controller's safety limits", where=self._where)
+        return np.asarray(joints, dtype=np.float64)
+
+    def move_joints(self, target_rad: Array, *, speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        """See RobotArm."""
+        control = self._ready()
+        target = _joints(target_rad, self._where)
+        self._begin("joint motion", lambda: control.moveJ(target, speed_rad_s, acceleration_rad_s2, True))
+
+    def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
+        """See RobotArm."""
+        control = self._ready()
+        pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
+        self._begin("linear motion", lambda: control.moveL(pose, speed_m_s, acceleration_m_s2, True))
+
+    def stop(self) -> None:
+        """See RobotArm. Returns when the arm stands; without a running script the dashboard stops the program."""
+        control = self._control
+        with vendor(self._where, "stopping the motion"):
+            if control is not None and control.isConnected() and control.isProgramRunning():
+                control.stopJ(self._config.stop_deceleration_rad_s2)
+            else:
+                _opened(self._dashboard, self._where).stop()
+
+    def is_moving(self) -> bool:
+        """See RobotArm. Raises SafetyStopError when a stop has ended the motion."""
+        sample = self._streaming().latest()
+        if not sample.safety.may_move:
+            raise self._safety_error(sample)
+        if time.monotonic() - self._motion_started_s < MOTION_START_S:
+            return True
+        if np.any(np.abs(sample.target_velocities_rad_s) > 1e-9):
+            return True
+        control = self._control
+        with vendor(self._where, "asking for the motion's progress"):
+            return (
+                control is not None
+                and control.isProgramRunning()
+                and control.getAsyncOperationProgressEx().isAsyncOperationRunning()
+            )
+
+    def settle(self, criteria: SettleCriteria) -> SettleReport:
+        """See RobotArm."""
+        newest = self._streaming().latest()
+        window = self._streaming().between(newest.monotonic_s - criteria.window_s, newest.monotonic_s)
+        return judge(window, criteria)
+
+    def set_digital_output(self, index: int, on: bool) -> None:
+        """See RobotArm."""
+        if not 0 <= index <= 7:
+            raise DeviceRefusedError(f"there is no standard digital output {index}", where=self._where)
+        io, receive = _opened(self._io, self._where), _opened(self._receive, self._where)
+        with vendor(self._where, "switching a digital output"):
+            if not io.setStandardDigitalOut(index, on):
+                raise DeviceRefusedError(f"digital output {index} was not switched", where=self._where)
+        self._read_back(lambda: bool(receive.getActualDigitalOutputBits() >> index & 1) == on, f"output {index}")
+
+    # --- parts -------------------------------------------------------------------------------------------
+
+    def _streaming(self) -> PoseStream:
+        return _opened(self._stream, self._where)
+
+    def _read_sample(self) -> RobotSample | None:
+        receive = self._receive
+        if receive is None:
+            return None
+        # Getters lock one by one: take the set again when a new package arrived in between.
+        for _ in range(3):
+            before_s = receive.getTimestamp()
+            if before_s == self._controller_time_s:
+                return None
+            sample = self._take(receive, before_s)
+            if receive.getTimestamp() == before_s:
+                self._controller_time_s = before_s
+                return sample
+        return None
+
+    def _take(self, receive: library.Receive, controller_time_s: float) -> RobotSample:
+        return RobotSample(
+            controller_time_s=controller_time_s,
+            monotonic_s=time.monotonic(),
+            joints_rad=np.array(receive.getActualQ()),
+            joint_velocities_rad_s=np.array(receive.getActualQd()),
+            target_velocities_rad_s=np.array(receive.getTargetQd()),
+            T_base_flange=from_rotation_vector(np.array(receive.getActualTCPPose())) @ inverse(self._T_flange_tcp),
+            tcp_speed_m_s=float(np.linalg.norm(receive.getActualTCPSpeed()[:3])),
+            safety=safety_state(receive.getSafetyStatusBits()),
+        )
+
+    def _obstacle(self) -> DeviceError | None:
+        """What keeps the arm from moving; only a person removes it."""
+        state = self.state()
+        if not state.sample.safety.may_move:
+            return self._safety_error(state.sample)
+        if state.robot_mode != "RUNNING":
+            remedy = "Power the arm on and release its brakes on the pendant"
+            return DeviceRefusedError(f"the arm is in mode {state.robot_mode}", where=self._where, remedy=remedy)
+        if self._facts is not None and not self._facts.remote_control:
+            remedy = "Switch the pendant from Local to Remote, then reconnect"
+            return DeviceRefusedError("the controller is in local control", where=self._where, remedy=remedy)
+        return None
+
+    def _safety_error(self, sample: RobotSample) -> SafetyStopError:
+        name = sample.safety.value.replace("_", " ")
+        remedy = "A person must find and clear the cause and release the stop on the pendant; then try again"
+        return SafetyStopError(f"the arm is in {name}", where=self._where, remedy=remedy)
+
+    def _ready(self) -> library.Control:
+        """The control interface with its script running. Raises what keeps the arm from moving."""
+        obstacle = self._obstacle()
+        if obstacle is not None:
+            raise obstacle
+        control = self._control
+        if control is None:
+            return self._connect_control()
+        with vendor(self._where, "starting the control script"):
+            if not control.isConnected():
+                raise DeviceUnavailableError("the control connection is lost", where=self._where, remedy="Reconnect")
+            if control.isProgramRunning():
+                return control
+            _LOG.info("%s: the control script had ended and is sent again", self._where)
+            control.reuploadScript()
+            self._wait(control.isProgramRunning, SCRIPT_START_S, "the control script to start")
+        self._read_tool()
+        return control
+
+    def _connect_control(self) -> library.Control:
+        with vendor(self._where, "starting the control script"):
+            self._control = control = library.control(self._config.host, STREAM_HZ)
+        self._read_tool()
+        return control
+
+    def _read_tool(self) -> None:
+        with vendor(self._where, "reading the tool centre point"):
+            pose = _opened(self._control, self._where).getTCPOffset()
+        if len(pose) != 6:
+            raise DeviceFaultError("the tool centre point cannot be read back", where=self._where)
+        self._T_flange_tcp = from_rotation_vector(np.array(pose))
+
+    def _begin(self, what: str, start: Callable[[], bool]) -> None:
+        self._motion_started_s = time.monotonic()
+        with vendor(self._where, f"starting the {what}"):
+            started = start()
+        if not started:
+            self._motion_started_s = -np.inf
+            raise self._refusal(f"the controller did not start the {what}")
+
+    def _refusal(self, what: str) -> DeviceError:
+        """The reason behind a call that just returned False: a stop, or a plain no."""
+        time.sleep(2 / STREAM_HZ)
+        return self._obstacle() or DeviceRefusedError(
+            what, where=self._where, remedy="See the log of the pendant for the reason"
+        )
+
+    def _raise_unless_running(self, control: library.Control) -> None:
+        if not control.isProgramRunning():
+            raise self._refusal("the control script ended")
+
+    def _read_back(self, agrees: Callable[[], bool], what: str) -> None:
+        with vendor(self._where, f"reading back the {what}"):
+            try:
+                self._wait(agrees, READ_BACK_S, what)
+            except DeviceTimeoutError:
+                raise DeviceFaultError(
+                    f"the {what} reads back differently from what was set", where=self._where
+                ) from None
+
+    def _wait(self, done: Callable[[], bool], timeout_s: float, what: str) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not done():
+            if time.monotonic() > deadline:
+                raise DeviceTimeoutError(f"waited {timeout_s:g} s for {what}", where=self._where)
+            time.sleep(0.01)
+
+
+def _opened(part: T | None, where: str) -> T:
+    if part is None:
+        raise DeviceUnavailableError("the robot is not connected", where=where, remedy="Open it first")
+    return part
+
+
+def _joints(values: Array, where: str) -> list[float]:
+    joints = np.asarray(values, dtype=np.float64)
+    if joints.shape != (6,) or not np.all(np.isfinite(joints)):
+        raise DeviceRefusedError(f"joints must be six finite numbers, not {values}", where=where)
+    return [float(v) for v in joints]

@@ -1,0 +1,153 @@
+"""The controller's pose stream: a sampling thread, a ring buffer in time, and the judgement of standing still."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drivers.errors import DeviceUnavailableError
+from drivers.interfaces import RobotSample, SafetyState, SettleCriteria, SettleReport
+from service.core.geometry import transform
+
+BUFFER_S = 30.0
+STREAM_HZ = 125.0
+POLL_S = 0.004
+MINIMUM_COVERAGE = 0.8  # of the settle window by samples
+
+_LOG = logging.getLogger(__name__)
+
+
+def safety_state(bits: int) -> SafetyState:
+    """The state behind the controller's safety_status_bits, the gravest first (RTDE guide)."""
+    for mask, state in (
+        (1 << 9 | 1 << 8, SafetyState.FAULT),  # fault, violation
+        (1 << 7 | 1 << 6 | 1 << 5, SafetyState.EMERGENCY_STOP),
+        (1 << 4, SafetyState.SAFEGUARD_STOP),
+        (1 << 2, SafetyState.PROTECTIVE_STOP),
+        (1 << 3, SafetyState.FAULT),  # recovery mode
+        (1 << 1, SafetyState.REDUCED),
+        (1 << 0, SafetyState.NORMAL),
+    ):
+        if bits & mask:
+            return state
+    return SafetyState.UNKNOWN
+
+
+class PoseStream:
+    """Polls a source of samples in its own thread and keeps the last BUFFER_S seconds.
+
+    `read` returns the newest sample, or None while the controller's clock has not advanced: the vendor's getters go
+    on returning old data when the link is dead. Whatever of `vendor_errors` it raises ends the stream.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[], RobotSample | None],
+        *,
+        stale_after_s: float,
+        where: str,
+        vendor_errors: tuple[type[Exception], ...],
+    ) -> None:
+        self._read, self._stale_after_s, self._where = read, stale_after_s, where
+        self._vendor_errors = vendor_errors
+        self._samples: deque[RobotSample] = deque()
+        self._lock = threading.Lock()
+        self._stop = threading.Event()
+        self._death = ""
+        self._thread = threading.Thread(target=self._run, name="ur pose stream", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._stop.set()
+        self._thread.join(5.0)
+
+    def latest(self) -> RobotSample:
+        """The newest sample. Raises DeviceUnavailableError when it is too old."""
+        deadline = time.monotonic() + self._stale_after_s
+        while True:
+            with self._lock:
+                newest = self._samples[-1] if self._samples else None
+            if newest is not None and time.monotonic() - newest.monotonic_s <= self._stale_after_s:
+                return newest
+            if newest is not None or self._death or time.monotonic() > deadline:  # only the first one is waited for
+                age = f"for {time.monotonic() - newest.monotonic_s:.1f} s" if newest else "yet"
+                raise DeviceUnavailableError(
+                    f"the robot's stream brought no new sample {age}{self._death}",
+                    where=self._where,
+                    remedy="Check the cable and the controller, then reconnect",
+                )
+            time.sleep(POLL_S)
+
+    def between(self, start_s: float, end_s: float) -> tuple[RobotSample, ...]:
+        """Samples that arrived between two host times, oldest first."""
+        with self._lock:
+            return tuple(s for s in self._samples if start_s <= s.monotonic_s <= end_s)
+
+    def clear(self) -> None:
+        """Forget everything, since the tool offset behind the flange poses changed on the way."""
+        with self._lock:
+            self._samples.clear()
+
+    def clock_offset_s(self) -> float:
+        """Controller time minus host monotonic time; the least delayed sample of the last seconds decides."""
+        self.latest()
+        with self._lock:
+            recent = list(self._samples)[-int(5 * STREAM_HZ) :]
+        return max(s.controller_time_s - s.monotonic_s for s in recent)
+
+    def _run(self) -> None:
+        while not self._stop.wait(POLL_S):
+            try:
+                sample = self._read()
+            except self._vendor_errors as error:
+                self._death = f" ({error})"
+                _LOG.warning("%s: pose stream: %s", self._where, error)
+                return
+            if sample is None:
+                continue
+            with self._lock:
+                self._samples.append(sample)
+                while self._samples[0].monotonic_s < sample.monotonic_s - BUFFER_S:
+                    self._samples.popleft()
+
+
+def judge(samples: Sequence[RobotSample], criteria: SettleCriteria) -> SettleReport:
+    """Whether an arm stood still over `samples`, which should span criteria.window_s.
+
+    Peak to peak is the diagonal of the box around the positions, and of the box around the rotation vectors
+    relative to the mean orientation: never less than the largest distance between two samples.
+    """
+    T = np.stack([s.T_base_flange for s in samples])
+    rotations = Rotation.from_matrix(T[:, :3, :3])
+    mean = rotations.mean()
+    turns = (mean.inv() * rotations).as_rotvec()
+    position_m = float(np.linalg.norm(np.ptp(T[:, :3, 3], axis=0)))
+    rotation_rad = float(np.linalg.norm(np.ptp(turns, axis=0)))
+    joint_speed = float(max(np.max(np.abs(s.joint_velocities_rad_s)) for s in samples))
+    tcp_speed = max(s.tcp_speed_m_s for s in samples)
+    at_target = all(not np.any(np.abs(s.target_velocities_rad_s) > 1e-9) for s in samples)
+    covered_s = samples[-1].monotonic_s - samples[0].monotonic_s
+    return SettleReport(
+        settled=bool(
+            at_target
+            and covered_s >= MINIMUM_COVERAGE * criteria.window_s
+            and joint_speed < criteria.joint_speed_rad_s
+            and tcp_speed < criteria.tcp_speed_m_s
+            and position_m < criteria.position_peak_to_peak_m
+            and rotation_rad < criteria.rotation_peak_to_peak_rad
+        ),
+        samples=len(samples),
+        joint_speed_rad_s=joint_speed,
+        tcp_speed_m_s=tcp_speed,
+        position_peak_to_peak_m=position_m,
+        rotation_peak_to_peak_rad=rotation_rad,
+        T_base_flange=transform(mean, T[:, :3, 3].mean(axis=0)),
+        joints_rad=np.mean([s.joints_rad for s in samples], axis=0),
+    )

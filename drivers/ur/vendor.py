@@ -1,0 +1,97 @@
+"""The part of ur_rtde that the driver uses, typed: the library itself ships no types."""
+
+from __future__ import annotations
+
+from typing import Protocol, cast
+
+import dashboard_client
+import rtde_control
+import rtde_io
+import rtde_receive
+
+
+class Connection(Protocol):
+    """What the four interfaces share."""
+
+    def isConnected(self) -> bool: ...  # noqa: D102 - the vendor's names and meanings
+    def disconnect(self) -> None: ...  # noqa: D102
+
+
+class Dashboard(Connection, Protocol):
+    """dashboard_client.DashboardClient."""
+
+    def connect(self, timeout_ms: int) -> None: ...  # noqa: D102
+    def polyscopeVersion(self) -> str: ...  # noqa: D102
+    def getSerialNumber(self) -> str: ...  # noqa: D102
+    def getRobotModel(self) -> str: ...  # noqa: D102
+    def isInRemoteControl(self) -> bool: ...  # noqa: D102
+    def stop(self) -> None: ...  # noqa: D102
+
+
+class Receive(Connection, Protocol):
+    """rtde_receive.RTDEReceiveInterface."""
+
+    def getTimestamp(self) -> float: ...  # noqa: D102
+    def getActualQ(self) -> list[float]: ...  # noqa: D102
+    def getActualQd(self) -> list[float]: ...  # noqa: D102
+    def getTargetQd(self) -> list[float]: ...  # noqa: D102
+    def getActualTCPPose(self) -> list[float]: ...  # noqa: D102
+    def getActualTCPSpeed(self) -> list[float]: ...  # noqa: D102
+    def getSafetyStatusBits(self) -> int: ...  # noqa: D102
+    def getRobotMode(self) -> int: ...  # noqa: D102
+    def getRuntimeState(self) -> int: ...  # noqa: D102
+    def getTargetSpeedFraction(self) -> float: ...  # noqa: D102
+    def getActualDigitalOutputBits(self) -> int: ...  # noqa: D102
+    def getPayload(self) -> float: ...  # noqa: D102
+
+
+class InputOutput(Connection, Protocol):
+    """rtde_io.RTDEIOInterface."""
+
+    def setStandardDigitalOut(self, output: int, on: bool) -> bool: ...  # noqa: D102
+
+
+class AsyncStatus(Protocol):
+    """rtde_control.AsyncOperationStatus."""
+
+    def isAsyncOperationRunning(self) -> bool: ...  # noqa: D102
+
+
+class Control(Connection, Protocol):
+    """rtde_control.RTDEControlInterface; calls return False where they fail."""
+
+    def isProgramRunning(self) -> bool: ...  # noqa: D102
+    def reuploadScript(self) -> bool: ...  # noqa: D102
+    def stopScript(self) -> None: ...  # noqa: D102
+    def setTcp(self, pose: list[float]) -> bool: ...  # noqa: D102
+    def getTCPOffset(self) -> list[float]: ...  # noqa: D102
+    def setPayload(self, mass_kg: float, cog_m: list[float]) -> bool: ...  # noqa: D102
+    def moveJ(self, q: list[float], speed: float, acceleration: float, asynchronous: bool) -> bool: ...  # noqa: D102
+    def moveL(self, pose: list[float], speed: float, acceleration: float, asynchronous: bool) -> bool: ...  # noqa: D102
+    def stopJ(self, deceleration: float) -> None: ...  # noqa: D102
+    def getAsyncOperationProgressEx(self) -> AsyncStatus: ...  # noqa: D102
+    def getInverseKinematicsHasSolution(self, pose: list[float], near: list[float]) -> bool: ...  # noqa: D102
+    def getInverseKinematics(self, pose: list[float], near: list[float]) -> list[float]: ...  # noqa: D102
+    def isJointsWithinSafetyLimits(self, q: list[float]) -> bool: ...  # noqa: D102
+
+
+def dashboard(host: str) -> Dashboard:
+    """A dashboard client that is not connected yet."""
+    return cast("Dashboard", dashboard_client.DashboardClient(host))
+
+
+def receive(host: str, frequency_hz: float, variables: list[str]) -> Receive:
+    """Connect and stream these output fields."""
+    return cast("Receive", rtde_receive.RTDEReceiveInterface(host, frequency_hz, variables))
+
+
+def input_output(host: str) -> InputOutput:
+    """Connect."""
+    return cast("InputOutput", rtde_io.RTDEIOInterface(host))
+
+
+def control(host: str, frequency_hz: float) -> Control:
+    """Connect and start the control script, without claiming the registers of an external force sensor."""
+    interface = rtde_control.RTDEControlInterface
+    flags = interface.FLAG_UPLOAD_SCRIPT | interface.FLAG_NO_EXT_FT
+    return cast("Control", interface(host, frequency_hz, flags))
