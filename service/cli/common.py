@@ -1,0 +1,98 @@
+"""What every command shares: consoles, options, errors turned into exit statuses, progress after two seconds."""
+
+from __future__ import annotations
+
+import json as json_module
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from typer.models import OptionInfo
+
+from service.core.errors import OrthocaptureError
+
+PROGRESS_AFTER_S = 2.0
+
+# The streams are looked up at each print, so that a redirected stdout is followed; results there, the rest on stderr.
+console = Console(highlight=False, soft_wrap=True)
+error_console = Console(stderr=True, highlight=False, soft_wrap=True)
+
+data_option: OptionInfo = typer.Option(
+    "--data",
+    envvar="ORTHOCAPTURE_DATA",
+    metavar="DIR",
+    help="Folder that holds the recorded runs.",
+    file_okay=False,
+)
+json_option: OptionInfo = typer.Option("--json", help="Print the result as JSON, for other programs.")
+
+DataOption = Annotated[Path, data_option]
+JsonOption = Annotated[bool, json_option]
+DEFAULT_DATA = Path("runs")
+
+
+def print_json(value: Any) -> None:
+    """Write one line of JSON to standard output, undecorated."""
+    typer.echo(json_module.dumps(value, ensure_ascii=False, allow_nan=False))
+
+
+def error_record(error: OrthocaptureError) -> dict[str, str]:
+    """An error as plain data."""
+    return {"kind": type(error).__name__, "what": error.what, "where": error.where, "remedy": error.remedy}
+
+
+def fail(error: OrthocaptureError, *, json: bool = False) -> typer.Exit:
+    """Report an error and return the exit to raise: `raise fail(error)`. Status 1: refused or failed."""
+    if json:
+        print_json({"error": error_record(error)})
+    else:
+        error_console.print(f"[bold red]Error:[/] {escape(error.what)}")
+        if error.where:
+            error_console.print(f"  where: {escape(error.where)}")
+        if error.remedy:
+            error_console.print(f"  what to do: {escape(error.remedy)}")
+    return typer.Exit(1)
+
+
+@contextmanager
+def reporting_errors(json: bool = False) -> Generator[None]:
+    """Around a command's body: an OrthocaptureError becomes its message and exit status 1; others are defects."""
+    try:
+        yield
+    except OrthocaptureError as error:
+        raise fail(error, json=json) from error
+
+
+@contextmanager
+def progress_bar(*, quiet: bool = False) -> Generator[Callable[[str, int, int], None]]:
+    """A bar with time left on stderr, from the third second on. Yields report(what, done, total)."""
+    started = time.monotonic()
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        console=error_console,
+        transient=True,
+    )
+    task = bar.add_task("", total=None)
+    shown = False
+
+    def report(what: str, done: int, total: int) -> None:
+        nonlocal shown
+        bar.update(task, description=what, completed=done, total=total)
+        if not quiet and not shown and time.monotonic() - started > PROGRESS_AFTER_S:
+            bar.start()
+            shown = True
+
+    try:
+        yield report
+    finally:
+        if shown:
+            bar.stop()

@@ -1,0 +1,208 @@
+"""The pure part of the audit: rows and hashes in, faults out. No database, no files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic_core import ValidationError
+
+from service.core.errors import StoreError
+from service.core.model import PAYLOAD, ArtefactRef
+from service.store.artefacts import record_sha256
+from service.store.events import ROOT, canonical, event_sha256, parse_canonical, references
+
+Rows = Sequence[Mapping[str, Any]]
+_REF_COLUMNS = tuple(ArtefactRef.model_fields)
+_JOB_COLUMNS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing that does not verify."""
+
+    run_id: str | None
+    seq: int | None  # of the event that it concerns
+    file: str
+    what: str  # what differs
+
+    def __str__(self) -> str:
+        place = ", ".join(
+            part
+            for part in (
+                f"run {self.run_id}" if self.run_id else "",
+                f"event {self.seq}" if self.seq is not None else "",
+                self.file,
+            )
+            if part
+        )
+        return f"{place}: {self.what}" if place else self.what
+
+
+@dataclass(frozen=True, slots=True)
+class FileState:
+    """What hashing a listed file again gave."""
+
+    shown: str
+    sha256: str
+    size: int
+    problem: str
+
+
+def run_faults(
+    run_id: str,
+    *,
+    run_rows: Rows,
+    head_rows: Rows,
+    event_rows: Rows,
+    artefact_rows: Rows,
+    job_rows: Rows,
+    files: Mapping[str, FileState],
+) -> Iterator[Fault]:
+    """Every fault of one run, in the order of its events, then those of the run as a whole."""
+    payloads: dict[int, Any] = {}
+    by_seq: dict[int, list[Mapping[str, Any]]] = {}
+    for row in artefact_rows:
+        by_seq.setdefault(int(row["seq"]), []).append(row)
+    recorded: set[tuple[str, int]] = set()
+    seq, previous = 0, ROOT
+    for row in event_rows:
+        yield from _link_faults(run_id, row, seq, previous)
+        seq, previous = int(row["seq"]), str(row["sha256"])
+        mine = by_seq.pop(seq, [])
+        payload, problem = _payload_of(row)
+        if problem:
+            yield Fault(run_id, seq, "", problem)
+            continue
+        payloads[seq] = payload
+        recorded |= {(str(item["sha256"]), int(item["size_bytes"])) for item in mine}
+        yield from _artefact_faults(run_id, row, payload, mine, recorded=recorded, files=files)
+    for left in by_seq.values():
+        for item in left:
+            what = f"artefact {item['original_name']} ({item['sha256']}) belongs to an event that is not there"
+            yield Fault(run_id, int(item["seq"]), "", what)
+    yield from _end_faults(run_id, run_rows, head_rows, event_rows)
+    yield from _job_faults(run_id, job_rows, payloads)
+
+
+def _link_faults(run_id: str, row: Mapping[str, Any], before: int, previous: str) -> Iterator[Fault]:
+    seq = int(row["seq"])
+    if seq != before + 1:
+        missing = f"event {before + 1} is" if seq == before + 2 else f"events {before + 1} to {seq - 1} are"
+        yield Fault(run_id, before + 1, "", f"{missing} missing from the chain")
+    elif row["previous_sha256"] != previous:
+        yield Fault(run_id, seq, "", f"previous_sha256 is {row['previous_sha256']}, the event before has {previous}")
+
+
+def _payload_of(row: Mapping[str, Any]) -> tuple[Any, str]:
+    """The payload as plain data and an empty text, or None and what is wrong with the event's content."""
+    try:
+        payload = parse_canonical(row["payload"])
+        PAYLOAD.validate_python(payload)
+        fields = {name: row[name] for name in ("seq", "run_id", "at_utc", "monotonic_s", "actor", "previous_sha256")}
+        digest = event_sha256({**fields, "payload": payload})
+        if digest != row["sha256"]:
+            return None, f"the content was altered: its SHA-256 is {digest}, recorded is {row['sha256']}"
+        if canonical(payload) != row["payload"]:
+            return None, "the payload is not in canonical form: its text was altered"
+        if payload["kind"] != row["kind"]:
+            return None, f"the column kind says {row['kind']}, the payload {payload['kind']}"
+        references(payload)
+    except (ValidationError, ValueError, StoreError) as error:
+        return None, f"the content was altered: it cannot be read ({str(error).splitlines()[0]})"
+    return payload, ""
+
+
+def _artefact_faults(
+    run_id: str,
+    event: Mapping[str, Any],
+    payload: Any,
+    rows: Rows,
+    *,
+    recorded: set[tuple[str, int]],
+    files: Mapping[str, FileState],
+) -> Iterator[Fault]:
+    seq = int(event["seq"])
+    named = references(payload)
+    for row in rows:
+        state = files[row["sha256"]]
+        if ArtefactRef(**{column: row[column] for column in _REF_COLUMNS}) not in named:
+            yield Fault(run_id, seq, state.shown, "the artefact's row is not what the event refers to")
+        elif record_sha256(event["sha256"], dict(row)) != row["record_sha256"]:
+            yield Fault(run_id, seq, state.shown, "the artefact's row was altered (device, step, time, who …)")
+        if state.problem:
+            yield Fault(run_id, seq, state.shown, f"{state.problem} ({row['original_name']})")
+        elif state.size != row["size_bytes"]:
+            what = f"the file has {state.size} bytes, recorded are {row['size_bytes']} ({row['original_name']})"
+            yield Fault(run_id, seq, state.shown, what)
+        elif state.sha256 != row["sha256"]:
+            yield Fault(run_id, seq, state.shown, f"the content was altered: its SHA-256 is {state.sha256}")
+    for ref in named:
+        if (ref.sha256, ref.size_bytes) not in recorded:
+            what = f"{payload['kind']} refers to {ref.original_name} ({ref.sha256}), which has no artefact row"
+            yield Fault(run_id, seq, "", what)
+
+
+def _end_faults(run_id: str, run_rows: Rows, head_rows: Rows, event_rows: Rows) -> Iterator[Fault]:
+    first, last = (event_rows[0], event_rows[-1]) if event_rows else (None, None)
+    end = (0, ROOT) if last is None else (last["seq"], last["sha256"])
+    for head in head_rows:
+        if (head["seq"], head["sha256"]) != end:
+            what = (
+                f"the chain ends at event {end[0]} ({end[1]}), it was left at event {head['seq']} ({head['sha256']})"
+            )
+            yield Fault(run_id, int(end[0]) + 1, "", what)
+    if not head_rows:
+        yield Fault(run_id, None, "", "the record of where the chain ends is missing")
+    if not run_rows:
+        yield Fault(run_id, None, "", "the run's own row is missing")
+    for row in run_rows:
+        if first is None or first["sha256"] != row["root_sha256"] or first["kind"] != "run_started":
+            yield Fault(run_id, 1, "", "the chain does not begin with the run_started that the run's row names")
+        elif _payload_of(first)[0] is not None and parse_canonical(first["payload"])["simulated"] != bool(
+            row["simulated"]
+        ):
+            yield Fault(run_id, 1, "", "the run's row and its first event disagree on whether it was simulated")
+
+
+def _job_faults(run_id: str, rows: Rows, payloads: Mapping[int, Any]) -> Iterator[Fault]:
+    enqueued = {seq: payload for seq, payload in payloads.items() if payload["kind"] == "job_enqueued"}
+    ended = {seq: payload for seq, payload in payloads.items() if payload["kind"] in ("job_finished", "job_failed")}
+    for row in rows:
+        shown = f"job {row['job_id']}"
+        payload = enqueued.pop(int(row["enqueued_seq"]), None)
+        if payload is None:
+            yield Fault(run_id, int(row["enqueued_seq"]), "", f"{shown} has no event job_enqueued")
+        elif (
+            any(payload[name] != row[column] for name, column in _JOB_COLUMNS.items())
+            or payload["idempotency_key"] != row["idempotency_key"]
+            or canonical(payload["arguments"]) != row["arguments"]
+        ):
+            yield Fault(run_id, int(row["enqueued_seq"]), "", f"{shown} differs from its event job_enqueued")
+        ends = {seq: end for seq, end in ended.items() if end["job"] == row["job_id"]}
+        for seq in ends:
+            del ended[seq]
+        expected = {"finished": "job_finished", "failed": "job_failed"}.get(str(row["state"]))
+        found = {seq: end["kind"] for seq, end in ends.items()}
+        if found != ({} if expected is None else {row["ended_seq"]: expected}):
+            what = f"{shown} is {row['state']}, but its ending events are {found or 'none'}"
+            yield Fault(run_id, row["ended_seq"], "", what)
+    for seq, payload in enqueued.items():
+        yield Fault(run_id, seq, "", f"job {payload['job']} was enqueued and has no row")
+    for seq, payload in ended.items():
+        yield Fault(run_id, seq, "", f"job {payload['job']} ended and has no row")
+
+
+def summary(payload: Mapping[str, Any]) -> str:
+    """One line on an event's payload: its short fields, in order."""
+    parts = [
+        f"{name}={value}"
+        for name, value in payload.items()
+        if name != "kind"
+        and isinstance(value, str | int | float | bool)
+        and value not in ("", False)
+        and name != "why"
+    ]
+    text = " ".join(part if len(part) <= 60 else part[:59] + "…" for part in parts)
+    return text if len(text) <= 160 else text[:159] + "…"
