@@ -1,0 +1,54 @@
+"""Rigid transforms as (4, 4) float64, named T_a_b: p_a = T_a_b @ p_b, for the simulators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+Json = dict[str, Any]
+
+
+def transform(rotation: Array, translation_m: Array) -> Array:
+    """T_a_b from the rotation (3, 3) of b's axes in a and the position of b's origin in a (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = translation_m
+    return T
+
+
+def from_euler(xyz_rad: Array, translation_m: Array) -> Array:
+    """T_a_b from rotations about the fixed x, y and z axes, in this order, and a position."""
+    return transform(Rotation.from_euler("xyz", xyz_rad).as_matrix(), translation_m)
+
+
+def inverse(T_a_b: Array) -> Array:
+    """T_b_a, exactly rigid."""
+    R = T_a_b[:3, :3]
+    return transform(R.T, -R.T @ T_a_b[:3, 3])
+
+
+def apply(T_a_b: Array, points_b: Array) -> Array:
+    """Map points (..., 3) from frame b to frame a."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def look_at(eye: Array, target: Array, up: Array) -> Array:
+    """T_world_camera (x right, y down, z forward) at `eye`, looking at `target`, image top towards `up`."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    return transform(np.stack([x, np.cross(z, x), z], axis=1), eye)
+
+
+def smoothstep(low: float, high: float, x: Array) -> Array:
+    """0 below `low`, 1 above `high`, cubic between (low > high falls)."""
+    t = np.clip((x - low) / (high - low), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
