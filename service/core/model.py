@@ -124,6 +124,17 @@ class StepNote(Record):
     data: dict[str, Any] = Field(default_factory=dict)
 
 
+class FilesKept(Record):
+    """Files that arrived from elsewhere (scanner, CT) or were decoded from such, now in the evidence."""
+
+    kind: Literal["files_kept"] = "files_kept"
+    step: str
+    attempt: int
+    device: str
+    note: str
+    artefacts: tuple[ArtefactRef, ...]
+
+
 class ViewpointCaptured(Record):
     """One exposure, complete: files, pose, settings, environment."""
 
@@ -288,6 +299,7 @@ Payload = Annotated[
     | DeviceTrouble
     | StepStarted
     | StepNote
+    | FilesKept
     | ViewpointCaptured
     | ViewpointFailed
     | StepMeasured

@@ -1,0 +1,85 @@
+"""`orthocapture doctor`: open every device of a rig and say what is there and what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from typing import Any
+
+import typer
+from rich.markup import escape
+
+from drivers.errors import DeviceError
+from drivers.interfaces import DeviceReport
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    error_record,
+    print_json,
+    progress_bar,
+    reporting_errors,
+)
+from service.cli.run import RigOption
+from service.core.errors import ConfigurationError, OrthocaptureError
+from service.rig import load_rig
+from service.station import Station
+
+_LOW_DISK_BYTES = 20e9  # a full capture of RAW and JPEG with its scans
+
+
+def doctor_command(rig: RigOption, data: DataOption = DEFAULT_DATA, json: JsonOption = False) -> None:
+    """Open every device of a rig: versions, clock offsets, free space, and what is wrong."""
+    found: dict[str, DeviceReport | OrthocaptureError] = {}
+    with reporting_errors(json):
+        station = Station(load_rig(rig))
+        try:
+            with progress_bar(quiet=json) as progress:
+                for i, name in enumerate(station.names()):
+                    progress(f"opening {name}", i, len(station.names()))
+                    try:
+                        found[name] = station.device(name).report()
+                    except (DeviceError, ConfigurationError) as error:
+                        found[name] = error
+        finally:
+            station.close()
+    existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
+    free_bytes = shutil.disk_usage(existing).free
+    healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
+    if json:
+        devices = {name: _record(report) for name, report in found.items()}
+        print_json({"ok": healthy, "devices": devices, "data": {"folder": str(data), "free_bytes": free_bytes}})
+    else:
+        for name, report in found.items():
+            _print(name, report)
+        note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"
+        console.print(f"[bold]data folder[/] {escape(str(data))}: {free_bytes / 1e9:.1f} GB free{note}")
+    if not healthy:
+        raise typer.Exit(1)
+
+
+def _record(report: DeviceReport | OrthocaptureError) -> dict[str, Any]:
+    if isinstance(report, OrthocaptureError):
+        return {"ok": False, "error": error_record(report)}
+    return {"ok": not report.problems, **dataclasses.asdict(report)}
+
+
+def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
+    if isinstance(report, OrthocaptureError):
+        console.print(f"[bold red]✗ {escape(name)}[/] {escape(str(report))}")
+        return
+    who = report.identity
+    mark = "[bold green]✓" if not report.problems else "[bold yellow]![/]"
+    console.print(f"{mark} {escape(name)}[/] {escape(who.model)}, serial {escape(who.serial)}, {escape(who.firmware)}")
+    console.print(f"    {escape(who.driver)} {escape(who.driver_version)} at {escape(who.address)}")
+    if report.clock_offset_s is not None:
+        console.print(f"    clock offset {report.clock_offset_s:+.3f} s")
+    if report.free_bytes is not None:
+        console.print(f"    {report.free_bytes / 1e9:.1f} GB free")
+    if report.battery_fraction is not None:
+        console.print(f"    battery {report.battery_fraction:.0%}")
+    for key, value in report.details.items():
+        console.print(f"    {escape(key)}: {escape(value)}")
+    for problem in report.problems:
+        console.print(f"    [yellow]{escape(problem)}[/]")

@@ -1,0 +1,46 @@
+"""`orthocapture protocol`: check a protocol file, write its schema and its diagram."""
+
+from __future__ import annotations
+
+import json as json_module
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from service.cli.common import JsonOption, console, print_json, reporting_errors
+from service.core.lifecycle import diagram
+from service.core.protocol import load_protocol, protocol_json_schema
+from service.steps import params_models
+
+protocol_app = typer.Typer(name="protocol", help="Check a protocol file before it is used.", no_args_is_help=True)
+
+
+@protocol_app.command("check")
+def check_command(file: Annotated[Path, typer.Argument(help="The protocol file.")], json: JsonOption = False) -> None:
+    """Read a protocol and say everything that is wrong with it, by file, line and field."""
+    with reporting_errors(json):
+        loaded = load_protocol(file, params_models())
+        protocol = loaded.protocol
+        if json:
+            steps = [{"id": s.id, "kind": s.kind, "irreversible": s.irreversible} for s in protocol.steps]
+            print_json({"id": protocol.id, "version": protocol.version, "sha256": loaded.sha256, "steps": steps})
+            return
+        console.print(f"{escape(str(file))} is sound: {protocol.id} {protocol.version}, {len(protocol.steps)} steps")
+        for step in protocol.steps:
+            marks = ", ".join(m for m, on in (("irreversible", step.irreversible), ("signed", step.sign)) if on)
+            console.print(f"  {step.id:<26} {step.kind:<20} {marks}")
+
+
+@protocol_app.command("schema")
+def schema_command() -> None:
+    """Print the JSON Schema of protocol files, for editors."""
+    typer.echo(json_module.dumps(protocol_json_schema(params_models()), indent=2, sort_keys=True))
+
+
+@protocol_app.command("diagram")
+def diagram_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
+    """Print the state machine of a protocol as a Mermaid diagram."""
+    with reporting_errors():
+        typer.echo(diagram(load_protocol(file, params_models()).protocol.step_ids))

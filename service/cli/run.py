@@ -1,0 +1,201 @@
+"""`orthocapture run`, `resume`, `act` and `status`: a protocol from its first step to its last."""
+
+from __future__ import annotations
+
+import getpass
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, error_console, print_json, reporting_errors
+from service.cli.operators import AutomaticOperator, Display, TerminalOperator
+from service.core.actions import check_action, record_to_sign
+from service.core.fold import fold
+from service.core.model import OperatorAction, OperatorVerb
+from service.core.protocol import load_protocol
+from service.core.run_state import RunState
+from service.rig import Rig, load_rig
+from service.runner import Runner
+from service.runs import recorded_rig, recorded_run, require_simulated, start_run
+from service.station import Station
+from service.steps import params_models
+from service.store.store import Store
+
+RigOption = Annotated[Path, typer.Option("--rig", help="The rig file: devices and stations of this site.")]
+OperatorOption = Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")]
+AutoOption = Annotated[
+    bool, typer.Option("--auto-confirm", help="Answer every question automatically; simulated rigs only.")
+]
+WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
+
+
+def run_command(
+    protocol: Annotated[Path, typer.Argument(help="The protocol file, such as protocols/exvivo_spine.yaml.")],
+    rig: RigOption,
+    data: DataOption = DEFAULT_DATA,
+    operator: OperatorOption = "",
+    auto_confirm: AutoOption = False,
+    worker: WorkerOption = True,
+    json: JsonOption = False,
+) -> None:
+    """Run a protocol step by step. Nothing moves before you have confirmed it."""
+    with reporting_errors(json):
+        loaded = load_protocol(protocol, params_models())
+        rig_file = load_rig(rig)
+        with Store.open(data) as store:
+            run_id = start_run(
+                store, loaded, rig_file, operator=operator or getpass.getuser(), auto_confirm=auto_confirm
+            )
+            state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker)
+        _report_end(run_id, state, json=json)
+
+
+def resume_command(
+    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    data: DataOption = DEFAULT_DATA,
+    auto_confirm: AutoOption = False,
+    worker: WorkerOption = True,
+    json: JsonOption = False,
+) -> None:
+    """Go on with a run after a crash, a power cut or a pause: nothing captured is lost or taken twice."""
+    with reporting_errors(json), Store.open(data) as store:
+        run_id = store.find_run(run)
+        _, root = recorded_run(store, run_id)
+        rig = recorded_rig(store, root)
+        state = drive(store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker)
+        _report_end(run_id, state, json=json)
+
+
+def act_command(
+    verb: Annotated[str, typer.Argument(help="confirm, sign, redo, skip, pause, resume or abort.")],
+    run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
+    step: Annotated[str | None, typer.Option("--step", help="The step, if it is not the current one.")] = None,
+    viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo this viewpoint alone.")] = None,
+    reason: Annotated[str, typer.Option("--reason", help="Why; needed for redo, skip and abort.")] = "",
+    meaning: Annotated[str, typer.Option("--meaning", help="What a signature says.")] = "",
+    operator: OperatorOption = "",
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist."""
+    with reporting_errors(json), Store.open(data) as store:
+        run_id = store.find_run(run)
+        protocol, _ = recorded_run(store, run_id)
+        state = fold(protocol, store.events(run_id))
+        name = operator or getpass.getuser()
+        if verb not in OPERATOR_VERBS:
+            raise typer.BadParameter(f"{verb!r} is none of {', '.join(OPERATOR_VERBS)}")
+        action = OperatorAction(
+            action=cast(OperatorVerb, verb),
+            step=step or state.current,
+            viewpoint=viewpoint,
+            reason=reason,
+            checklist=protocol.step(state.current).checklist if verb == "confirm" else (),
+            meaning=meaning,
+            signed_sha256=record_to_sign(protocol, state) if verb == "sign" else "",
+        )
+        check_action(protocol, state, action, name)
+        store.record(run_id, [action], actor=name)
+        if json:
+            print_json({"run": run_id, "recorded": verb, "step": action.step})
+        else:
+            console.print(f"Recorded: {verb} of {action.step} by {escape(name)}")
+
+
+OPERATOR_VERBS = ("confirm", "sign", "redo", "skip", "pause", "resume", "abort")
+
+
+def status_command(
+    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """Show how far a run is: steps, gates, deviations."""
+    with reporting_errors(json), Store.open(data) as store:
+        run_id = store.find_run(run)
+        protocol, _ = recorded_run(store, run_id)
+        state = fold(protocol, store.events(run_id))
+    if json:
+        print_json(status_record(run_id, state))
+        return
+    table = Table(title=f"Run {run_id}: {state.status}", title_justify="left")
+    for heading in ("step", "state", "attempt", "views", "gates"):
+        table.add_column(heading)
+    for step in protocol.steps:
+        now = state.steps[step.id]
+        gates = ", ".join(f"{v.measure} {'ok' if v.passed else 'FAILED'}" for v in now.verdicts)
+        phase = "skipped" if now.skipped else now.phase.replace("_", " ")
+        table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), gates)
+    console.print(table)
+    for deviation in state.deviations:
+        if not deviation.is_note:
+            console.print(f"deviation: {escape(deviation.text)}")
+
+
+def status_record(run_id: str, state: RunState) -> dict[str, Any]:
+    """A run's state as plain data."""
+    return {
+        "run": run_id,
+        "status": state.status,
+        "current": state.current,
+        "deviations": [d.text for d in state.deviations if not d.is_note],
+        "steps": {
+            name: {"phase": s.phase, "attempt": s.attempt, "captured": sorted(s.captured), "measures": dict(s.measures)}
+            for name, s in state.steps.items()
+        },
+    }
+
+
+def drive(
+    store: Store, run_id: str, rig: Rig, *, data: Path, auto_confirm: bool, worker: bool
+) -> RunState:
+    """Run the runner in this process, with a worker beside it, until the run ends."""
+    protocol, root = recorded_run(store, run_id)
+    display = Display(error_console)
+    if auto_confirm:
+        require_simulated(rig)
+        operator: TerminalOperator | AutomaticOperator = AutomaticOperator(
+            root.operator, protocol, display, rig.section.hands
+        )
+    else:
+        operator = TerminalOperator(root.operator, protocol, display)
+    station = Station(rig)
+    try:
+        with _worker(data, wanted=worker):
+            return Runner(store, run_id, protocol, station, operator).run()
+    finally:
+        display.clear()
+        station.close()
+
+
+@contextmanager
+def _worker(data: Path, *, wanted: bool) -> Generator[None]:
+    """A worker process that ends with this block, or with this process."""
+    if not wanted:
+        yield
+        return
+    command = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(data), "--with-parent", "--json"]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+
+
+def _report_end(run_id: str, state: RunState, *, json: bool) -> None:
+    if json:
+        print_json(status_record(run_id, state))
+    else:
+        console.print(f"Run {run_id} is {state.status}; {state.deviation_count} deviations. Evidence: audit verify")
+    if state.status != "completed":
+        raise typer.Exit(1)
+
+

@@ -1,0 +1,36 @@
+"""Outlines as plain data and back: a cone and its evidence say everything, the points follow from it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.cones import Cone
+from service.compute.markers.records import DetectionOptions, Evidence, SphereOutline, outline_from_cone
+
+_EVIDENCE = tuple(field.name for field in dataclasses.fields(Evidence))
+
+
+def outline_record(outline: SphereOutline) -> dict[str, Any]:
+    """An outline as JSON data."""
+    record: dict[str, Any] = {name: getattr(outline, name) for name in _EVIDENCE}
+    record["axis"] = outline.cone.axis.tolist()
+    record["half_angle_rad"] = float(outline.cone.half_angle_rad)
+    record["centre_px"] = list(outline.centre_px)
+    record["semi_axes_px"] = list(outline.semi_axes_px)
+    record["angle_rad"] = outline.angle_rad
+    return record
+
+
+def outline_from_record(record: dict[str, Any], camera: CameraModel) -> SphereOutline:
+    """The outline again, its points sampled anew on the same conic."""
+    evidence = Evidence(**{name: _value(record[name]) for name in _EVIDENCE})
+    cone = Cone(np.array(record["axis"]), float(record["half_angle_rad"]))
+    return outline_from_cone(cone, camera, DetectionOptions().n_points, evidence)
+
+
+def _value(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value

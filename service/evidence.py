@@ -1,0 +1,115 @@
+"""The runner's view of the evidence: the run's events as they are, folded; and the writing of new ones."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from service.core.decide import advance, fold
+from service.core.errors import ComputeError, IntegrityError
+from service.core.model import ArtefactRef, Event, Payload, ViewpointCaptured
+from service.core.protocol import Protocol
+from service.core.run_state import RunState
+from service.steps.context import JobRequest, JobResult
+from service.store.leases import RunLease
+from service.store.records import NewArtefact, NewJob
+from service.store.store import Store
+
+
+@dataclass
+class RunLog:
+    """The events of one run, kept up to date with the database, and their fold."""
+
+    store: Store
+    run_id: str
+    protocol: Protocol
+    events: list[Event] = field(default_factory=list[Event])
+    state: RunState = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.state = fold(self.protocol, [])
+        self.refresh()
+
+    def refresh(self) -> RunState:
+        """Read what other processes (worker, command line, web) have appended meanwhile."""
+        for event in self.store.events(self.run_id, after_seq=len(self.events)):
+            self.events.append(event)
+            self.state = advance(self.protocol, self.state, event)
+        return self.state
+
+    def captures(self, step_id: str) -> tuple[ViewpointCaptured, ...]:
+        """The valid captures of a step's current attempt, in order."""
+        payloads = (self.events[seq - 1].payload for seq in sorted(self.refresh().steps[step_id].captured.values()))
+        return tuple(payload for payload in payloads if isinstance(payload, ViewpointCaptured))
+
+
+@dataclass
+class StepEvidence:
+    """service.steps.context.Evidence for one execution of one step."""
+
+    log: RunLog
+    lease: RunLease
+    step: str
+    attempt: int
+    checkpoint: Callable[[], None]
+    progress: Callable[[str, int, int], None]
+    wait: Callable[[float], None]
+
+    def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "runner") -> None:
+        """Append events and artefact rows in one transaction."""
+        self.log.store.record(self.log.run_id, payloads, actor=actor, artefacts=artefacts, lease=self.lease)
+
+    def put_file(self, path: Path, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Copy a file into the store."""
+        return self.log.store.put_file(path, kind=kind, media_type=media_type, original_name=original_name)
+
+    def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Write bytes into the store."""
+        return self.log.store.put_bytes(data, kind=kind, media_type=media_type, original_name=original_name)
+
+    def path(self, ref: ArtefactRef) -> Path:
+        """Where an artefact's bytes lie."""
+        return self.log.store.artefact_path(ref.sha256)
+
+    def captures(self, step_id: str) -> tuple[ViewpointCaptured, ...]:
+        """See service.steps.context.Evidence."""
+        return self.log.captures(step_id)
+
+    def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
+        """Enqueue jobs, once whatever restarts happen, and wait for their results in order.
+
+        Raises ComputeError with the worker's words when a job failed for good.
+        """
+        keys = [self._key(request) for request in requests]
+        jobs = [
+            NewJob(kind=r.kind, step=self.step, attempt=self.attempt, idempotency_key=key, arguments=r.arguments)
+            for r, key in zip(requests, keys, strict=True)
+        ]
+        self.log.store.record(self.log.run_id, [], actor="runner", jobs=jobs, lease=self.lease)
+        while True:
+            self.checkpoint()
+            state = self.log.refresh()
+            mine = {job.idempotency_key: job for job in state.steps[self.step].jobs.values()}
+            if any(key not in mine for key in keys):
+                raise IntegrityError("a job just enqueued is not in the record", where=f"step {self.step}")
+            for key in keys:
+                if mine[key].status == "failed":
+                    raise ComputeError(
+                        f"the worker could not do {mine[key].kind}: {mine[key].message}", where=f"step {self.step}"
+                    )
+            done = sum(mine[key].status == "finished" for key in keys)
+            open_kinds = [mine[key].kind for key in keys if mine[key].status != "finished"]
+            self.progress(", ".join(open_kinds) or "computed", done, len(keys))
+            if done == len(keys):
+                return tuple(JobResult(mine[key].measures, mine[key].artefacts, mine[key].result) for key in keys)
+            self.wait(0.2)
+
+    def _key(self, request: JobRequest) -> str:
+        arguments = hashlib.sha256(json.dumps(request.arguments, sort_keys=True).encode()).hexdigest()[:16]
+        # A failed job is tried anew when the operator repeats the step: its key must differ.
+        jobs = self.log.refresh().steps[self.step].jobs.values()
+        failed = sum(job.kind == request.kind and job.status == "failed" for job in jobs)
+        return f"{self.step}/{self.attempt}/{request.kind}/{arguments}/{failed}"

@@ -1,0 +1,99 @@
+"""The rig file: which devices a site has, at which stations, as validated configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from pydantic import Field, ValidationError
+
+from service.core.errors import ConfigurationError
+from service.core.geometry import Transform
+from service.core.model import Record
+
+Vector3 = tuple[float, float, float]
+
+
+class StationSection(Record):
+    """A place where a robot base stands; the scene as a technician measured it, in that base frame."""
+
+    robot: str
+    scene_centre_m: Vector3
+    scene_up: Vector3 = (0.0, 0.0, 1.0)
+    approach_azimuth_deg: float  # direction from the scene to the base, about the base's z axis
+
+
+class PayloadSection(Record):
+    """What hangs on the flange."""
+
+    mass_kg: Annotated[float, Field(gt=0, lt=50)]
+    centre_of_gravity_m: Vector3
+
+
+class RigSection(Record):
+    """The rig file."""
+
+    name: str
+    simulated: bool = False
+    hands: str | None = None  # address of a simulated technician (simulated rigs only)
+    devices: dict[str, dict[str, Any]]
+    stations: dict[str, StationSection] = Field(default_factory=dict)
+    T_flange_camera_nominal: tuple[tuple[float, float, float, float], ...] | None = None
+    payload: PayloadSection | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """A rig file as read."""
+
+    section: RigSection
+    path: Path
+    source: bytes
+
+    @property
+    def folder(self) -> Path:
+        """Relative paths in the file are relative to this."""
+        return self.path.parent
+
+    def nominal_T_flange_camera(self) -> Transform:
+        """The camera mount's drawing; ConfigurationError when the rig file has none or it is not rigid."""
+        rows = self.section.T_flange_camera_nominal
+        where = str(self.path)
+        if rows is None:
+            raise ConfigurationError(
+                "the rig file has no T_flange_camera_nominal",
+                where=where,
+                remedy="Give the camera mount's pose on the flange from its drawing (4×4, metres)",
+            )
+        T = np.array(rows, dtype=np.float64)
+        if T.shape != (4, 4) or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-4):
+            raise ConfigurationError("T_flange_camera_nominal is not a rigid 4×4 transform", where=where)
+        return T
+
+
+def load_rig(path: Path) -> Rig:
+    """Read rig.yaml; ConfigurationError names the file and the field."""
+    try:
+        source = path.read_bytes()
+        data: object = yaml.safe_load(source)
+    except OSError as error:
+        raise ConfigurationError(f"cannot read the rig file: {error.strerror}", where=str(path)) from error
+    except yaml.YAMLError as error:
+        raise ConfigurationError(f"the rig file is not YAML: {error}", where=str(path)) from error
+    if not isinstance(data, Mapping):
+        raise ConfigurationError("the rig file holds no mapping", where=str(path))
+    try:
+        section = RigSection.model_validate(data)
+    except ValidationError as error:
+        problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise ConfigurationError(f"the rig file is wrong: {problems}", where=str(path)) from error
+    for name, station in section.stations.items():
+        if station.robot not in section.devices:
+            raise ConfigurationError(
+                f"station {name!r} names robot {station.robot!r}, which is not among the devices", where=str(path)
+            )
+    return Rig(section, path.resolve(), source)

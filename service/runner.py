@@ -1,0 +1,246 @@
+"""The imperative loop: decide → act → append. The only place that executes decisions and touches hardware."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.metadata import distributions
+from os import getpid
+from typing import Protocol as Interface
+from typing import Any
+
+from drivers.errors import DeviceError
+from service.core.actions import refuse
+from service.core.decide import (
+    AbortRun,
+    Accept,
+    AskOperator,
+    EvaluateGates,
+    FinishRun,
+    Halt,
+    Retry,
+    RunStep,
+    decide,
+    evaluate_gates,
+)
+from service.core.errors import OrthocaptureError
+from service.core.model import (
+    ActionRefused,
+    DeviceTrouble,
+    OperatorAction,
+    Payload,
+    RunAborted,
+    RunCompleted,
+    SessionStarted,
+    StepFailed,
+    StepMeasured,
+    StepPassed,
+    StepRetried,
+    StepStarted,
+)
+from service.core.protocol import Protocol
+from service.core.recovery import recovery_policy
+from service.core.run_state import RunState
+from service.evidence import RunLog, StepEvidence
+from service.steps import step_kinds
+from service.steps.context import Devices, StepContext, StepInterruptedError, StepOutcome
+from service.store.leases import RunLease
+from service.store.store import Store
+
+_LEASE_S = 30.0
+_POLL_S = 0.1
+
+
+class Operator(Interface):
+    """The person in front of the run, or what stands in for one on a simulated rig."""
+
+    name: str
+
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
+        """An answer if there is one by now; called about ten times a second while a question is open."""
+        ...
+
+    def show(self, what: str, done: int, total: int) -> None:
+        """Progress of the work under way."""
+        ...
+
+    def tell(self, message: str) -> None:
+        """One line on what happened."""
+        ...
+
+
+@dataclass
+class Runner:
+    """Drives one run to its end, or to the next halt."""
+
+    store: Store
+    run_id: str
+    protocol: Protocol
+    devices: Devices
+    operator: Operator
+    monotonic_s: Callable[[], float] = time.monotonic
+    wait: Callable[[float], None] = time.sleep
+    _log: RunLog = field(init=False)
+    _lease: RunLease = field(init=False)
+    _renew_at_s: float = field(init=False, default=0.0)
+    _pedal: int | None = field(init=False, default=None)
+
+    def run(self) -> RunState:
+        """Take the lease, record the session, and act on decisions until the run ends or an operator stops it.
+
+        A paused run waits here for its resumption. Raises LeaseHeldError if another runner drives the run.
+        """
+        with self.store.lease(self.run_id, f"runner on {socket.gethostname()}", _LEASE_S) as lease:
+            self._lease = lease
+            self._log = RunLog(self.store, self.run_id, self.protocol)
+            resumed = self._log.state.sessions > 0
+            self._append(
+                SessionStarted(
+                    resumed=resumed, software=software_versions(), host=socket.gethostname(), pid=getpid()
+                )
+            )
+            while True:
+                self._keep_lease()
+                state = self._log.refresh()
+                if state.terminal:
+                    return state
+                self._act(state)
+
+    def _act(self, state: RunState) -> None:
+        decision = decide(self.protocol, state)
+        match decision:
+            case AskOperator():
+                self._ask(decision, state)
+            case RunStep(step, attempt, begin):
+                if begin:
+                    self._append(StepStarted(step=step, attempt=attempt))
+                self._execute(step, attempt)
+            case EvaluateGates(step, attempt, measures):
+                verdicts = evaluate_gates(self.protocol.step(step), attempt, measures)
+                self._append(verdicts)
+                failed = [v for v in verdicts.verdicts if not v.passed]
+                for verdict in failed:
+                    self.operator.tell(f"{step}: {verdict.measure} = {verdict.value} is outside its limits")
+            case Accept(step, attempt):
+                self._append(StepPassed(step=step, attempt=attempt))
+                self.operator.tell(f"{self.protocol.step(step).title}: passed")
+            case Retry(step, attempt, why, wait_s):
+                self.wait(wait_s)
+                self._append(StepRetried(step=step, attempt=attempt, why=why))
+            case FinishRun(deviations):
+                self._append(RunCompleted(deviations=deviations))
+            case AbortRun(reason):
+                self._append(RunAborted(reason=reason))
+            case Halt():
+                self.operator.show("paused", 0, 0)
+                self.wait(_POLL_S)
+
+    # --- operator ---
+
+    def _ask(self, question: AskOperator, state: RunState) -> None:
+        answer = self._pedal_press(question) or self.operator.poll(question, state)
+        if answer is None:
+            self.wait(_POLL_S)
+            return
+        self.submit(answer)
+
+    def submit(self, action: OperatorAction) -> None:
+        """Append an action if it is allowed now; otherwise append its refusal and say why."""
+        state = self._log.refresh()
+        refusal = refuse(self.protocol, state, action, self.operator.name)
+        if refusal is None:
+            self._append(action, actor=self.operator.name)
+            return
+        self._append(
+            ActionRefused(action=action.action, step=action.step, why=str(refusal)), actor=self.operator.name
+        )
+        self.operator.tell(f"refused: {refusal}")
+
+    def _pedal_press(self, question: AskOperator) -> OperatorAction | None:
+        """A new press of the foot pedal confirms the open step, hands-free."""
+        try:
+            lightbox = self.devices.lightbox()
+            presses = lightbox.pedal_presses() if lightbox is not None else 0
+        except DeviceError:
+            return None  # doctor and capture report a missing box; a question can be answered without it
+        before, self._pedal = self._pedal, presses
+        if before is None or presses <= before or "confirm" not in question.options:
+            return None
+        return OperatorAction(action="confirm", step=question.step, checklist=question.checklist, via="pedal")
+
+    # --- steps ---
+
+    def _execute(self, step_id: str, attempt: int) -> None:
+        step = self.protocol.step(step_id)
+        kind = step_kinds()[step.kind]
+        evidence = StepEvidence(
+            self._log, self._lease, step_id, attempt, self._checkpoint, self.operator.show, self.wait
+        )
+        context = StepContext(
+            protocol=self.protocol,
+            step=step,
+            attempt=attempt,
+            run=self._log.state,
+            devices=self.devices,
+            evidence=evidence,
+            checkpoint=self._checkpoint,
+            progress=self.operator.show,
+            monotonic_s=self.monotonic_s,
+            wait=self.wait,
+            operator=self.operator.name,
+        )
+        try:
+            outcome = kind.execute(context, step.params)
+        except StepInterruptedError as interruption:
+            self.operator.tell(str(interruption))
+        except OrthocaptureError as error:
+            self._failed(step_id, attempt, error)
+        else:
+            self._measured(step_id, attempt, outcome)
+
+    def _measured(self, step: str, attempt: int, outcome: StepOutcome) -> None:
+        self._append(
+            StepMeasured(
+                step=step,
+                attempt=attempt,
+                measures={name: float(value) for name, value in outcome.measures.items()},
+                artefacts=outcome.artefacts,
+                result=dict(outcome.result),
+            )
+        )
+
+    def _failed(self, step_id: str, attempt: int, error: OrthocaptureError) -> None:
+        state = self._log.refresh().steps[step_id]
+        name = type(error).__name__
+        policy = recovery_policy(self.protocol.step(step_id).recovery, name, state.failures + 1)
+        payloads: list[Payload] = []
+        if isinstance(error, DeviceError):
+            payloads.append(DeviceTrouble(device=error.where or step_id, error=name, message=str(error)))
+        payloads.append(
+            StepFailed(step=step_id, attempt=attempt, error=name, message=str(error), recovery=policy)
+        )
+        self._append(*payloads)
+        self.operator.tell(f"{step_id}: {error}. What was captured is safe")
+
+    def _checkpoint(self) -> None:
+        """Called by steps wherever they may stop: keeps the lease, and notices pause and abort."""
+        self._keep_lease()
+        state = self._log.refresh()
+        if state.paused or state.terminal:
+            raise StepInterruptedError(f"the operator asked to {'pause' if state.paused else 'abort'}")
+
+    def _append(self, *payloads: Payload, actor: str = "runner") -> None:
+        self.store.record(self.run_id, payloads, actor=actor, lease=self._lease)
+
+    def _keep_lease(self) -> None:
+        if self.monotonic_s() > self._renew_at_s:
+            self._lease.renew()
+            self._renew_at_s = self.monotonic_s() + _LEASE_S / 3
+
+
+def software_versions() -> dict[str, str]:
+    """Every installed distribution and its version, for the record."""
+    found: dict[str, Any] = {d.metadata["Name"]: d.version for d in distributions()}
+    return {name: str(version) for name, version in sorted(found.items()) if name}

@@ -1,0 +1,81 @@
+"""Beginning and continuing a run: what is recorded first, and what must hold before anything moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from service.core.errors import ConfigurationError, IntegrityError
+from service.core.model import RunStarted
+from service.core.protocol import LoadedProtocol, Protocol, parse_protocol
+from service.rig import Rig, load_rig
+from service.runner import software_versions
+from service.steps import params_models
+from service.store.records import NewArtefact
+from service.store.store import Store
+
+_LOOPBACK = ("127.", "localhost", "ptpip:127.", "socket://127.")
+
+
+def start_run(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, auto_confirm: bool) -> str:
+    """Record the root of a new run's chain; its name.
+
+    Raises ConfigurationError when automatic confirmation is asked for on anything but a simulated rig.
+    """
+    if auto_confirm:
+        require_simulated(rig)
+    source = loaded.source.encode()
+    protocol = store.put_bytes(
+        source, kind="protocol", media_type="application/yaml", original_name=f"{loaded.protocol.id}.yaml"
+    )
+    rig_ref = store.put_bytes(rig.source, kind="rig", media_type="application/yaml", original_name=str(rig.path))
+    payload = RunStarted(
+        protocol_id=loaded.protocol.id,
+        protocol_version=loaded.protocol.version,
+        protocol_sha256=loaded.sha256,
+        protocol=protocol,
+        rig=rig_ref,
+        simulated=rig.section.simulated,
+        auto_confirm=auto_confirm,
+        operator=operator,
+        software=software_versions(),
+    )
+    return store.create_run(payload, operator, [NewArtefact(protocol, "runner"), NewArtefact(rig_ref, "runner")])
+
+
+def recorded_run(store: Store, run_id: str) -> tuple[Protocol, RunStarted]:
+    """The protocol as it was when the run began, from the evidence; and the run's root."""
+    root = store.events(run_id)[0].payload
+    if not isinstance(root, RunStarted):
+        raise IntegrityError("the run's first event is not run_started", where=run_id)
+    content = store.artefact_path(root.protocol.sha256, verify=True).read_bytes()
+    return parse_protocol(content, params_models(), name=root.protocol.original_name).protocol, root
+
+
+def recorded_rig(store: Store, root: RunStarted) -> Rig:
+    """The rig of a run: its file must still be what it was.
+
+    Raises ConfigurationError when the file has changed since the run began.
+    """
+    rig = load_rig(Path(root.rig.original_name))
+    if rig.source != store.artefact_path(root.rig.sha256, verify=True).read_bytes():
+        raise ConfigurationError(
+            "the rig file has changed since the run began",
+            where=str(rig.path),
+            remedy="Restore it, or start a new run: calibration and poses belong to one rig",
+        )
+    return rig
+
+
+def require_simulated(rig: Rig) -> None:
+    """Refuse automatic confirmation unless the rig says that it is simulated and every address is this machine's."""
+    remedy = "Leave --auto-confirm out: on a real rig a person confirms every motion"
+    if not rig.section.simulated:
+        raise ConfigurationError("automatic confirmation is for simulated rigs only", where=str(rig.path), remedy=remedy)
+    for name, settings in rig.section.devices.items():
+        address = str(settings.get("host") or settings.get("port") or "")
+        if (":" in address or "host" in settings) and not address.startswith(_LOOPBACK):
+            raise ConfigurationError(
+                f"device {name!r} at {address} is not on this machine, so the rig cannot be simulated",
+                where=str(rig.path),
+                remedy=remedy,
+            )

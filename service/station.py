@@ -1,0 +1,167 @@
+"""The composition root: opens the concrete drivers of a rig. Nobody else names them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from pydantic import ValidationError
+
+from drivers.host import hosted
+from drivers.interfaces import (
+    Camera,
+    CtSource,
+    Device,
+    Lightbox,
+    Payload,
+    RobotArm,
+    Scanner,
+    Transform,
+)
+from drivers.plugin import DriverConfig, DriverSpec
+from service.core.errors import ConfigurationError
+from service.rig import Rig
+from service.steps.context import StationLayout
+
+GROUP = "orthocapture.drivers"
+INTERFACES: Mapping[str, type[Any]] = {
+    "robot": RobotArm,
+    "camera": Camera,
+    "scanner": Scanner,
+    "ct": CtSource,
+    "lightbox": Lightbox,
+}
+_PATH_FIELDS = ("folder", "port", "path")
+
+D = TypeVar("D", bound=Device)
+
+
+class Station:
+    """The devices of one rig, built on first use and kept open until `close`."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self._open: dict[str, Device] = {}
+
+    def names(self) -> tuple[str, ...]:
+        """Devices of the rig file, in its order."""
+        return tuple(self.rig.section.devices)
+
+    def device(self, name: str) -> Device:
+        """An open device. Raises ConfigurationError or DeviceError."""
+        if name not in self._open:
+            spec, device = self._build(name)
+            device.open()
+            self._open[name] = device
+            if spec.kind == "robot" and self.rig.section.payload is not None:
+                payload = self.rig.section.payload
+                cast(RobotArm, device).configure(Payload(payload.mass_kg, payload.centre_of_gravity_m), np.eye(4))
+        return self._open[name]
+
+    def close(self) -> None:
+        """Let go of every device."""
+        for device in self._open.values():
+            device.close()
+        self._open.clear()
+
+    # --- roles, as steps ask for them (service.steps.context.Devices) ---
+
+    def robot(self, station: str) -> RobotArm:
+        """The arm that stands at a station."""
+        return cast(RobotArm, self.device(self.layout(station).robot))
+
+    def camera(self) -> Camera:
+        """The only camera of the rig."""
+        return cast(Camera, self.device(self._only("camera")))
+
+    def scanner(self) -> Scanner:
+        """The only scanner of the rig."""
+        return cast(Scanner, self.device(self._only("scanner")))
+
+    def ct(self) -> CtSource:
+        """The only CT folder of the rig."""
+        return cast(CtSource, self.device(self._only("ct")))
+
+    def lightbox(self) -> Lightbox | None:
+        """The light box, if the rig has one."""
+        names = self._of_kind("lightbox")
+        return cast(Lightbox, self.device(names[0])) if names else None
+
+    def layout(self, station: str) -> StationLayout:
+        """Where things are at a station of the rig file."""
+        section = self.rig.section.stations.get(station)
+        if section is None:
+            known = ", ".join(self.rig.section.stations) or "none"
+            raise ConfigurationError(
+                f"the rig has no station {station!r}", where=str(self.rig.path), remedy=f"Stations: {known}"
+            )
+        azimuth = math.radians(section.approach_azimuth_deg)
+        return StationLayout(
+            station, section.robot, section.scene_centre_m, (math.cos(azimuth), math.sin(azimuth), 0.0)
+        )
+
+    def nominal_T_flange_camera(self) -> Transform:
+        """The camera mount's drawing."""
+        return self.rig.nominal_T_flange_camera()
+
+    def reopen(self, device: Device) -> None:
+        """Close and open again, after a link dropped."""
+        device.close()
+        device.open()
+
+    # --- building ---
+
+    def kind_of(self, name: str) -> str:
+        """robot, camera, scanner, ct or lightbox."""
+        return self._spec(name)[0].kind
+
+    def _of_kind(self, kind: str) -> list[str]:
+        return [name for name in self.names() if self.kind_of(name) == kind]
+
+    def _only(self, kind: str) -> str:
+        names = self._of_kind(kind)
+        if len(names) != 1:
+            raise ConfigurationError(
+                f"this step needs exactly one {kind}, the rig has {len(names)}", where=str(self.rig.path)
+            )
+        return names[0]
+
+    def _spec(self, name: str) -> tuple[DriverSpec, str]:
+        settings = self.rig.section.devices.get(name)
+        where = f"{self.rig.path}, device {name}"
+        if settings is None:
+            raise ConfigurationError(f"the rig has no device {name!r}", where=str(self.rig.path))
+        driver = settings.get("driver")
+        points = {point.name: point for point in entry_points(group=GROUP)}
+        if driver not in points:
+            raise ConfigurationError(
+                f"no driver {driver!r} is installed", where=where, remedy=f"Installed: {', '.join(sorted(points))}"
+            )
+        return cast(DriverSpec, points[driver].load()), points[driver].value
+
+    def _build(self, name: str) -> tuple[DriverSpec, Device]:
+        spec, spec_path = self._spec(name)
+        config = self._config(name, spec)
+        if spec.hosted:
+            interface = INTERFACES[spec.kind]
+            return spec, cast(
+                Device, hosted(interface, spec_path, config, call_timeout_s=spec.call_timeout_s, name=name)
+            )
+        return spec, spec.build(config)
+
+    def _config(self, name: str, spec: DriverSpec) -> DriverConfig:
+        settings = {key: value for key, value in self.rig.section.devices[name].items() if key != "driver"}
+        for field in _PATH_FIELDS:
+            value = settings.get(field)
+            if isinstance(value, str) and ":" not in value:  # addresses such as ptpip:… or socket://… stay
+                settings[field] = str(self.rig.folder / value)
+        try:
+            return spec.config.model_validate(settings)
+        except ValidationError as error:
+            problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+            raise ConfigurationError(
+                f"device {name!r} is configured wrongly: {problems}", where=str(self.rig.path)
+            ) from error

@@ -1,0 +1,83 @@
+"""Files that arrive from elsewhere (scanner, CT): wait for them, keep the originals, hand arrays to the worker."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from drivers.errors import DeviceTimeoutError
+from drivers.interfaces import ScannedMesh
+from service.core.model import ArtefactRef, FilesKept
+from service.steps.context import StepContext
+from service.store.records import NewArtefact
+
+T = TypeVar("T")
+
+
+def wait_for(context: StepContext, find: Callable[[], Sequence[T]], wait_s: float, what: str) -> T:
+    """The newest of what `find` returns, as soon as there is one; DeviceTimeoutError after `wait_s`."""
+    deadline_s = context.monotonic_s() + wait_s
+    while not (found := find()):
+        context.checkpoint()
+        context.progress(f"waiting for {what}", 0, 1)
+        if context.monotonic_s() > deadline_s:
+            raise DeviceTimeoutError(
+                f"{what} did not arrive within {wait_s:.0f} s",
+                where=f"step {context.step.id}",
+                remedy="Check the export folder with `orthocapture doctor`, then confirm to wait again",
+            )
+        context.wait(0.5)
+    return found[-1]
+
+
+def keep(context: StepContext, path: Path, *, device: str, kind: str, media_type: str) -> ArtefactRef:
+    """Copy one original file into the evidence; nothing is repaired, nothing removed at the source."""
+    ref = context.evidence.put_file(path, kind=kind, media_type=media_type, original_name=path.name)
+    _record(context, ref, device, f"kept {path.name}")
+    return ref
+
+
+def keep_array(context: StepContext, array: Any, *, device: str, kind: str, name: str) -> ArtefactRef:
+    """Keep a decoded array (.npy) beside the originals, for the worker."""
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    ref = context.evidence.put_bytes(buffer.getvalue(), kind=kind, media_type="application/x-npy", original_name=name)
+    _record(context, ref, device, f"decoded {name}")
+    return ref
+
+
+def keep_mesh(
+    context: StepContext, scan: ScannedMesh, *, device: str, kind: str
+) -> tuple[ArtefactRef, tuple[ArtefactRef, ...]]:
+    """Keep a scan's original files and its decoded mesh (.npz: vertices_m, faces); (mesh, all)."""
+    originals = tuple(
+        keep(context, path, device=device, kind=f"{kind}_original", media_type="application/octet-stream")
+        for path in scan.source.files
+    )
+    buffer = io.BytesIO()
+    np.savez(buffer, vertices_m=scan.mesh.vertices_m, faces=scan.mesh.faces)
+    mesh = context.evidence.put_bytes(
+        buffer.getvalue(), kind=kind, media_type="application/x-npz", original_name=f"{scan.source.name}.npz"
+    )
+    _record(context, mesh, device, f"read {scan.source.name}: unit {scan.unit} ({scan.unit_evidence})")
+    return mesh, (*originals, mesh)
+
+
+def _record(context: StepContext, ref: ArtefactRef, device: str, note: str) -> None:
+    row = NewArtefact(
+        ref=ref,
+        device=device,
+        step=context.step.id,
+        attempt=context.attempt,
+        viewpoint=None,
+        who=context.operator,
+        at_utc=datetime.now(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z"),
+        monotonic_s=context.monotonic_s(),
+    )
+    payload = FilesKept(step=context.step.id, attempt=context.attempt, device=device, note=note, artefacts=(ref,))
+    context.evidence.record(payload, artefacts=(row,))

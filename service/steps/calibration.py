@@ -1,0 +1,70 @@
+"""Step kind `calibration`: board images from the robot give the intrinsics and the hand-eye transform."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from service.core.errors import ConfigurationError
+from service.core.model import Record
+from service.steps.capture import capture_viewpoints
+from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.inputs import captured_images, result_of
+from service.steps.viewpoints import ViewpointSet, plan_viewpoints
+
+
+class Params(Record):
+    """Which board images, and what is computed from them."""
+
+    solve: tuple[Literal["intrinsics", "hand_eye"], ...]
+    viewpoints: tuple[ViewpointSet, ...] = ()
+    images_of: str | None = None  # use the images of this earlier calibration step instead of new ones
+    intrinsics_of: str | None = None  # hand-eye alone: the step that solved the intrinsics
+
+
+class Result(Record):
+    """The camera and, where solved, where it sits on the flange (4×4, metres)."""
+
+    camera: dict[str, float]
+    T_flange_camera: tuple[tuple[float, ...], ...] | None = None
+    T_base_board: tuple[tuple[float, ...], ...] | None = None
+    details: dict[str, object]
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Capture the board, then let the worker solve."""
+    measures: dict[str, float] = {}
+    source = params.images_of or context.step.id
+    if params.images_of is None:
+        plan = [
+            viewpoint
+            for viewpoint_set in params.viewpoints
+            for viewpoint in plan_viewpoints(viewpoint_set, context.devices.layout(viewpoint_set.station))
+        ]
+        nominal = context.devices.nominal_T_flange_camera()
+        measures |= capture_viewpoints(context, plan, nominal, image_kind="board_image").measures()
+    camera = None
+    if "intrinsics" not in params.solve:
+        if params.intrinsics_of is None:
+            raise ConfigurationError(
+                "hand-eye needs intrinsics", where=f"step {context.step.id}", remedy="Name the step in intrinsics_of"
+            )
+        camera = result_of(context, params.intrinsics_of)["camera"]
+    board = context.protocol.board
+    (answer,) = context.evidence.run_jobs(
+        JobRequest(
+            "calibrate",
+            {
+                "solve": list(params.solve),
+                "images": captured_images(context, [source]),
+                "columns": board.columns,
+                "rows": board.rows,
+                "square_m": board.square_mm / 1000,
+                "camera": camera,
+            },
+        )
+    )
+    result = Result.model_validate(answer.result)
+    return StepOutcome({**measures, **answer.measures}, answer.artefacts, result.model_dump(mode="json"))
+
+
+KIND = StepKind("calibration", Params, Result, execute)

@@ -1,0 +1,332 @@
+"""One image, from the shutter to the evidence: move, settle, expose, download, record, for each viewpoint."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from drivers.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceTimeoutError,
+    DeviceUnavailableError,
+    StaleImageError,
+    UnreachablePoseError,
+    UnreadableFileError,
+)
+from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, RobotSample, SettleReport
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
+from service.core.model import ArtefactRef, Matrix4, ViewpointCaptured, ViewpointFailed
+from service.steps.context import StepContext
+from service.steps.motion import MotionLimits, move_and_settle, settle_criteria
+from service.steps.viewpoints import Viewpoint, flange_target
+from service.store.records import NewArtefact
+
+#: Errors after which the same viewpoint may be tried again on a reopened device.
+_WORTH_ANOTHER_TRY = (
+    DeviceUnavailableError,
+    DeviceTimeoutError,
+    DeviceBusyError,
+    StaleImageError,
+    UnreadableFileError,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureTotals:
+    """What a capture loop came to, the earlier part of a resumed one included."""
+
+    planned: int
+    captured: int
+    given_up: int
+    settings_departures: int
+    moved: int
+
+    def measures(self) -> dict[str, float]:
+        """As numbers for gates."""
+        return {
+            "viewpoints_planned": float(self.planned),
+            "viewpoints_captured": float(self.captured),
+            "viewpoints_given_up": float(self.given_up),
+            "settings_departures": float(self.settings_departures),
+            "moved_during_exposure": float(self.moved),
+        }
+
+
+def capture_viewpoints(
+    context: StepContext, viewpoints: Sequence[Viewpoint], T_flange_camera: Transform, *, image_kind: str
+) -> CaptureTotals:
+    """Capture every viewpoint that this attempt has not captured yet, in order.
+
+    Args:
+        T_flange_camera: the best known mounting; decides only where the camera goes, not where it was.
+        image_kind: artefact kind of the photographs (`image`, `board_image`, `control_image`).
+
+    Raises DeviceError when a viewpoint fails for good, StepInterruptedError on pause.
+    """
+    earlier = context.evidence.captures(context.step.id)
+    done = {capture.viewpoint for capture in earlier}
+    given_up = set(context.state.skipped_viewpoints)
+    camera = context.devices.camera()
+    wanted = _wanted_settings(context)
+    camera.apply(wanted)
+    bad_settings = sum(not capture.verdicts["settings"] for capture in earlier)
+    moved = sum(not capture.verdicts["still"] for capture in earlier)
+    for number, viewpoint in enumerate(viewpoints):
+        context.progress("viewpoints", number, len(viewpoints))
+        if viewpoint.name in done:
+            continue
+        context.checkpoint()
+        try:
+            verdicts = _capture_with_retries(context, camera, viewpoint, T_flange_camera, wanted, image_kind)
+        except UnreachablePoseError as error:
+            context.evidence.record(_failed(context, viewpoint, error, skipped=True))
+            given_up.add(viewpoint.name)
+            continue
+        done.add(viewpoint.name)
+        bad_settings += not verdicts["settings"]
+        moved += not verdicts["still"]
+    context.progress("viewpoints", len(viewpoints), len(viewpoints))
+    return CaptureTotals(
+        planned=len(viewpoints),
+        captured=len(done),
+        given_up=len(given_up - done),
+        settings_departures=bad_settings,
+        moved=moved,
+    )
+
+
+def _capture_with_retries(
+    context: StepContext,
+    camera: Camera,
+    viewpoint: Viewpoint,
+    T_flange_camera: Transform,
+    wanted: CameraSettings,
+    image_kind: str,
+) -> dict[str, bool]:
+    tries = 1 + context.step.recovery.retries
+    for attempt in range(1, tries + 1):
+        try:
+            robot = context.devices.robot(viewpoint.station)
+            settled = _go_to(context, robot, viewpoint, T_flange_camera)
+            return _expose(context, camera, robot, viewpoint, settled, wanted, image_kind)
+        except _WORTH_ANOTHER_TRY as error:
+            context.evidence.record(_failed(context, viewpoint, error, skipped=False))
+            if attempt == tries:
+                raise
+            context.checkpoint()
+            context.devices.reopen(camera)
+            camera.apply(wanted)
+    raise AssertionError("unreachable: the loop returns or raises")
+
+
+def _go_to(context: StepContext, robot: RobotArm, viewpoint: Viewpoint, T_flange_camera: Transform) -> SettleReport:
+    near = robot.state().sample.joints_rad
+    target = robot.solve_ik(flange_target(viewpoint.T_base_camera, T_flange_camera), near)
+    motion = context.protocol.motion
+    limits = MotionLimits(motion.speed_rad_s, motion.acceleration_rad_s2, context.protocol.settle.timeout_s)
+    criteria = settle_criteria(context)
+    report = move_and_settle(context, robot, target, limits, criteria)
+    if motion.dwell_s > 0:
+        context.wait(motion.dwell_s)
+    return report
+
+
+def _expose(
+    context: StepContext,
+    camera: Camera,
+    robot: RobotArm,
+    viewpoint: Viewpoint,
+    settled: SettleReport,
+    wanted: CameraSettings,
+    image_kind: str,
+) -> dict[str, bool]:
+    """Take the picture and write it down: files first, then one transaction with rows and event."""
+    environment = _environment(context)
+    with tempfile.TemporaryDirectory(prefix="orthocapture-") as folder:
+        image = camera.capture(Path(folder))
+        window = robot.samples(image.trigger_monotonic_s, image.trigger_monotonic_s + wanted.exposure_s + 0.3)
+        pose = _mean_pose(window, settled)
+        refs = [
+            context.evidence.put_file(
+                file.path,
+                kind=image_kind if file.media_type == "image/jpeg" else "raw",
+                media_type=file.media_type,
+                original_name=file.camera_name,
+            )
+            for file in image.files
+        ]
+    refs.append(_pose_log(context, viewpoint, window))
+    criteria = settle_criteria(context)
+    verdicts = {
+        "still": pose.spread_m <= criteria.position_peak_to_peak_m
+        and pose.spread_rad <= criteria.rotation_peak_to_peak_rad,
+        "settings": settings_agree(image.exif, wanted),
+    }
+    now = datetime.now(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
+    rows = tuple(
+        NewArtefact(
+            ref=ref,
+            device="robot" if ref.kind == "pose_log" else "camera",
+            step=context.step.id,
+            attempt=context.attempt,
+            viewpoint=viewpoint.name,
+            who=context.operator,
+            at_utc=now,
+            monotonic_s=image.trigger_monotonic_s,
+        )
+        for ref in refs
+    )
+    context.evidence.record(
+        ViewpointCaptured(
+            step=context.step.id,
+            attempt=context.attempt,
+            viewpoint=viewpoint.name,
+            station=viewpoint.station,
+            artefacts=tuple(refs),
+            T_base_flange=_rows(pose.T_base_flange),
+            pose_sigma_m=pose.sigma_m,
+            pose_sigma_rad=pose.sigma_rad,
+            joints_rad=tuple(float(q) for q in pose.joints_rad),
+            pose_samples=pose.samples,
+            trigger_monotonic_s=image.trigger_monotonic_s,
+            arrival_monotonic_s=image.arrival_monotonic_s,
+            controller_time_s=pose.controller_time_s,
+            clock_offset_s=pose.clock_offset_s,
+            camera=_camera_record(image),
+            environment=environment,
+            verdicts=verdicts,
+        ),
+        artefacts=rows,
+    )
+    return verdicts
+
+
+@dataclass(frozen=True, slots=True)
+class _ExposurePose:
+    T_base_flange: Transform
+    joints_rad: Array
+    samples: int
+    sigma_m: float
+    sigma_rad: float
+    spread_m: float
+    spread_rad: float
+    controller_time_s: float
+    clock_offset_s: float
+
+
+def _mean_pose(window: Sequence[RobotSample], settled: SettleReport) -> _ExposurePose:
+    """Average the pose over the exposure; rotations average on the tangent of the settled pose."""
+    if not window:
+        raise DeviceUnavailableError(
+            "the robot's pose stream has no sample during the exposure",
+            remedy="The image cannot be used without its pose; the viewpoint is taken again",
+        )
+    reference = inverse(settled.T_base_flange)
+    deltas = [reference @ s.T_base_flange for s in window]
+    positions = np.array([s.T_base_flange[:3, 3] for s in window])
+    angles = np.array([rotation_angle_rad(d) for d in deltas])
+    middle = window[len(window) // 2]
+    T = settled.T_base_flange.copy() if len(window) < 3 else middle.T_base_flange.copy()
+    T[:3, 3] = positions.mean(axis=0)
+    return _ExposurePose(
+        T_base_flange=T,
+        joints_rad=np.mean([s.joints_rad for s in window], axis=0),
+        samples=len(window),
+        sigma_m=float(np.sqrt(positions.var(axis=0).sum())),
+        sigma_rad=float(angles.std()),
+        spread_m=float(np.ptp(positions, axis=0).max()),
+        spread_rad=float(np.ptp(angles)),
+        controller_time_s=middle.controller_time_s,
+        clock_offset_s=middle.controller_time_s - middle.monotonic_s,
+    )
+
+
+def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
+    """Whether an image's EXIF shows the protocol's settings (aperture and time to 2 %, ISO exactly)."""
+    return (
+        abs(actual.aperture_f / wanted.aperture_f - 1) < 0.02
+        and abs(actual.exposure_s / wanted.exposure_s - 1) < 0.02
+        and actual.iso == wanted.iso
+    )
+
+
+def _wanted_settings(context: StepContext) -> CameraSettings:
+    camera = context.protocol.camera
+    return CameraSettings(
+        aperture_f=camera.aperture_f,
+        exposure_s=camera.exposure_s,
+        iso=camera.iso,
+        focus_mode=camera.focus_mode,
+        image_quality=camera.image_quality,
+    )
+
+
+def _environment(context: StepContext) -> dict[str, float]:
+    lightbox = context.devices.lightbox()
+    if lightbox is None:
+        return {}
+    try:
+        reading = lightbox.read()
+    except DeviceUnavailableError:
+        context.devices.reopen(lightbox)
+        reading = lightbox.read()
+    return {"light_lux": reading.light_lux, "temperature_c": reading.temperature_c}
+
+
+def _pose_log(context: StepContext, viewpoint: Viewpoint, window: Sequence[RobotSample]) -> ArtefactRef:
+    """The pose stream over the exposure, as it was received."""
+    lines = [
+        json.dumps(
+            {
+                "controller_time_s": s.controller_time_s,
+                "monotonic_s": s.monotonic_s,
+                "joints_rad": s.joints_rad.tolist(),
+                "T_base_flange": s.T_base_flange.tolist(),
+                "tcp_speed_m_s": s.tcp_speed_m_s,
+                "safety": s.safety.value,
+            }
+        )
+        for s in window
+    ]
+    return context.evidence.put_bytes(
+        ("\n".join(lines) + "\n").encode(),
+        kind="pose_log",
+        media_type="application/x-ndjson",
+        original_name=f"{viewpoint.name}.poses.jsonl",
+    )
+
+
+def _camera_record(image: CapturedImage) -> dict[str, object]:
+    return {
+        **dataclasses.asdict(image.exif),
+        "counter": image.counter,
+        "exif_time": image.exif_time,
+        "lens": image.lens,
+        "focal_length_mm": image.focal_length_mm,
+    }
+
+
+def _failed(context: StepContext, viewpoint: Viewpoint, error: DeviceError, *, skipped: bool) -> ViewpointFailed:
+    return ViewpointFailed(
+        step=context.step.id,
+        attempt=context.attempt,
+        viewpoint=viewpoint.name,
+        error=type(error).__name__,
+        message=str(error),
+        skipped=skipped,
+    )
+
+
+def _rows(T: Transform) -> Matrix4:
+    if T.shape != (4, 4):
+        raise DataError(f"a pose is a 4×4 matrix, not {T.shape}")
+    return tuple((float(r[0]), float(r[1]), float(r[2]), float(r[3])) for r in T)

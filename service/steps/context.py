@@ -1,0 +1,158 @@
+"""What a step is given and what it gives back: StepContext, StepOutcome, StepKind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from drivers.interfaces import Camera, CtSource, Device, Lightbox, RobotArm, Scanner, Transform
+from service.core.decide import RunState, StepState
+from service.core.errors import OrthocaptureError
+from service.core.model import ArtefactRef, Payload, Record, StepNote, ViewpointCaptured
+from service.core.protocol import Protocol as LabProtocol
+from service.core.protocol import Step
+from service.store.records import NewArtefact
+
+P = TypeVar("P", bound=Record)
+
+
+class StepInterruptedError(OrthocaptureError):
+    """An operator paused or aborted while the step worked; the robot stands still when this is raised."""
+
+
+@dataclass(frozen=True, slots=True)
+class StationLayout:
+    """What a technician knows of a station: which arm stands there and where the scene is, in its base frame."""
+
+    name: str
+    robot: str  # device name in rig.yaml
+    scene_centre_m: tuple[float, float, float]
+    approach: tuple[float, float, float]  # horizontal unit vector from the scene towards the base
+
+
+class Devices(Protocol):
+    """The open devices of a rig, by role; opened on first use. Raises ConfigurationError if the rig has none."""
+
+    def robot(self, station: str) -> RobotArm:
+        """The arm at a station, configured with its payload."""
+        ...
+
+    def camera(self) -> Camera:
+        """The camera."""
+        ...
+
+    def scanner(self) -> Scanner:
+        """The scanner's export folder."""
+        ...
+
+    def ct(self) -> CtSource:
+        """The CT suite's folder."""
+        ...
+
+    def lightbox(self) -> Lightbox | None:
+        """The light and environment box, if the rig has one."""
+        ...
+
+    def layout(self, station: str) -> StationLayout:
+        """Where things are at a station."""
+        ...
+
+    def nominal_T_flange_camera(self) -> Transform:
+        """The camera mount's drawing."""
+        ...
+
+    def reopen(self, device: Device) -> None:
+        """Open a device again after its link dropped."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class JobRequest:
+    """Work for the registration worker; `arguments` is plain JSON data."""
+
+    kind: str
+    arguments: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class JobResult:
+    """What the worker answered."""
+
+    measures: Mapping[str, float]
+    artefacts: tuple[ArtefactRef, ...]
+    result: Mapping[str, Any]
+
+
+class Evidence(Protocol):
+    """Where a step writes down what happens. Nothing that cannot be recorded is done."""
+
+    def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "") -> None:
+        """Append events (and artefact rows) in one transaction."""
+        ...
+
+    def put_file(self, path: Path, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Copy a file into the content-addressed store."""
+        ...
+
+    def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Write bytes into the content-addressed store."""
+        ...
+
+    def path(self, ref: ArtefactRef) -> Path:
+        """Where the bytes of an artefact lie."""
+        ...
+
+    def captures(self, step_id: str) -> tuple[ViewpointCaptured, ...]:
+        """The valid captures of a step's current attempt, this moment's included, in order."""
+        ...
+
+    def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
+        """Enqueue jobs (once, whatever restarts) and wait for the worker's results, in order."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class StepContext:
+    """Everything that a step may touch."""
+
+    protocol: LabProtocol
+    step: Step
+    attempt: int
+    run: RunState
+    devices: Devices
+    evidence: Evidence
+    checkpoint: Callable[[], None]  # raises StepInterruptedError after a pause or abort; call it often
+    progress: Callable[[str, int, int], None]  # what, done, of how many
+    monotonic_s: Callable[[], float]
+    wait: Callable[[float], None]
+    operator: str
+
+    @property
+    def state(self) -> StepState:
+        """The folded state of this step, as of the start of this execution."""
+        return self.run.steps[self.step.id]
+
+    def note(self, note: str, **data: Any) -> None:
+        """Record a StepNote."""
+        self.evidence.record(StepNote(step=self.step.id, attempt=self.attempt, note=note, data=data))
+
+
+@dataclass(frozen=True, slots=True)
+class StepOutcome:
+    """The numbers a step measured (gates judge them), what it produced, and its Result."""
+
+    measures: Mapping[str, float]
+    artefacts: tuple[ArtefactRef, ...] = ()
+    result: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+
+@dataclass(frozen=True, slots=True)
+class StepKind(Generic[P]):
+    """A step kind: its name in the protocol, its Params, its Result and what it does."""
+
+    name: str
+    params: type[P]
+    result: type[Record]
+    execute: Callable[[StepContext, P], StepOutcome]

@@ -1,0 +1,70 @@
+"""Step kind `ct_import`: the CT series arrives, is kept slice by slice, and becomes a surface with its spheres."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from drivers.interfaces import CtSource
+from service.core.model import ArtefactRef, Record
+from service.steps.arrivals import keep, keep_array, keep_mesh, wait_for
+from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+
+
+class Params(Record):
+    """What to expect from the CT suite."""
+
+    source: Literal["dicom", "mesh"] = "dicom"  # mesh: segmented elsewhere (Mimics STL)
+    threshold_hu: float = -300.0  # skin, spheres against air
+    spheres: int  # registration and control spheres in the volume
+    wait_s: float = 600.0
+
+
+class Result(Record):
+    """The spheres in the CT frame, metres."""
+
+    spheres_m: tuple[tuple[float, float, float], ...]
+    details: dict[str, Any]
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Wait for one sound series (or mesh), keep its files, let the worker make the surface."""
+    ct = context.devices.ct()
+    radius_m = context.protocol.spheres.radius_mm / 1000
+    measures: dict[str, float] = {}
+    kept: tuple[ArtefactRef, ...]
+    arguments: dict[str, Any] = {"radius_m": radius_m, "expected": params.spheres}
+    if params.source == "mesh":
+        scan = ct.read_mesh(wait_for(context, ct.segmented_meshes, params.wait_s, "a segmented CT mesh"))
+        mesh, kept = keep_mesh(context, scan, device="ct", kind="ct_mesh")
+        arguments["mesh"] = mesh.sha256
+        job = "locate_spheres"
+    else:
+        series = wait_for(context, lambda: _sound(ct), params.wait_s, "a CT series without faults")
+        volume = ct.read(series)
+        kept = tuple(
+            keep(context, path, device="ct", kind="ct_slice", media_type="application/dicom") for path in series.files
+        )
+        arguments |= {
+            "slices": [ref.sha256 for ref in kept],
+            "hounsfield": keep_array(
+                context, volume.hounsfield, device="ct", kind="ct_volume", name="hounsfield.npy"
+            ).sha256,
+            "T_ct_voxel": volume.T_ct_voxel.tolist(),
+            "threshold_hu": params.threshold_hu,
+        }
+        measures = {
+            "slices": float(series.slices),
+            "slice_spacing_mm": volume.spacing_m[2] * 1000,
+            "voxel_mm": max(volume.spacing_m) * 1000,
+        }
+        job = "ct_surface"
+    (answer,) = context.evidence.run_jobs(JobRequest(job, arguments))
+    result = Result.model_validate(answer.result)
+    return StepOutcome({**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"))
+
+
+def _sound(ct: CtSource) -> tuple[Any, ...]:
+    return tuple(series for series in ct.series() if not series.problems and series.slices > 1)
+
+
+KIND = StepKind("ct_import", Params, Result, execute)

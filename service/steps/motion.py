@@ -1,0 +1,76 @@
+"""Moving an arm and waiting until it stands still, stopping at once when the operator says so."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from drivers.errors import DeviceTimeoutError, SafetyStopError
+from drivers.interfaces import RobotArm, SettleCriteria, SettleReport
+from service.core.geometry import Array
+from service.steps.context import StepContext, StepInterruptedError
+
+_POLL_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class MotionLimits:
+    """How an arm may move in a run."""
+
+    speed_rad_s: float
+    acceleration_rad_s2: float
+    settle_timeout_s: float
+    travel_timeout_s: float = 120.0
+
+
+def settle_criteria(context: StepContext) -> SettleCriteria:
+    """The protocol's definition of standing still."""
+    settle = context.protocol.settle
+    return SettleCriteria(
+        window_s=settle.window_s,
+        joint_speed_rad_s=settle.joint_speed_rad_s,
+        tcp_speed_m_s=settle.tcp_speed_m_s,
+        position_peak_to_peak_m=settle.position_peak_to_peak_m,
+        rotation_peak_to_peak_rad=settle.rotation_peak_to_peak_rad,
+    )
+
+
+def move_and_settle(
+    context: StepContext, robot: RobotArm, target_rad: Array, limits: MotionLimits, criteria: SettleCriteria
+) -> SettleReport:
+    """Move to joints (6,) and return once the pose stream is quiet.
+
+    Raises SafetyStopError, DeviceTimeoutError (after stopping the arm), StepInterruptedError (arm stands still).
+    """
+    robot.move_joints(target_rad, speed_rad_s=limits.speed_rad_s, acceleration_rad_s2=limits.acceleration_rad_s2)
+    deadline_s = context.monotonic_s() + limits.travel_timeout_s + limits.settle_timeout_s
+    while True:
+        try:
+            context.checkpoint()
+        except StepInterruptedError:
+            _stand_still(context, robot, criteria)
+            raise
+        safety = robot.state().sample.safety
+        if not safety.may_move:
+            raise SafetyStopError(
+                f"the robot reports {safety.value.replace('_', ' ')}",
+                remedy="Find and clear the cause at the robot; the step goes on after you confirm",
+            )
+        if not robot.is_moving():
+            report = robot.settle(criteria)
+            if report.settled:
+                return report
+        if context.monotonic_s() > deadline_s:
+            _stand_still(context, robot, criteria)
+            raise DeviceTimeoutError(
+                "the robot did not arrive and settle in time",
+                remedy="Look for vibration of the mount or a joint that drifts",
+            )
+        context.wait(_POLL_S)
+
+
+def _stand_still(context: StepContext, robot: RobotArm, criteria: SettleCriteria) -> None:
+    """Stop and wait for the stand-still: 'paused' may be shown only then."""
+    robot.stop()
+    deadline_s = context.monotonic_s() + 10.0
+    while not robot.settle(criteria).settled and context.monotonic_s() < deadline_s:
+        context.wait(_POLL_S)

@@ -1,0 +1,62 @@
+"""Step kind `scan_import`: the hand scanner's export is kept, checked and searched for its spheres."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from service.core.model import Record
+from service.steps.arrivals import keep_mesh, wait_for
+from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.inputs import result_of
+
+
+class Params(Record):
+    """What the scan must hold."""
+
+    spheres: int
+    wait_s: float = 1800.0
+    application: str | None = None  # the step whose coat is still on the specimen
+    compare_with: str | None = None  # an earlier ct_import or scan_import: did the spheres move since?
+
+
+class Result(Record):
+    """The spheres in the scan frame, metres."""
+
+    spheres_m: tuple[tuple[float, float, float], ...]
+    details: dict[str, Any]
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Wait for a complete export that is newer than this step, keep it, let the worker find the spheres."""
+    scanner = context.devices.scanner()
+    since = context.state.started_utc
+
+    def fresh() -> list[Any]:
+        return [e for e in scanner.exports() if _time(e.modified_utc) >= _time(since)]
+
+    scan = scanner.read(wait_for(context, fresh, params.wait_s, "a complete scan export"))
+    measures = {f"scan_{name}": float(value) for name, value in scan.findings.items()}
+    measures["faces"] = float(len(scan.mesh.faces))
+    if params.application is not None:
+        applied = float(result_of(context, params.application)["applied_monotonic_s"])
+        measures["since_application_min"] = (context.monotonic_s() - applied) / 60
+    mesh, kept = keep_mesh(context, scan, device="scanner", kind="scan_mesh")
+    arguments: dict[str, Any] = {
+        "mesh": mesh.sha256,
+        "radius_m": context.protocol.spheres.radius_mm / 1000,
+        "expected": params.spheres,
+    }
+    if params.compare_with is not None:
+        arguments["reference_m"] = result_of(context, params.compare_with)["spheres_m"]
+    (answer,) = context.evidence.run_jobs(JobRequest("locate_spheres", arguments))
+    result = Result.model_validate(answer.result)
+    return StepOutcome({**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"))
+
+
+def _time(text: str) -> datetime:
+    moment = datetime.fromisoformat(text)
+    return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+
+
+KIND = StepKind("scan_import", Params, Result, execute)

@@ -1,0 +1,50 @@
+"""Step kind `timed_application`: a coat that is applied once and fades, such as scanning spray."""
+
+from __future__ import annotations
+
+from service.core.model import Record
+from service.steps.context import StepContext, StepKind, StepOutcome
+
+
+class Params(Record):
+    """What is applied and how long it lasts."""
+
+    product: str
+    sublimates_after_s: float
+    scan_within_s: float
+    settle_s: float = 0.0  # wait this long before the next step
+
+
+class Result(Record):
+    """When the coat was applied, on the host's clock."""
+
+    product: str
+    applied_monotonic_s: float
+    scan_within_s: float
+    sublimates_after_s: float
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Start the timer at the operator's confirmation and let the coat settle."""
+    applied = context.monotonic_s()
+    context.note(
+        f"{params.product} applied: scan within {params.scan_within_s / 60:.0f} min, "
+        f"gone after {params.sublimates_after_s / 3600:.1f} h",
+        applied_monotonic_s=applied,
+    )
+    remaining = params.settle_s
+    while remaining > 0:
+        context.checkpoint()
+        context.progress("letting the coat settle", int(params.settle_s - remaining), int(params.settle_s))
+        context.wait(min(0.2, remaining))
+        remaining -= 0.2
+    result = Result(
+        product=params.product,
+        applied_monotonic_s=applied,
+        scan_within_s=params.scan_within_s,
+        sublimates_after_s=params.sublimates_after_s,
+    )
+    return StepOutcome(measures={"applications": 1.0}, result=result.model_dump())
+
+
+KIND = StepKind("timed_application", Params, Result, execute)

@@ -1,0 +1,112 @@
+"""Where the camera should stand: viewpoints on arcs around the scene centre, from the protocol's parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from pydantic import model_validator
+
+from service.core.errors import OrthocaptureError
+from service.core.geometry import Array, Transform, inverse, look_at, transform
+from service.core.model import Record
+from service.steps.context import StationLayout
+
+
+class NoViewpointError(OrthocaptureError):
+    """A viewpoint set has no viewpoint."""
+
+
+class Arc(Record):
+    """Viewpoints at one tilt from the vertical, evenly spread over an azimuth range.
+
+    Azimuth 0 looks from the robot's side; tilt 0 looks straight down.
+    """
+
+    tilt_deg: float
+    azimuth_from_deg: float
+    azimuth_to_deg: float
+    count: int
+    distance_m: float
+
+    @model_validator(mode="after")
+    def _plausible(self) -> Self:
+        if not (0 <= self.tilt_deg <= 80 and self.count >= 1 and 0.2 <= self.distance_m <= 2):
+            raise ValueError("an arc needs tilt_deg 0…80, count ≥ 1 and distance_m 0.2…2")
+        return self
+
+
+class ViewpointSet(Record):
+    """Arcs seen from one station, and how the camera is turned and aimed."""
+
+    station: str
+    prefix: str
+    arcs: tuple[Arc, ...]
+    rolls_deg: tuple[float, ...] = (0.0,)  # cycled over the viewpoints
+    aim_spread_m: float = 0.0  # spread of the aim point around the scene centre (for board images)
+    aim_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the aim point, in the base frame
+
+    @property
+    def count(self) -> int:
+        """How many viewpoints the set has."""
+        return sum(arc.count for arc in self.arcs)
+
+
+@dataclass(frozen=True, slots=True)
+class Viewpoint:
+    """One pose for the camera."""
+
+    name: str
+    station: str
+    T_base_camera: Transform
+
+
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
+    """All viewpoints of a set in the base frame of its station, in the order of capture.
+
+    Raises NoViewpointError when the set is empty.
+    """
+    centre = np.array(layout.scene_centre_m) + np.array(viewpoint_set.aim_offset_m)
+    approach = np.array(layout.approach)
+    side = np.cross(_UP, approach)
+    viewpoints: list[Viewpoint] = []
+    for arc in viewpoint_set.arcs:
+        azimuths = np.deg2rad(np.linspace(arc.azimuth_from_deg, arc.azimuth_to_deg, arc.count))
+        if arc.count == 1:
+            azimuths = np.deg2rad([(arc.azimuth_from_deg + arc.azimuth_to_deg) / 2])
+        for azimuth in azimuths:
+            i = len(viewpoints)
+            horizontal = np.cos(azimuth) * approach + np.sin(azimuth) * side
+            tilt = np.deg2rad(arc.tilt_deg)
+            eye = centre + arc.distance_m * (np.cos(tilt) * _UP + np.sin(tilt) * horizontal)
+            aim = centre + viewpoint_set.aim_spread_m * _spread(i, approach, side)
+            roll = np.deg2rad(viewpoint_set.rolls_deg[i % len(viewpoint_set.rolls_deg)])
+            # The image's top points away from the base: the wrist then keeps its natural posture.
+            T_base_camera = look_at(eye, aim, -approach) @ _rotation_about_axis(roll)
+            viewpoints.append(Viewpoint(f"{viewpoint_set.prefix}{i + 1:03d}", layout.name, T_base_camera))
+    if not viewpoints:
+        raise NoViewpointError(
+            f"viewpoint set {viewpoint_set.prefix!r} is empty", remedy="Give it at least one arc in the protocol"
+        )
+    return tuple(viewpoints)
+
+
+def flange_target(T_base_camera: Transform, T_flange_camera: Transform) -> Transform:
+    """T_base_flange that puts the camera at T_base_camera."""
+    return T_base_camera @ inverse(T_flange_camera)
+
+
+def _spread(i: int, approach: Array, side: Array) -> Array:
+    """Low-discrepancy offset in the horizontal plane, within ±1 (R2 sequence, Roberts 2018)."""
+    u = (0.5 + 0.7548776662466927 * (i + 1)) % 1.0
+    v = (0.5 + 0.5698402909980532 * (i + 1)) % 1.0
+    return (2 * u - 1) * side + (2 * v - 1) * approach
+
+
+def _rotation_about_axis(angle_rad: float) -> Transform:
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return transform(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
