@@ -78,17 +78,13 @@ def connect_dashboard(host: str) -> library.Dashboard:
     return client
 
 
-def read_facts(dashboard: library.Dashboard, host: str) -> ControllerFacts:
+def read_facts(dashboard: library.Dashboard, host: str, timeout_s: float) -> ControllerFacts:
     """Version, serial number and model. Raises DeviceFaultError for software that is too old."""
-    with vendor(host, "reading version and serial number"):
+    with vendor(host, "reading the version"):
         software = dashboard.polyscopeVersion()
-        serial = dashboard.getSerialNumber().strip()
-        model = dashboard.getRobotModel().strip()
     match = re.search(r"(\d+)\.(\d+)", software)
-    if match is None or not serial:
-        raise DeviceFaultError(
-            f"the controller names no version or serial number: {software!r} {serial!r}", where=host
-        )
+    if match is None:
+        raise DeviceFaultError(f"the controller names no version: {software!r}", where=host)
     version = (int(match.group(1)), int(match.group(2)))
     minimum = MINIMUM_VERSION.get(version[0], (0, 0))
     if version < minimum:
@@ -97,8 +93,29 @@ def read_facts(dashboard: library.Dashboard, host: str) -> ControllerFacts:
             where=host,
             remedy=f"Update the controller to {minimum[0]}.{minimum[1]} or later",
         )
+    # The vendor's client refuses these two questions for a CB3, which answers them all the same.
+    serial, model = _questions(host, "get serial number", "get robot model", timeout_s=timeout_s)
+    if not serial.isdigit():
+        raise DeviceFaultError(f"the controller names no serial number: {serial!r}", where=host)
     remote = True
     if version[0] >= 5:  # CB3 has no local mode
         with vendor(host, "asking for remote control"):
             remote = dashboard.isInRemoteControl()
     return ControllerFacts(f"{model}{'e' if version[0] >= 5 else ''}", serial, software, version, remote)
+
+
+def _questions(host: str, *questions: str, timeout_s: float) -> list[str]:
+    answers: list[str] = []
+    try:
+        with (
+            socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection,
+            connection.makefile("rw", encoding="utf-8", newline="\n") as lines,
+        ):
+            lines.readline()  # welcome
+            for question in questions:
+                lines.write(f"{question}\n")
+                lines.flush()
+                answers.append(lines.readline().strip())
+    except OSError as error:
+        raise DeviceUnavailableError(f"the dashboard server failed: {error}", where=host) from error
+    return answers

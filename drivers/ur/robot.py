@@ -94,7 +94,7 @@ class UrRobot:
         self.close()
         probe(self._config.host, self._config.connect_timeout_s)
         self._dashboard = dashboard = connect_dashboard(self._config.host)
-        self._facts = facts = read_facts(dashboard, self._where)
+        self._facts = facts = read_facts(dashboard, self._where, self._config.connect_timeout_s)
         # A script of an earlier client in another register range would block the control constructor for minutes.
         with vendor(self._where, "stopping the running program"):
             dashboard.stop()

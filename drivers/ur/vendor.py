@@ -22,8 +22,6 @@ class Dashboard(Connection, Protocol):
 
     def connect(self, timeout_ms: int) -> None: ...  # noqa: D102
     def polyscopeVersion(self) -> str: ...  # noqa: D102
-    def getSerialNumber(self) -> str: ...  # noqa: D102
-    def getRobotModel(self) -> str: ...  # noqa: D102
     def isInRemoteControl(self) -> bool: ...  # noqa: D102
     def stop(self) -> None: ...  # noqa: D102
 

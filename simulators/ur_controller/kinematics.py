@@ -173,9 +173,9 @@ def rotation_vector(R: Array) -> Array:
     sine = 0.5 * math.sqrt(float(w @ w))
     cosine = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
     angle = math.atan2(sine, cosine)
-    if angle < 1e-9:
+    if sine < 1e-12 and cosine > 0:
         return 0.5 * w
-    if sine > 1e-4:
+    if cosine > 0 or sine > 1e-4:
         return w * (0.5 * angle / sine)
     # Near a half turn: the axis from the largest column of R + 1.
     B = 0.5 * (R + R.T) + np.eye(3) * -cosine
