@@ -128,7 +128,7 @@ class CameraBody:
         picture = self._source.develop(moment, settings)
         captured = f"{shot.taken:%Y%m%dT%H%M%S}"
         height, width = picture.shape[:2]
-        stem = f"DSC{(moment.counter - 1) % 99999 + 1:05d}"
+        stem = f"DSC{(moment.counter - 1) % 9999 + 1:05d}"
         files: list[CameraFile] = []
         if settings.file_format != FILE_RAW:
             jpeg = encode_jpeg(picture, shot)

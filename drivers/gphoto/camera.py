@@ -1,0 +1,320 @@
+"""The camera driver: settings with read-back, exposures whose files must be new and whole, live view, health."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections.abc import Callable
+from datetime import datetime, timezone
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal
+
+import gphoto2 as gp
+
+from drivers.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceRefusedError,
+    DeviceStorageFullError,
+    DeviceTimeoutError,
+    DeviceUnavailableError,
+    StaleImageError,
+    UnreadableFileError,
+)
+from drivers.gphoto import settings as words
+from drivers.gphoto.link import AddedFile, Link, library_version
+from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
+from drivers.photo_file import check_jpeg_complete, read_exif, sha256_of
+from drivers.plugin import DriverConfig
+
+_LOG = logging.getLogger(__name__)
+SET_ATTEMPTS, BUSY_ATTEMPTS = 3, 5
+READ_BACK_TIMEOUT_S = 2.0
+LEAST_FREE_BYTES = 200_000_000  # one RAW+JPEG of 61 megapixels
+MEDIA_TYPES = {".JPG": "image/jpeg", ".JPEG": "image/jpeg", ".ARW": "image/x-sony-arw"}
+_NAME = re.compile(r"(?:capt_)?(?P<stem>[A-Za-z_]*?(?P<counter>\d+))(?P<suffix>\.\w+)$")
+
+
+class GphotoConfig(DriverConfig):
+    """A camera in rig.yaml: `port` is ptpip:HOST:PORT:PORT, usb:BUS,DEVICE, or empty for the only one on USB."""
+
+    port: str = ""
+    model: str = ""  # part of the name, to choose among several on USB
+    capture_target: Literal["computer", "card", "both"] = "computer"
+    capture_timeout_s: float = 40.0
+
+
+class GphotoCamera:
+    """Implements drivers.interfaces.Camera. Blocking; to be run in a process of its own by drivers.host."""
+
+    def __init__(self, config: GphotoConfig) -> None:
+        self._config = config
+        self._link = Link(config.port, config.model)
+        self._identity: DeviceIdentity | None = None
+        self._last: CapturedImage | None = None
+        self._hashes: set[str] = set()
+        self._clock_offset_s: float | None = None
+
+    # --- every device -----------------------------------------------------------------------------------
+
+    def open(self) -> DeviceIdentity:
+        """Connect (again), set where files go, read back who answers."""
+        self._link.open()
+        self._set(words.TARGET, words.TARGET_CODES[self._config.capture_target])
+        self._identity = DeviceIdentity(
+            kind="camera",
+            model=self._link.value("cameramodel"),
+            serial=self._link.value("serialnumber").lstrip("0"),
+            firmware=self._link.value("deviceversion"),
+            driver="gphoto",
+            driver_version=f"python-gphoto2 {version('gphoto2')}, libgphoto2 {library_version()}",
+            address=self._config.port or "usb",
+        )
+        return self._identity
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        self._link.close()
+
+    def report(self) -> DeviceReport:
+        """Battery, free space, mode dial; the clock offset is that of the last exposure's EXIF time."""
+        if self._identity is None:
+            raise DeviceUnavailableError("The camera is not open", where=self._link.where, remedy="Open it first")
+        self._link.refresh()
+        free = self._link.free_bytes()
+        battery = words.number_of(self._link.value("batterylevel").rstrip("%"))
+        program = self._link.value("expprogram")
+        problems: list[str] = []
+        if battery is not None and battery < 20:
+            problems.append(f"Battery at {battery:g} %: change it, or feed the camera from the mains")
+        if program != "M":
+            problems.append(f"Exposure program is {program}: turn the mode dial to M")
+        if free is not None and free < LEAST_FREE_BYTES:
+            problems.append(f"{free / 1e6:.0f} MB free in the camera: empty or change the card")
+        names = (words.F_NUMBER, words.SHUTTER, words.ISO, words.FOCUS, words.QUALITY)
+        return DeviceReport(
+            identity=self._identity,
+            clock_offset_s=self._clock_offset_s,
+            free_bytes=free,
+            battery_fraction=None if battery is None else battery / 100.0,
+            details={name: self._link.value(name) for name in names},
+            problems=tuple(problems),
+        )
+
+    # --- settings -----------------------------------------------------------------------------------------
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Set one by one from the live choice lists and read back; DeviceRefusedError when it does not hold."""
+        self._link.refresh()
+        self._apply_word(words.QUALITY, settings.image_quality)
+        self._apply_word(words.FOCUS, settings.focus_mode)
+        self._apply_number(words.F_NUMBER, settings.aperture_f)
+        self._apply_number(words.SHUTTER, settings.exposure_s)
+        self._apply_number(words.ISO, float(settings.iso))
+        return self.settings()
+
+    def settings(self) -> CameraSettings:
+        """What the camera is set to now: events are drained first, which empties libgphoto2's 2 s cache."""
+        self._link.refresh()
+        return CameraSettings(
+            aperture_f=self._number(words.F_NUMBER),
+            exposure_s=self._number(words.SHUTTER),
+            iso=round(self._number(words.ISO)),
+            focus_mode=self._link.value(words.FOCUS),
+            image_quality=words.quality_of(self._link.value(words.QUALITY)),
+        )
+
+    def _number(self, name: str) -> float:
+        word = self._link.value(name)
+        number = words.number_of(word)
+        if number is None:
+            raise DeviceRefusedError(
+                f"The camera reports {name} {word!r}, which is no number",
+                where=self._link.where,
+                remedy="Turn the mode dial to M; check that the lens is locked in place",
+            )
+        return number
+
+    def _apply_number(self, name: str, wanted: float) -> None:
+        self._set(name, words.choose_number(name, wanted, self._link.choices(name), self._link.where))
+
+    def _apply_word(self, name: str, wanted: str) -> None:
+        self._set(name, words.choose_word(name, wanted, self._link.choices(name), self._link.where))
+
+    def _set(self, name: str, word: str) -> None:
+        refusal: DeviceError | None = None
+        for _ in range(SET_ATTEMPTS):
+            if self._link.value(name) == word:
+                return
+            try:
+                self._link.put(name, word)
+            except (DeviceRefusedError, DeviceBusyError) as error:
+                refusal = error
+            if self._reads_back(name, word):
+                return
+        now = self._link.value(name)
+        raise DeviceRefusedError(
+            f"The camera keeps {name} at {now} instead of {word}",
+            where=self._link.where,
+            remedy="Turn the mode dial to M and check what the camera's menu allows in this mode",
+        ) from refusal
+
+    def _reads_back(self, name: str, word: str) -> bool:
+        deadline = time.monotonic() + READ_BACK_TIMEOUT_S
+        while True:
+            self._link.refresh()
+            if self._link.value(name) == word:
+                return True
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.1)
+
+    # --- exposures -----------------------------------------------------------------------------------------
+
+    def capture(self, folder: Path) -> CapturedImage:
+        """One exposure, its undecoded files in `folder`.
+
+        `exif` has aperture, time and ISO of the file; focus mode and quality, for which EXIF has no standard tag, are
+        the camera's settings. Raises StaleImageError, UnreadableFileError, DeviceStorageFullError and link errors.
+        """
+        for left in self._link.refresh():
+            _LOG.warning("%s was still in the camera and is not part of this exposure", left.name)
+        quality = words.quality_of(self._link.value(words.QUALITY))
+        focus = self._link.value(words.FOCUS)
+        self._check_space()
+        trigger_s = self._trigger()
+        added = self._collect(2 if quality == "RAW+JPEG" else 1, trigger_s)
+        arrival_s = time.monotonic()
+        stems = {_parse(one.name)[0] for one in added}
+        if len(stems) != 1:
+            raise self._stale(f"Files of different exposures arrived together: {', '.join(sorted(stems))}")
+        files = sorted((self._save(one, folder) for one in added), key=lambda file: file.media_type != "image/jpeg")
+        exif = read_exif(files[0].path)
+        image = CapturedImage(
+            files=tuple(files),
+            counter=_parse(added[0].name)[1],
+            exif_time=exif.taken,
+            exif=exif.settings(focus_mode=focus, image_quality=quality),
+            lens=exif.lens,
+            focal_length_mm=exif.focal_length_mm or 0.0,
+            trigger_monotonic_s=trigger_s,
+            arrival_monotonic_s=arrival_s,
+        )
+        self._check_new(image)
+        self._clock_offset_s = _clock_offset_s(exif.taken, trigger_s)
+        self._last = image
+        self._hashes.update(file.sha256 for file in files)
+        return image
+
+    def _check_space(self) -> None:
+        free = self._link.free_bytes()
+        if free is not None and (free == 0 or (self._config.capture_target != "computer" and free < LEAST_FREE_BYTES)):
+            raise DeviceStorageFullError(
+                f"{free / 1e6:.0f} MB free in the camera", where=self._link.where, remedy="Empty or change the card"
+            )
+
+    def _trigger(self) -> float:
+        for attempt in range(1, BUSY_ATTEMPTS + 1):
+            trigger_s = time.monotonic()
+            try:
+                self._link.call("Releasing the shutter", lambda camera: camera.trigger_capture())
+            except DeviceBusyError:
+                if attempt == BUSY_ATTEMPTS:
+                    raise
+                time.sleep(0.2 * attempt)
+            except DeviceUnavailableError as error:
+                # Full store, wrong mode and lost link all come as -1: the camera is asked which.
+                self._check_space()
+                raise DeviceRefusedError(
+                    f"The camera answers but did not release the shutter: {error.what}",
+                    where=self._link.where,
+                    remedy="Check the display of the camera; dial on M, save destination not camera only",
+                ) from error
+            else:
+                return trigger_s
+        raise AssertionError
+
+    def _collect(self, expected: int, trigger_s: float) -> list[AddedFile]:
+        added: list[AddedFile] = []
+        while len(added) < expected:
+            if time.monotonic() - trigger_s > self._config.capture_timeout_s:
+                names = ", ".join(one.name for one in added) or "none"
+                raise DeviceTimeoutError(
+                    f"{expected} file(s) were due {self._config.capture_timeout_s:g} s after the shutter, came: {names}",
+                    where=self._link.where,
+                    remedy="Check the save destination and the display of the camera, then take the exposure again",
+                )
+            event, data = self._link.next_event(200)
+            if event == gp.GP_EVENT_FILE_ADDED:
+                added.append(AddedFile(str(data.folder), str(data.name)))
+        return added
+
+    def _save(self, added: AddedFile, folder: Path) -> CapturedFile:
+        stem, _, suffix = _parse(added.name)
+        target = folder / f"{stem}{suffix}"
+        if target.exists():
+            raise self._stale(f"{target.name} came from the camera before")
+        fetch: Callable[[gp.Camera], gp.CameraFile] = lambda camera: camera.file_get(  # noqa: E731
+            added.folder, added.name, gp.GP_FILE_TYPE_NORMAL
+        )
+        partial = target.with_name(target.name + ".part")
+        file = self._link.call(f"Fetching {target.name}", fetch)
+        partial.write_bytes(memoryview(file.get_data_and_size()))
+        info = self._link.call("Asking the file's size", lambda c: c.file_get_info(added.folder, added.name)).file
+        size = partial.stat().st_size
+        if info.fields & gp.GP_FILE_INFO_SIZE and info.size != size:
+            raise UnreadableFileError(
+                f"{target.name} has {size} bytes where the camera announced {info.size}",
+                where=str(partial),
+                remedy="Take this exposure again; the files recorded before it are not affected",
+            )
+        if MEDIA_TYPES.get(suffix.upper()) == "image/jpeg":
+            check_jpeg_complete(partial)
+        partial.rename(target)
+        media_type = MEDIA_TYPES.get(suffix.upper(), "application/octet-stream")
+        return CapturedFile(target, target.name, sha256_of(target), size, media_type)
+
+    def _check_new(self, image: CapturedImage) -> None:
+        last = self._last
+        name = image.files[0].camera_name
+        if any(file.sha256 in self._hashes for file in image.files):
+            raise self._stale(f"{name} is byte for byte a file that came before")
+        if last is None:
+            return
+        if image.counter == last.counter:
+            raise self._stale(f"The file counter stayed at {name}")
+        # The counter of file names starts again after 9999.
+        if image.counter < last.counter and (image.counter - last.counter) % 10000 > 100:
+            raise self._stale(f"The file counter went back from {last.files[0].camera_name} to {name}")
+        if image.exif_time <= last.exif_time:
+            raise self._stale(f"The EXIF time of {name} ({image.exif_time}) is not after {last.exif_time}")
+
+    def _stale(self, what: str) -> StaleImageError:
+        return StaleImageError(what, where=self._link.where, remedy="Open the camera again and repeat the exposure")
+
+    # --- live view -----------------------------------------------------------------------------------------
+
+    def preview(self) -> bytes:
+        """One live-view frame, JPEG."""
+        frame = self._link.call("Fetching a live-view frame", lambda camera: camera.capture_preview())
+        return bytes(memoryview(frame.get_data_and_size()))
+
+
+def _parse(name: str) -> tuple[str, int, str]:
+    """Stem, counter and suffix of a camera's file name; libgphoto2 puts capt_ before those from the memory."""
+    match = _NAME.match(name)
+    if match is None:
+        raise StaleImageError(f"The file name {name} has no counter", where="camera", remedy="Repeat the exposure")
+    return match["stem"], int(match["counter"]), match["suffix"]
+
+
+def _clock_offset_s(taken: str, trigger_monotonic_s: float) -> float | None:
+    """Camera clock minus host UTC at the release; None when EXIF lacks the offset from UTC."""
+    try:
+        stamp = datetime.strptime(taken, "%Y:%m:%d %H:%M:%S.%f%z")
+    except ValueError:
+        return None
+    released = time.time() - (time.monotonic() - trigger_monotonic_s)
+    return (stamp - datetime.fromtimestamp(released, timezone.utc)).total_seconds()

@@ -1,0 +1,221 @@
+"""The connection to libgphoto2: versions, ports, error codes, single widgets, events, recovery of descriptor 0."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import gphoto2 as gp
+
+from drivers.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceFaultError,
+    DeviceRefusedError,
+    DeviceStorageFullError,
+    DeviceTimeoutError,
+    DeviceUnavailableError,
+)
+
+_LOG = logging.getLogger(__name__)
+T = TypeVar("T")
+BROKEN_VERSIONS = ("2.5.31",)
+LEAST_VERSION = (2, 5, 30)
+OPEN_ATTEMPTS = 3
+PTPIP_MODEL = "PTP/IP Camera"
+
+_ERRORS: dict[int, tuple[type[DeviceError], str]] = {
+    gp.GP_ERROR_CAMERA_BUSY: (DeviceBusyError, "Wait a moment and repeat"),
+    gp.GP_ERROR_BAD_PARAMETERS: (DeviceRefusedError, "Choose a value that the camera offers in its present mode"),
+    gp.GP_ERROR_NOT_SUPPORTED: (DeviceRefusedError, "Set the camera to PC Remote and the dial to M"),
+    gp.GP_ERROR_TIMEOUT: (DeviceTimeoutError, "Check cable and power, then open the camera again"),
+    gp.GP_ERROR_NO_SPACE: (DeviceStorageFullError, "Change or empty the memory card"),
+    gp.GP_ERROR_IO_USB_CLAIM: (
+        DeviceUnavailableError,
+        "Another program holds the camera: end gvfs-gphoto2-volume-monitor or the photo import program",
+    ),
+    gp.GP_ERROR_MODEL_NOT_FOUND: (DeviceUnavailableError, "Switch the camera on and check the cable"),
+}
+_UNAVAILABLE = "Check cable and power, then open the camera again; re-plug it if that does not help"
+
+
+def check_library_version(version: str) -> None:
+    """Raise DeviceFaultError for a libgphoto2 that is known to break the Alpha 7R V, or that is too old for it."""
+    try:
+        numbers = tuple(int(part) for part in version.split(".")[:3])
+    except ValueError as error:
+        raise DeviceFaultError(
+            f"libgphoto2 reports the version {version!r}", where="libgphoto2", remedy="Install libgphoto2 2.5.34"
+        ) from error
+    if version in BROKEN_VERSIONS or numbers < LEAST_VERSION:
+        raise DeviceFaultError(
+            f"libgphoto2 {version} does not work with this camera",
+            where="libgphoto2",
+            remedy="Install libgphoto2 2.5.34 or later (the gphoto2 package from PyPI brings it along)",
+        )
+
+
+def library_version() -> str:
+    """Version of libgphoto2 that is loaded."""
+    return str(gp.gp_library_version(gp.GP_VERSION_SHORT)[0])
+
+
+def translate(error: gp.GPhoto2Error, doing: str, where: str) -> DeviceError:
+    """The DeviceError for a libgphoto2 error code; −1 says nothing, so it counts as a lost link."""
+    kind, remedy = _ERRORS.get(int(error.code), (DeviceUnavailableError, _UNAVAILABLE))
+    return kind(f"{doing} failed: {error.string} ({error.code})", where=where, remedy=remedy)
+
+
+def keep_descriptor_zero() -> None:
+    """Put /dev/null back on descriptor 0: every exit of a PTP/IP camera closes it, whatever it is by then."""
+    try:
+        os.fstat(0)
+    except OSError:
+        null = os.open(os.devnull, os.O_RDONLY)
+        if null != 0:
+            os.dup2(null, 0)
+            os.close(null)
+
+
+@dataclass(frozen=True, slots=True)
+class AddedFile:
+    """A file that the camera announced."""
+
+    folder: str
+    name: str
+
+
+class Link:
+    """One libgphoto2 camera; every method raises DeviceError."""
+
+    def __init__(self, port: str, model: str) -> None:
+        self.where = f"camera at {port or 'USB'}"
+        self._port = port
+        self._model = model
+        self._camera: gp.Camera | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a camera was opened and not closed since."""
+        return self._camera is not None
+
+    def open(self) -> None:
+        """Connect, with back-off: bodies need a moment after a lost session."""
+        check_library_version(library_version())
+        self.close()
+        for attempt in range(1, OPEN_ATTEMPTS + 1):
+            keep_descriptor_zero()
+            try:
+                camera = self._select()
+                camera.init()
+            except gp.GPhoto2Error as error:
+                keep_descriptor_zero()
+                if attempt == OPEN_ATTEMPTS:
+                    raise translate(error, "Connecting", self.where) from error
+                _LOG.warning("connecting to %s: %s; attempt %d", self.where, error, attempt)
+                time.sleep(0.5 * attempt)
+            else:
+                self._camera = camera
+                return
+
+    def _select(self) -> gp.Camera:
+        camera = gp.Camera()
+        if not self._port.startswith("ptpip:"):
+            found = [(name, port) for name, port in gp.Camera.autodetect() if self._fits(name, port)]
+            if len(found) != 1:
+                names = ", ".join(f"{name} at {port}" for name, port in found) or "none"
+                raise DeviceUnavailableError(
+                    f"One camera on USB is needed, found: {names}",
+                    where=self.where,
+                    remedy="Switch the camera on (USB mode PC Remote), or give port or model in the rig file",
+                )
+            model, port = found[0]
+        else:
+            # Without the second port libgphoto2 sends the event connection to 15740, whatever the first one says.
+            parts = self._port.split(":")
+            port = f"{self._port}:{parts[2]}" if len(parts) == 3 else self._port
+            model = PTPIP_MODEL
+        ports = gp.PortInfoList()
+        ports.load()
+        camera.set_port_info(ports[ports.lookup_path(port)])
+        abilities = gp.CameraAbilitiesList()
+        abilities.load()
+        camera.set_abilities(abilities[abilities.lookup_model(model)])
+        return camera
+
+    def _fits(self, name: str, port: str) -> bool:
+        return (self._port in ("", "usb", "usb:") or port == self._port) and self._model in name
+
+    def close(self) -> None:
+        """Let go; a dead link is only logged."""
+        camera, self._camera = self._camera, None
+        if camera is None:
+            return
+        try:
+            camera.exit()
+        except gp.GPhoto2Error as error:
+            _LOG.warning("closing %s: %s", self.where, error)
+        del camera
+        keep_descriptor_zero()
+
+    def call(self, doing: str, function: Callable[[gp.Camera], T]) -> T:
+        """Run a function on the camera, errors translated."""
+        if self._camera is None:
+            raise DeviceUnavailableError("The camera is not open", where=self.where, remedy="Open it first")
+        try:
+            return function(self._camera)
+        except gp.GPhoto2Error as error:
+            raise translate(error, doing, self.where) from error
+
+    def refresh(self, wait_ms: int = 1) -> list[AddedFile]:
+        """Drain waiting events, which also makes libgphoto2 read all properties anew; returns announced files."""
+        added: list[AddedFile] = []
+        while True:
+            event, data = self.next_event(wait_ms)
+            if event == gp.GP_EVENT_TIMEOUT:
+                return added
+            if event == gp.GP_EVENT_FILE_ADDED:
+                added.append(AddedFile(str(data.folder), str(data.name)))
+
+    def next_event(self, wait_ms: int) -> tuple[int, Any]:
+        """The next event of the camera or GP_EVENT_TIMEOUT."""
+        return self.call("Waiting for the camera", lambda camera: camera.wait_for_event(wait_ms))
+
+    def value(self, name: str) -> str:
+        """Value of one widget; DeviceRefusedError when the camera has no such setting."""
+
+        def read(camera: gp.Camera) -> str:
+            return str(camera.get_single_config(name).get_value())
+
+        return self.call(f"Reading the setting {name}", read)
+
+    def choices(self, name: str) -> tuple[str, ...]:
+        """What the camera offers for a widget now; empty for free text and ranges."""
+
+        def read(camera: gp.Camera) -> tuple[str, ...]:
+            widget = camera.get_single_config(name)
+            if widget.get_type() not in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU):
+                return ()
+            return tuple(str(choice) for choice in widget.get_choices())
+
+        return self.call(f"Reading the choices of {name}", read)
+
+    def put(self, name: str, value: str) -> None:
+        """Send one widget alone: a refusal is silent when the whole tree is sent."""
+
+        def write(camera: gp.Camera) -> None:
+            widget = camera.get_single_config(name)
+            widget.set_value(value)
+            camera.set_single_config(name, widget)
+
+        self.call(f"Setting {name} to {value}", write)
+
+    def free_bytes(self) -> int | None:
+        """Free space of the camera's stores; None for a body that lists none (usual in PC Remote mode)."""
+        stores = self.call("Reading the free space", lambda camera: list(camera.get_storageinfo()))
+        known = [int(store.freekbytes) * 1024 for store in stores if store.fields & gp.GP_STORAGEINFO_FREESPACEKBYTES]
+        return sum(known) if known else None
