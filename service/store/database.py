@@ -64,8 +64,11 @@ def open_database(data_dir: Path, files: Files) -> Database:
     engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
     database = Database(engine, path, files)
     try:
-        with database.writing() as connection:
-            _upgrade(connection, path)
+        with database.reading() as connection:
+            is_current = _revision(connection) == _head()
+        if not is_current:
+            with database.writing() as connection:
+                _upgrade(connection, path)
     except BaseException:
         database.close()
         raise
