@@ -1,0 +1,174 @@
+"""A CT suite, seen through the DICOM folder it delivers, and meshes segmented elsewhere that lie in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from pydicom.dataset import FileDataset
+
+from drivers.dicom_slices import SliceHeader, arrange, dicom_files, problems_of, read_dicom, read_header
+from drivers.errors import UnreadableFileError
+from drivers.export_watch import ExportWatch
+from drivers.interfaces import CtSeries, CtVolume, DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
+from drivers.mesh_file import MeshUnit, read_mesh_file
+from drivers.plugin import DriverConfig, DriverSpec
+from drivers.scan_folder import free_bytes, require_folder
+
+# What pydicom, its plug-ins and Pillow raise for pixel data that is cut short, damaged or of a codec that is not there.
+_DECODE_ERRORS = (ValueError, RuntimeError, AttributeError, KeyError, IndexError, OSError, EOFError, TypeError)
+
+
+class DicomFolderConfig(DriverConfig):
+    """Section of rig.yaml."""
+
+    folder: Path = Field(description="where the CT suite delivers its series, in sub-folders or not")
+    mesh_unit: MeshUnit = Field(default="auto", description="of segmented meshes: mm, m, or auto (from the size)")
+    stable_s: float = Field(default=10.0, ge=0, description="how long a segmented mesh must stay unchanged")
+
+
+class DicomFolder:
+    """drivers.interfaces.CtSource on a folder; reads, and never writes or deletes there."""
+
+    def __init__(self, config: DicomFolderConfig) -> None:
+        self._config = config
+        self._watch = ExportWatch(config.folder, config.stable_s)
+        self._headers: dict[tuple[Path, int, int], SliceHeader | str] = {}
+
+    def open(self) -> DeviceIdentity:
+        """Check that the folder is there."""
+        require_folder(self._config.folder)
+        self._watch.poll()
+        return self._identity()
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def report(self) -> DeviceReport:
+        """Series found, what is wrong with them, and files that are not DICOM."""
+        series = self.series()
+        problems = [f"series {one.uid} ({one.description}): {text}" for one in series for text in one.problems]
+        problems += [text for text in self._headers.values() if isinstance(text, str)]
+        return DeviceReport(
+            identity=self._identity(),
+            free_bytes=free_bytes(self._config.folder),
+            details={"series": str(len(series)), "usable": str(sum(not one.problems for one in series))},
+            problems=tuple(problems) + self._watch.poll()[1],
+        )
+
+    def series(self) -> tuple[CtSeries, ...]:
+        """All series with images, those with problems too, by UID."""
+        require_folder(self._config.folder)
+        groups: dict[str, list[SliceHeader]] = {}
+        for header in self._scan():
+            groups.setdefault(header.series_uid, []).append(header)
+        return tuple(self._series(uid, headers) for uid, headers in sorted(groups.items()))
+
+    def read(self, series: CtSeries) -> CtVolume:
+        """Read one series into Hounsfield units.
+
+        Voxel axes: i along a row of the image, j down its columns, k along their cross product, so that T_ct_voxel is right-handed
+        whatever the order of the files; the frame is DICOM's patient frame (x left, y back, z head), metres.
+
+        Raises:
+            UnreadableFileError: the series has problems, or a slice cannot be decoded; names slice and file.
+        """
+        headers = [self._header(path) for path in series.files]
+        sound = [header for header in headers if isinstance(header, SliceHeader)]
+        problems = [header for header in headers if isinstance(header, str)] + list(problems_of(sound))
+        if problems:
+            raise UnreadableFileError(
+                f"the series cannot be used: {'; '.join(problems)}",
+                where=f"{series.uid} in {self._config.folder}",
+                remedy="Export the complete series again from the CT suite; gaps are never interpolated",
+            )
+        ordered, T_ct_voxel, spacing = arrange(sound)
+        first = ordered[0]
+        volume = np.empty((len(ordered), first.rows, first.columns), dtype=np.int16)
+        for k, header in enumerate(ordered):
+            volume[k] = _hounsfield(header)
+        return CtVolume(volume, T_ct_voxel, spacing, self._series(series.uid, ordered))
+
+    def segmented_meshes(self) -> tuple[ScanExport, ...]:
+        """Complete meshes in the folder (STL, PLY, OBJ), oldest first."""
+        require_folder(self._config.folder)
+        return self._watch.poll()[0]
+
+    def read_mesh(self, export: ScanExport) -> ScannedMesh:
+        """Read one of them, in metres."""
+        return read_mesh_file(export.files[0], self._config.mesh_unit, export=export)
+
+    def _scan(self) -> list[SliceHeader]:
+        fresh: dict[tuple[Path, int, int], SliceHeader | str] = {}
+        for path in dicom_files(self._config.folder):
+            fresh[_key(path)] = self._header(path)
+        self._headers = fresh
+        return [header for header in fresh.values() if isinstance(header, SliceHeader)]
+
+    def _header(self, path: Path) -> SliceHeader | str:
+        """The header, or why there is none; read once for a file that does not change."""
+        try:
+            known = self._headers.get(_key(path))
+        except OSError as error:
+            return f"{path.name}: cannot be opened ({error.strerror})"
+        return read_header(path) if known is None else known
+
+    def _series(self, uid: str, headers: list[SliceHeader]) -> CtSeries:
+        return CtSeries(
+            uid=uid,
+            description=headers[0].description,
+            modality=headers[0].modality,
+            slices=len(headers),
+            files=tuple(header.path for header in headers),
+            problems=problems_of(headers),
+        )
+
+    def _identity(self) -> DeviceIdentity:
+        return DeviceIdentity(
+            kind="ct",
+            model="DICOM folder",
+            serial="",
+            firmware="",
+            driver="dicom_folder",
+            driver_version=f"pydicom {version('pydicom')}",
+            address=str(self._config.folder),
+        )
+
+
+def _key(path: Path) -> tuple[Path, int, int]:
+    stat = path.stat()
+    return path, stat.st_size, stat.st_mtime_ns
+
+
+def _hounsfield(header: SliceHeader) -> NDArray[np.int16]:
+    """Pixels of one slice, rescaled: (J, I)."""
+    try:
+        dataset = read_dicom(header.path)
+        stored = np.asarray(dataset.pixel_array)
+    except _DECODE_ERRORS as error:
+        raise UnreadableFileError(
+            f"the image of slice {header.instance_uid} cannot be decoded ({error})",
+            where=str(header.path),
+            remedy=f"Export it again, uncompressed (it has transfer syntax {header.transfer_syntax})",
+        ) from error
+    if stored.shape != (header.rows, header.columns):
+        raise UnreadableFileError(
+            f"slice {header.instance_uid} holds an image of shape {stored.shape} instead of "
+            f"{(header.rows, header.columns)}",
+            where=str(header.path),
+            remedy="Export the series again as single monochrome slices",
+        )
+    slope, intercept = _rescale(dataset)
+    return np.clip(np.rint(stored * slope + intercept), -32768, 32767).astype(np.int16)
+
+
+def _rescale(dataset: FileDataset) -> tuple[float, float]:
+    values: Mapping[str, object] = {name: dataset.get(name) for name in ("RescaleSlope", "RescaleIntercept")}
+    return float(str(values["RescaleSlope"])), float(str(values["RescaleIntercept"]))
+
+
+DRIVER = DriverSpec(kind="ct", config=DicomFolderConfig, build=DicomFolder, hosted=False, call_timeout_s=300.0)

@@ -1,0 +1,210 @@
+r"""The light and environment box: light level, temperature, shutter relay and foot pedal over a serial line.
+
+Wire: 115200 baud, 8 data bits, no parity, one stop bit, ASCII lines. The host ends its lines with LF; the box ends its own with LF
+or CR LF. One reply to each request, and each reply begins with the name of what it reports, so that a banner, a late reply or
+noise is recognised and skipped. Lines that begin with # are comments (the banner after power-up).
+
+    *IDN?        *IDN <maker>,<model>,<serial>,<firmware>
+    LIGHT?       LIGHT <lux>                 decimal number, lux at the specimen
+    TEMP?        TEMP <degrees Celsius>      decimal number
+    SHUTTER?     SHUTTER <0|1>               1: relay closed
+    SHUTTER 0|1  SHUTTER <0|1>               the state after switching
+    PEDAL?       PEDAL <count>               presses since power-up
+    other        ERR <code> <text>           1 unknown request, 2 wrong argument, 3 sensor fault
+"""
+
+from __future__ import annotations
+
+import termios
+import time
+from importlib.metadata import version
+
+import serial
+from pydantic import Field
+
+from drivers.errors import (
+    DeviceFaultError,
+    DeviceRefusedError,
+    DeviceTimeoutError,
+    DeviceUnavailableError,
+)
+from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading
+from drivers.plugin import DriverConfig, DriverSpec
+
+_LINK_ERRORS = (serial.SerialException, OSError, termios.error)
+_ATTEMPTS = 3
+_MAX_LINE = 256
+
+
+class LightboxConfig(DriverConfig):
+    """Section of rig.yaml."""
+
+    port: str = Field(min_length=1, description="a serial device, a link to one, or a socket://HOST:PORT address")
+    baudrate: int = Field(default=115200, gt=0)
+    timeout_s: float = Field(
+        default=1.0, gt=0, description="longest wait for a reply; a request is tried three times"
+    )
+
+
+class SerialLightbox:
+    """drivers.interfaces.Lightbox over pyserial. A broken link is an error once; the next call opens the port again."""
+
+    def __init__(self, config: LightboxConfig) -> None:
+        self._config = config
+        self._port: serial.SerialBase | None = None
+        self._pending = b""
+
+    def open(self) -> DeviceIdentity:
+        """Open the port, skip what the box says unasked, and ask who it is."""
+        self.close()
+        return self._identity()
+
+    def close(self) -> None:
+        """Let go of the port."""
+        port, self._port, self._pending = self._port, None, b""
+        if port is not None:
+            try:
+                port.close()
+            except _LINK_ERRORS:
+                return  # the link is dead already, which is what was asked for
+
+    def report(self) -> DeviceReport:
+        """Identity and current readings; a sensor fault is a problem, not an error."""
+        identity = self._identity()
+        details: dict[str, str] = {}
+        problems: list[str] = []
+        for request, unit in (("LIGHT", "lx"), ("TEMP", "°C"), ("SHUTTER", ""), ("PEDAL", "")):
+            try:
+                details[request.lower()] = f"{self._ask(f'{request}?', request)} {unit}".strip()
+            except DeviceRefusedError as error:
+                problems.append(str(error))
+        return DeviceReport(identity=identity, details=details, problems=tuple(problems))
+
+    def read(self) -> EnvironmentReading:
+        """Light level in lux, temperature in °C, state of the relay."""
+        return EnvironmentReading(
+            light_lux=self._number("LIGHT"),
+            temperature_c=self._number("TEMP"),
+            shutter_relay_closed=self._number("SHUTTER") == 1,
+            monotonic_s=time.monotonic(),
+        )
+
+    def set_shutter_relay(self, closed: bool) -> None:
+        """Switch the relay; DeviceFaultError when the box reports another state afterwards."""
+        if self._ask(f"SHUTTER {int(closed)}", "SHUTTER") != str(int(closed)):
+            raise DeviceFaultError(
+                "the shutter relay did not switch",
+                where=self._config.port,
+                remedy="Check the relay and its supply, then try again",
+            )
+
+    def pedal_presses(self) -> int:
+        """Presses since the box was powered up."""
+        return int(self._number("PEDAL"))
+
+    def _identity(self) -> DeviceIdentity:
+        fields = [field.strip() for field in self._ask("*IDN?", "*IDN").split(",")]
+        if len(fields) != 4:
+            raise DeviceFaultError(
+                f"this is not a light box: it identifies itself as {','.join(fields)!r}",
+                where=self._config.port,
+                remedy="Check which device is on this port",
+            )
+        return DeviceIdentity(
+            kind="lightbox",
+            model=f"{fields[0]} {fields[1]}",
+            serial=fields[2],
+            firmware=fields[3],
+            driver="lightbox",
+            driver_version=f"pyserial {version('pyserial')}",
+            address=self._config.port,
+        )
+
+    def _number(self, quantity: str) -> float:
+        return float(self._ask(f"{quantity}?", quantity))
+
+    def _ask(self, request: str, name: str) -> str:
+        """The value of the reply called `name`; tried again when nothing usable comes in time."""
+        heard = b""
+        try:
+            port = self._opened()
+            for _ in range(_ATTEMPTS):
+                # What is in the buffer answers an earlier request, or is a banner.
+                port.reset_input_buffer()
+                self._pending = b""
+                port.write(request.encode("ascii") + b"\n")
+                deadline = time.monotonic() + self._config.timeout_s
+                while (line := self._line(port, deadline)) is not None:
+                    heard = line or heard
+                    value = self._value(line, request, name)
+                    if value is not None:
+                        return value
+        except _LINK_ERRORS as error:
+            self.close()
+            raise DeviceUnavailableError(
+                f"the light box is not connected ({error})",
+                where=self._config.port,
+                remedy="Check the cable and the power of the box; it is opened again at the next request",
+            ) from error
+        detail = f"; it said {heard[:40]!r}" if heard else ""
+        raise DeviceTimeoutError(
+            f"no usable reply to {request} in {_ATTEMPTS} × {self._config.timeout_s:g} s{detail}",
+            where=self._config.port,
+            remedy="Check that the box is powered, that the baud rate is right, and that the port is the box's",
+        )
+
+    def _opened(self) -> serial.SerialBase:
+        if self._port is None:
+            try:
+                port = serial.serial_for_url(self._config.port, baudrate=self._config.baudrate, timeout=0.05)
+            except ValueError as error:
+                raise DeviceUnavailableError(
+                    f"the port cannot be opened ({error})",
+                    where=self._config.port,
+                    remedy="Correct the port in rig.yaml",
+                ) from error
+            port.write_timeout = self._config.timeout_s
+            self._port = port
+        return self._port
+
+    def _line(self, port: serial.SerialBase, deadline_s: float) -> bytes | None:
+        """The next complete line without its end, or None when the time is over."""
+        while b"\n" not in self._pending:
+            if time.monotonic() >= deadline_s:
+                return None
+            self._pending += port.read(max(1, min(port.in_waiting, _MAX_LINE)))
+            # Noise without line ends must not grow without bound; a reply is short.
+            if b"\n" not in self._pending:
+                self._pending = self._pending[-_MAX_LINE:]
+        line, self._pending = self._pending.split(b"\n", 1)
+        return line.strip()
+
+    def _value(self, line: bytes, request: str, name: str) -> str | None:
+        """The value if this line is the reply that is waited for; None for anything else."""
+        if not line.isascii():
+            return None
+        word, _, value = line.decode("ascii").partition(" ")
+        if word == "ERR":
+            raise DeviceRefusedError(
+                f"the light box refuses {request}: {value}",
+                where=self._config.port,
+                remedy="See the box's manual for the error; check its sensors",
+            )
+        if word != name or not value.isprintable():
+            return None
+        if name != "*IDN":
+            try:
+                number = float(value)
+            except ValueError:
+                return None
+            if name in ("SHUTTER", "PEDAL") and not value.isdigit():
+                return None
+            return None if number != number else value  # noqa: PLR0124 - only NaN differs from itself
+        return value
+
+
+def _build(config: LightboxConfig) -> SerialLightbox:
+    return SerialLightbox(config)
+
+
+DRIVER = DriverSpec(kind="lightbox", config=LightboxConfig, build=_build, hosted=False, call_timeout_s=30.0)

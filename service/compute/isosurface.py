@@ -1,0 +1,92 @@
+"""Surface of a CT volume at a threshold: marching cubes, in slabs when the volume is large."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.measure import marching_cubes
+
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, apply
+
+SLAB_VOXELS = 100_000_000  # marching cubes copies its input to float32: 400 MB
+
+
+def surface(
+    volume_hu: NDArray[np.int16],
+    T_ct_voxel: Transform,
+    threshold_hu: float,
+    *,
+    slab_voxels: int = SLAB_VOXELS,
+) -> tuple[Array, NDArray[np.int32]]:
+    """Triangles where the volume crosses a threshold; what is denser is inside.
+
+    Args:
+        volume_hu: (K, J, I) Hounsfield units.
+        T_ct_voxel: (4, 4) affine from voxel indices (i, j, k) to metres in the CT frame.
+        threshold_hu: e.g. the middle between air and plastic.
+        slab_voxels: at most about so many voxels are worked on at a time.
+
+    Returns:
+        vertices (V, 3) in metres in the CT frame, and faces (F, 3), counter-clockwise seen from outside. The surface is open where the
+        object reaches the border of the volume.
+
+    Raises:
+        ComputeError: the volume is not three-dimensional or nowhere crosses the threshold.
+
+    Source: Lewiner et al., "Efficient implementation of Marching Cubes' cases with topological guarantees", 2003
+    (scikit-image).
+    """
+    if volume_hu.ndim != 3 or min(volume_hu.shape) < 2:
+        raise ComputeError(f"a volume of shape {volume_hu.shape} has no surface", remedy="Check the CT series")
+    low, high = int(volume_hu.min()), int(volume_hu.max())
+    # Off the integers: a voxel that equals the level exactly would give triangles without area.
+    level = threshold_hu + 0.25 if float(threshold_hu).is_integer() else float(threshold_hu)
+    if not low < level < high:
+        raise ComputeError(
+            f"no surface at {threshold_hu:g} HU: the volume holds {low} to {high} HU",
+            remedy="Choose a threshold between air and the material that is wanted",
+        )
+    depth = max(2, slab_voxels // (volume_hu.shape[1] * volume_hu.shape[2]))
+    vertices: list[Array] = []
+    faces: list[NDArray[np.int64]] = []
+    seams: list[NDArray[np.bool_]] = []
+    count = 0
+    last = volume_hu.shape[0] - 1
+    for first in range(0, last, depth):
+        # Neighbouring slabs share one slice, so that their surfaces meet in it.
+        end = min(first + depth, last)
+        slab = volume_hu[first : end + 1]
+        if not slab.min() < level < slab.max():
+            continue
+        kji, triangles, _, _ = marching_cubes(slab.astype(np.float32), level, gradient_direction="descent")
+        on_seam = ((kji[:, 0] == 0) & (first > 0)) | ((kji[:, 0] == end - first) & (end < last))
+        ijk = kji[:, ::-1].astype(np.float64)
+        ijk[:, 2] += first
+        vertices.append(ijk)
+        seams.append(on_seam)
+        faces.append(triangles.astype(np.int64) + count)
+        count += len(ijk)
+    if not vertices:
+        # Only possible where two neighbouring slices lie on either side of the level and none crosses it within.
+        raise ComputeError(f"no surface at {threshold_hu:g} HU", remedy="Choose another threshold")
+    points, triangles = _sewn(np.concatenate(vertices), np.concatenate(faces), np.concatenate(seams))
+    # Going from array order (k, j, i) to (i, j, k) mirrors, and so does a left-handed T_ct_voxel.
+    if np.linalg.det(T_ct_voxel[:3, :3]) > 0:
+        triangles = triangles[:, ::-1]
+    return apply(T_ct_voxel, points), np.ascontiguousarray(triangles, dtype=np.int32)
+
+
+def _sewn(points: Array, faces: NDArray[np.int64], on_seam: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64]]:
+    """Merge the vertices (voxel units) that two slabs have in common; drop faces that collapse."""
+    seam = np.flatnonzero(on_seam)
+    if len(seam):
+        _, first, index = np.unique(np.round(points[seam], 3), axis=0, return_index=True, return_inverse=True)
+        target = np.arange(len(points))
+        target[seam] = seam[first][index.reshape(-1)]
+        kept = np.unique(target)
+        rank = np.zeros(len(points), dtype=np.int64)
+        rank[kept] = np.arange(len(kept))
+        points, faces = points[kept], rank[target][faces]
+    a, b, c = faces.T
+    return points, faces[(a != b) & (b != c) & (c != a)]

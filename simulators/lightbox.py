@@ -1,0 +1,189 @@
+"""The light and environment box at the other end of a serial line: a pseudo-terminal that speaks its ASCII protocol."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import select
+import signal
+import socket
+import time
+import tty
+from pathlib import Path
+from types import FrameType
+
+from simulators.faults import Fault, FaultPlan
+from simulators.serve import SimulatorError, Termination, announce
+
+log = logging.getLogger(__name__)
+
+BANNER = b"# ORTHO-LB1 light and environment box ready\r\n"
+IDENTITY = "orthocapture,ORTHO-LB1 simulated,LB-0001,1.2"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--link", type=Path, metavar="PATH", help="symbolic link to the pseudo-terminal")
+    parser.add_argument("--world", metavar="HOST:PORT", help="control socket of the rig that knows light and pedal")
+
+
+def serve(args: argparse.Namespace) -> None:
+    """Serve until SIGTERM; each SIGUSR1 is a press of the pedal."""
+    termination = Termination(with_parent=args.with_parent)
+    box = Lightbox(args.faults, World(args.world) if args.world else None, args.link)
+
+    def press(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        box.press_pedal()
+
+    signal.signal(signal.SIGUSR1, press)
+    try:
+        announce(port=box.plug_in(), link=None if args.link is None else str(args.link))
+        while not termination.is_set():
+            box.serve_once(0.2)
+    finally:
+        box.unplug()
+
+
+class World:
+    """What the rig says of light, temperature and pedal; kept for a moment, asked again when the link was lost."""
+
+    def __init__(self, address: str) -> None:
+        host, _, port = address.rpartition(":")
+        if not port.isdigit():
+            raise SimulatorError(f"--world wants HOST:PORT, not {address!r}")
+        self._address = (host or "127.0.0.1", int(port))
+        self._view: dict[str, float] = {}
+        self._asked_s = -1.0
+
+    def view(self) -> dict[str, float]:
+        """light_lux, temperature_c, pedal_presses; the last known when the world does not answer."""
+        if time.monotonic() - self._asked_s > 0.05:
+            try:
+                with socket.create_connection(self._address, timeout=1.0) as link, link.makefile("rb") as lines:
+                    link.sendall(b'{"op": "view"}\n')
+                    answer = json.loads(lines.readline())
+                keys = ("light_lux", "temperature_c", "pedal_presses")
+                self._view = {key: float(answer[key]) for key in keys if key in answer}
+                self._asked_s = time.monotonic()
+            except (OSError, ValueError) as error:
+                log.warning("the world does not answer: %s", error)
+        return self._view
+
+
+class Lightbox:
+    """State of the box and its end of the line."""
+
+    def __init__(self, faults: FaultPlan, world: World | None, link: Path | None) -> None:
+        self._faults = faults
+        self._world = world
+        self._link = link
+        self._ends: tuple[int, int] | None = None
+        self._heard = b""
+        self._shutter = 0
+        self._pressed = 0
+
+    def plug_in(self) -> str:
+        """Make the pseudo-terminal and its link, say the banner; returns the path of the terminal."""
+        master, slave = os.openpty()
+        # The slave stays open here, so that the terminal lives on while no client holds it.
+        tty.setraw(slave)
+        name = os.ttyname(slave)
+        self._ends, self._heard = (master, slave), b""
+        if self._link is not None:
+            self._link.parent.mkdir(parents=True, exist_ok=True)
+            temporary = self._link.with_name(f".{self._link.name}.{os.getpid()}")
+            temporary.unlink(missing_ok=True)
+            temporary.symlink_to(name)
+            temporary.replace(self._link)
+        os.write(master, BANNER)
+        return name
+
+    def unplug(self) -> None:
+        """Pull the cable: the terminal vanishes."""
+        if self._ends is None:
+            return
+        for end in self._ends:
+            os.close(end)
+        self._ends = None
+        if self._link is not None and self._link.is_symlink():
+            self._link.unlink()
+
+    def press_pedal(self) -> None:
+        """One press, in stand-alone use."""
+        self._pressed += 1
+
+    def serve_once(self, timeout_s: float) -> None:
+        """Answer what comes within the time."""
+        if self._ends is None:
+            return
+        master = self._ends[0]
+        ready, _, _ = select.select([master], [], [], timeout_s)
+        if not ready:
+            return
+        self._heard = (self._heard + os.read(master, 4096))[-4096:]
+        while b"\n" in self._heard:
+            line, self._heard = self._heard.split(b"\n", 1)
+            request = line.decode("ascii", "replace").strip()
+            if request:
+                self._reply(request)
+
+    def _reply(self, request: str) -> None:
+        fault = self._faults.check("lightbox", request)
+        answer = (self._answer(request) + "\r\n").encode("ascii")
+        if fault is not None:
+            log.info("fault %s at %s", fault.kind, request)
+            if self._spoiled(fault, answer):
+                return
+            answer = b"ERR 3 sensor fault\r\n" if fault.kind == "reject" else answer
+        if self._ends is not None:
+            os.write(self._ends[0], answer)
+
+    def _spoiled(self, fault: Fault, answer: bytes) -> bool:
+        """Let the fault happen; whether the answer is done with."""
+        assert self._ends is not None
+        seconds = float(fault.value) if isinstance(fault.value, (int, float)) else 0.5
+        match fault.kind:
+            case "drop":
+                return True
+            case "truncate":
+                os.write(self._ends[0], answer[: len(answer) // 2])
+                return True
+            case "corrupt":
+                os.write(self._ends[0], b"\xff\x00\x9e" + answer[3:] + b"\x80\xfe\n")
+                return True
+            case "stall":
+                time.sleep(seconds)
+            case "banner":
+                os.write(self._ends[0], BANNER)
+            case "unplug":
+                self.unplug()
+                time.sleep(seconds)
+                self.plug_in()
+                return True
+            case _:
+                pass
+        return False
+
+    def _answer(self, request: str) -> str:
+        view = self._world.view() if self._world is not None else {}
+        match request.split():
+            case ["*IDN?"]:
+                return f"*IDN {IDENTITY}"
+            case ["LIGHT?"]:
+                return f"LIGHT {view.get('light_lux', 45_000.0):.1f}"
+            case ["TEMP?"]:
+                return f"TEMP {view.get('temperature_c', 21.5):.2f}"
+            case ["SHUTTER?"]:
+                return f"SHUTTER {self._shutter}"
+            case ["SHUTTER", ("0" | "1") as state]:
+                self._shutter = int(state)
+                return f"SHUTTER {self._shutter}"
+            case ["SHUTTER", *_]:
+                return "ERR 2 wrong argument"
+            case ["PEDAL?"]:
+                return f"PEDAL {self._pressed + int(view.get('pedal_presses', 0))}"
+            case _:
+                return "ERR 1 unknown request"
