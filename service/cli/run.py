@@ -8,17 +8,25 @@ import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, error_console, print_json, reporting_errors
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    error_console,
+    print_json,
+    reporting_errors,
+)
 from service.cli.operators import AutomaticOperator, Display, TerminalOperator
 from service.core.actions import check_action, record_to_sign
 from service.core.fold import fold
-from service.core.model import OperatorAction, OperatorVerb
+from service.core.model import OperatorAction
 from service.core.protocol import load_protocol
 from service.core.run_state import RunState
 from service.rig import Rig, load_rig
@@ -93,7 +101,7 @@ def act_command(
         if verb not in OPERATOR_VERBS:
             raise typer.BadParameter(f"{verb!r} is none of {', '.join(OPERATOR_VERBS)}")
         action = OperatorAction(
-            action=cast(OperatorVerb, verb),
+            action=verb,
             step=step or state.current,
             viewpoint=viewpoint,
             reason=reason,

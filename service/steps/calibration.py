@@ -50,6 +50,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
             )
         camera = result_of(context, params.intrinsics_of)["camera"]
     board = context.protocol.board
+    if board is None:
+        raise ConfigurationError(
+            "the protocol describes no calibration board", where=context.protocol.id, remedy="Add a section `board`"
+        )
     (answer,) = context.evidence.run_jobs(
         JobRequest(
             "calibrate",

@@ -32,7 +32,9 @@ HANDLERS: Mapping[str, Handler] = {
 }
 
 
-def work(store: Store, *, until_idle: bool, stop: Callable[[], bool], progress: Callable[[str, int, int], None]) -> int:
+def work(
+    store: Store, *, until_idle: bool, stop: Callable[[], bool], progress: Callable[[str, int, int], None]
+) -> int:
     """Serve jobs until `stop()`, or with `until_idle` until none is left; the number of jobs done."""
     name = f"worker {socket.gethostname()}:{os.getpid()}"
     done = 0
@@ -65,9 +67,7 @@ def _do(store: Store, job: Job, progress: Callable[[str, int, int], None]) -> No
     duration_s = time.monotonic() - started_s
     rows = [NewArtefact(ref=ref, device="worker", step=job.step, attempt=job.attempt) for ref in answer.artefacts]
     try:
-        store.finish_job(
-            job, measures=answer.measures, duration_s=duration_s, result=answer.result, artefacts=rows
-        )
+        store.finish_job(job, measures=answer.measures, duration_s=duration_s, result=answer.result, artefacts=rows)
     except LeaseLostError:
         _log.warning("job %s was taken over by another worker; its result stands", job.job_id)
 

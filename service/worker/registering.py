@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -14,40 +11,36 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.compute.constellations import match_constellations
+from service.compute.images import read_image
 from service.compute.markers.archive import outline_from_record, outline_record
-from service.compute.markers.detect import detect_spheres as detect_in_image
 from service.compute.markers.records import SphereOutline
 from service.compute.overlay import draw_overlay
-from service.compute.photograph import read_photograph
-from service.compute.registration.control import assign_controls
+from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE, Detection, detect_all, register_images
 from service.compute.registration.evaluation import evaluate as evaluate_controls
-from service.compute.registration.identity import identify
-from service.compute.registration.solve import RegistrationResult, register as solve_registration
+from service.compute.registration.hypotheses import match, sightings
+from service.compute.registration.identity import Assignment
+from service.compute.registration.solve import RegistrationResult
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
+from service.core.model import ArtefactRef
 from service.worker.job import JobAnswer, JobContext
 
 
 def detect_spheres(context: JobContext) -> JobAnswer:
     """Outlines of every sphere in every image, as one artefact that all registrations share."""
-    camera = context.camera()
     images = context.arguments["images"]
-    tasks = [(context.input(image["sha256"]), camera) for image in images]
-    found: dict[str, list[dict[str, Any]]] = {}
-    workers = min(len(tasks), os.cpu_count() or 1)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for i, (image, outlines) in enumerate(zip(images, pool.map(_detect, tasks), strict=True)):
-            found[image["viewpoint"]] = outlines
-            context.progress("spheres in images", i + 1, len(images))
-    total = sum(map(len, found.values()))
+    files = [context.input(image["sha256"]) for image in images]
+    outlines = detect_all(
+        files,
+        context.camera(),
+        workers=min(len(files), os.cpu_count() or 1),
+        progress=lambda done, total: context.progress("spheres in images", done, total),
+    )
+    records = [[outline_record(outline) for outline in found] for found in outlines]
+    found = dict(zip((image["viewpoint"] for image in images), records, strict=True))
+    total = sum(map(len, records))
     ref = context.keep_json(found, kind="outlines", name="outlines.json")
     return JobAnswer({"outlines": float(total), "outlines_an_image": total / len(images)}, (ref,))
-
-
-def _detect(task: tuple[Path, CameraModel]) -> list[dict[str, Any]]:
-    path, camera = task
-    cv2.setNumThreads(1)  # the pool already uses every core
-    return [outline_record(outline) for outline in detect_in_image(read_photograph(path), camera)]
 
 
 def register(context: JobContext) -> JobAnswer:
@@ -60,16 +53,14 @@ def register(context: JobContext) -> JobAnswer:
     radius_m = float(arguments["radius_m"])
     names = [image["viewpoint"] for image in images]
     robot = source == "robot"
-    assignments = identify(
-        outlines, spheres, camera, poses, radius_m=radius_m, groups=groups, metric=robot, names=names
+    solved = register_images(
+        outlines, poses, camera, spheres, radius_m, groups=groups, estimate_scale=not robot, names=names
     )
-    answer = solve_registration(
-        outlines, assignments, poses, groups, spheres, radius_m, camera, estimate_scale=not robot
-    )
+    answer = solved.registration
     centre = spheres.mean(axis=0)
     measures = {
         "rms_px": answer.rms_px,
-        "markers": float(len({r.marker for r in answer.residuals if not r.excluded})),
+        "markers": float(len(solved.markers)),
         "images": float(answer.n_images),
         "excluded_outlines": float(len(answer.excluded)),
         "predicted_error_mm": 1e3 * answer.sigma_at_m(centre),
@@ -80,9 +71,7 @@ def register(context: JobContext) -> JobAnswer:
         "scale": answer.scale,
         "covariance": answer.covariance.tolist(),
         "rms_px": answer.rms_px,
-        "T_world_station": {
-            _station(images, groups, g): T.tolist() for g, T in answer.T_world_group.items()
-        },
+        "T_world_station": {_station(images, groups, g): T.tolist() for g, T in answer.T_world_group.items()},
         "T_scan_camera": {
             name: T.tolist() for name, T in zip(names, answer.T_scan_camera, strict=True) if np.isfinite(T).all()
         },
@@ -105,13 +94,15 @@ def evaluate(context: JobContext) -> JobAnswer:
     if not len(controls):
         raise ComputeError("the control scan shows no sphere beside the registration spheres")
     table: list[dict[str, Any]] = []
-    refs = []
+    refs: list[ArtefactRef] = []
     for source, registration in arguments["registrations"].items():
         cameras = registration["T_scan_camera"]
         seen = [i for i, image in enumerate(images) if image["viewpoint"] in cameras]
         T_scan_camera = np.array([cameras[images[i]["viewpoint"]] for i in seen])
         mine = [outlines[i] for i in seen]
-        assignments = assign_controls(mine, T_scan_camera, controls, radius_m, camera, others_m=spheres)
+        assignments = [
+            _controls(o, T, spheres, controls, radius_m, camera) for o, T in zip(mine, T_scan_camera, strict=True)
+        ]
         answer = evaluate_controls(mine, assignments, T_scan_camera, controls, radius_m, camera)
         table.append(
             {
@@ -123,7 +114,7 @@ def evaluate(context: JobContext) -> JobAnswer:
             }
         )
         if source != "robot":
-            refs += _overlays(context, images, seen, source, T_scan_camera, np.vstack([spheres, controls]))
+            refs += _overlays(context, [images[i] for i in seen], source, mine, T_scan_camera, spheres, controls)
     best = min(table, key=lambda row: row["mean_radial_error_mm"])
     measures = {f"{row['poses']}_mean_radial_error_mm": row["mean_radial_error_mm"] for row in table}
     measures |= {f"{row['poses']}_mean_reprojection_error_px": row["mean_reprojection_error_px"] for row in table}
@@ -169,30 +160,59 @@ def _residuals(answer: RegistrationResult, names: Sequence[str]) -> dict[str, An
     }
 
 
+def _controls(
+    outlines: Sequence[SphereOutline],
+    T_scan_camera: Array,
+    spheres: Array,
+    controls: Array,
+    radius_m: float,
+    camera: CameraModel,
+) -> Assignment:
+    """Which outlines are control spheres: those that the registration predicts there, and no registration sphere."""
+    centres = apply(inverse(T_scan_camera), np.vstack([spheres, controls]))
+    pairs = match(sightings(outlines, radius_m, camera), centres, radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
+    markers = {outline: marker - len(spheres) for outline, marker, _ in pairs if marker >= len(spheres)}
+    return Assignment(markers, inverse(T_scan_camera))
+
+
 def _overlays(
     context: JobContext,
     images: Sequence[dict[str, Any]],
-    seen: Sequence[int],
     source: str,
+    outlines: Sequence[Sequence[SphereOutline]],
     T_scan_camera: Array,
-    spheres_m: Array,
-) -> list[Any]:
-    """Pictures of two images, one a station, with the registered spheres drawn over them."""
+    spheres: Array,
+    controls: Array,
+) -> list[ArtefactRef]:
+    """Pictures of one image a station, with detected and predicted outlines drawn over it."""
     camera, radius_m = context.camera(), float(context.arguments["radius_m"])
-    stations: dict[str, int] = {}
-    for k, i in enumerate(seen):
-        stations.setdefault(images[i]["station"], k)
-    refs = []
-    for k in stations.values():
-        image = images[seen[k]]
+    first: dict[str, int] = {}
+    for i, image in enumerate(images):
+        first.setdefault(image["station"], i)
+    refs: list[ArtefactRef] = []
+    for i in first.values():
+        centres = apply(inverse(T_scan_camera[i]), np.vstack([spheres, controls]))
+        pairs = match(sightings(outlines[i], radius_m, camera), centres, radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
+        marker = {outline: m for outline, m, _ in pairs}
+        detections = [
+            Detection(
+                outline,
+                m if m is not None and m < len(spheres) else None,
+                m - len(spheres) if m is not None and m >= len(spheres) else None,
+                None,
+            )
+            for outline, m in ((o, marker.get(j)) for j, o in enumerate(outlines[i]))
+        ]
         picture = draw_overlay(
-            read_photograph(context.input(image["sha256"])),
-            _outlines(context, [image], camera)[0],
-            apply(inverse(T_scan_camera[k]), spheres_m),
-            radius_m,
+            read_image(context.input(images[i]["sha256"])),
             camera,
+            detections,
+            T_scan_camera=T_scan_camera[i],
+            registration_centres_m=spheres,
+            control_centres_m=controls,
+            radius_m=radius_m,
         )
         jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
-        name = f"{source}_{image['viewpoint']}.jpg"
+        name = f"{source}_{images[i]['viewpoint']}.jpg"
         refs.append(context.keep_bytes(jpeg, kind="overlay", media_type="image/jpeg", name=name))
     return refs

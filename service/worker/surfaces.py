@@ -9,7 +9,8 @@ import numpy as np
 
 from service.compute.constellations import match_constellations
 from service.compute.isosurface import surface
-from service.compute.mesh_spheres import MeshSphere, locate_spheres as find_spheres
+from service.compute.mesh_spheres import MeshSphere
+from service.compute.mesh_spheres import locate_spheres as find_spheres
 from service.core.geometry import Array
 from service.worker.job import JobAnswer, JobContext
 
@@ -21,7 +22,9 @@ def ct_surface(context: JobContext) -> JobAnswer:
     vertices_m, faces = surface(hounsfield, np.array(arguments["T_ct_voxel"]), float(arguments["threshold_hu"]))
     buffer = io.BytesIO()
     np.savez(buffer, vertices_m=vertices_m, faces=faces)
-    mesh = context.keep_bytes(buffer.getvalue(), kind="ct_mesh", media_type="application/x-npz", name="ct_surface.npz")
+    mesh = context.keep_bytes(
+        buffer.getvalue(), kind="ct_mesh", media_type="application/x-npz", name="ct_surface.npz"
+    )
     answer = _search(context, vertices_m, faces)
     return JobAnswer({**answer.measures, "surface_faces": float(len(faces))}, (mesh,), answer.result)
 

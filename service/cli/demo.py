@@ -1,0 +1,162 @@
+"""`orthocapture demo`: a whole run on a simulated rig, from specimen to registered data set, over the real wires."""
+
+from __future__ import annotations
+
+import json as json_module
+import selectors
+import subprocess
+import sys
+import time
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from service.cli.common import JsonOption, console, error_console, print_json, progress_bar, reporting_errors
+from service.cli.run import drive
+from service.compute.registration.evaluation import true_error_m
+from service.core.errors import OrthocaptureError
+from service.core.geometry import inverse
+from service.core.protocol import load_protocol
+from service.dataset.export import export_dataset
+from service.dataset.report import write_report
+from service.dataset.summary import RunSummary, summarise
+from service.rig import load_rig
+from service.runs import start_run
+from service.steps import params_models
+from service.store.audit import verify
+from service.store.store import Store
+
+_PROTOCOL = Path(__file__).parents[2] / "protocols" / "demo.yaml"
+
+
+def demo_command(
+    out: Annotated[Path, typer.Option("--out", help="Folder for the rig, the evidence and the report.")] = Path(
+        "demo-run"
+    ),
+    scene: Annotated[int, typer.Option("--scene", help="Seed of the simulated scene.")] = 7,
+    image_width: Annotated[int, typer.Option("--image-width", help="Width of the simulated photographs.")] = 1440,
+    json: JsonOption = False,
+) -> None:
+    """Run the demonstration protocol on a simulated rig and show what comes out. Takes a few minutes."""
+    started_s = time.monotonic()
+    with reporting_errors(json):
+        folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
+        with _simulated_rig(folder / "rig", scene, image_width) as ready:
+            rig = load_rig(Path(ready["rig"]))
+            loaded = load_protocol(_PROTOCOL, params_models())
+            data = folder / "data"
+            with Store.open(data) as store:
+                run_id = start_run(store, loaded, rig, operator="demo", auto_confirm=True)
+                state = drive(store, run_id, rig, data=data, auto_confirm=True, worker=True)
+                if state.status != "completed":
+                    raise OrthocaptureError(f"the demo is {state.status}: {state.stop_reason}", where=state.current)
+        with Store.open(data) as store, progress_bar(quiet=json) as progress:
+            summary = summarise(store, run_id, loaded.protocol)
+            audit = verify(data, run_id, progress)
+            truth = true_errors_mm(summary, Path(ready["truth"]))
+            report = folder / "report.html"
+            write_report(summary, audit, report, true_error_mm=truth)
+            dataset = folder / "dataset"
+            export_dataset(summary, dataset)
+            table = [{**row, "true_error_mm": truth[row["poses"]]} for row in summary.table()]
+            database = str(store.database_path)
+    result = {
+        "run": run_id,
+        "data_dir": str(data),
+        "database": database,
+        "artefacts": str(data / "artefacts"),
+        "dataset": str(dataset),
+        "report": str(report),
+        "audit_ok": audit.ok,
+        "duration_s": round(time.monotonic() - started_s, 1),
+        "table": table,
+    }
+    if json:
+        print_json(result)
+    else:
+        _print(result)
+    if not audit.ok:
+        raise typer.Exit(1)
+
+
+def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
+    """True registration error at the scene centre for each source of poses, from the simulator's own record.
+
+    Read after the run, by the demo and tests alone.
+    """
+    truth = json_module.loads(truth_file.read_text())
+    exposures = [
+        json_module.loads(line)
+        for line in (truth_file.parent / "truth_exposures.jsonl").read_text().splitlines()
+        if line.strip()
+    ]
+    T_world_camera = {exposure["sha256"]: np.array(exposure["T_world_camera"]) for exposure in exposures}
+    T_scan_world = inverse(np.array(truth["scans"][-1]["T_world_scan"]))
+    photographs = {capture.viewpoint: capture.artefacts[0].sha256 for capture in summary.captures()}
+    centre_scan_m = np.array(summary.result("scan_import")["spheres_m"]).mean(axis=0)
+    errors: dict[str, float] = {}
+    for source, registration in summary.result("registration")["registrations"].items():
+        cameras: Mapping[str, Any] = registration["T_scan_camera"]
+        estimated = np.array([cameras[name] for name in cameras])
+        true = np.array([T_scan_world @ T_world_camera[photographs[name]] for name in cameras])
+        errors[source] = 1e3 * true_error_m(estimated, true, centre_scan_m)
+    return errors
+
+
+@contextmanager
+def _simulated_rig(folder: Path, scene: int, image_width: int) -> Generator[dict[str, Any]]:
+    """A rig process around one scene; ended with this block."""
+    folder.mkdir(parents=True)
+    command = [
+        sys.executable, "-m", "simulators", "rig", "--scene", str(scene), "--dir", str(folder),
+        "--image-width", str(image_width), "--speed-up", "3", "--ct-voxel-mm", "0.8", "--with-parent",
+    ]  # fmt: skip
+    log = folder / "rig.log"
+    with log.open("w") as errors:
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, text=True
+        )
+    try:
+        yield _ready(process, log, timeout_s=120)
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _ready(process: subprocess.Popen[str], log: Path, *, timeout_s: float) -> dict[str, Any]:
+    assert process.stdout is not None
+    with selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        line = process.stdout.readline() if selector.select(timeout_s) else ""
+    if not line:
+        raise OrthocaptureError(
+            "the simulated rig did not start", where=str(log), remedy="Read that log; is another rig running?"
+        )
+    return json_module.loads(line)
+
+
+def _print(result: Mapping[str, Any]) -> None:
+    error_console.print()
+    table = Table(title="Registration error on the control spheres", title_justify="left")
+    table.add_column("camera poses")
+    for heading in ("mean radial error (mm)", "mean reprojection error (px)", "true error (mm)"):
+        table.add_column(heading, justify="right")
+    for row in result["table"]:
+        table.add_row(
+            row["poses"],
+            f"{row['mean_radial_error_mm']:.3f}",
+            f"{row['mean_reprojection_error_px']:.2f}",
+            f"{row['true_error_mm']:.3f}",
+        )
+    console.print(table)
+    for name in ("run", "database", "artefacts", "dataset", "report"):
+        console.print(f"{name:<10} {result[name]}")
+    console.print(f"{'audit':<10} {'verified' if result['audit_ok'] else 'FAILED'}")
+    console.print(f"{'took':<10} {result['duration_s']:.0f} s")

@@ -1,0 +1,115 @@
+"""`orthocapture register`: register anyone's posed images with a scan, without a run."""
+
+from __future__ import annotations
+
+import json as json_module
+import os
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from drivers.mesh_file import read_mesh_file
+from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
+from service.compute.mesh_spheres import locate_spheres
+from service.compute.pipeline import detect_all, register_images
+from service.compute.pose_files import read_camera, read_poses, read_spheres
+from service.core.errors import ConfigurationError, DataError
+from service.core.geometry import Array
+
+_IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+
+
+def register_command(
+    images: Annotated[Path, typer.Option("--images", help="Folder of the images.")],
+    camera: Annotated[Path, typer.Option("--camera", help="camera.json: width, height, fx, fy, cx, cy, k1, k2, p1, p2.")],
+    poses: Annotated[
+        Path, typer.Option("--poses", help="Poses CSV (T_world_camera, metres), transforms.json or COLMAP model folder.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The result file to write.")],
+    mesh: Annotated[Path | None, typer.Option("--mesh", help="The scan with the spheres in it.")] = None,
+    spheres: Annotated[Path | None, typer.Option("--spheres", help="spheres.json, instead of a mesh.")] = None,
+    radius_mm: Annotated[float | None, typer.Option("--radius-mm", help="Radius of the spheres.")] = None,
+    mesh_unit: Annotated[str, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
+    control: Annotated[
+        str, typer.Option("--control", help="Indices of the mesh's spheres that only serve the evaluation: 3,7,9.")
+    ] = "",
+    estimate_scale: Annotated[bool, typer.Option("--estimate-scale", help="The poses are not metric.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Register posed images with a scan by the spheres that both show, and say how well it fits."""
+    with reporting_errors(json):
+        files = _images(images)
+        model = read_camera(camera)
+        known = read_poses(poses, [file.name for file in files])
+        registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control)
+        with progress_bar(quiet=json) as progress:
+            outlines = detect_all(
+                files,
+                model,
+                workers=min(len(files), os.cpu_count() or 1),
+                progress=lambda done, total: progress("spheres in images", done, total),
+            )
+        result = register_images(
+            outlines,
+            np.array([known[file.name] for file in files]),
+            model,
+            registration_m,
+            radius_m,
+            control_centres_m=control_m,
+            estimate_scale=estimate_scale,
+            names=[file.name for file in files],
+        )
+        record = result.as_json(model)
+        record["spheres_mm"] = {"registration": (registration_m * 1e3).tolist(), "control": (control_m * 1e3).tolist()}
+        out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
+        if json:
+            print_json(record)
+            return
+        console.print(f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms")
+        if result.evaluation is not None:
+            evaluation = result.evaluation
+            console.print(
+                f"control spheres: {evaluation.mean_radial_error_mm:.3f} mm mean radial error, "
+                f"{evaluation.mean_reprojection_error_px:.2f} px mean reprojection error"
+            )
+        console.print(f"written: {out}")
+
+
+def _images(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise DataError("the image folder does not exist", where=str(folder))
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGE_SUFFIXES)
+    if not files:
+        raise DataError("no image in this folder", where=str(folder), remedy="JPEG, PNG or TIFF files are read")
+    return files
+
+
+def _spheres(
+    mesh: Path | None, spheres: Path | None, radius_mm: float | None, mesh_unit: str, control: str
+) -> tuple[Array, Array, float]:
+    """Registration and control centres (M, 3), (C, 3) and the radius, metres."""
+    if (mesh is None) == (spheres is None):
+        raise typer.BadParameter("give either --mesh or --spheres")
+    if spheres is not None:
+        known = read_spheres(spheres)
+        return known.registration_m, known.control_m, known.radius_m if radius_mm is None else radius_mm / 1e3
+    if radius_mm is None:
+        raise typer.BadParameter("--mesh needs --radius-mm")
+    assert mesh is not None
+    scan = read_mesh_file(mesh, mesh_unit)
+    found = locate_spheres(scan.mesh.vertices_m, scan.mesh.faces, radius_mm / 1e3)
+    centres = np.array([sphere.centre_m for sphere in found])
+    try:
+        chosen = sorted({int(word) for word in control.split(",") if word.strip()})
+    except ValueError as error:
+        raise typer.BadParameter(f"--control takes indices such as 3,7,9, not {control!r}") from error
+    if chosen and not 0 <= chosen[0] <= chosen[-1] < len(centres):
+        raise ConfigurationError(
+            f"--control names sphere {chosen[-1]}, the mesh has {len(centres)} (0 … {len(centres) - 1})",
+            where=str(mesh),
+            remedy="Run without --control once: result.json lists the spheres in their order",
+        )
+    rest = [i for i in range(len(centres)) if i not in chosen]
+    return centres[rest], centres[chosen], radius_mm / 1e3

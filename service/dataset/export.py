@@ -1,0 +1,67 @@
+"""The registered data set as files: images, camera, poses and mesh in one frame, and where each came from."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from service.compute.camera_model import CameraModel
+from service.compute.pose_files import write_camera, write_poses_csv, write_transforms_json
+from service.core.errors import DataError
+from service.core.geometry import Transform
+from service.dataset.summary import RunSummary
+
+
+def export_dataset(summary: RunSummary, folder: Path) -> None:
+    """Write images/, camera.json, poses.csv, transforms.json, mesh.ply and dataset.json into a new folder.
+
+    The common frame is that of the scan (metres): the scan is the ground truth and is not resampled.
+
+    Raises:
+        DataError: nothing was evaluated, or the folder exists.
+    """
+    best = summary.best()
+    if best is None:
+        raise DataError("the run has no evaluated registration", where=summary.run_id, remedy="Finish the run first")
+    if folder.exists():
+        raise DataError("the folder exists already", where=str(folder), remedy="Name a new one; nothing is overwritten")
+    images = folder / "images"
+    images.mkdir(parents=True)
+    registered = summary.result("registration")["registrations"][best]
+    calibrated = next(s.result for s in summary.state.steps.values() if s.result.get("camera"))
+    intrinsics = dict(calibrated["camera"])
+    camera = CameraModel(int(intrinsics.pop("width")), int(intrinsics.pop("height")), **intrinsics)
+    poses: dict[str, Transform] = {}
+    sources: dict[str, str] = {}
+    for capture in summary.captures():
+        T = registered["T_scan_camera"].get(capture.viewpoint)
+        photograph = capture.artefacts[0]
+        if T is None or photograph.kind not in ("image", "control_image"):
+            continue
+        name = f"{capture.viewpoint}.jpg"
+        shutil.copyfile(summary.store.artefact_path(photograph.sha256), images / name)
+        poses[name], sources[name] = np.array(T), photograph.sha256
+    write_camera(folder / "camera.json", camera)
+    write_poses_csv(folder / "poses.csv", poses)
+    write_transforms_json(folder / "transforms.json", camera, {f"images/{name}": T for name, T in poses.items()})
+    vertices_m, faces = summary.scan_mesh()
+    trimesh.Trimesh(vertices_m, faces, process=False).export(folder / "mesh.ply")
+    description = {
+        "run": summary.run_id,
+        "simulated": summary.root.simulated,
+        "protocol": f"{summary.root.protocol_id} {summary.root.protocol_version}",
+        "protocol_sha256": summary.root.protocol_sha256,
+        "frame": "scan",
+        "unit": "m",
+        "poses": "poses.csv is T_scan_camera: x right, y down, z forward; transforms.json has OpenGL axes",
+        "pose_source": best,
+        "evaluation": list(summary.table()),
+        "deviations": [d.text for d in summary.state.deviations if not d.is_note],
+        "head_of_chain_sha256": summary.events[-1].sha256,
+        "image_sha256": sources,
+    }
+    (folder / "dataset.json").write_text(json.dumps(description, indent=1), encoding="utf-8")
