@@ -1,0 +1,80 @@
+"""The one place where our conventions and COLMAP's meet: half a pixel, and the direction of poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+
+from service.compute.camera_model import CameraModel
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform, inverse, transform
+
+HALF_PIXEL = 0.5  # COLMAP's first pixel spans 0..1, so its centre lies at 0.5; ours lies at 0
+
+
+def to_colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
+    """COLMAP's OPENCV camera of our calibrated one."""
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model="OPENCV",
+        width=camera.width,
+        height=camera.height,
+        params=[
+            camera.fx,
+            camera.fy,
+            camera.cx + HALF_PIXEL,
+            camera.cy + HALF_PIXEL,
+            camera.k1,
+            camera.k2,
+            camera.p1,
+            camera.p2,
+        ],
+    )
+
+
+def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
+    """Our camera of a COLMAP camera.
+
+    Raises:
+        DataError: its model has distortion terms that ours does not.
+    """
+    p = [float(v) for v in camera.params]
+    size = (int(camera.width), int(camera.height))
+    name = camera.model_name
+    if name == "OPENCV":
+        fx, fy, cx, cy, k1, k2, p1, p2 = p
+    elif name == "PINHOLE":
+        (fx, fy, cx, cy), (k1, k2, p1, p2) = p, (0.0,) * 4
+    elif name in {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}:
+        f, cx, cy, *radial = p
+        fx = fy = f
+        k1, k2, p1, p2 = (*radial, 0.0, 0.0, 0.0, 0.0)[:4]
+    else:
+        raise DataError(
+            f"camera model {name} is not supported",
+            where=f"camera {camera.camera_id}",
+            remedy="export the model with an OPENCV, RADIAL, SIMPLE_RADIAL or PINHOLE camera",
+        )
+    return CameraModel(*size, fx, fy, cx - HALF_PIXEL, cy - HALF_PIXEL, k1, k2, p1, p2)
+
+
+def to_colmap_pose(T_world_camera: Transform) -> pycolmap.Rigid3d:
+    """COLMAP's cam_from_world of our pose."""
+    T_camera_world = inverse(T_world_camera)
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(T_camera_world[:3, :3]), T_camera_world[:3, 3])
+
+
+def from_colmap_pose(cam_from_world: pycolmap.Rigid3d) -> Transform:
+    """T_world_camera of COLMAP's cam_from_world."""
+    rotation = np.asarray(cam_from_world.rotation.matrix(), dtype=np.float64)
+    return inverse(transform(rotation, np.asarray(cam_from_world.translation, dtype=np.float64)))
+
+
+def to_colmap_pixels(pixels: Array) -> Array:
+    """COLMAP's image coordinates (N, 2) of our pixels (N, 2)."""
+    return pixels + HALF_PIXEL
+
+
+def from_colmap_pixels(points: Array) -> Array:
+    """Our pixels (N, 2) of COLMAP's image coordinates (N, 2)."""
+    return points - HALF_PIXEL

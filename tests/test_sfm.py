@@ -1,0 +1,136 @@
+"""Structure from motion on analytically rendered views: accuracy, shared features, missing images, errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from service.compute.camera_model import CameraModel
+from service.compute.sfm import SfmModel, SfmOptions, choose_pairs, reconstruct
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Transform, align_points, apply
+from tests.support.textured_scene import camera_of_width, render, ring_of_poses, slabs
+
+OPTIONS = SfmOptions(max_features=1500, neighbours=4)
+
+
+@pytest.fixture(scope="module")
+def camera() -> CameraModel:
+    return camera_of_width(480)
+
+
+@pytest.fixture(scope="module")
+def views(camera: CameraModel, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Transform]]:
+    folder = tmp_path_factory.mktemp("views")
+    scene = slabs()
+    out: dict[str, tuple[Path, Transform]] = {}
+    for k, T in enumerate(ring_of_poses(8)):
+        path = folder / f"blob{k}"  # as in a content-addressed store: no suffix
+        path.write_bytes(
+            cv2.imencode(".jpg", render(scene, camera, T, k), [cv2.IMWRITE_JPEG_QUALITY, 96])[1].tobytes()
+        )
+        out[f"station {k % 2 + 1}/view_{k}.jpg"] = (path, T)
+    return out
+
+
+def _rms_m(model: SfmModel, views: dict[str, tuple[Path, Transform]]) -> float:
+    truth = np.array([views[name][1][:3, 3] for name in model.T_world_camera])
+    found = np.array([T[:3, 3] for T in model.T_world_camera.values()])
+    T, scale = align_points(truth, found, with_scale=True)
+    for name, pose in model.T_world_camera.items():
+        drift = T[:3, :3] @ pose[:3, :3] @ views[name][1][:3, :3].T
+        assert np.degrees(np.arccos(np.clip((np.trace(drift) - 1) / 2, -1, 1))) < 0.085  # one pixel
+    return float(np.sqrt(np.mean(np.sum((truth - apply(T, scale * found)) ** 2, axis=1))))
+
+
+def test_both_mappers_share_features_and_find_the_poses(
+    camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    images = {name: path for name, (path, _) in views.items()}
+    prior = {name: T for name, (_, T) in views.items()}
+    # a picture of something else cannot be registered and must be reported
+    stray = tmp_path / "stray.png"
+    cv2.imwrite(str(stray), np.random.default_rng(0).integers(0, 255, (camera.height, camera.width), dtype=np.uint8))
+    images["stray.png"] = stray
+    seen: list[tuple[str, int, int]] = []
+    first = reconstruct(
+        images,
+        camera,
+        tmp_path / "work",
+        T_world_camera_prior=prior,
+        options=OPTIONS,
+        progress=lambda *step: seen.append(step),
+    )
+    second = reconstruct(images, camera, tmp_path / "work", "global", T_world_camera_prior=prior, options=OPTIONS)
+    for model in (first, second):
+        assert set(model.T_world_camera) == set(views)
+        assert model.missing == ("stray.png",)
+        assert model.n_registered == len(views)
+        assert model.mean_reprojection_error_px < 0.4
+        assert len(model.points_world) > 300
+        # 0.25 mm is a quarter of a pixel at the scene
+        assert _rms_m(model, views) < 2.5e-4
+    assert set(first.seconds) == {"extract", "match", "map"}
+    assert set(second.seconds) == {"map"}
+    assert {stage for stage, _, _ in seen} == {"extract", "match", "map"}
+    assert all(0 <= done <= total for _, done, total in seen)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_wrong_size_or_broken_image_is_named(
+    camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path
+) -> None:
+    images = {name: path for name, (path, _) in list(views.items())[:4]}
+    broken = tmp_path / "cut.jpg"
+    broken.write_bytes(next(iter(images.values())).read_bytes()[:300])
+    with pytest.raises(DataError, match=r"cut\.jpg"):
+        reconstruct({**images, "cut.jpg": broken}, camera, tmp_path / "a", options=OPTIONS)
+    small = tmp_path / "small.png"
+    cv2.imwrite(str(small), np.zeros((100, 150), dtype=np.uint8))
+    with pytest.raises(DataError, match=r"small\.png"):
+        reconstruct({**images, "small.png": small}, camera, tmp_path / "b", options=OPTIONS)
+
+
+def test_unrelated_images_give_no_model(camera: CameraModel, tmp_path: Path) -> None:
+    paths: list[Path] = []
+    for k in range(3):
+        paths.append(tmp_path / f"noise{k}.png")
+        noise = np.random.default_rng(k).integers(0, 255, (camera.height, camera.width), dtype=np.uint8)
+        cv2.imwrite(str(paths[-1]), cv2.GaussianBlur(noise, (0, 0), 3))
+    with pytest.raises(ComputeError, match="registered 0 of 3"):
+        reconstruct(paths, camera, tmp_path / "work", options=OPTIONS)
+
+
+def test_missing_file_and_too_few_images(camera: CameraModel, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="does not exist"):
+        reconstruct([tmp_path / "nothing.jpg"], camera, tmp_path / "work")
+    with pytest.raises(ComputeError, match="at least 3"):
+        reconstruct([], camera, tmp_path / "work")
+
+
+def test_pairs_are_neighbours_and_connected() -> None:
+    poses = ring_of_poses(24)
+    names = [f"v{k:02d}" for k in range(24)]
+    prior = dict(zip(names, poses, strict=True))
+    pairs = choose_pairs(names, prior, SfmOptions(neighbours=6))
+    assert 24 * 6 / 2 <= len(pairs) < 24 * 6
+    reach = {0}
+    for _ in range(24):
+        reach |= {j for i, j in pairs if i in reach} | {i for i, j in pairs if j in reach}
+    assert reach == set(range(24))
+    # an image without a pose is matched with all others, and no prior means all pairs
+    del prior["v07"]
+    assert sum(7 in pair for pair in choose_pairs(names, prior, SfmOptions(neighbours=6))) == 23
+    assert len(choose_pairs(names, None, SfmOptions())) == 24 * 23 / 2
+
+
+def test_two_far_stations_are_bridged() -> None:
+    """Two tight groups of views, further apart than the angle limit, still get pairs that join them."""
+    poses = ring_of_poses(24, tilt_deg=45)
+    names = [f"v{k:02d}" for k in range(24)]
+    prior = {names[k]: poses[k] for k in (1, 3, 5, 13, 15, 17)}
+    pairs = choose_pairs(sorted(prior), prior, SfmOptions(neighbours=2, max_angle_deg=30))
+    assert any(i < 3 <= j for i, j in pairs)
