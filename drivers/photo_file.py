@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import exiv2
-
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import CameraSettings
 
+# Without types of its own; see docs/decisions/0002-strict-typing.md.
+exiv2: Any = importlib.import_module("exiv2")
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
 _STANDALONE = {0x01, *range(0xD0, 0xD8)}
 
@@ -48,65 +49,88 @@ class ExifRecord:
         return CameraSettings(self.aperture_f, self.exposure_s, self.iso, focus_mode, image_quality)
 
 
+# The library's own look-up functions crash the process on pictures without EXIF, so keys are asked for by name.
+_KEYS = {
+    "make": ("Exif.Image.Make",),
+    "model": ("Exif.Image.Model", "Exif.Image.UniqueCameraModel"),
+    "serial": ("Exif.Photo.BodySerialNumber", "Exif.Image.CameraSerialNumber"),
+    "lens": ("Exif.Photo.LensModel",),
+    "aperture": ("Exif.Photo.FNumber", "Exif.Image.FNumber"),
+    "exposure": ("Exif.Photo.ExposureTime", "Exif.Image.ExposureTime"),
+    "iso": ("Exif.Photo.ISOSpeedRatings", "Exif.Image.ISOSpeedRatings", "Exif.Photo.RecommendedExposureIndex"),
+    "focal_length": ("Exif.Photo.FocalLength", "Exif.Image.FocalLength"),
+    "orientation": ("Exif.Image.Orientation",),
+    "taken": ("Exif.Photo.DateTimeOriginal", "Exif.Image.DateTimeOriginal"),
+    "subseconds": ("Exif.Photo.SubSecTimeOriginal",),
+    "offset": ("Exif.Photo.OffsetTimeOriginal",),
+}
+
+
 def read_exif(path: Path) -> ExifRecord:
     """Read the EXIF of a photograph (JPEG, TIFF, PNG, raw). Raises UnreadableFileError if it is no picture at all."""
     try:
         image = exiv2.ImageFactory.open(str(path))
         image.readMetadata()
+        exif = image.exifData()
+        return ExifRecord(
+            path=path,
+            make=_text(exif, "make"),
+            model=_text(exif, "model"),
+            body_serial=_text(exif, "serial"),
+            lens=_text(exif, "lens"),
+            aperture_f=_number(exif, "aperture"),
+            exposure_s=_number(exif, "exposure"),
+            iso=_integer(exif, "iso"),
+            focal_length_mm=_number(exif, "focal_length"),
+            taken=_taken(exif),
+            orientation=_integer(exif, "orientation") or 1,
+            width=int(image.pixelWidth()),
+            height=int(image.pixelHeight()),
+        )
     except exiv2.Exiv2Error as error:
         raise UnreadableFileError(
             f"The photograph cannot be read: {error}", where=str(path), remedy="Copy it again from the camera"
         ) from error
-    exif = image.exifData()
-    return ExifRecord(
-        path=path,
-        make=_text(exiv2.make(exif), exif),
-        model=_text(exiv2.model(exif), exif),
-        body_serial=_text(exiv2.serialNumber(exif), exif),
-        lens=_text(exiv2.lensName(exif), exif),
-        aperture_f=_number(exiv2.fNumber(exif), exif),
-        exposure_s=_number(exiv2.exposureTime(exif), exif),
-        iso=_integer(exiv2.isoSpeed(exif), exif),
-        focal_length_mm=_number(exiv2.focalLength(exif), exif),
-        taken=_taken(exif),
-        orientation=_integer(exiv2.orientation(exif), exif) or 1,
-        width=int(image.pixelWidth()),
-        height=int(image.pixelHeight()),
-    )
 
 
-def _text(found: Any, exif: Any) -> str:
-    return "" if found == exif.end() else str(found.print(exif)).strip()
+def _find(exif: Any, name: str) -> Any:
+    for key in _KEYS[name]:
+        if key in exif and exif[key].count() > 0:
+            return exif[key]
+    return None
 
 
-def _number(found: Any, exif: Any) -> float | None:
-    if found == exif.end() or found.count() == 0:
+def _text(exif: Any, name: str) -> str:
+    found = _find(exif, name)
+    return "" if found is None else str(found.toString()).strip("\0 ")
+
+
+def _number(exif: Any, name: str) -> float | None:
+    found = _find(exif, name)
+    if found is None:
         return None
     numerator, denominator = found.toRational()
     # Cameras write 0/0 for a lens that does not report.
     return numerator / denominator if denominator and numerator > 0 else None
 
 
-def _integer(found: Any, exif: Any) -> int | None:
-    return None if found == exif.end() or found.count() == 0 else int(found.toInt64())
+def _integer(exif: Any, name: str) -> int | None:
+    found = _find(exif, name)
+    return None if found is None else int(found.toInt64())
 
 
 def _taken(exif: Any) -> str:
-    parts: list[str] = []
-    for key, prefix in (("DateTimeOriginal", ""), ("SubSecTimeOriginal", "."), ("OffsetTimeOriginal", "")):
-        found = exif.findKey(exiv2.ExifKey(f"Exif.Photo.{key}"))
-        value = "" if found == exif.end() else str(found.toString()).strip()
-        if not value and not parts:
-            return ""
-        parts.append(f"{prefix}{value}" if value else "")
-    return "".join(parts)
+    moment, subseconds = _text(exif, "taken"), _text(exif, "subseconds")
+    if not moment:
+        return ""
+    return moment + (f".{subseconds}" if subseconds else "") + _text(exif, "offset")
 
 
 def check_jpeg_complete(path: Path) -> None:
     """Raise UnreadableFileError unless the file is a JPEG whose picture has its end marker.
 
-    Data after the first picture (the previews that Sony appends) are allowed. Inside compressed data FF D9 can only be
-    the end marker (ITU T.81, B.1.1.2), so a search after the first scan header decides.
+    Data after the first picture (the previews that Sony appends) are allowed. Inside compressed data FF D9 can
+    only be the end marker (ITU T.81, B.1.1.2), so a search after the first scan header decides.
     """
     data = path.read_bytes()
     if data[:2] != bytes((0xFF, _SOI)):

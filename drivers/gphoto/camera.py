@@ -5,13 +5,10 @@ from __future__ import annotations
 import logging
 import re
 import time
-from collections.abc import Callable
-from datetime import datetime, timezone
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
-
-import gphoto2 as gp
 
 from drivers.errors import (
     DeviceBusyError,
@@ -24,7 +21,7 @@ from drivers.errors import (
     UnreadableFileError,
 )
 from drivers.gphoto import settings as words
-from drivers.gphoto.link import AddedFile, Link, library_version
+from drivers.gphoto.link import AddedFile, Link, gp, library_version
 from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
 from drivers.photo_file import check_jpeg_complete, read_exif, sha256_of
 from drivers.plugin import DriverConfig
@@ -210,7 +207,9 @@ class GphotoCamera:
 
     def _check_space(self) -> None:
         free = self._link.free_bytes()
-        if free is not None and (free == 0 or (self._config.capture_target != "computer" and free < LEAST_FREE_BYTES)):
+        if free is not None and (
+            free == 0 or (self._config.capture_target != "computer" and free < LEAST_FREE_BYTES)
+        ):
             raise DeviceStorageFullError(
                 f"{free / 1e6:.0f} MB free in the camera", where=self._link.where, remedy="Empty or change the card"
             )
@@ -241,8 +240,9 @@ class GphotoCamera:
         while len(added) < expected:
             if time.monotonic() - trigger_s > self._config.capture_timeout_s:
                 names = ", ".join(one.name for one in added) or "none"
+                waited_s = self._config.capture_timeout_s
                 raise DeviceTimeoutError(
-                    f"{expected} file(s) were due {self._config.capture_timeout_s:g} s after the shutter, came: {names}",
+                    f"{expected} file(s) were due {waited_s:g} s after the shutter, came: {names}",
                     where=self._link.where,
                     remedy="Check the save destination and the display of the camera, then take the exposure again",
                 )
@@ -256,11 +256,10 @@ class GphotoCamera:
         target = folder / f"{stem}{suffix}"
         if target.exists():
             raise self._stale(f"{target.name} came from the camera before")
-        fetch: Callable[[gp.Camera], gp.CameraFile] = lambda camera: camera.file_get(  # noqa: E731
-            added.folder, added.name, gp.GP_FILE_TYPE_NORMAL
-        )
         partial = target.with_name(target.name + ".part")
-        file = self._link.call(f"Fetching {target.name}", fetch)
+        file = self._link.call(
+            f"Fetching {target.name}", lambda c: c.file_get(added.folder, added.name, gp.GP_FILE_TYPE_NORMAL)
+        )
         partial.write_bytes(memoryview(file.get_data_and_size()))
         info = self._link.call("Asking the file's size", lambda c: c.file_get_info(added.folder, added.name)).file
         size = partial.stat().st_size
@@ -317,4 +316,4 @@ def _clock_offset_s(taken: str, trigger_monotonic_s: float) -> float | None:
     except ValueError:
         return None
     released = time.time() - (time.monotonic() - trigger_monotonic_s)
-    return (stamp - datetime.fromtimestamp(released, timezone.utc)).total_seconds()
+    return (stamp - datetime.fromtimestamp(released, UTC)).total_seconds()

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
-
-import gphoto2 as gp
 
 from drivers.errors import (
     DeviceBusyError,
@@ -21,6 +20,8 @@ from drivers.errors import (
     DeviceUnavailableError,
 )
 
+gp: Any = importlib.import_module("gphoto2")  # no types; see docs/decisions/0002-strict-typing.md
+Gphoto = Any  # a gphoto2.Camera
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 BROKEN_VERSIONS = ("2.5.31",)
@@ -64,7 +65,7 @@ def library_version() -> str:
     return str(gp.gp_library_version(gp.GP_VERSION_SHORT)[0])
 
 
-def translate(error: gp.GPhoto2Error, doing: str, where: str) -> DeviceError:
+def translate(error: Any, doing: str, where: str) -> DeviceError:
     """The DeviceError for a libgphoto2 error code; −1 says nothing, so it counts as a lost link."""
     kind, remedy = _ERRORS.get(int(error.code), (DeviceUnavailableError, _UNAVAILABLE))
     return kind(f"{doing} failed: {error.string} ({error.code})", where=where, remedy=remedy)
@@ -96,7 +97,7 @@ class Link:
         self.where = f"camera at {port or 'USB'}"
         self._port = port
         self._model = model
-        self._camera: gp.Camera | None = None
+        self._camera: Gphoto | None = None
 
     @property
     def is_open(self) -> bool:
@@ -122,7 +123,7 @@ class Link:
                 self._camera = camera
                 return
 
-    def _select(self) -> gp.Camera:
+    def _select(self) -> Gphoto:
         camera = gp.Camera()
         if not self._port.startswith("ptpip:"):
             found = [(name, port) for name, port in gp.Camera.autodetect() if self._fits(name, port)]
@@ -162,7 +163,7 @@ class Link:
         del camera
         keep_descriptor_zero()
 
-    def call(self, doing: str, function: Callable[[gp.Camera], T]) -> T:
+    def call(self, doing: str, function: Callable[[Gphoto], T]) -> T:
         """Run a function on the camera, errors translated."""
         if self._camera is None:
             raise DeviceUnavailableError("The camera is not open", where=self.where, remedy="Open it first")
@@ -188,7 +189,7 @@ class Link:
     def value(self, name: str) -> str:
         """Value of one widget; DeviceRefusedError when the camera has no such setting."""
 
-        def read(camera: gp.Camera) -> str:
+        def read(camera: Gphoto) -> str:
             return str(camera.get_single_config(name).get_value())
 
         return self.call(f"Reading the setting {name}", read)
@@ -196,7 +197,7 @@ class Link:
     def choices(self, name: str) -> tuple[str, ...]:
         """What the camera offers for a widget now; empty for free text and ranges."""
 
-        def read(camera: gp.Camera) -> tuple[str, ...]:
+        def read(camera: Gphoto) -> tuple[str, ...]:
             widget = camera.get_single_config(name)
             if widget.get_type() not in (gp.GP_WIDGET_RADIO, gp.GP_WIDGET_MENU):
                 return ()
@@ -207,7 +208,7 @@ class Link:
     def put(self, name: str, value: str) -> None:
         """Send one widget alone: a refusal is silent when the whole tree is sent."""
 
-        def write(camera: gp.Camera) -> None:
+        def write(camera: Gphoto) -> None:
             widget = camera.get_single_config(name)
             widget.set_value(value)
             camera.set_single_config(name, widget)

@@ -7,10 +7,17 @@ from fractions import Fraction
 
 from drivers.errors import DeviceRefusedError
 
-F_NUMBER, SHUTTER, ISO, FOCUS, QUALITY, TARGET = "f-number", "shutterspeed", "iso", "focusmode", "imagequality", "d222"
+F_NUMBER, SHUTTER, ISO, FOCUS, QUALITY, TARGET = (
+    "f-number",
+    "shutterspeed",
+    "iso",
+    "focusmode",
+    "imagequality",
+    "d222",
+)
 RELATIVE_TOLERANCE = 0.01  # neighbouring thirds of a stop differ by 12 % and more
 TARGET_CODES = {"computer": "1", "card": "16", "both": "17"}
-# The named widget sends an empty value; on a body in mode 2 the finer words come in place of the plain ones.
+# On a body in mode 2 the finer words come in place of the plain ones.
 _QUALITY_WORDS = {
     "JPEG": ("JPEG", "Extra Fine", "X.Fine", "Fine"),
     "RAW": ("RAW",),
@@ -31,7 +38,9 @@ def choose_number(name: str, wanted: float, offered: Sequence[str], where: str) 
     numbers = [(word, number) for word in offered if (number := number_of(word)) is not None]
     if not numbers:
         raise DeviceRefusedError(
-            f"The camera offers no values for {name}", where=where, remedy="Turn the mode dial to M and check the lens"
+            f"The camera offers no values for {name}",
+            where=where,
+            remedy="Turn the mode dial to M and check the lens",
         )
     numbers.sort(key=lambda pair: abs(pair[1] - wanted))
     word, number = numbers[0]
@@ -49,7 +58,9 @@ def choose_word(name: str, wanted: str, offered: Sequence[str], where: str) -> s
         if word in offered:
             return word
     raise DeviceRefusedError(
-        f"The camera does not offer {name} {wanted}", where=where, remedy=f"It offers: {', '.join(offered) or 'nothing'}"
+        f"The camera does not offer {name} {wanted}",
+        where=where,
+        remedy=f"It offers: {', '.join(offered) or 'nothing'}",
     )
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
 import struct
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Any
 
 import cv2
-import exiv2
 import numpy as np
 from numpy.typing import NDArray
 
 from simulators.serve import SimulatorError
 from simulators.sony_camera.properties import ExposureSettings
 
+exiv2: Any = importlib.import_module("exiv2")  # a library without types of its own
 MAKE, MODEL, LENS = "SONY", "ILCE-7RM5", "FE 24-70mm F2.8 GM"
 BODY_SERIAL, FIRMWARE = "05318008", "ILCE-7RM5 v3.00"
 FOCAL_LENGTH_MM = 50
@@ -45,8 +47,8 @@ def encode_jpeg(picture: NDArray[np.uint8], shot: Shot) -> bytes:
     return _with_exif(encoded.tobytes(), picture.shape[1], picture.shape[0], shot)
 
 
-def _with_exif(jpeg: bytes, width: int, height: int, shot: Shot) -> bytes:
-    image = exiv2.ImageFactory.open(jpeg)
+def _with_exif(file: bytes, width: int, height: int, shot: Shot) -> bytes:
+    image = exiv2.ImageFactory.open(file)
     image.readMetadata()
     exif = image.exifData()
     settings = shot.settings
@@ -138,4 +140,5 @@ def encode_raw(picture: NDArray[np.uint8], shot: Shot) -> bytes:
         else:
             field = data.ljust(4, b"\0")
         directory += struct.pack("<HHI", tag, kind, count) + field
-    return b"II*\0" + struct.pack("<I", 8) + directory + struct.pack("<I", 0) + extra + pixels
+    tiff = b"II*\0" + struct.pack("<I", 8) + directory + struct.pack("<I", 0) + extra + pixels
+    return _with_exif(tiff, width, height, shot)

@@ -18,8 +18,21 @@ OBJECT_ADDED = 0xC201
 OK, GENERAL_ERROR, SESSION_NOT_OPEN, NOT_SUPPORTED = 0x2001, 0x2002, 0x2003, 0x2005
 INVALID_STORAGE, INVALID_HANDLE, STORE_FULL, ACCESS_DENIED = 0x2008, 0x2009, 0x200C, 0x200F
 DEVICE_BUSY, INVALID_VALUE = 0x2019, 0x201C
-_REJECTIONS = {"busy": DEVICE_BUSY, "disk_full": STORE_FULL, "reject": ACCESS_DENIED, "error": GENERAL_ERROR}
-# A real body answers a poll in milliseconds while its processor exposes; the client would ask a thousand times a second.
+_REJECTIONS = {
+    "busy": DEVICE_BUSY,
+    "disk_full": STORE_FULL,
+    "reject": ACCESS_DENIED,
+    "error": GENERAL_ERROR,
+    "ignore": OK,
+}
+_CODES: dict[type[Exception], int] = {
+    BusyError: DEVICE_BUSY,
+    CardFullError: STORE_FULL,
+    NotWritableError: ACCESS_DENIED,
+    RefusedValueError: INVALID_VALUE,
+    SimulatorError: GENERAL_ERROR,
+}
+# A real body takes milliseconds to answer a poll while it exposes; the client asks as often as it is answered.
 _POLL_WHILE_EXPOSING_S = 0.005
 
 
@@ -56,10 +69,6 @@ class Responder:
             0x9209: ("get_properties", self._all_properties),
         }
 
-    def expects_data(self, request: codec.Request) -> bool:
-        """Whether the client's data phase follows."""
-        return request.sends_data
-
     def handle(self, request: codec.Request, data: bytes) -> Reply:
         """Carry out one operation. Planned faults of the kinds busy, disk_full, reject, error and ignore act here."""
         known = self._operations.get(request.operation)
@@ -67,25 +76,14 @@ class Responder:
             return Reply(NOT_SUPPORTED)
         name, operation = known
         fault = self._faults.check("camera", self._message(name, request, data))
-        if fault is not None:
-            if fault.kind == "disk_full":
-                self._body.free_bytes = 0
-            if fault.kind in _REJECTIONS:
-                return Reply(_REJECTIONS[fault.kind])
-            if fault.kind == "ignore":
-                return Reply()
+        if fault is not None and fault.kind == "disk_full":
+            self._body.free_bytes = 0
+        if fault is not None and fault.kind in _REJECTIONS:
+            return Reply(_REJECTIONS[fault.kind])
         try:
             reply = operation(request, data)
-        except BusyError:
-            return Reply(DEVICE_BUSY)
-        except CardFullError:
-            return Reply(STORE_FULL)
-        except NotWritableError:
-            return Reply(ACCESS_DENIED)
-        except RefusedValueError:
-            return Reply(INVALID_VALUE)
-        except SimulatorError:
-            return Reply(GENERAL_ERROR)
+        except tuple(_CODES) as error:
+            return Reply(_CODES[type(error)])
         return Reply(reply.code, reply.parameters, reply.data, fault)
 
     def _message(self, name: str, request: codec.Request, data: bytes) -> str:

