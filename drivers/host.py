@@ -107,6 +107,7 @@ class HostedDevice:
         self._child: _Child | None = None
         self._sequence = 0
         self._obituary = "not opened yet"
+        self._suspect = False  # the driver reported a lost link
         self._watch_stop = threading.Event()
         self._watcher: threading.Thread | None = None
 
@@ -119,8 +120,8 @@ class HostedDevice:
     def open(self) -> DeviceIdentity:
         """Start the child unless one is alive, and open the device in it."""
         with self._lock:
-            if self._child is not None and self._child.process.poll() is not None:
-                self._bury()
+            if self._child is not None and (self._suspect or self._child.process.poll() is not None):
+                self._bury()  # a native library that lost its link is not trusted with a second connection
             fresh = self._child is None
             if fresh:
                 self._start()
@@ -186,6 +187,7 @@ class HostedDevice:
             self._bury()
             raise self._unavailable() from error
         if not ok:
+            self._suspect = self._suspect or isinstance(value, DeviceUnavailableError)
             raise value
         return value
 
@@ -223,6 +225,7 @@ class HostedDevice:
         reader = threading.Thread(target=_log_output, args=(process, self._name), daemon=True)
         reader.start()
         self._child = _Child(process, Connection(ours.detach()), reader)
+        self._suspect = False
         start = (self._spec_path, self._config_json, self._call_timeout_s)
         try:
             self._exchange("start", start, {}, START_TIMEOUT_S)
@@ -304,6 +307,8 @@ class _Server:
                 self._connection.send_bytes(reply)
         if self._device is not None:
             self._device.close()
+        logging.shutdown()
+        os._exit(0)  # without the destructors of native libraries, which may wait for a dead link
 
     def _read(self) -> None:
         try:

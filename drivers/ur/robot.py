@@ -82,6 +82,7 @@ class UrRobot:
         self._receive: library.Receive | None = None
         self._io: library.InputOutput | None = None
         self._control: library.Control | None = None
+        self._abandoned: list[library.Control] = []  # kept from their destructors
         self._stream: PoseStream | None = None
         self._T_flange_tcp: Transform = np.eye(4)
         self._controller_time_s = -1.0
@@ -118,14 +119,17 @@ class UrRobot:
         """End a motion that is under way, then the script and the connections; a dead link is no error."""
         stream, self._stream = self._stream, None
         control, self._control = self._control, None
+        alive = stream is not None and stream.alive
         if stream is not None:
             stream.close()
-        with contextlib.suppress(*VENDOR_ERRORS):
-            if control is not None and control.isConnected():
-                if control.isProgramRunning():
+        if alive and control is not None:  # on a dead link these calls wait for ever, or crash
+            with contextlib.suppress(*VENDOR_ERRORS):
+                if control.isConnected() and control.isProgramRunning():
                     control.stopJ(self._config.stop_deceleration_rad_s2)
                     control.stopScript()
                 control.disconnect()
+        elif control is not None:
+            self._abandoned.append(control)
         for client in (self._io, self._receive, self._dashboard):
             with contextlib.suppress(*VENDOR_ERRORS):
                 if client is not None and client.isConnected():
@@ -372,8 +376,8 @@ class UrRobot:
             raise self._refusal(f"the controller did not start the {what}")
 
     def _refusal(self, what: str) -> DeviceError:
-        """The reason behind a call that just returned False: a stop, or a plain no."""
-        time.sleep(2 / STREAM_HZ)
+        """The reason behind a call that just returned False: a lost link (raised), a stop, or a plain no."""
+        self._streaming().next()
         return self._obstacle() or DeviceRefusedError(
             what, where=self._where, remedy="See the log of the pendant for the reason"
         )

@@ -68,6 +68,13 @@ class PoseStream:
         self._stop.set()
         self._thread.join(5.0)
 
+    @property
+    def alive(self) -> bool:
+        """Whether samples come in."""
+        with self._lock:
+            newest = self._samples[-1] if self._samples else None
+        return newest is not None and time.monotonic() - newest.monotonic_s <= self._stale_after_s
+
     def latest(self) -> RobotSample:
         """The newest sample. Raises DeviceUnavailableError when it is too old."""
         deadline = time.monotonic() + self._stale_after_s
@@ -84,6 +91,13 @@ class PoseStream:
                     remedy="Check the cable and the controller, then reconnect",
                 )
             time.sleep(POLL_S)
+
+    def next(self) -> RobotSample:
+        """A sample that arrives from now on. Raises DeviceUnavailableError when none does."""
+        now_s = time.monotonic()
+        while (sample := self.latest()).monotonic_s <= now_s:
+            time.sleep(POLL_S)
+        return sample
 
     def between(self, start_s: float, end_s: float) -> tuple[RobotSample, ...]:
         """Samples that arrived between two host times, oldest first."""

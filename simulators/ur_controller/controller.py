@@ -101,6 +101,7 @@ class Controller:
         self._stopped_at_s = -math.inf
         self._button_released_s = -math.inf
         self._pending_fault: tuple[float, Fault] | None = None
+        self.stream_fault: Fault | None = None  # for the server: a motion that takes the stream with it
         self._ring: tuple[float, Array] | None = None
         self._place_tool()
 
@@ -167,6 +168,11 @@ class Controller:
         return self.robot_mode is RobotMode.RUNNING and self.safety in (SafetyMode.NORMAL, SafetyMode.REDUCED)
 
     @property
+    def planned_qd(self) -> Array:
+        """Joint velocities as the motion has them, before speed slider and speed-up."""
+        return self.motion.qd if self.motion is not None else np.zeros(6)
+
+    @property
     def steady(self) -> bool:
         """is_steady(): the target stands still; it sees nothing of the arm's swinging."""
         return self.motion is None
@@ -176,7 +182,9 @@ class Controller:
         fault = self.faults.check(self.device, "move")
         if fault is not None and fault.kind == "reject":
             return False
-        if fault is not None:
+        if fault is not None and fault.kind in ("stall", "drop"):
+            self.stream_fault = fault
+        elif fault is not None:
             delay_s = float(fault.value) if isinstance(fault.value, (int, float)) else 0.15
             self._pending_fault = (self.time_s + delay_s, fault)
         self.motion = motion

@@ -238,7 +238,7 @@ class ControlProgram:
         acceleration = self._in(7 if self._in_int(0) == 41 else 6)
         frame = kinematics.from_pose(c.tcp_pose_m)
         motion = Speed(
-            c.model, c.target_q, c.target_qd, T_flange_tcp=frame, target=target, acceleration=acceleration, tool=tool
+            c.model, c.target_q, c.planned_qd, T_flange_tcp=frame, target=target, acceleration=acceleration, tool=tool
         )
         if not c.may_move or not c.start(motion):
             raise StopProgram("the controller does not allow motion")
@@ -247,7 +247,7 @@ class ControlProgram:
         c = self._c
         if isinstance(c.motion, Servo):
             c.motion.target = goal
-        elif not c.may_move or not c.start(Servo(c.target_q, c.target_qd, goal, self._in(9))):
+        elif not c.may_move or not c.start(Servo(c.target_q, c.planned_qd, goal, self._in(9))):
             raise StopProgram("the controller does not allow motion")
 
     def _stop_now(self) -> None:
@@ -256,7 +256,7 @@ class ControlProgram:
         deceleration = self._in(0)
         if self._executing == 33:  # stopL's rate is the tool's, in m/s²; taken over the arm's usual lever of 0.5 m
             deceleration /= 0.5
-        self._c.replace(Stop(self._c.target_q, self._c.target_qd, deceleration))
+        self._c.replace(Stop(self._c.target_q, self._c.planned_qd, deceleration))
         self._blocking = self._in_int(1) != 1 or self._executing not in (33, 34)
 
     def _payload(self) -> None:
@@ -319,7 +319,7 @@ class Interpreter:
         """Kill the program; the arm stops."""
         self._program = None
         if self._c.motion is not None:
-            self._c.replace(Stop(self._c.target_q, self._c.target_qd, 4.0))
+            self._c.replace(Stop(self._c.target_q, self._c.planned_qd, 4.0))
         self._c.runtime = Runtime.STOPPED
         self._c.generation += 1
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from simulators.serve import SimulatorError, Termination
 from simulators.ur_controller import fields
 from simulators.ur_controller import rtde_codec as codec
-from simulators.ur_controller.controller import Controller, RobotMode
+from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.dashboard import WELCOME, Dashboard
 from simulators.ur_controller.program import Interpreter, ScriptReader
 
@@ -356,13 +356,16 @@ class Server:
             del self.owners[name]
 
     def _stream(self, now_s: float) -> None:
-        if self.controller.robot_mode is RobotMode.RUNNING and self.controller.faults.faults:
-            fault = self.controller.faults.check(self.controller.device, "stream")
-            if fault is not None and fault.kind == "stall":
-                self._stalled_until_s = now_s + (float(fault.value) if isinstance(fault.value, (int, float)) else 1e9)
-            elif fault is not None:
-                for link in self._links:
-                    link.dead = link.dead or isinstance(link, RtdeLink)
+        controller = self.controller
+        fault, controller.stream_fault = controller.stream_fault, None
+        if fault is None and controller.faults.faults:
+            fault = controller.faults.check(controller.device, "stream")
+        if fault is not None and fault.kind == "stall":
+            seconds = float(fault.value) if isinstance(fault.value, (int, float)) else 1e9
+            self._stalled_until_s = now_s + seconds
+        elif fault is not None:
+            for link in self._links:
+                link.dead = link.dead or isinstance(link, RtdeLink)
         if now_s < self._stalled_until_s:
             return
         for link in self._links:
