@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drivers.mesh_file import read_mesh_file
+from drivers.mesh_file import MeshUnit, read_mesh_file
 from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
 from service.compute.mesh_spheres import locate_spheres
 from service.compute.pipeline import detect_all, register_images
@@ -31,7 +31,7 @@ def register_command(
     mesh: Annotated[Path | None, typer.Option("--mesh", help="The scan with the spheres in it.")] = None,
     spheres: Annotated[Path | None, typer.Option("--spheres", help="spheres.json, instead of a mesh.")] = None,
     radius_mm: Annotated[float | None, typer.Option("--radius-mm", help="Radius of the spheres.")] = None,
-    mesh_unit: Annotated[str, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
+    mesh_unit: Annotated[MeshUnit, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
     control: Annotated[
         str, typer.Option("--control", help="Indices of the mesh's spheres that only serve the evaluation: 3,7,9.")
     ] = "",
@@ -87,7 +87,7 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _spheres(
-    mesh: Path | None, spheres: Path | None, radius_mm: float | None, mesh_unit: str, control: str
+    mesh: Path | None, spheres: Path | None, radius_mm: float | None, mesh_unit: MeshUnit, control: str
 ) -> tuple[Array, Array, float]:
     """Registration and control centres (M, 3), (C, 3) and the radius, metres."""
     if (mesh is None) == (spheres is None):

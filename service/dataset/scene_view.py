@@ -28,9 +28,9 @@ def scene_figure(
         stations: station of each viewpoint.
     """
     share = 1.0 - min(1.0, _FACES_SHOWN / max(len(faces), 1))
-    points, triangles = vertices_m.astype(np.float32), faces.astype(np.int32)
+    points, triangles = vertices_m, faces.astype(np.int64)
     if share > 0:
-        points, triangles = fast_simplification.simplify(points, triangles, target_reduction=share)
+        points, triangles = fast_simplification.simplify(points, triangles, target_reduction=share)[:2]
     figure = go.Figure()
     figure.add_mesh3d(
         x=points[:, 0], y=points[:, 1], z=points[:, 2], i=triangles[:, 0], j=triangles[:, 1], k=triangles[:, 2],
