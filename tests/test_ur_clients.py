@@ -268,3 +268,22 @@ def test_unmodified_ur_rtde(controller: tuple[str, str]) -> None:
     assert "until 5s after occurrence" in said["early_unlock"]
     assert said["again"] == [False, True]
     assert said["slider"] == pytest.approx(0.5)
+
+
+# --- world --------------------------------------------------------------------------------------------------------
+
+
+def test_world_is_told_the_joints() -> None:
+    host = address(49)
+    with socket.create_server(("127.0.0.1", 0)) as world:
+        world.settimeout(10)
+        port = world.getsockname()[1]
+        joints = "0.1,-1.2,1.3,-1.4,-1.5,0.6"
+        with simulated_ur(host, "--world", f"127.0.0.1:{port}", "--arm", "robot", "--initial-joints", joints):
+            connection, _ = world.accept()
+            connection.settimeout(10)
+            with connection, connection.makefile("r") as lines:
+                still = [json.loads(lines.readline()) for _ in range(4)]
+                assert {(m["op"], m["arm"]) for m in still} == {("robot", "robot")}
+                assert still[0]["q"] == [0.1, -1.2, 1.3, -1.4, -1.5, 0.6]
+                assert 0 < still[3]["t"] - still[0]["t"] < 0.6, "ten times a second at rest"
