@@ -25,8 +25,8 @@ from service.compute.registration.solve import OutlineResidual, RegistrationResu
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
 
-_CONTROL_GATE = 0.5  # of the radius: a control sphere is where the registration says, or the registration is wrong
-_CONTROL_SIZE_GATE = 0.15
+CONTROL_GATE = 0.5  # of the radius: a control sphere is where the registration says, or the registration is wrong
+CONTROL_SIZE_GATE = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,6 +262,6 @@ def _find_controls(
             out.append(Assignment())
             continue
         seen = sightings([found[j] for j in free], radius_m, camera)
-        pairs = match(seen, apply(inverse(T), controls), radius_m, _CONTROL_GATE, _CONTROL_SIZE_GATE)
+        pairs = match(seen, apply(inverse(T), controls), radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
         out.append(Assignment({free[d]: m for d, m, _ in pairs}, inverse(T), registration.scale))
     return tuple(out)

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.markers.cones import Cone, cone_of_sphere
+from service.compute.markers.records import Evidence, SphereOutline, outline_from_cone
 from service.core.geometry import Array, apply, inverse, look_at, transform
 
 RADIUS_M = 0.015
@@ -53,9 +55,46 @@ def scene(n_images: int = 6, width: int = 1536, seed: int = 0) -> Scene:
         distance = rng.uniform(0.58, 0.72)
         eye = distance * np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
         up = np.array([np.cos(azimuth + 2.4), np.sin(azimuth + 2.4), 0.2])
-        T_scan_camera = look_at(eye, rng.uniform(-0.02, 0.02, 3) + [0, 0, 0.05], up)
+        T_scan_camera = look_at(eye, rng.uniform(-0.02, 0.02, 3) + np.array([0, 0, 0.05]), up)
         poses.append(T_world_scan @ T_scan_camera)
     return Scene(T_world_scan, np.array(poses), camera(width))
+
+
+def exact_outlines(
+    made: Scene, image: int, centres_scan_m: Array, noise_px: float = 0.0, seed: int = 0, margin_px: float = 0.0
+) -> tuple[tuple[SphereOutline, ...], tuple[int, ...]]:
+    """Outlines as a perfect detector gives them, in random order, of the spheres inside the image; and their indices.
+
+    `noise_px` moves a cone's two directions and its size.
+    """
+    rng = np.random.default_rng(1000 * seed + image)
+    c = made.centres_camera(image, centres_scan_m)
+    pixels = made.camera.project(c)
+    inside = np.all(
+        (pixels > margin_px) & (pixels < np.array([made.camera.width, made.camera.height]) - margin_px), axis=1
+    )
+    order = rng.permutation(np.nonzero(inside & (c[:, 2] > 0.1))[0])
+    evidence = Evidence(1.0, 0.1, max(noise_px, 0.02) * 10, 300, 0.3, (180.0, 180.0, 180.0), 0.9)
+    out: list[SphereOutline] = []
+    for k in order:
+        cone = cone_of_sphere(c[k], RADIUS_M)
+        d = rng.normal(size=3) * noise_px / made.camera.fx
+        axis = cone.axis + cone.frame()[:, :2] @ d[:2]
+        noisy = Cone(axis / float(np.linalg.norm(axis)), cone.half_angle_rad + float(d[2]))
+        out.append(outline_from_cone(noisy, made.camera, 200, evidence))
+    return tuple(out), tuple(int(k) for k in order)
+
+
+def false_outlines(cam: CameraModel, n: int, seed: int = 0) -> tuple[SphereOutline, ...]:
+    """Detections of things that are no spheres, at random places, of likely sizes."""
+    rng = np.random.default_rng(seed)
+    evidence = Evidence(0.8, 0.2, 0.2, 200, 0.2, (120.0, 120.0, 120.0), 0.6)
+    out: list[SphereOutline] = []
+    for _ in range(n):
+        pixel = rng.uniform([0, 0], [cam.width, cam.height])[None]
+        centre = np.append(cam.normalise(pixel)[0], 1.0) * rng.uniform(0.5, 0.8)
+        out.append(outline_from_cone(cone_of_sphere(centre, RADIUS_M), cam, 200, evidence))
+    return tuple(out)
 
 
 def _background(shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float64]:
@@ -81,7 +120,7 @@ def render(
     noise: float = 0.004,
     occluders: int = 0,
 ) -> NDArray[np.uint8]:
-    """Image (H, W, 3) BGR uint8 of matte spheres (centres (M, 3) in the camera frame) under one lamp, through JPEG."""
+    """Image (H, W, 3) BGR uint8, through JPEG, of matte spheres (centres (M, 3) in the camera frame) under a lamp."""
     rng = np.random.default_rng(seed)
     image = _background((cam.height, cam.width), rng)
     lamp = np.array([0.35, -0.5, -0.8]) + rng.uniform(-0.2, 0.2, 3)

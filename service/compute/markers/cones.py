@@ -24,8 +24,8 @@ class Cone:
         With E^-1 = P Q^-1 P^T for a sphere c, r in the camera frame: E ~ (|c|^2 - r^2) I - c c^T, which is
         cos^2(a) I - u u^T for u = c / |c| and sin(a) = r / |c|.
         """
-        E = np.cos(self.half_angle_rad) ** 2 * np.eye(3) - np.outer(self.axis, self.axis)
-        return E / float(np.linalg.norm(E))
+        E: Array = float(np.cos(self.half_angle_rad) ** 2) * np.eye(3) - self.axis[:, None] * self.axis
+        return np.asarray(E / float(np.sqrt(np.sum(E**2))), dtype=np.float64)
 
     def frame(self) -> Array:
         """(3, 3) columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""
@@ -149,11 +149,10 @@ def ransac_cone(
         return None
     order = np.argsort(slots, kind="stable")
     rays, strengths, sorted_slots = rays[order], strengths[order], slots[order]
-    # Triples spread around the outline: one point from each third of the azimuth, chosen by strength.
+    # Triples spread around the outline for a whole one, closer together where only an arc is seen.
     first = rng.integers(0, len(rays), trials)
-    shift = (len(rays) * np.array([[0.0, 1 / 3, 2 / 3]]) + rng.uniform(-0.14, 0.14, (trials, 3)) * len(rays)).astype(
-        int
-    )
+    apart = np.where(np.arange(trials) % 2 == 0, 1 / 3, 0.14)[:, None] * [[0.0, 1.0, 2.0]]
+    shift = ((apart + rng.uniform(-0.05, 0.05, (trials, 3))) * len(rays)).astype(int)
     picks = (first[:, None] + shift) % len(rays)
     axis, half = cones_through(rays[picks])
     good = np.isfinite(half) & (half > bounds[0]) & (half < bounds[1])

@@ -82,6 +82,9 @@ def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: Detec
     rng = np.random.default_rng(options.seed)
     kept: list[RoughSphere] = []
     for candidate in candidates:
+        middle = np.append(coarse_camera.normalise(np.array([[candidate.x, candidate.y]]))[0], 1.0)
+        if any(_within(middle, k.cone) for k in kept if k.score > 0.6):
+            continue  # a highlight or a shadow on a sphere that is already known
         rough = _examine(coarse, edge_map, coarse_camera, candidate, options, rng)
         if rough is not None:
             kept.append(rough)
@@ -101,6 +104,7 @@ def _examine(
     length = float(np.linalg.norm(axis))
     cone = Cone(axis / length, float(np.arctan(candidate.radius / camera.fx / length)))
     coverage = 0.0
+    votes = np.zeros(96)
     for envelope in (0.3, 0.14):
         reach = max(4.0, envelope * candidate.radius)
         where = profiles(cone, camera, 96, np.arange(-reach, reach + 0.1, max(0.5, reach / 24)))
@@ -122,19 +126,29 @@ def _examine(
             return None
     if cone.axis[2] < 0.3:
         return None
-    interior, loss, colour = _interior(coarse, edge_map, cone, camera)
-    if interior > options.max_interior_edges or loss > 0.6 or coverage < 0.8 * options.min_coverage:
+    interior, loss, leak, colour = _interior(coarse, edge_map, cone, camera, votes < 0.3)
+    if (
+        leak > options.max_leak
+        or interior > options.max_interior_edges
+        or loss > 0.6
+        or coverage < 0.8 * options.min_coverage
+    ):
         return None
     return RoughSphere(cone, coverage, interior, loss, colour)
 
 
 def _interior(
-    coarse: NDArray[np.uint8], edge_map: NDArray[np.bool_], cone: Cone, camera: CameraModel
-) -> tuple[float, float, tuple[float, float, float]]:
-    """Edge density inside, loss of the ellipse against the colour mask, and median colour.
+    coarse: NDArray[np.uint8],
+    edge_map: NDArray[np.bool_],
+    cone: Cone,
+    camera: CameraModel,
+    edgeless: NDArray[np.bool_],
+) -> tuple[float, float, float, tuple[float, float, float]]:
+    """Edge density inside, loss of the ellipse against the colour mask, leak, and median colour.
 
     The mask holds what has the chromaticity of the disc's own middle; the loss is the paper's FP + FN, over the
-    area, taken in a box a quarter larger than the ellipse.
+    area. The leak is the part of the outline without an edge (`edgeless`, one for each of K azimuths) across which
+    the mask goes on: the circle is then only a part of something of another shape.
     """
     outline = camera.project(cone.rays(np.linspace(0, 2 * np.pi, 64), np.full(64, cone.half_angle_rad)))
     centre = outline.mean(axis=0)
@@ -151,7 +165,7 @@ def _interior(
         masks.append(canvas > 0)
     whole, core = masks
     if core.sum() < 20:
-        return 1.0, 1.0, (0.0, 0.0, 0.0)
+        return 1.0, 1.0, 1.0, (0.0, 0.0, 0.0)
     interior = float(edge_map[low[1] : high[1], low[0] : high[0]][core].mean())
     lab = cv2.cvtColor(box, cv2.COLOR_BGR2LAB).astype(np.float32)
     inside = lab[core]
@@ -161,7 +175,19 @@ def _interior(
     mask = np.all(np.abs(lab - middle) < spread * [4.0, 3.5, 3.5], axis=2)
     colour = np.median(box[core], axis=0)
     loss = float((whole & ~mask).sum()) / float(whole.sum())
-    return interior, loss, (float(colour[0]), float(colour[1]), float(colour[2]))
+    azimuth = np.linspace(0.0, 2 * np.pi, len(edgeless), endpoint=False)
+    leaks = edgeless.copy()
+    for part in (0.86, 1.13):
+        at = camera.project(cone.rays(azimuth, np.full(len(azimuth), part * cone.half_angle_rad))) - low
+        x, y = np.rint(at).astype(int).T
+        here = (x >= 0) & (y >= 0) & (x < mask.shape[1]) & (y < mask.shape[0])
+        leaks &= here
+        leaks[here] &= mask[y[here], x[here]]
+    return interior, loss, float(leaks.mean()), (float(colour[0]), float(colour[1]), float(colour[2]))
+
+
+def _within(direction: Array, cone: Cone) -> bool:
+    return float(direction @ cone.axis) > float(np.linalg.norm(direction)) * float(np.cos(0.8 * cone.half_angle_rad))
 
 
 def _without_overlaps(roughs: list[RoughSphere]) -> list[RoughSphere]:
@@ -233,12 +259,11 @@ def refine_outline(
         result = _robust_cone(cone, where.azimuth_rad, found.offset_px, found.sigma_px, found.ok, where.per_pixel_rad)
         if result is None:
             return None
-        cone, used, sigma_px, rms_px = result
+        cone, used, coverage, sigma_px, rms_px = result
         radius_px = cone.half_angle_rad * camera.fx
         contrast = float(np.median(np.abs(found.step[used])))
         middle = camera.project(cone.axis[None])[0]
         colour = _median_colour(image_bgr, middle, 0.5 * radius_px)
-        coverage = float(used.mean())
         last = (cone, Evidence(coverage, rms_px, sigma_px, int(used.sum()), contrast, colour, score))
     assert last is not None
     cone, evidence = last
@@ -249,8 +274,8 @@ def refine_outline(
 
 def _robust_cone(
     cone: Cone, azimuth: Array, offset_px: Array, sigma_px: Array, ok: NDArray[np.bool_], per_pixel: Array
-) -> tuple[Cone, NDArray[np.bool_], float, float] | None:
-    """Cone by Tukey's weights on the geometric distances; the points used, their robust sigma and their rms (px)."""
+) -> tuple[Cone, NDArray[np.bool_], float, float, float] | None:
+    """Cone by Tukey's weights on the geometric distances; points used, coverage, robust sigma and rms (px)."""
     if ok.sum() < 24:
         return None
     rays = cone.rays(azimuth, cone.half_angle_rad + offset_px * per_pixel)
@@ -271,7 +296,8 @@ def _robust_cone(
     used = ok & (np.abs(residual) < 3.5 * scale)
     if used.sum() < 24:
         return None
-    return fitted, used, scale, float(np.sqrt(np.mean(residual[used] ** 2)))
+    coverage = float((ok & (np.abs(residual) < max(0.5, 3.5 * scale))).mean())
+    return fitted, used, coverage, scale, float(np.sqrt(np.mean(residual[used] ** 2)))
 
 
 def _median_colour(image: NDArray[np.uint8], middle: Array, reach: float) -> tuple[float, float, float]:

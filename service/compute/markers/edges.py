@@ -200,6 +200,6 @@ def sub_pixel_edges(
     count = np.isfinite(outer).any(axis=1) & np.isfinite(inner_values).any(axis=1)
     step = np.zeros(len(y))
     step[count] = np.nanmean(inner_values[count], axis=1) - np.nanmean(outer[count], axis=1)
-    ok = usable & count & (at > 0) & (at < len(grid) - 1) & (sigma < 0.4) & (noise < 12 * typical)
+    ok = usable & count & (at > 0) & (at < len(grid) - 1) & (sigma < 0.5) & (noise < 25 * typical)
     ok &= np.abs(offset - around_px) < reach_px
     return SubPixelEdges(offset, sigma, step, ok, blur)

@@ -12,7 +12,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import residuals
 from service.compute.registration.identity import Assignment
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, align_points, apply, inverse
+from service.core.geometry import Array, align_points, apply, inverse
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +109,5 @@ def true_error_m(T_scan_camera: Array, T_scan_camera_true: Array, centre_scan_m:
     motion is arbitrary); with T that fit, the error is |T c - c|.
     """
     good = np.all(np.isfinite(T_scan_camera.reshape(len(T_scan_camera), -1)), axis=1)
-    T: Transform
-    T, _ = align_points(T_scan_camera_true[good, :3, 3], T_scan_camera[good, :3, 3])
-    return float(np.linalg.norm(apply(T, centre_scan_m) - centre_scan_m))
+    T_true_estimated, _ = align_points(T_scan_camera_true[good, :3, 3], T_scan_camera[good, :3, 3])
+    return float(np.linalg.norm(apply(T_true_estimated, centre_scan_m) - centre_scan_m))

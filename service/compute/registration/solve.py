@@ -75,20 +75,24 @@ class _Problem:
     T_base_camera: Array  # (N, 4, 4)
     centres: Array
     radius_m: float
+    axes: Array  # (O, 3) unit directions to the sphere centres
+    half_angles: Array  # (O,)
     sigma: Array  # (O,) of one of the L points as an independent measurement, normalised units
     with_scale: bool
     cost: Cost
 
-    def camera_centres(self, B: Array, scale: float) -> Array:
-        """(O, 3) sphere centres in their cameras for B (G, 4, 4) = T_base_scan of each group."""
-        base = np.einsum("oij,oj->oi", B[self.group, :3, :3], self.centres[self.marker]) + B[self.group, :3, 3]
+    def camera_centres(self, bases: Array, scale: float) -> Array:
+        """(O, 3) sphere centres in their cameras for `bases` (G, 4, 4) = T_base_scan of each group."""
+        base = (
+            np.einsum("oij,oj->oi", bases[self.group, :3, :3], self.centres[self.marker]) + bases[self.group, :3, 3]
+        )
         T = self.T_base_camera[self.image]
         return np.einsum("oji,oj->oi", T[:, :3, :3], base - scale * T[:, :3, 3])
 
-    def point_residuals(self, B: Array, scale: float, cost: Cost) -> list[Array]:
+    def point_residuals(self, bases: Array, scale: float, cost: Cost) -> list[Array]:
         return [
             residuals(p, np.broadcast_to(c, p.shape), self.radius_m, cost)
-            for p, c in zip(self.points, self.camera_centres(B, scale), strict=True)
+            for p, c in zip(self.points, self.camera_centres(bases, scale), strict=True)
         ]
 
 
@@ -124,14 +128,14 @@ def register(
     """
     problem, members = _assemble(outlines, assignments, poses, groups, centres_scan_m, radius_m, camera)
     problem.with_scale, problem.cost = estimate_scale, cost
-    B, scale = _start(problem, assignments, poses, np.asarray(groups))
+    bases, scale = _start(problem, assignments, poses, np.asarray(groups))
     f = 0.5 * (camera.fx + camera.fy)
     keep = np.ones(len(members), dtype=bool)
     weights = np.ones(len(members))
-    B, scale = _solve(problem, B, scale, weights)
+    bases, scale = _solve(problem, bases, scale, weights)
     rms = np.zeros(len(members))
     for _ in range(6 if robust else 0):
-        rms = f * np.array([np.sqrt(np.mean(r**2)) for r in problem.point_residuals(B, scale, "sampson")])
+        rms = f * np.array([np.sqrt(np.mean(r**2)) for r in problem.point_residuals(bases, scale, "sampson")])
         typical = float(np.median(rms[keep]))
         new_keep = rms < max(5.0 * typical, 0.8)
         # Huber on the outline as a whole: its 200 points err together.
@@ -139,18 +143,18 @@ def register(
         settled = bool(np.array_equal(new_keep, keep) and np.abs(new_weights - weights).max() < 0.02)
         keep, weights = new_keep, new_weights
         _require(problem, keep, members)
-        B, scale = _solve(problem, B, scale, weights)
+        bases, scale = _solve(problem, bases, scale, weights)
         if settled:
             break
-    rms = f * np.array([np.sqrt(np.mean(r**2)) for r in problem.point_residuals(B, scale, "sampson")])
-    covariance, chi2 = _covariance(problem, B, scale, weights)
-    T_world_group = {g: B[0] @ inverse(B[k]) for k, g in enumerate(problem.groups)}
+    rms = f * np.array([np.sqrt(np.mean(r**2)) for r in problem.point_residuals(bases, scale, "sampson")])
+    covariance, chi2 = _covariance(problem, bases, scale, weights)
+    T_world_group = {g: bases[0] @ inverse(bases[k]) for k, g in enumerate(problem.groups)}
     metric = np.array(poses, dtype=np.float64)
     metric[:, :3, 3] *= scale
     position = {g: k for k, g in enumerate(problem.groups)}
     T_scan_camera = np.array(
         [
-            inverse(B[position[int(g)]]) @ T if int(g) in position else np.full((4, 4), np.nan)
+            inverse(bases[position[int(g)]]) @ T if int(g) in position else np.full((4, 4), np.nan)
             for g, T in zip(groups, metric, strict=True)
         ]
     )
@@ -163,7 +167,7 @@ def register(
         for o, (i, j, m) in enumerate(members)
     )  # fmt: skip
     return RegistrationResult(
-        T_world_scan=B[0],
+        T_world_scan=bases[0],
         scale=scale,
         T_world_group=T_world_group,
         covariance=covariance,
@@ -211,6 +215,8 @@ def _assemble(
         T_base_camera=np.asarray(poses, dtype=np.float64),
         centres=centres,
         radius_m=radius_m,
+        axes=np.array([outlines[i][j].cone.axis for i, j, _ in members]),
+        half_angles=np.array([outlines[i][j].cone.half_angle_rad for i, j, _ in members]),
         sigma=np.array(sigma),
         with_scale=False,
         cost="sampson",
@@ -234,13 +240,13 @@ def _require(problem: _Problem, keep: NDArray[np.bool_], members: list[tuple[int
 def _start(
     problem: _Problem, assignments: Sequence[Assignment], poses: Array, groups: NDArray[np.int64]
 ) -> tuple[Array, float]:
-    """B (G, 4, 4) and scale from the assignments' poses: the median image of each group."""
+    """Bases (G, 4, 4) and scale from the assignments' poses: the median image of each group."""
     scale = 1.0
     if problem.with_scale:
         scales = [a.scale for a in assignments if a.scale is not None]
         if scales:
             scale = float(np.median(scales))
-    B: list[Transform] = []
+    bases: list[Transform] = []
     for g in problem.groups:
         candidates: list[Transform] = []
         for i, a in enumerate(assignments):
@@ -255,11 +261,11 @@ def _start(
         far = np.linalg.norm(places - np.median(places, axis=0), axis=1)
         near = np.argsort(far)[: max(1, (len(far) + 1) // 2)]
         R = Rotation.from_matrix(np.array([candidates[k][:3, :3] for k in near])).mean()
-        B.append(transform(R, places[near].mean(axis=0) - R.apply(middle)))
-    return np.array(B), scale
+        bases.append(transform(R, places[near].mean(axis=0) - R.apply(middle)))
+    return np.array(bases), scale
 
 
-def _solve(problem: _Problem, B: Array, scale: float, weights: Array) -> tuple[Array, float]:
+def _solve(problem: _Problem, bases: Array, scale: float, weights: Array) -> tuple[Array, float]:
     active = [o for o in range(len(weights)) if weights[o] > 0]
     P = np.concatenate([problem.points[o] for o in active])
     count = np.array([len(problem.points[o]) for o in active])
@@ -275,13 +281,14 @@ def _solve(problem: _Problem, B: Array, scale: float, weights: Array) -> tuple[A
     model = problem.centres[problem.marker[active]]
     n_groups = len(problem.groups)
     n = 6 * n_groups + int(problem.with_scale)
+    axes, half = problem.axes[active], problem.half_angles[active]
 
     def unpack(x: Array) -> tuple[Array, float]:
         out = np.tile(np.eye(4), (n_groups, 1, 1))
         for k in range(n_groups):
             d = x[6 * k : 6 * k + 6]
-            out[k, :3, :3] = Rotation.from_rotvec(d[3:]).as_matrix() @ B[k, :3, :3]
-            out[k, :3, 3] = B[k, :3, 3] + d[:3]
+            out[k, :3, :3] = Rotation.from_rotvec(d[3:]).as_matrix() @ bases[k, :3, :3]
+            out[k, :3, 3] = bases[k, :3, 3] + d[:3]
         return out, scale * float(np.exp(x[-1])) if problem.with_scale else scale
 
     def centres(x: Array) -> tuple[Array, Array, float]:
@@ -290,57 +297,67 @@ def _solve(problem: _Problem, B: Array, scale: float, weights: Array) -> tuple[A
         base = rotated + now[group, :3, 3] - s * T[:, :3, 3]
         return np.einsum("oji,oj->oi", T[:, :3, :3], base), rotated, s
 
+    def directions(x: Array) -> Array:
+        c = centres(x)[0]
+        distance = np.linalg.norm(c, axis=1)
+        return (((c / distance[:, None] - axes) / half[:, None]) * np.sqrt(weights[active])[:, None]).ravel()
+
     def fun(x: Array) -> Array:
         return residuals(P, centres(x)[0][owner], problem.radius_m, problem.cost) * row
 
     def jac(x: Array) -> Array:
         c, rotated, s = centres(x)
-        D = residuals_and_derivative(P, c[owner], problem.radius_m, problem.cost)[1] * row[:, None]
-        D = np.einsum("nj,nij->ni", D, T[owner, :3, :3])  # derivative in base axes
+        slope = residuals_and_derivative(P, c[owner], problem.radius_m, problem.cost)[1] * row[:, None]
+        slope = np.einsum("nj,nij->ni", slope, T[owner, :3, :3])  # derivative in base axes
         J = np.zeros((len(P), n))
         for k in range(n_groups):
             here = group[owner] == k
-            J[here, 6 * k : 6 * k + 3] = D[here]
+            J[here, 6 * k : 6 * k + 3] = slope[here]
             turn = -skew(rotated) @ left_jacobian(x[6 * k + 3 : 6 * k + 6])
-            J[here, 6 * k + 3 : 6 * k + 6] = np.einsum("ni,nij->nj", D[here], turn[owner[here]])
+            J[here, 6 * k + 3 : 6 * k + 6] = np.einsum("ni,nij->nj", slope[here], turn[owner[here]])
         if problem.with_scale:
-            J[:, -1] = -s * np.einsum("ni,ni->n", D, T[owner, :3, 3])
+            J[:, -1] = -s * np.einsum("ni,ni->n", slope, T[owner, :3, 3])
         return J
 
-    fit = least_squares(fun, np.zeros(n), jac=jac, method="lm", x_scale="jac", max_nfev=200)
+    # The outlines' cost is convex only within a radius: the directions of the centres come first.
+    start = least_squares(directions, np.zeros(n), loss="soft_l1", f_scale=0.1, x_scale="jac").x
+    tight = 1e-12
+    fit = least_squares(
+        fun, start, jac=jac, method="lm", x_scale="jac", max_nfev=200, ftol=tight, xtol=tight, gtol=tight
+    )
     if not np.all(np.isfinite(fit.x)):
         raise ComputeError("the registration did not converge", remedy="Check the camera poses and the sphere list")
     return unpack(np.asarray(fit.x))
 
 
-def _covariance(problem: _Problem, B: Array, scale: float, weights: Array) -> tuple[Array, float]:
+def _covariance(problem: _Problem, bases: Array, scale: float, weights: Array) -> tuple[Array, float]:
     """Covariance of the first group's pose [and ln scale], and the reduced chi square per outline degree of freedom.
 
     Always in the geometric cost: it is what the outlines' noise means, whichever cost was minimised.
     """
     n_groups = len(problem.groups)
     n = 6 * n_groups + int(problem.with_scale)
-    H = np.zeros((n, n))
+    information = np.zeros((n, n))
     chi2, used = 0.0, 0
-    centres = problem.camera_centres(B, scale)
+    centres = problem.camera_centres(bases, scale)
     for o in np.nonzero(weights > 0)[0]:
         p = problem.points[o]
-        r, D = residuals_and_derivative(p, np.broadcast_to(centres[o], p.shape), problem.radius_m, "sampson")
+        r, slope = residuals_and_derivative(p, np.broadcast_to(centres[o], p.shape), problem.radius_m, "sampson")
         T = problem.T_base_camera[problem.image[o]]
         k = int(problem.group[o])
-        rotated = B[k, :3, :3] @ problem.centres[problem.marker[o]]
-        D = D @ T[:3, :3].T
+        rotated = bases[k, :3, :3] @ problem.centres[problem.marker[o]]
+        slope = slope @ T[:3, :3].T
         J = np.zeros((len(p), n))
-        J[:, 6 * k : 6 * k + 3] = D
-        J[:, 6 * k + 3 : 6 * k + 6] = D @ -skew(rotated)
+        J[:, 6 * k : 6 * k + 3] = slope
+        J[:, 6 * k + 3 : 6 * k + 6] = slope @ -skew(rotated)
         if problem.with_scale:
-            J[:, -1] = -scale * D @ T[:3, 3]
-        H += weights[o] * J.T @ J / problem.sigma[o] ** 2
+            J[:, -1] = -scale * slope @ T[:3, 3]
+        information += weights[o] * J.T @ J / problem.sigma[o] ** 2
         chi2 += float(weights[o] * np.sum(r**2) / problem.sigma[o] ** 2)
         used += 1
     free = max(1, 3 * used - n)
     reduced = chi2 / free
-    d = 1 / np.sqrt(np.diag(H))
-    full = np.linalg.pinv(H * np.outer(d, d)) * np.outer(d, d) * max(1.0, reduced)
+    d = 1 / np.sqrt(np.diag(information))
+    full = np.linalg.pinv(information * np.outer(d, d)) * np.outer(d, d) * max(1.0, reduced)
     pick = [*range(6), n - 1] if problem.with_scale else list(range(6))
     return full[np.ix_(pick, pick)], reduced

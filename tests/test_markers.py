@@ -1,0 +1,174 @@
+"""The sphere detector: cones, sub-pixel outlines, and what must not spoil them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from service.compute.markers.cones import Cone, cone_ellipse, cone_of_sphere, fit_cone, ransac_cone
+from service.compute.markers.detect import detect_spheres, refine_outline
+from service.compute.markers.records import DetectionOptions, SphereOutline
+from service.core.errors import DataError
+from service.core.geometry import Array
+from tests.support.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, camera, render, scene
+
+directions = st.tuples(st.floats(-0.35, 0.35), st.floats(-0.25, 0.25), st.floats(0.4, 1.5))
+
+
+def sphere_at(where: tuple[float, float, float]) -> Array:
+    return np.array([where[0] * where[2], where[1] * where[2], where[2]])
+
+
+@given(directions)
+def test_points_on_the_ellipse_are_on_the_conic_and_on_the_sphere(where: tuple[float, float, float]) -> None:
+    centre = sphere_at(where)
+    cone = cone_of_sphere(centre, RADIUS_M)
+    points = cone_ellipse(cone).equidistant(200)
+    lifted = np.column_stack([points, np.ones(200)])
+    value = np.einsum("ni,ij,nj->n", lifted, cone.conic, lifted)
+    assert np.abs(value).max() < 1e-12
+    rays = lifted / np.linalg.norm(lifted, axis=1, keepdims=True)
+    gap = np.linalg.norm(np.cross(rays, centre), axis=1)
+    assert np.allclose(gap, RADIUS_M, atol=1e-10)
+    spacing = np.linalg.norm(np.diff(np.vstack([points, points[:1]]), axis=0), axis=1)
+    assert spacing.max() / spacing.min() < 1.01
+
+
+@given(directions)
+def test_conic_equals_the_papers_projection_of_the_quadric(where: tuple[float, float, float]) -> None:
+    c = sphere_at(where)
+    Q = np.block([[np.eye(3), -c[:, None]], [-c[None], np.array([[c @ c - RADIUS_M**2]])]])
+    P = np.hstack([np.eye(3), np.zeros((3, 1))])
+    conic = np.linalg.inv(P @ np.linalg.inv(Q) @ P.T)
+    conic *= np.sign(np.trace(conic)) / np.linalg.norm(conic)
+    assert np.allclose(conic, cone_of_sphere(c, RADIUS_M).conic, atol=1e-9)
+
+
+@settings(max_examples=25)
+@given(directions, st.integers(0, 10_000), st.floats(0.35, 0.9))
+def test_ransac_finds_the_cone_among_outliers(where: tuple[float, float, float], seed: int, part: float) -> None:
+    rng = np.random.default_rng(seed)
+    truth = cone_of_sphere(sphere_at(where), RADIUS_M)
+    start = Cone(truth.axis, truth.half_angle_rad)
+    n = 120
+    azimuth = np.arange(n) * 2 * np.pi / n
+    visible = azimuth < part * 2 * np.pi
+    wrong = truth.half_angle_rad * rng.uniform(0.75, 1.25, n)
+    rays = truth.rays(azimuth, np.where(visible, truth.half_angle_rad, wrong))
+    result = ransac_cone(
+        rays, np.ones(n), np.arange(n), (0.5 * truth.half_angle_rad, 2 * truth.half_angle_rad), 2e-4, rng
+    )
+    assert result is not None
+    cone, inlier = result
+    assert inlier[visible].mean() > 0.95
+    final = fit_cone(rays[visible], np.ones(int(visible.sum())), start)
+    assert float(np.linalg.norm(final.axis - truth.axis)) < 1e-9
+    assert np.isclose(cone.half_angle_rad, truth.half_angle_rad, atol=2e-4)
+
+
+def errors_px(
+    found: tuple[SphereOutline, ...], centres: Array, fx: float
+) -> tuple[list[float], list[float], list[int]]:
+    """Axis errors, radius errors and identities of detections against the true spheres."""
+    truth = [cone_of_sphere(c, RADIUS_M) for c in centres]
+    axes, radii, ids = [], [], []
+    for o in found:
+        gaps = [float(np.linalg.norm(o.cone.axis - t.axis)) * fx for t in truth]
+        k = int(np.argmin(gaps))
+        axes.append(gaps[k])
+        radii.append((o.cone.half_angle_rad - truth[k].half_angle_rad) * fx)
+        ids.append(k)
+    return axes, radii, ids
+
+
+def test_all_whole_spheres_are_found_to_a_tenth_of_a_pixel_without_bias() -> None:
+    made = scene(4)
+    everything = np.vstack([REGISTRATION_M, CONTROL_M])
+    all_axes: list[float] = []
+    all_radii: list[float] = []
+    for i in (0, 1):
+        c = made.centres_camera(i, everything)
+        found = detect_spheres(render(made.camera, c, i), made.camera)
+        axes, radii, ids = errors_px(found, c, made.camera.fx)
+        pixels = made.camera.project(c)
+        whole = np.all((pixels > 60) & (pixels < np.array([made.camera.width, made.camera.height]) - 60), axis=1)
+        assert set(np.nonzero(whole)[0]) <= set(ids)
+        assert len(set(ids)) == len(ids)
+        assert max(axes) < 0.2
+        all_axes += axes
+        all_radii += radii
+    assert float(np.sqrt(np.mean(np.square(all_axes)))) < 0.08
+    assert abs(float(np.mean(all_radii))) < 0.04
+
+
+@pytest.mark.parametrize(
+    ("colour", "blur_px"), [((0.1, 0.35, 0.12), 0.6), ((0.05, 0.25, 0.8), 0.9), ((0.25, 0.25, 0.25), 1.6)]
+)
+def test_other_colours_and_defocus(colour: tuple[float, float, float], blur_px: float) -> None:
+    cam = camera(1024)
+    centres = np.array([[-0.1, -0.05, 0.6], [0.08, 0.06, 0.65], [0.1, -0.06, 0.7]])
+    found = detect_spheres(render(cam, centres, 3, colour=colour, blur_px=blur_px), cam)
+    axes, radii, ids = errors_px(found, centres, cam.fx)
+    assert sorted(ids) == [0, 1, 2]
+    assert max(axes) < 0.25
+    assert max(map(abs, radii)) < 0.25
+
+
+def test_occlusion_and_border_leave_the_outline_right() -> None:
+    cam = camera(1024)
+    centres = np.array([[-0.1, -0.05, 0.6], [0.08, 0.04, 0.65], [0.0, 0.138, 0.6]])
+    image = render(cam, centres, 5)
+    first = cam.project(centres)[0].round().astype(int)
+    cv2.line(
+        image, (int(first[0]) - 60, int(first[1]) - 30), (int(first[0]) + 60, int(first[1]) + 5), (40, 40, 45), 9
+    )
+    found = detect_spheres(image, cam)
+    axes, _, ids = errors_px(found, centres, cam.fx)
+    assert {0, 1} <= set(ids)
+    assert max(axes) < 0.4
+    assert any(o.coverage < 0.9 for o in found)
+
+
+def test_an_image_without_spheres_has_none() -> None:
+    cam = camera(1024)
+    assert detect_spheres(render(cam, np.zeros((0, 3)), 8, occluders=6), cam) == ()
+
+
+def test_squares_and_ellipses_are_no_spheres() -> None:
+    cam = camera(1024)
+    image = render(cam, np.zeros((0, 3)), 9)
+    cv2.rectangle(image, (200, 200), (280, 280), (190, 190, 190), -1)
+    cv2.ellipse(image, (600, 300), (70, 35), 20, 0, 360, (190, 190, 190), -1, cv2.LINE_AA)
+    assert detect_spheres(image, cam) == ()
+
+
+def test_refining_near_a_prediction_gives_the_same_outline() -> None:
+    cam = camera(1024)
+    centre = np.array([0.05, 0.02, 0.6])
+    image = render(cam, centre[None], 4)
+    truth = cone_of_sphere(centre, RADIUS_M)
+    shifted = Cone(truth.frame() @ np.array([0.001, -0.001, 1.0]), truth.half_angle_rad * 1.03)
+    found = refine_outline(image, cam, Cone(shifted.axis / np.linalg.norm(shifted.axis), shifted.half_angle_rad))
+    assert found is not None
+    assert np.linalg.norm(found.cone.axis - truth.axis) * cam.fx < 0.1
+    away = cone_of_sphere(np.array([-0.12, -0.06, 0.6]), RADIUS_M)
+    assert refine_outline(image, cam, away) is None
+
+
+def test_record_is_whole() -> None:
+    cam = camera(1024)
+    centre = np.array([0.05, 0.02, 0.6])
+    (found,) = detect_spheres(render(cam, centre[None], 4), cam, DetectionOptions(n_points=150))
+    assert found.points.shape == found.points_px.shape == found.captured_px(cam).shape == (150, 2)
+    assert found.semi_axes_px[0] >= found.semi_axes_px[1] > 30
+    assert np.allclose(found.centre_camera_m(RADIUS_M), centre, atol=0.003)
+    assert 0.4 < found.coverage <= 1
+    assert 0 < found.rms_px < 0.3
+
+
+def test_wrong_size_is_refused() -> None:
+    with pytest.raises(DataError, match="768×512"):
+        detect_spheres(np.zeros((512, 768, 3), np.uint8), camera(1024))
