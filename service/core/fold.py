@@ -15,6 +15,7 @@ from service.core.model import (
     DeviceOpened,
     DeviceTrouble,
     Event,
+    FilesKept,
     GatesEvaluated,
     JobEnqueued,
     JobFailed,
@@ -152,6 +153,10 @@ def _device_opened(protocol: Protocol, state: RunState, event: Event, p: DeviceO
 
 def _device_trouble(protocol: Protocol, state: RunState, event: Event, p: DeviceTrouble) -> RunState:
     return replace(state, troubles=(*state.troubles, Trouble(event.seq, p.device, p.error, p.message)))
+
+
+def _files_kept(protocol: Protocol, state: RunState, event: Event, p: FilesKept) -> RunState:
+    return _void(state, event) if _is_void(state, event, p.step, p.attempt) else state
 
 
 def _run_completed(protocol: Protocol, state: RunState, event: Event, p: RunCompleted) -> RunState:
@@ -310,6 +315,7 @@ _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunStat
     DeviceOpened: _device_opened,
     DeviceTrouble: _device_trouble,
     StepStarted: _step_started,
+    FilesKept: _files_kept,
     StepNote: _step_note,
     ViewpointCaptured: _viewpoint_captured,
     ViewpointFailed: _viewpoint_failed,

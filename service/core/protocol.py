@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, cast
 
 from pydantic import (
@@ -27,7 +27,7 @@ from service.core.errors import ProtocolError
 from service.core.lifecycle import RESERVED_STEP_IDS
 from service.core.model import Record
 from service.core.protocol_rules import rule_violations
-from service.core.yaml_tree import Path, Plain, Problem, YamlTree, field_name, parse_yaml
+from service.core.yaml_tree import FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
 
 ParamsT = TypeVar("ParamsT", bound=BaseModel)
 
@@ -224,7 +224,7 @@ class _FileProtocol(ProtocolFields):
     steps: Annotated[tuple[_FileStep, ...], Field(min_length=1)]
 
 
-def load_protocol(path: FilePath, params_models: Mapping[str, type[BaseModel]]) -> LoadedProtocol:
+def load_protocol(path: Path, params_models: Mapping[str, type[BaseModel]]) -> LoadedProtocol:
     """Read a protocol file; `params_models` gives the Params of every known step kind.
 
     Raises ProtocolError naming file:line and field of everything that is wrong, all of it at once.
@@ -292,9 +292,11 @@ def _validate_params(
     return params
 
 
-def _problem(details: ErrorDetails, prefix: Path, tree: YamlTree, model: type[BaseModel] | None = None) -> Problem:
+def _problem(
+    details: ErrorDetails, prefix: FieldPath, tree: YamlTree, model: type[BaseModel] | None = None
+) -> Problem:
     """Say in a technician's words what pydantic found, and where it stands in the file."""
-    at: Path = prefix
+    at: FieldPath = prefix
     for part in details["loc"]:
         if (*at, part) in tree.lines:  # parts that are not in the file are names of union members
             at = (*at, part)
@@ -323,7 +325,7 @@ _SECTIONS: Mapping[str, type[BaseModel]] = {
 }
 
 
-def _known_fields(at: Path) -> Mapping[str, object]:
+def _known_fields(at: FieldPath) -> Mapping[str, object]:
     section = next((part for part in reversed(at[:-1]) if isinstance(part, str)), "")
     return _SECTIONS.get(section, _FileProtocol).model_fields
 

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import cast
 
-from service.core.yaml_tree import Path, Plain
+from service.core.yaml_tree import FieldPath, Plain
 
 
-def rule_violations(data: dict[str, Plain]) -> Iterator[tuple[Path, str]]:
+def rule_violations(data: dict[str, Plain]) -> Iterator[tuple[FieldPath, str]]:
     """(field, what is wrong) for a protocol file's data, which may be malformed in any way."""
     steps = data.get("steps")
     seen: dict[str, int] = {}
     for index, step in enumerate(steps if isinstance(steps, list) else []):
         if isinstance(step, dict):
-            at: Path = ("steps", index)
+            at: FieldPath = ("steps", index)
             yield from _identity(step, at, seen)
             yield from _requires(step, at, seen, _all_ids(cast(list[Plain], steps)))
             yield from _irreversible(step, at)
@@ -27,15 +27,15 @@ def _all_ids(steps: list[Plain]) -> set[str]:
     return {str(step["id"]) for step in steps if isinstance(step, dict) and isinstance(step.get("id"), str)}
 
 
-def _identity(step: dict[str, Plain], at: Path, seen: dict[str, int]) -> Iterator[tuple[Path, str]]:
+def _identity(step: dict[str, Plain], at: FieldPath, seen: dict[str, int]) -> Iterator[tuple[FieldPath, str]]:
     step_id = step.get("id")
     if isinstance(step_id, str) and step_id in seen:
         yield (*at, "id"), f"duplicate step id {step_id!r}, first used by steps[{seen[step_id]}]"
 
 
 def _requires(
-    step: dict[str, Plain], at: Path, seen: dict[str, int], everyone: set[str]
-) -> Iterator[tuple[Path, str]]:
+    step: dict[str, Plain], at: FieldPath, seen: dict[str, int], everyone: set[str]
+) -> Iterator[tuple[FieldPath, str]]:
     required = step.get("requires")
     for index, name in enumerate(required if isinstance(required, list) else []):
         if not isinstance(name, str) or name in seen:
@@ -49,10 +49,10 @@ def _requires(
         yield (*at, "requires", index), message
 
 
-def _irreversible(step: dict[str, Plain], at: Path) -> Iterator[tuple[Path, str]]:
+def _irreversible(step: dict[str, Plain], at: FieldPath) -> Iterator[tuple[FieldPath, str]]:
     if step.get("irreversible") is not True:
         return
-    where: Path = (*at, "irreversible")
+    where: FieldPath = (*at, "irreversible")
     if not step.get("requires"):
         yield where, "an irreversible step needs `requires`: the captures that must have passed before it"
     if step.get("sign") is not True:
@@ -61,13 +61,13 @@ def _irreversible(step: dict[str, Plain], at: Path) -> Iterator[tuple[Path, str]
         yield (*at, "confirm"), "an irreversible step is always confirmed by a person"
 
 
-def _gates(step: dict[str, Plain], at: Path) -> Iterator[tuple[Path, str]]:
+def _gates(step: dict[str, Plain], at: FieldPath) -> Iterator[tuple[FieldPath, str]]:
     gates = step.get("gates")
     measures: set[str] = set()
     for index, gate in enumerate(gates if isinstance(gates, list) else []):
         if not isinstance(gate, dict):
             continue
-        where: Path = (*at, "gates", index)
+        where: FieldPath = (*at, "gates", index)
         low, high = gate.get("min"), gate.get("max")
         if low is None and high is None:
             yield where, "a gate needs limits: min, max or both"

@@ -11,7 +11,7 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from service.core.errors import ProtocolError
 
-Path = tuple[str | int, ...]  # ("steps", 3, "gates", 0, "max")
+FieldPath = tuple[str | int, ...]  # ("steps", 3, "gates", 0, "max")
 Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
 
 # The core schema of YAML 1.2 (section 10.3): unlike YAML 1.1, "on" and "12:30" stay text and 1e-3 is a number.
@@ -37,17 +37,17 @@ class YamlTree:
     """A document: its data, the line of every field, and what is wrong with it as YAML."""
 
     data: Plain
-    lines: Mapping[Path, int]
+    lines: Mapping[FieldPath, int]
     problems: tuple[Problem, ...]
 
-    def line(self, path: Path) -> int:
+    def line(self, path: FieldPath) -> int:
         """The line of a field, or of the nearest field around it that is in the file."""
         while path not in self.lines:
             path = path[:-1]
         return self.lines[path]
 
 
-def field_name(path: Path) -> str:
+def field_name(path: FieldPath) -> str:
     """`steps[3].gates[0].max` for ("steps", 3, "gates", 0, "max")."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")
 
@@ -78,10 +78,10 @@ class _Builder:
     """Walks the compose tree once."""
 
     def __init__(self) -> None:
-        self.lines: dict[Path, int] = {(): 1}
+        self.lines: dict[FieldPath, int] = {(): 1}
         self.problems: list[Problem] = []
 
-    def build(self, node: Node, path: Path, around: tuple[Node, ...]) -> Plain:
+    def build(self, node: Node, path: FieldPath, around: tuple[Node, ...]) -> Plain:
         if any(node is outer for outer in around):
             self._problem(node, path, "an alias that contains itself")
             return None
@@ -97,7 +97,7 @@ class _Builder:
         assert isinstance(node, ScalarNode)
         return _scalar(node)
 
-    def _mapping(self, node: MappingNode, path: Path, around: tuple[Node, ...]) -> dict[str, Plain]:
+    def _mapping(self, node: MappingNode, path: FieldPath, around: tuple[Node, ...]) -> dict[str, Plain]:
         data: dict[str, Plain] = {}
         for key, value in node.value:
             name = _scalar(key) if isinstance(key, ScalarNode) else None
@@ -111,7 +111,7 @@ class _Builder:
                 data[name] = self.build(value, (*path, name), around)
         return data
 
-    def _problem(self, node: Node, path: Path, message: str) -> None:
+    def _problem(self, node: Node, path: FieldPath, message: str) -> None:
         self.problems.append(Problem(node.start_mark.line + 1, field_name(path), message))
 
 
