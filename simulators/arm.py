@@ -13,11 +13,11 @@ _ALPHA_RAD = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 
 def perturbed_forward(q: Array, deltas: Array) -> Array:
     """T_base_flange (4, 4) at joints q (6,); deltas (6, 4) are added to a, d (metres), alpha, theta (radians)."""
-    T = np.eye(4)
+    T_base_link = np.eye(4)
     nominal = np.stack([ARM_MODEL.a_m, ARM_MODEL.d_m, _ALPHA_RAD, q], axis=1)
     for a, d, alpha, theta in nominal + deltas:
         ct, st, ca, sa = np.cos(theta), np.sin(theta), np.cos(alpha), np.sin(alpha)
-        T = T @ np.array(
+        T_base_link = T_base_link @ np.array(
             [[ct, -st * ca, st * sa, a * ct], [st, ct * ca, -ct * sa, a * st], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
         )
-    return T
+    return T_base_link

@@ -65,7 +65,7 @@ class Anatomy:
         between = LEVEL_SPACING_M / 2 - np.abs(s)
         spinous = 0.017 * smoothstep(0.0105, 0.0065, np.abs(s + 0.002)) * smoothstep(0.0048, 0.0022, np.abs(d))
         spinous *= 1.0 + 0.12 * np.cos(300.0 * s)
-        lamina = 0.0065 * smoothstep(0.0135, 0.0095, np.abs(s)) * np.exp(-((np.abs(d) / 0.0125) ** 4))
+        lamina = 0.0065 * smoothstep(0.0150, 0.0070, np.abs(s)) * np.exp(-((np.abs(d) / 0.0125) ** 4))
         facet = 0.0085 * np.exp(-(((np.abs(d) - 0.0150) / 0.0042) ** 2) - (between / 0.0055) ** 2)
         return np.maximum(np.maximum(spinous, lamina), facet)
 

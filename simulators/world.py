@@ -138,9 +138,9 @@ class Scene:
         (towards where the camera looks), squares of 15 mm.
         """
         rng = np.random.default_rng([self.seed, 0xB0A2D, nth])
-        tilt = np.radians(rng.uniform(2.0, 6.0, 2)) * rng.choice([-1.0, 1.0], 2)
+        tilt = np.radians(rng.uniform(1.0, 4.0, 2)) * rng.choice([-1.0, 1.0], 2)
         T_world_centre = from_euler(np.array([np.pi + tilt[0], tilt[1], rng.uniform(-0.15, 0.15)]), np.zeros(3))
-        T_world_centre[:3, 3] = [rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02), 0.150]
+        T_world_centre[:3, 3] = [rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02), 0.140]
         half = 0.5 * BOARD_SQUARE_M * (np.array(BOARD_SQUARES) - 2.0)
         return T_world_centre @ from_euler(np.zeros(3), np.array([-half[0], -half[1], 0.0]))
 
