@@ -14,7 +14,7 @@ class Params(Record):
     """What to expect from the CT suite."""
 
     source: Literal["dicom", "mesh"] = "dicom"  # mesh: segmented elsewhere (Mimics STL)
-    threshold_hu: float = -300.0  # skin, spheres against air
+    threshold_hu: float = -450.0  # half way between air and soft tissue or plastic: neither grows nor shrinks
     spheres: int  # registration and control spheres in the volume
     wait_s: float = 600.0
 
