@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +25,11 @@ class Cone:
         With E^-1 = P Q^-1 P^T for a sphere c, r in the camera frame: E ~ (|c|^2 - r^2) I - c c^T, which is
         cos^2(a) I - u u^T for u = c / |c| and sin(a) = r / |c|.
         """
-        E: Array = float(np.cos(self.half_angle_rad) ** 2) * np.eye(3) - self.axis[:, None] * self.axis
-        return np.asarray(E / float(np.sqrt(np.sum(E**2))), dtype=np.float64)
+        a = math.cos(self.half_angle_rad) ** 2
+        norm = math.sqrt(3 * a**2 - 2 * a + 1)
+        conic: Array = np.eye(3) * (a / norm)
+        conic -= self.axis[:, None] * self.axis / norm
+        return conic
 
     def frame(self) -> Array:
         """(3, 3) columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""
