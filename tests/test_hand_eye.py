@@ -1,0 +1,133 @@
+"""Hand-eye calibration against known truth: accuracy, honest errors, half-turned boards, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from service.compute.hand_eye import Method, calibrate_hand_eye, place_board
+from service.compute.intrinsics import half_turn
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array, Transform, inverse, look_at, rotation_angle_rad, transform
+
+T_FLANGE_CAMERA = transform(Rotation.from_rotvec([0.02, -0.03, 1.55]), np.array([0.012, -0.055, 0.093]))
+T_BASE_BOARD = transform(Rotation.from_euler("xyz", [176, 3, 40], degrees=True), np.array([0.7, -0.1, 0.05]))
+
+
+def _session(
+    count: int,
+    *,
+    noise_mm: float = 0.0,
+    noise_deg: float = 0.0,
+    seed: int = 0,
+    T_base_board: Transform = T_BASE_BOARD,
+) -> tuple[Array, Array]:
+    """Robot poses with noise, and exact board poses, of a camera looking at the board from all sides."""
+    rng = np.random.default_rng(seed)
+    hands: list[Transform] = []
+    boards: list[Transform] = []
+    for _ in range(count):
+        tilt, azimuth = np.deg2rad(rng.uniform(5, 40)), rng.uniform(0, 2 * np.pi)
+        eye = -0.6 * np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
+        T_board_camera = look_at(eye, rng.uniform(-0.03, 0.03, 3), rng.normal(0, 1, 3))
+        hand = T_base_board @ T_board_camera @ inverse(T_FLANGE_CAMERA)
+        wobble = transform(
+            Rotation.from_rotvec(np.deg2rad(rng.normal(0, noise_deg, 3))), rng.normal(0, noise_mm, 3) * 1e-3
+        )
+        hands.append(hand @ wobble)
+        boards.append(inverse(T_board_camera))
+    return np.stack(hands), np.stack(boards)
+
+
+def _error_mm(T: Transform) -> float:
+    return float(np.linalg.norm(T[:3, 3] - T_FLANGE_CAMERA[:3, 3]) * 1e3)
+
+
+@pytest.mark.parametrize("method", ["park", "daniilidis", "tsai", "horaud", "andreff"])
+def test_exact_data_gives_the_exact_answer(method: Method) -> None:
+    result = calibrate_hand_eye(*_session(12), method=method, bootstrap=5)
+    assert _error_mm(result.T_flange_camera) < 1e-6
+    np.testing.assert_allclose(result.T_base_board, T_BASE_BOARD, atol=1e-9)
+    assert result.method == method
+    assert set(result.methods) == {"park", "daniilidis", "tsai", "horaud", "andreff"}
+    assert result.spread_mm < 1e-5
+    assert result.held_out_mm.max() < 1e-5
+
+
+def test_noisy_robot_stays_within_the_bootstrap_sigma() -> None:
+    ratios: list[float] = []
+    for seed in range(6):
+        result = calibrate_hand_eye(*_session(40, noise_mm=0.15, noise_deg=0.02, seed=seed), seed=seed)
+        assert _error_mm(result.T_flange_camera) < 0.2
+        assert result.held_out_mm.mean() >= result.residual_mm.mean()
+        assert 0.1 < result.held_out_mm.mean() < 0.8
+        assert result.rotation_spread_deg > 60
+        assert result.second_axis_deg > 20
+        assert result.condition < 10
+        ratios.append(_error_mm(result.T_flange_camera) / result.sigma_mm)
+    # neither several times too proud nor too modest
+    assert 0.3 < float(np.sqrt(np.mean(np.square(ratios)))) < 2.0
+
+
+@given(flips=st.lists(st.booleans(), min_size=14, max_size=14), seed=st.integers(0, 50))
+@settings(max_examples=15, deadline=None)
+def test_half_turned_boards_are_turned_back(flips: list[bool], seed: int) -> None:
+    turn = half_turn(9, 7, 0.02)
+    assert turn is not None
+    hands, boards = _session(14, noise_mm=0.1, noise_deg=0.02, seed=seed)
+    mixed = np.where(np.array(flips)[:, None, None], boards @ turn, boards)
+    result = calibrate_hand_eye(hands, mixed, T_board_turned=turn, bootstrap=2)
+    assert _error_mm(result.T_flange_camera) < 0.5
+    # the group may be turned as a whole: nobody can tell, and it does not matter
+    assert list(result.turned) in (flips, [not f for f in flips])
+
+
+def test_unresolved_half_turns_show_in_the_residuals() -> None:
+    turn = half_turn(9, 7, 0.02)
+    assert turn is not None
+    hands, boards = _session(14)
+    boards[3] = boards[3] @ turn
+    assert calibrate_hand_eye(hands, boards, bootstrap=2).residual_mm.max() > 5
+
+
+def test_motions_that_determine_nothing_are_refused() -> None:
+    hands, boards = _session(12)
+    with pytest.raises(ComputeError, match="at least 6"):
+        calibrate_hand_eye(hands[:5], boards[:5])
+    axis = [transform(Rotation.from_euler("z", 8 * k, degrees=True), np.array([0.01 * k, 0, 0])) for k in range(10)]
+    with pytest.raises(ComputeError, match="one axis only"):
+        calibrate_hand_eye(np.stack(axis), np.stack(axis))
+    small = [
+        transform(Rotation.from_rotvec(np.deg2rad(v)), v) for v in np.random.default_rng(0).uniform(-3, 3, (10, 3))
+    ]
+    with pytest.raises(ComputeError, match="turned by"):
+        calibrate_hand_eye(np.stack(small), np.stack(small))
+
+
+def test_data_that_do_not_belong_together_are_refused() -> None:
+    hands, boards = _session(8)
+    with pytest.raises(DataError, match="belong together"):
+        calibrate_hand_eye(hands, boards[:-1])
+    boards[2, 0, 3] = np.nan
+    with pytest.raises(DataError, match="finite"):
+        calibrate_hand_eye(hands, boards)
+    with pytest.raises(DataError, match="belong together"):
+        place_board(hands[:0], boards[:0], T_FLANGE_CAMERA)
+
+
+def test_two_stations_are_joined_through_the_board() -> None:
+    T_base1_base2 = transform(Rotation.from_euler("z", 178, degrees=True), np.array([1.6, 0.02, -0.01]))
+    T_base2_board = inverse(T_base1_base2) @ T_BASE_BOARD
+    first = place_board(*_session(6, noise_mm=0.05, noise_deg=0.005), T_FLANGE_CAMERA)
+    second = place_board(
+        *_session(6, noise_mm=0.05, noise_deg=0.005, seed=1, T_base_board=T_base2_board), T_FLANGE_CAMERA
+    )
+    joined = first.T_base_board @ inverse(second.T_base_board)
+    offset = inverse(T_base1_base2) @ joined
+    assert np.linalg.norm(offset[:3, 3]) < 2e-4
+    assert np.degrees(rotation_angle_rad(offset)) < 0.02
+    assert 0 < first.sigma_mm < 0.1
+    assert first.residual_mm.shape == (6,)
