@@ -1,0 +1,73 @@
+"""COLMAP model folders through pycolmap, in a child process: it takes over signal handlers and may crash."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any, cast
+
+from service.compute.camera_model import CameraModel
+from service.core.errors import DataError
+from service.core.geometry import Transform
+
+
+def read_model(folder: Path) -> dict[str, Transform]:
+    """T_world_camera by image name of the model in `folder`.
+
+    Raises:
+        DataError: the model cannot be read.
+    """
+    return cast("dict[str, Transform]", _in_child(_read, folder, str(folder)))
+
+
+def write_model(folder: Path, camera: CameraModel, T_world_camera: dict[str, Transform]) -> None:
+    """Write a text model without points into an existing folder."""
+    _in_child(_write, folder, str(folder), camera, T_world_camera)
+
+
+def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> object:
+    context = multiprocessing.get_context("spawn")
+    try:
+        with ProcessPoolExecutor(1, mp_context=context) as pool:
+            outcome = pool.submit(work, *arguments).result()
+    except BrokenProcessPool:
+        outcome = "pycolmap crashed on it"
+    if isinstance(outcome, str):
+        raise DataError(
+            f"the COLMAP model cannot be read or written: {outcome}",
+            where=str(folder),
+            remedy="check that cameras, images and points3D belong together and are complete",
+        )
+    return outcome
+
+
+def _read(folder: str) -> dict[str, Transform] | str:
+    colmap = importlib.import_module("pycolmap")
+    convention = importlib.import_module("service.compute.colmap_convention")
+    colmap.logging.minloglevel = colmap.logging.FATAL.value
+    try:
+        model = colmap.Reconstruction(folder)
+    except (RuntimeError, ValueError, OSError) as error:  # what pycolmap raises
+        return str(error).strip().splitlines()[-1]
+    images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
+    return {image.name: convention.from_colmap_pose(image.cam_from_world()) for image in images}
+
+
+def _write(folder: str, camera: CameraModel, T_world_camera: dict[str, Transform]) -> str | None:
+    colmap = importlib.import_module("pycolmap")
+    convention = importlib.import_module("service.compute.colmap_convention")
+    colmap.logging.minloglevel = colmap.logging.FATAL.value
+    model = colmap.Reconstruction()
+    model.add_camera_with_trivial_rig(convention.to_colmap_camera(camera))
+    for image_id, (name, T) in enumerate(T_world_camera.items(), start=1):
+        image = colmap.Image(name=name, camera_id=1, image_id=image_id)
+        model.add_image_with_trivial_frame(image, convention.to_colmap_pose(T))
+    try:
+        model.write_text(folder)
+    except (RuntimeError, ValueError, OSError) as error:
+        return str(error).strip().splitlines()[-1]
+    return None
