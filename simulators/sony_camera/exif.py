@@ -83,7 +83,7 @@ def _with_exif(file: bytes, width: int, height: int, shot: Shot) -> bytes:
     exif["Exif.Photo.PixelXDimension"] = exiv2.ULongValue(width)
     exif["Exif.Photo.PixelYDimension"] = exiv2.ULongValue(height)
     image.writeMetadata()
-    return bytes(image.io())
+    return bytes(image.io().data())
 
 
 def encode_raw(picture: NDArray[np.uint8], shot: Shot) -> bytes:
