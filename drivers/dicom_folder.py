@@ -19,7 +19,7 @@ from drivers.mesh_file import MeshUnit, read_mesh_file
 from drivers.plugin import DriverConfig, DriverSpec
 from drivers.scan_folder import free_bytes, require_folder
 
-# What pydicom, its plug-ins and Pillow raise for pixel data that is cut short, damaged or of a codec that is not there.
+# What pydicom, its plug-ins and Pillow raise for pixels that are cut short, damaged or of a codec that is missing.
 _DECODE_ERRORS = (ValueError, RuntimeError, AttributeError, KeyError, IndexError, OSError, EOFError, TypeError)
 
 
@@ -71,8 +71,9 @@ class DicomFolder:
     def read(self, series: CtSeries) -> CtVolume:
         """Read one series into Hounsfield units.
 
-        Voxel axes: i along a row of the image, j down its columns, k along their cross product, so that T_ct_voxel is right-handed
-        whatever the order of the files; the frame is DICOM's patient frame (x left, y back, z head), metres.
+        Voxel axes: i along a row of the image, j down its columns, k along their cross product, so that T_ct_voxel is
+        right-handed whatever the order of the files. The frame is DICOM's patient
+        frame (x left, y back, z head), metres.
 
         Raises:
             UnreadableFileError: the series has problems, or a slice cannot be decoded; names slice and file.

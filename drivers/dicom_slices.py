@@ -193,14 +193,14 @@ def _shape_problems(headers: Sequence[SliceHeader]) -> list[str]:
     for what, keys in (
         ("image size", [(h.rows, h.columns) for h in headers]),
         ("pixel spacing", [tuple(round(x, 4) for x in h.pixel_spacing_mm or ()) for h in headers]),
-        ("orientation", [tuple(round(x / 2e-3) + 0 for x in h.orientation or ()) for h in headers]),
+        ("orientation", [tuple(round(x / 2e-3) for x in h.orientation or ()) for h in headers]),
     ):
         usual = Counter(keys).most_common(1)[0][0]
+        slack = 1 if what == "orientation" else 0  # rounded to 0.002: neighbours are the same
         other = [
             header
             for header, key in zip(headers, keys, strict=True)
-            if key != usual
-            and not (what == "orientation" and max(abs(a - b) for a, b in zip(key, usual, strict=True)) < 2)
+            if max(abs(a - b) for a, b in zip(key, usual, strict=True)) > slack
         ]
         if other:
             problems.append(f"mixed {what}: {_named(other)}")
@@ -254,7 +254,7 @@ def _along_normal(headers: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Ar
 
 
 def arrange(headers: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Transform, tuple[float, float, float]]:
-    """Slices in order of k, T_ct_voxel (4, 4) in metres, and spacing (i, j, k) in metres, of a series without problems.
+    """Slices in order of k, T_ct_voxel (4, 4) and spacing (i, j, k) in metres, of a series without problems.
 
     The step along k is taken from the positions, so that a tilted gantry gives the shear it has.
     """

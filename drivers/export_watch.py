@@ -24,8 +24,8 @@ class _Seen:
 class ExportWatch:
     """Complete exports of a folder.
 
-    Size and modification time must stay as they are for `stable_s` as this host observes it: the clocks of a share and of
-    this host may differ, so the age of a file says nothing.
+    Size and modification time must stay as they are for `stable_s` as this host observes it: the clocks of a share
+    and of this host may differ, so the age of a file says nothing.
     """
 
     def __init__(self, folder: Path, stable_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:

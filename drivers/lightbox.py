@@ -1,8 +1,8 @@
 r"""The light and environment box: light level, temperature, shutter relay and foot pedal over a serial line.
 
-Wire: 115200 baud, 8 data bits, no parity, one stop bit, ASCII lines. The host ends its lines with LF; the box ends its own with LF
-or CR LF. One reply to each request, and each reply begins with the name of what it reports, so that a banner, a late reply or
-noise is recognised and skipped. Lines that begin with # are comments (the banner after power-up).
+Wire: 115200 baud, 8 data bits, no parity, one stop bit, ASCII lines. The host ends its lines with LF; the box ends
+its own with LF or CR LF. One reply to each request, and each reply begins with the name of what it reports, so that a
+banner, a late reply or noise is recognised and skipped. Lines that begin with # are comments (the banner).
 
     *IDN?        *IDN <maker>,<model>,<serial>,<firmware>
     LIGHT?       LIGHT <lux>                 decimal number, lux at the specimen
@@ -39,19 +39,17 @@ _MAX_LINE = 256
 class LightboxConfig(DriverConfig):
     """Section of rig.yaml."""
 
-    port: str = Field(min_length=1, description="a serial device, a link to one, or a socket://HOST:PORT address")
+    port: str = Field(min_length=1, description="serial device, link to one, or socket://HOST:PORT")
     baudrate: int = Field(default=115200, gt=0)
-    timeout_s: float = Field(
-        default=1.0, gt=0, description="longest wait for a reply; a request is tried three times"
-    )
+    timeout_s: float = Field(default=1.0, gt=0, description="longest wait for a reply; three attempts")
 
 
 class SerialLightbox:
-    """drivers.interfaces.Lightbox over pyserial. A broken link is an error once; the next call opens the port again."""
+    """drivers.interfaces.Lightbox over pyserial. After a broken link the next call opens the port again."""
 
     def __init__(self, config: LightboxConfig) -> None:
         self._config = config
-        self._port: serial.SerialBase | None = None
+        self._port: serial.Serial | None = None
         self._pending = b""
 
     def open(self) -> DeviceIdentity:
@@ -153,7 +151,7 @@ class SerialLightbox:
             remedy="Check that the box is powered, that the baud rate is right, and that the port is the box's",
         )
 
-    def _opened(self) -> serial.SerialBase:
+    def _opened(self) -> serial.Serial:
         if self._port is None:
             try:
                 port = serial.serial_for_url(self._config.port, baudrate=self._config.baudrate, timeout=0.05)
@@ -167,7 +165,7 @@ class SerialLightbox:
             self._port = port
         return self._port
 
-    def _line(self, port: serial.SerialBase, deadline_s: float) -> bytes | None:
+    def _line(self, port: serial.Serial, deadline_s: float) -> bytes | None:
         """The next complete line without its end, or None when the time is over."""
         while b"\n" not in self._pending:
             if time.monotonic() >= deadline_s:

@@ -19,9 +19,11 @@ from drivers.mesh_format import check_complete, companions, file_has_normals
 
 MeshUnit = Literal["auto", "mm", "m"]
 METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
-# Diagonal of the bounding box that a specimen on a table, or one segmented bone, can have. The range must stay
-# narrower than the factor 1000 between the units: then no size fits both.
-PLAUSIBLE_DIAGONAL_M = (0.02, 3.0)
+# Diagonal of the bounding box. To infer the unit, that of a scene with its spheres: the range is narrower than the steps
+# from millimetres to centimetres or inches, so that those are not mistaken for it. A configured unit must only be
+# credible for whatever may be scanned, a single bone too.
+SCENE_DIAGONAL_M = (0.1, 3.0)
+OBJECT_DIAGONAL_M = (0.02, 3.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
 
 IntArray = NDArray[np.int64]
@@ -45,8 +47,8 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
 
     Returns:
         The mesh with bitwise equal vertices merged (STL facets, UV seams), vertex normals (V, 3) from the file or
-        area-weighted from its faces, and `findings`: vertices, faces, holes, boundary_edges, non_manifold_edges, components,
-        degenerate_faces, unreferenced_vertices, normals_computed.
+        area-weighted from its faces, and `findings`: vertices, faces, holes, boundary_edges, non_manifold_edges,
+        components, degenerate_faces, unreferenced_vertices, normals_computed.
 
     Raises:
         IncompleteExportError: truncated, still growing, locked, or a companion is missing.
@@ -84,10 +86,7 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
     first, index = merge_equal(vertices)
     merged, faces = vertices[first], index[faces]
     computed = normals is None
-    if normals is None:
-        kept = vertex_normals(merged, faces)
-    else:
-        kept = _unit_length(_summed(index, normals, len(merged)))
+    kept = vertex_normals(merged, faces) if normals is None else _unit_length(_summed(index, normals, len(merged)))
     findings = {**mesh_findings(merged, faces), "normals_computed": float(computed)}
     return ScannedMesh(Mesh(merged, faces.astype(np.int32), kept), found, evidence, findings, export)
 
@@ -223,8 +222,8 @@ def _validate(path: Path, vertices: Array, faces: IntArray) -> None:
 def _unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str]:
     """The unit to believe and why."""
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
-    low, high = PLAUSIBLE_DIAGONAL_M
-    span = f"a scene is {low:g} to {high:g} m across"
+    low, high = SCENE_DIAGONAL_M if unit == "auto" else OBJECT_DIAGONAL_M
+    span = f"{'a scene' if unit == 'auto' else 'what is scanned'} is {low:g} to {high:g} m across"
     fitting = [name for name, scale in METRES_PER_UNIT.items() if low <= diagonal * scale <= high]
     if unit == "auto":
         if len(fitting) != 1:
@@ -232,7 +231,8 @@ def _unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str]:
                 f"the unit cannot be told: the bounding box is {diagonal:.6g} file units across, which is credible "
                 f"neither in millimetres nor in metres ({span})",
                 where=str(path),
-                remedy="Set the unit of the export in the scanner's software to millimetres and export again",
+                remedy="Set the unit of the export in the scanner's software to millimetres and export again; if this is a "
+                "single object, configure its unit",
             )
         other = "m" if fitting[0] == "mm" else "mm"
         return fitting[0], (

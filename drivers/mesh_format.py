@@ -20,8 +20,10 @@ _AGAIN = "Wait until the export has finished; if it has, export the scan again"
 _HEAD_BYTES = 64 * 1024
 _TEXTURE = re.compile(rb"^\s*(?:map_\w+|bump|disp|decal|norm|refl)\s+(.+?)\s*$", re.MULTILINE | re.IGNORECASE)
 _MTLLIB = re.compile(rb"^\s*mtllib\s+(.+?)\s*$", re.MULTILINE)
-_COUNT = re.compile(
-    rb"^#.*?\b(vert(?:ices|exes|ex count|s)|faces)\b\s*[:=]?\s*(\d+)\s*$", re.MULTILINE | re.IGNORECASE
+_WHAT = rb"(vertices|vertexes|verts|faces)"
+_COUNTS = tuple(
+    re.compile(pattern, re.MULTILINE | re.IGNORECASE)
+    for pattern in (rb"^#\s*(\d+) " + _WHAT + rb"\s*$", rb"^#\s*" + _WHAT + rb"\s*[:=]?\s*(\d+)\s*$")
 )
 
 
@@ -286,7 +288,12 @@ def _check_obj(path: Path) -> None:
         )
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
-    announced = {name[:1].lower(): int(number) for name, number in _COUNT.findall(head + b"\n" + tail)}
+    announced: dict[bytes, int] = {}
+    for pattern in _COUNTS:
+        for pair in pattern.findall(head + b"\n" + tail):
+            number, what = sorted(pair)  # digits sort before letters
+            # Of several objects each may have its own count: the largest is a lower bound of all.
+            announced[what[:1].lower()] = max(int(number), announced.get(what[:1].lower(), 0))
     vertices = faces = 0
     with path.open("rb") as stream:
         while block := stream.readlines(1 << 22):

@@ -12,7 +12,7 @@ from types import FrameType
 import numpy as np
 from numpy.typing import NDArray
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
-from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, ImplicitVRLittleEndian, generate_uid
+from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian, ImplicitVRLittleEndian, generate_uid
 
 from simulators.ct_volume import Grid, grid_around, voxelise
 from simulators.faults import FaultPlan
@@ -63,7 +63,7 @@ def true_frames(seed: int) -> tuple[Array, Array]:
     """T_world_ct of the patient frame, and T_world_gantry whose axes are those of the image grid."""
     rng = np.random.default_rng([seed, 0xC7])
     # The board lies in the gantry a little askew, and the patient frame is what the scanner makes of it.
-    T_world_gantry = from_euler(rng.uniform(-0.10, 0.10, 3) + [0.0, 0.0, rng.uniform(-0.3, 0.3)], np.zeros(3))
+    T_world_gantry = from_euler(rng.uniform(-0.10, 0.10, 3) * [1.0, 1.0, 3.0], np.zeros(3))
     T_ct_gantry = from_euler(rng.uniform(-np.pi, np.pi, 3), rng.uniform(-0.3, 0.3, 3))
     return T_world_gantry @ inverse(T_ct_gantry), T_world_gantry
 
@@ -99,7 +99,8 @@ def write_series(
 ) -> None:
     """Write one file a slice of volume (K, J, I); T_ct_grid is rigid, its origin the centre of voxel (0, 0, 0).
 
-    Faults of the device `ct`, on `slice`: drop (a gap), truncate, corrupt, duplicate, tilt, disk_full; on `series`: localiser.
+    Faults of the device `ct`, on `slice`: drop (a gap), truncate, corrupt, duplicate, tilt, disk_full;
+    on `series`: localiser.
     """
     common = _common(volume.shape, grid, T_ct_grid, series)
     syntax = ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian
@@ -112,6 +113,7 @@ def write_series(
         if kind == "disk_full":
             raise SimulatorError(f"no space left in {folder}: the series is incomplete")
         position = (T_ct_grid[:3, 3] + k * grid.voxel_m * T_ct_grid[:3, 2]) * 1000.0
+        path = folder
         for _ in range(2 if kind == "duplicate" else 1):
             number += 1
             path = folder / f"CT{number:05d}.dcm"
@@ -167,7 +169,7 @@ def _write_slice(
     hounsfield: NDArray[np.int16],
     position_mm: Array,
     number: int,
-    syntax: str,
+    syntax: UID,
     *,
     tilted: bool,
 ) -> None:

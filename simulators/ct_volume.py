@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from simulators.geometry import Array, Array32, apply, inverse
@@ -19,7 +19,7 @@ HOUNSFIELD = {"specimen": TISSUE, "board": WOOD, "post": WOOD, "steel": STEEL}
 NOISE_HU = 15.0
 BLUR_VOXELS = 0.55  # of the scanner's point spread, as a Gaussian sigma
 MARGIN_VOXELS = 8
-_SUBRAYS = 3  # a side; the lateral part of antialiasing, the one along the ray is exact
+_SUBRAY_PITCH_M = 0.27e-3  # lateral antialiasing; along the ray it is exact
 _ROWS = 24  # rows J computed together
 _HALO = 3  # rows that the blur needs beside them
 _RESTART_M = 2e-6  # past a hit, to find the next
@@ -55,13 +55,13 @@ class _Solid:
         self.hounsfield = HOUNSFIELD[part.material]
         p = apply(inverse(grid.T_world_grid), part.vertices_m)[part.faces]
         self.low, self.high = p.reshape(-1, 3).min(axis=0), p.reshape(-1, 3).max(axis=0)
-        self._scene = rtcore_scene.EmbreeScene()
+        self._scene = EmbreeScene()
         self._mesh = TriangleMesh(self._scene, p.astype(np.float32))
         self._entering = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, 2] < 0  # outward normal against the ray
         self._vertices = p
 
     def coverage(self, grid: Grid, first_row: int, rows: int) -> tuple[Box, Array32] | None:
-        """The box of voxels (k, j, i slices of these rows) that the solid can touch, and the fraction of each inside."""
+        """The box of voxels (slices k, j, i) of these rows that the solid can touch, and the fraction inside."""
         h = grid.voxel_m
         low = np.maximum(np.floor(self.low / h).astype(int) - 1 - [0, first_row, 0], 0)
         high = np.ceil(self.high / h).astype(int) + 2 - [0, first_row, 0]
@@ -69,13 +69,12 @@ class _Solid:
         if np.any(high <= low):
             return None
         n_i, n_j, n_k = (int(n) for n in high - low)
-        sub = (np.arange(_SUBRAYS) + 0.5) / _SUBRAYS - 0.5
+        side = max(2, round(h / _SUBRAY_PITCH_M))
+        sub = (np.arange(side) + 0.5) / side - 0.5
         x = ((np.arange(low[0], high[0])[:, None] + sub) * h).ravel()
         y = ((np.arange(low[1], high[1])[:, None] + first_row + sub) * h).ravel()
         gy, gx = np.meshgrid(y, x, indexing="ij")
-        cell = (
-            np.repeat(np.arange(n_j), _SUBRAYS)[:, None] * n_i + np.repeat(np.arange(n_i), _SUBRAYS)[None]
-        ).ravel()
+        cell = (np.repeat(np.arange(n_j), side)[:, None] * n_i + np.repeat(np.arange(n_i), side)[None]).ravel()
         start = np.full(gx.size, float(self.low[2]) - h)
         origins = np.stack([gx.ravel(), gy.ravel(), start], axis=1).astype(np.float32)
         up = np.zeros_like(origins)
@@ -87,7 +86,7 @@ class _Solid:
             hit = face >= 0
             origins, cell, face = origins[hit], cell[hit], face[hit]
             z = self._depth(origins, face)
-            # Voxel k spans k - 0.5 to k + 0.5: the one that is entered gets the rest of its length, all later ones all.
+            # Voxel k spans k - 0.5 to k + 0.5: the one that is entered gets the rest of its length, later ones all.
             u = np.clip(z / h + 0.5 - low[2], 0.0, n_k)
             k = u.astype(np.int64)
             sign = np.where(self._entering[face], 1.0, -1.0)
@@ -95,9 +94,10 @@ class _Solid:
             shares += [sign * (1.0 - u + k), sign * (u - k)]
             origins[:, 2] = np.maximum(z + _RESTART_M, np.nextafter(origins[:, 2], np.float32(np.inf)))
         change = np.bincount(np.concatenate(voxels), np.concatenate(shares), (n_k + 2) * n_j * n_i)
-        inside = np.cumsum(change.reshape(n_k + 2, n_j, n_i)[:n_k].astype(np.float32), axis=0) / _SUBRAYS**2
+        inside = np.cumsum(change.reshape(n_k + 2, n_j, n_i)[:n_k].astype(np.float32), axis=0)
+        inside *= np.float32(1.0 / side**2)
         box = (slice(low[2], high[2]), slice(low[1], high[1]), slice(low[0], high[0]))
-        return box, np.clip(inside, 0.0, 1.0)
+        return box, np.clip(inside, 0.0, 1.0, out=inside)
 
     def _depth(self, origins: Array32, face: NDArray[np.int32]) -> Array:
         """z where vertical rays meet their faces, in double precision."""
@@ -164,12 +164,12 @@ def _add_sphere(slab: Array32, grid: Grid, first_row: int, centre: Array) -> Non
 
 
 def _bone(scene: Scene, grid: Grid, origin: NDArray[np.int64], inside: Array32) -> Array32:
-    """Bone or not, in a box at voxel `origin` (i, j, k): vertebral bodies along the midline, and the processes that stand in the wound."""
+    """Bone or not, in a box at voxel `origin` (i, j, k): vertebral bodies, and processes in the wound."""
     bone = np.zeros(inside.shape, dtype=np.float32)
     k, j, i = np.nonzero(inside > 0.02)
     if len(k) == 0:
         return bone
-    p = apply(grid.T_world_grid, grid.voxel_m * (np.stack([i, j, k], axis=1) + origin))
+    p = apply(grid.T_world_grid, np.asarray((np.stack([i, j, k], axis=1) + origin) * grid.voxel_m, dtype=np.float64))
     anatomy = scene.specimen.anatomy
     near = np.abs(p[:, 1] - anatomy.midline(p[:, 0])) < 0.024
     k, j, i, p = k[near], j[near], i[near], p[near]

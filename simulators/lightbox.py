@@ -1,4 +1,4 @@
-"""The light and environment box at the other end of a serial line: a pseudo-terminal that speaks its ASCII protocol."""
+"""The light and environment box at the other end of a serial line: a pseudo-terminal with its ASCII protocol."""
 
 from __future__ import annotations
 
@@ -169,21 +169,15 @@ class Lightbox:
 
     def _answer(self, request: str) -> str:
         view = self._world.view() if self._world is not None else {}
-        match request.split():
-            case ["*IDN?"]:
-                return f"*IDN {IDENTITY}"
-            case ["LIGHT?"]:
-                return f"LIGHT {view.get('light_lux', 45_000.0):.1f}"
-            case ["TEMP?"]:
-                return f"TEMP {view.get('temperature_c', 21.5):.2f}"
-            case ["SHUTTER?"]:
-                return f"SHUTTER {self._shutter}"
-            case ["SHUTTER", ("0" | "1") as state]:
-                self._shutter = int(state)
-                return f"SHUTTER {self._shutter}"
-            case ["SHUTTER", *_]:
-                return "ERR 2 wrong argument"
-            case ["PEDAL?"]:
-                return f"PEDAL {self._pressed + int(view.get('pedal_presses', 0))}"
-            case _:
-                return "ERR 1 unknown request"
+        readings = {
+            "*IDN?": f"*IDN {IDENTITY}",
+            "LIGHT?": f"LIGHT {view.get('light_lux', 45_000.0):.1f}",
+            "TEMP?": f"TEMP {view.get('temperature_c', 21.5):.2f}",
+            "PEDAL?": f"PEDAL {self._pressed + int(view.get('pedal_presses', 0))}",
+        }
+        if request in ("SHUTTER 0", "SHUTTER 1"):
+            self._shutter = int(request[-1])
+        if request in ("SHUTTER?", "SHUTTER 0", "SHUTTER 1"):
+            return f"SHUTTER {self._shutter}"
+        wrong = "ERR 2 wrong argument" if request.startswith("SHUTTER") else "ERR 1 unknown request"
+        return readings.get(request, wrong)

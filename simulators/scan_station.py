@@ -8,12 +8,13 @@ import signal
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from types import FrameType
 
 import numpy as np
-from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from scipy.spatial.transform import Rotation
 
 from simulators.faults import Fault, FaultPlan
@@ -105,7 +106,7 @@ def _seen_counts(parts: list[Part]) -> list[tuple[Array, Array]]:
     vertices = np.concatenate([part.vertices_m for part in parts])
     faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets[:-1], strict=True)])
     normals = np.concatenate([vertex_normals(part.vertices_m, part.faces) for part in parts])
-    scene = rtcore_scene.EmbreeScene()
+    scene = EmbreeScene()
     mesh = TriangleMesh(scene, vertices[faces].astype(np.float32))
     origins = vertices + 0.3e-3 * normals
     count, best = np.zeros(len(vertices)), np.zeros(len(vertices))
@@ -123,7 +124,7 @@ def _seen_counts(parts: list[Part]) -> list[tuple[Array, Array]]:
         count += free
         best = np.where(free, np.maximum(best, cosine), best)
     del mesh
-    return [(count[a:b], best[a:b]) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
+    return [(count[a:b], best[a:b]) for a, b in pairwise(offsets)]
 
 
 def _sweep() -> Iterator[tuple[Array, Array]]:
@@ -148,7 +149,7 @@ def _observed(
     *,
     glossy: bool,
 ) -> tuple[Array, Ints, Array]:
-    """Vertices, faces and normals of a part as scanned: finer mesh, unseen surface missing, noise along the normal."""
+    """Vertices, faces and normals of a part as scanned: finer mesh, unseen surface missing, noisy."""
     # Glossy surface is lost where it is seen obliquely or seldom.
     score = np.minimum(count / (7.0 if glossy else 2.5), np.maximum(best_cosine, 0.0) / (0.62 if glossy else 0.35))
     vertices, faces = part.vertices_m, part.faces

@@ -28,8 +28,8 @@ def surface(
         slab_voxels: at most about so many voxels are worked on at a time.
 
     Returns:
-        vertices (V, 3) in metres in the CT frame, and faces (F, 3), counter-clockwise seen from outside. The surface is open where the
-        object reaches the border of the volume.
+        vertices (V, 3) in metres in the CT frame, and faces (F, 3), counter-clockwise seen from outside. The surface
+        is open where the object reaches the border of the volume.
 
     Raises:
         ComputeError: the volume is not three-dimensional or nowhere crosses the threshold.
@@ -71,8 +71,9 @@ def surface(
         # Only possible where two neighbouring slices lie on either side of the level and none crosses it within.
         raise ComputeError(f"no surface at {threshold_hu:g} HU", remedy="Choose another threshold")
     points, triangles = _sewn(np.concatenate(vertices), np.concatenate(faces), np.concatenate(seams))
-    # Going from array order (k, j, i) to (i, j, k) mirrors, and so does a left-handed T_ct_voxel.
-    if np.linalg.det(T_ct_voxel[:3, :3]) > 0:
+    # scikit-image winds its faces for (k, j, i) clockwise seen from outside; the change to (i, j, k) mirrors them, and
+    # a left-handed T_ct_voxel mirrors them back.
+    if np.linalg.det(T_ct_voxel[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
     return apply(T_ct_voxel, points), np.ascontiguousarray(triangles, dtype=np.int32)
 
