@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import pytest
 
 from service.core.errors import ProtocolError
 from service.core.protocol import load_protocol, protocol_json_schema
+from service.core.protocol_docs import lifecycle_text, schema_text
 from tests.support.core import KINDS, TOY, CaptureParams, ChecklistParams, load
 
 
@@ -155,3 +157,11 @@ def test_the_schema_knows_the_params_of_every_kind() -> None:
     assert schema["$defs"]["CaptureParams"]["required"] == ["views"]
     exposure: dict[str, Any] = schema["$defs"]["CameraSection"]["properties"]["exposure_s"]
     assert {option["type"] for option in exposure["anyOf"]} == {"number", "string"}
+
+
+def test_the_generated_documents() -> None:
+    assert json.loads(schema_text(KINDS)) == protocol_json_schema(KINDS)
+    page = lifecycle_text(load(TOY).protocol)
+    assert "| spray | spray | Spray | yes |  | yes | capture |  |" in page
+    assert "views ≥ 3 views; sharp ≥ 0.2 and ≤ 1" in page
+    assert "```mermaid\nstateDiagram-v2" in page

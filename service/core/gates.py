@@ -28,8 +28,12 @@ def _verdict(gate: Gate, value: float | None) -> GateVerdict:
 
 def describe(verdict: GateVerdict) -> str:
     """`rms 0.71 px, allowed ≤ 0.5`: one line for an operator."""
-    low = "" if verdict.minimum is None else f"≥ {verdict.minimum:g}"
-    high = "" if verdict.maximum is None else f"≤ {verdict.maximum:g}"
-    allowed = " and ".join(limit for limit in (low, high) if limit)
     value = "was not measured" if verdict.value is None else f"{verdict.value:.4g} {verdict.unit}".rstrip()
-    return f"{verdict.measure} {value}, allowed {allowed}"
+    return f"{verdict.measure} {value}, allowed {limits(verdict.minimum, verdict.maximum)}"
+
+
+def limits(minimum: float | None, maximum: float | None) -> str:
+    """`≥ 0.2 and ≤ 1`."""
+    low = "" if minimum is None else f"≥ {minimum:g}"
+    high = "" if maximum is None else f"≤ {maximum:g}"
+    return " and ".join(limit for limit in (low, high) if limit)
