@@ -14,7 +14,7 @@ from drivers.mesh_file import MeshUnit, read_mesh_file
 from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
 from service.compute.mesh_spheres import locate_spheres
 from service.compute.pipeline import detect_all, register_images
-from service.compute.pose_files import read_camera, read_poses, read_spheres
+from service.compute.pose_files import read_camera_json, read_poses, read_spheres_json
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array
 
@@ -41,7 +41,7 @@ def register_command(
     """Register posed images with a scan by the spheres that both show, and say how well it fits."""
     with reporting_errors(json):
         files = _images(images)
-        model = read_camera(camera)
+        model = read_camera_json(camera)
         known = read_poses(poses, [file.name for file in files])
         registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control)
         with progress_bar(quiet=json) as progress:
@@ -93,7 +93,7 @@ def _spheres(
     if (mesh is None) == (spheres is None):
         raise typer.BadParameter("give either --mesh or --spheres")
     if spheres is not None:
-        known = read_spheres(spheres)
+        known = read_spheres_json(spheres)
         return known.registration_m, known.control_m, known.radius_m if radius_mm is None else radius_mm / 1e3
     if radius_mm is None:
         raise typer.BadParameter("--mesh needs --radius-mm")

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from service.compute.camera_model import CameraModel
-from service.compute.pose_files import write_camera, write_poses_csv, write_transforms_json
+from service.compute.pose_files import write_camera_json, write_poses_csv, write_transforms_json
 from service.core.errors import DataError
 from service.core.geometry import Transform
 from service.dataset.summary import RunSummary
@@ -45,7 +45,7 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
         name = f"{capture.viewpoint}.jpg"
         shutil.copyfile(summary.store.artefact_path(photograph.sha256), images / name)
         poses[name], sources[name] = np.array(T), photograph.sha256
-    write_camera(folder / "camera.json", camera)
+    write_camera_json(folder / "camera.json", camera)
     write_poses_csv(folder / "poses.csv", poses)
     write_transforms_json(folder / "transforms.json", camera, {f"images/{name}": T for name, T in poses.items()})
     vertices_m, faces = summary.scan_mesh()
