@@ -108,8 +108,13 @@ class StepEvidence:
             self.wait(0.2)
 
     def _key(self, request: JobRequest) -> str:
+        """The same for the same work: after a restart or a retry its result is used, not computed again.
+
+        A redo of the step begins a new generation; a job that has failed is tried anew when the step is repeated.
+        """
+        state = self.log.refresh()
+        generation = sum(past.step == self.step and past.viewpoint is None for past in state.superseded)
         arguments = hashlib.sha256(json.dumps(request.arguments, sort_keys=True).encode()).hexdigest()[:16]
-        # A failed job is tried anew when the operator repeats the step: its key must differ.
-        jobs = self.log.refresh().steps[self.step].jobs.values()
-        failed = sum(job.kind == request.kind and job.status == "failed" for job in jobs)
-        return f"{self.step}/{self.attempt}/{request.kind}/{arguments}/{failed}"
+        key = f"{self.step}/{generation}/{request.kind}/{arguments}/"
+        jobs = state.steps[self.step].jobs.values()
+        return key + str(sum(job.idempotency_key.startswith(key) and job.status == "failed" for job in jobs))

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import distributions
 from os import getpid
-from typing import Protocol as Interface
 from typing import Any
+from typing import Protocol as Interface
 
 from drivers.errors import DeviceError
+from drivers.interfaces import DeviceReport
 from service.core.actions import refuse
 from service.core.decide import (
     AbortRun,
@@ -28,6 +31,7 @@ from service.core.decide import (
 from service.core.errors import OrthocaptureError
 from service.core.model import (
     ActionRefused,
+    DeviceOpened,
     DeviceTrouble,
     OperatorAction,
     Payload,
@@ -51,6 +55,7 @@ from service.store.store import Store
 
 _LEASE_S = 30.0
 _POLL_S = 0.1
+_PEDAL_RETRY_S = 30.0
 
 
 class Operator(Interface):
@@ -85,7 +90,9 @@ class Runner:
     _log: RunLog = field(init=False)
     _lease: RunLease = field(init=False)
     _renew_at_s: float = field(init=False, default=0.0)
-    _pedal: int | None = field(init=False, default=None)
+    _asked: AskOperator | None = field(init=False, default=None)
+    _pedal: int | None = field(init=False, default=None)  # presses when the open question was first asked
+    _pedal_again_s: float = field(init=False, default=0.0)
 
     def run(self) -> RunState:
         """Take the lease, record the session, and act on decisions until the run ends or an operator stops it.
@@ -95,12 +102,13 @@ class Runner:
         with self.store.lease(self.run_id, f"runner on {socket.gethostname()}", _LEASE_S) as lease:
             self._lease = lease
             self._log = RunLog(self.store, self.run_id, self.protocol)
+            if self._log.state.terminal:
+                return self._log.state
             resumed = self._log.state.sessions > 0
             self._append(
-                SessionStarted(
-                    resumed=resumed, software=software_versions(), host=socket.gethostname(), pid=getpid()
-                )
+                SessionStarted(resumed=resumed, software=software_versions(), host=socket.gethostname(), pid=getpid())
             )
+            self.devices.watch(self._opened)
             while True:
                 self._keep_lease()
                 state = self._log.refresh()
@@ -159,25 +167,35 @@ class Runner:
         self.operator.tell(f"refused: {refusal}")
 
     def _pedal_press(self, question: AskOperator) -> OperatorAction | None:
-        """A new press of the foot pedal confirms the open step, hands-free."""
+        """A press of the foot pedal since the question was asked confirms it, hands-free."""
+        if question != self._asked:
+            self._asked, self._pedal = question, None
+        if self.monotonic_s() < self._pedal_again_s:
+            return None
         try:
             lightbox = self.devices.lightbox()
             presses = lightbox.pedal_presses() if lightbox is not None else 0
-        except DeviceError:
-            return None  # doctor and capture report a missing box; a question can be answered without it
-        before, self._pedal = self._pedal, presses
-        if before is None or presses <= before or "confirm" not in question.options:
+        except DeviceError as error:
+            self._pedal_again_s = self.monotonic_s() + _PEDAL_RETRY_S
+            self.operator.tell(f"the foot pedal does not work: {error}")
             return None
+        if self._pedal is None or presses < self._pedal:  # a box that was switched off counts from zero
+            self._pedal = presses
+        if presses == self._pedal or "confirm" not in question.options:
+            return None
+        self._pedal = presses
         return OperatorAction(action="confirm", step=question.step, checklist=question.checklist, via="pedal")
+
+    def _opened(self, device: str, report: DeviceReport) -> None:
+        self._append(DeviceOpened(device=device, report=dataclasses.asdict(report)))
 
     # --- steps ---
 
     def _execute(self, step_id: str, attempt: int) -> None:
         step = self.protocol.step(step_id)
         kind = step_kinds()[step.kind]
-        evidence = StepEvidence(
-            self._log, self._lease, step_id, attempt, self._checkpoint, self.operator.show, self.wait
-        )
+        checkpoint = partial(self._checkpoint, step_id, attempt)
+        evidence = StepEvidence(self._log, self._lease, step_id, attempt, checkpoint, self.operator.show, self.wait)
         context = StepContext(
             protocol=self.protocol,
             step=step,
@@ -185,13 +203,14 @@ class Runner:
             run=self._log.state,
             devices=self.devices,
             evidence=evidence,
-            checkpoint=self._checkpoint,
+            checkpoint=checkpoint,
             progress=self.operator.show,
             monotonic_s=self.monotonic_s,
             wait=self.wait,
             operator=self.operator.name,
         )
         try:
+            checkpoint()
             outcome = kind.execute(context, step.params)
         except StepInterruptedError as interruption:
             self.operator.tell(str(interruption))
@@ -218,18 +237,18 @@ class Runner:
         payloads: list[Payload] = []
         if isinstance(error, DeviceError):
             payloads.append(DeviceTrouble(device=error.where or step_id, error=name, message=str(error)))
-        payloads.append(
-            StepFailed(step=step_id, attempt=attempt, error=name, message=str(error), recovery=policy)
-        )
+        payloads.append(StepFailed(step=step_id, attempt=attempt, error=name, message=str(error), recovery=policy))
         self._append(*payloads)
         self.operator.tell(f"{step_id}: {error}. What was captured is safe")
 
-    def _checkpoint(self) -> None:
-        """Called by steps wherever they may stop: keeps the lease, and notices pause and abort."""
+    def _checkpoint(self, step: str, attempt: int) -> None:
+        """Called by steps wherever they may stop: keeps the lease, and notices what operators have asked for."""
         self._keep_lease()
         state = self._log.refresh()
-        if state.paused or state.terminal:
-            raise StepInterruptedError(f"the operator asked to {'pause' if state.paused else 'abort'}")
+        if state.paused:
+            raise StepInterruptedError("paused")
+        if state.terminal or (state.current, state.step.attempt, state.phase) != (step, attempt, "running"):
+            raise StepInterruptedError(f"the operator has ended this attempt; the run is {state.status}")
 
     def _append(self, *payloads: Payload, actor: str = "runner") -> None:
         self.store.record(self.run_id, payloads, actor=actor, lease=self._lease)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ipaddress import ip_address
 from pathlib import Path
 
 from service.core.errors import ConfigurationError, IntegrityError
@@ -13,7 +14,7 @@ from service.steps import params_models
 from service.store.records import NewArtefact
 from service.store.store import Store
 
-_LOOPBACK = ("127.", "localhost", "ptpip:127.", "socket://127.")
+_SCHEMES = ("ptpip:", "socket://")
 
 
 def start_run(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, auto_confirm: bool) -> str:
@@ -70,12 +71,24 @@ def require_simulated(rig: Rig) -> None:
     """Refuse automatic confirmation unless the rig says that it is simulated and every address is this machine's."""
     remedy = "Leave --auto-confirm out: on a real rig a person confirms every motion"
     if not rig.section.simulated:
-        raise ConfigurationError("automatic confirmation is for simulated rigs only", where=str(rig.path), remedy=remedy)
+        raise ConfigurationError(
+            "automatic confirmation is for simulated rigs only", where=str(rig.path), remedy=remedy
+        )
     for name, settings in rig.section.devices.items():
         address = str(settings.get("host") or settings.get("port") or "")
-        if (":" in address or "host" in settings) and not address.startswith(_LOOPBACK):
+        if (":" in address or "host" in settings) and not _is_this_machine(address):
             raise ConfigurationError(
                 f"device {name!r} at {address} is not on this machine, so the rig cannot be simulated",
                 where=str(rig.path),
                 remedy=remedy,
             )
+
+
+def _is_this_machine(address: str) -> bool:
+    for scheme in _SCHEMES:
+        address = address.removeprefix(scheme)
+    host = address.split(":")[0]
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import entry_points
 from typing import Any, TypeVar, cast
 
@@ -15,6 +15,7 @@ from drivers.interfaces import (
     Camera,
     CtSource,
     Device,
+    DeviceReport,
     Lightbox,
     Payload,
     RobotArm,
@@ -45,6 +46,7 @@ class Station:
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self._open: dict[str, Device] = {}
+        self._on_open: Callable[[str, DeviceReport], None] | None = None
 
     def names(self) -> tuple[str, ...]:
         """Devices of the rig file, in its order."""
@@ -53,13 +55,27 @@ class Station:
     def device(self, name: str) -> Device:
         """An open device. Raises ConfigurationError or DeviceError."""
         if name not in self._open:
-            spec, device = self._build(name)
-            device.open()
+            device = self._build(name)
+            self._connect(name, device)
             self._open[name] = device
-            if spec.kind == "robot" and self.rig.section.payload is not None:
-                payload = self.rig.section.payload
-                cast(RobotArm, device).configure(Payload(payload.mass_kg, payload.centre_of_gravity_m), np.eye(4))
         return self._open[name]
+
+    def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
+        """Have every device that is opened from now on reported, by its name."""
+        self._on_open = on_open
+
+    def _connect(self, name: str, device: Device) -> None:
+        """Open a device and make it ready; one that is not ready is not left open."""
+        try:
+            device.open()
+            payload = self.rig.section.payload
+            if self.kind_of(name) == "robot" and payload is not None:
+                cast(RobotArm, device).configure(Payload(payload.mass_kg, payload.centre_of_gravity_m), np.eye(4))
+            if self._on_open is not None:
+                self._on_open(name, device.report())
+        except BaseException:
+            device.close()
+            raise
 
     def close(self) -> None:
         """Let go of every device."""
@@ -109,8 +125,9 @@ class Station:
 
     def reopen(self, device: Device) -> None:
         """Close and open again, after a link dropped."""
+        name = next(name for name, known in self._open.items() if known is device)
         device.close()
-        device.open()
+        self._connect(name, device)
 
     # --- building ---
 
@@ -142,15 +159,13 @@ class Station:
             )
         return cast(DriverSpec, points[driver].load()), points[driver].value
 
-    def _build(self, name: str) -> tuple[DriverSpec, Device]:
+    def _build(self, name: str) -> Device:
         spec, spec_path = self._spec(name)
         config = self._config(name, spec)
         if spec.hosted:
             interface = INTERFACES[spec.kind]
-            return spec, cast(
-                Device, hosted(interface, spec_path, config, call_timeout_s=spec.call_timeout_s, name=name)
-            )
-        return spec, spec.build(config)
+            return cast(Device, hosted(interface, spec_path, config, call_timeout_s=spec.call_timeout_s, name=name))
+        return spec.build(config)
 
     def _config(self, name: str, spec: DriverSpec) -> DriverConfig:
         settings = {key: value for key, value in self.rig.section.devices[name].items() if key != "driver"}

@@ -24,9 +24,9 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.operators import AutomaticOperator, Display, TerminalOperator
-from service.core.actions import check_action, record_to_sign
+from service.core.actions import VERBS, record_to_sign, refuse
 from service.core.fold import fold
-from service.core.model import OperatorAction
+from service.core.model import ActionRefused, OperatorAction
 from service.core.protocol import load_protocol
 from service.core.run_state import RunState
 from service.rig import Rig, load_rig
@@ -73,7 +73,7 @@ def resume_command(
     json: JsonOption = False,
 ) -> None:
     """Go on with a run after a crash, a power cut or a pause: nothing captured is lost or taken twice."""
-    with reporting_errors(json), Store.open(data) as store:
+    with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         _, root = recorded_run(store, run_id)
         rig = recorded_rig(store, root)
@@ -93,13 +93,13 @@ def act_command(
     json: JsonOption = False,
 ) -> None:
     """Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist."""
-    with reporting_errors(json), Store.open(data) as store:
+    if verb not in VERBS:
+        raise typer.BadParameter(f"{verb!r} is none of {', '.join(VERBS)}", param_hint="VERB")
+    with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)
         state = fold(protocol, store.events(run_id))
         name = operator or getpass.getuser()
-        if verb not in OPERATOR_VERBS:
-            raise typer.BadParameter(f"{verb!r} is none of {', '.join(OPERATOR_VERBS)}")
         action = OperatorAction(
             action=verb,
             step=step or state.current,
@@ -109,15 +109,16 @@ def act_command(
             meaning=meaning,
             signed_sha256=record_to_sign(protocol, state) if verb == "sign" else "",
         )
-        check_action(protocol, state, action, name)
+        refusal = refuse(protocol, state, action, name)
+        if refusal is not None:
+            record = ActionRefused(action=action.action, step=action.step, why=str(refusal))
+            store.record(run_id, [record], actor=name)
+            raise refusal
         store.record(run_id, [action], actor=name)
         if json:
             print_json({"run": run_id, "recorded": verb, "step": action.step})
         else:
             console.print(f"Recorded: {verb} of {action.step} by {escape(name)}")
-
-
-OPERATOR_VERBS = ("confirm", "sign", "redo", "skip", "pause", "resume", "abort")
 
 
 def status_command(
@@ -126,7 +127,7 @@ def status_command(
     json: JsonOption = False,
 ) -> None:
     """Show how far a run is: steps, gates, deviations."""
-    with reporting_errors(json), Store.open(data) as store:
+    with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)
         state = fold(protocol, store.events(run_id))
@@ -155,15 +156,18 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
         "current": state.current,
         "deviations": [d.text for d in state.deviations if not d.is_note],
         "steps": {
-            name: {"phase": s.phase, "attempt": s.attempt, "captured": sorted(s.captured), "measures": dict(s.measures)}
+            name: {
+                "phase": s.phase,
+                "attempt": s.attempt,
+                "captured": sorted(s.captured),
+                "measures": dict(s.measures),
+            }
             for name, s in state.steps.items()
         },
     }
 
 
-def drive(
-    store: Store, run_id: str, rig: Rig, *, data: Path, auto_confirm: bool, worker: bool
-) -> RunState:
+def drive(store: Store, run_id: str, rig: Rig, *, data: Path, auto_confirm: bool, worker: bool) -> RunState:
     """Run the runner in this process, with a worker beside it, until the run ends."""
     protocol, root = recorded_run(store, run_id)
     display = Display(error_console)
@@ -205,5 +209,3 @@ def _report_end(run_id: str, state: RunState, *, json: bool) -> None:
         console.print(f"Run {run_id} is {state.status}; {state.deviation_count} deviations. Evidence: audit verify")
     if state.status != "completed":
         raise typer.Exit(1)
-
-

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -72,36 +72,40 @@ def capture_viewpoints(
 
     Raises DeviceError when a viewpoint fails for good, StepInterruptedError on pause.
     """
-    earlier = context.evidence.captures(context.step.id)
-    done = {capture.viewpoint for capture in earlier}
-    given_up = set(context.state.skipped_viewpoints)
     camera = context.devices.camera()
     wanted = _wanted_settings(context)
-    camera.apply(wanted)
-    bad_settings = sum(not capture.verdicts["settings"] for capture in earlier)
-    moved = sum(not capture.verdicts["still"] for capture in earlier)
-    for number, viewpoint in enumerate(viewpoints):
-        context.progress("viewpoints", number, len(viewpoints))
-        if viewpoint.name in done:
-            continue
+    _apply(context, camera, wanted)
+    given_up = set(context.state.skipped_viewpoints)
+    taken: set[str] = set()  # in this execution, successful or not
+    # Looked up anew each time: an operator may send a viewpoint back while the arm moves.
+    while todo := _next(context, viewpoints, given_up, taken):
         context.checkpoint()
+        context.progress("viewpoints", len(viewpoints) - len(todo), len(viewpoints))
+        viewpoint = todo[0]
         try:
-            verdicts = _capture_with_retries(context, camera, viewpoint, T_flange_camera, wanted, image_kind)
+            _capture_with_retries(context, camera, viewpoint, T_flange_camera, wanted, image_kind)
         except UnreachablePoseError as error:
             context.evidence.record(_failed(context, viewpoint, error, skipped=True))
             given_up.add(viewpoint.name)
-            continue
-        done.add(viewpoint.name)
-        bad_settings += not verdicts["settings"]
-        moved += not verdicts["still"]
+        taken.add(viewpoint.name)
     context.progress("viewpoints", len(viewpoints), len(viewpoints))
+    captures = context.evidence.captures(context.step.id)
     return CaptureTotals(
         planned=len(viewpoints),
-        captured=len(done),
-        given_up=len(given_up - done),
-        settings_departures=bad_settings,
-        moved=moved,
+        captured=len(captures),
+        given_up=len(given_up),
+        settings_departures=sum(not capture.verdicts["settings"] for capture in captures),
+        moved=sum(not capture.verdicts["still"] for capture in captures),
     )
+
+
+def _next(
+    context: StepContext, viewpoints: Sequence[Viewpoint], given_up: Set[str], taken: Set[str]
+) -> list[Viewpoint]:
+    """What is still to be captured, in order. An image whose verdicts failed is taken again, once an execution."""
+    captures = {capture.viewpoint: capture for capture in context.evidence.captures(context.step.id)}
+    done = {name for name, capture in captures.items() if name in taken or all(capture.verdicts.values())}
+    return [viewpoint for viewpoint in viewpoints if viewpoint.name not in done and viewpoint.name not in given_up]
 
 
 def _capture_with_retries(
@@ -111,21 +115,43 @@ def _capture_with_retries(
     T_flange_camera: Transform,
     wanted: CameraSettings,
     image_kind: str,
-) -> dict[str, bool]:
-    tries = 1 + context.step.recovery.retries
-    for attempt in range(1, tries + 1):
+) -> None:
+    robot = context.devices.robot(viewpoint.station)
+    for tries_left in range(context.step.recovery.retries, -1, -1):
+        arrived = False
         try:
-            robot = context.devices.robot(viewpoint.station)
             settled = _go_to(context, robot, viewpoint, T_flange_camera)
-            return _expose(context, camera, robot, viewpoint, settled, wanted, image_kind)
+            arrived = True
+            _expose(context, camera, robot, viewpoint, settled, wanted, image_kind)
         except _WORTH_ANOTHER_TRY as error:
             context.evidence.record(_failed(context, viewpoint, error, skipped=False))
-            if attempt == tries:
+            if tries_left == 0:
                 raise
             context.checkpoint()
-            context.devices.reopen(camera)
-            camera.apply(wanted)
-    raise AssertionError("unreachable: the loop returns or raises")
+            if arrived:
+                context.devices.reopen(camera)
+                camera.apply(wanted)
+            if not arrived or not _streams(robot):
+                context.devices.reopen(robot)
+        else:
+            return
+
+
+def _apply(context: StepContext, camera: Camera, wanted: CameraSettings) -> None:
+    """Set the camera, which may have dropped its link since it was last used."""
+    try:
+        camera.apply(wanted)
+    except _WORTH_ANOTHER_TRY:
+        context.devices.reopen(camera)
+        camera.apply(wanted)
+
+
+def _streams(robot: RobotArm) -> bool:
+    try:
+        robot.state()
+    except _WORTH_ANOTHER_TRY:
+        return False
+    return True
 
 
 def _go_to(context: StepContext, robot: RobotArm, viewpoint: Viewpoint, T_flange_camera: Transform) -> SettleReport:
@@ -148,7 +174,7 @@ def _expose(
     settled: SettleReport,
     wanted: CameraSettings,
     image_kind: str,
-) -> dict[str, bool]:
+) -> None:
     """Take the picture and write it down: files first, then one transaction with rows and event."""
     environment = _environment(context)
     with tempfile.TemporaryDirectory(prefix="orthocapture-") as folder:
@@ -207,7 +233,6 @@ def _expose(
         ),
         artefacts=rows,
     )
-    return verdicts
 
 
 @dataclass(frozen=True, slots=True)

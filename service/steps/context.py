@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-from drivers.interfaces import Camera, CtSource, Device, Lightbox, RobotArm, Scanner, Transform
+from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox, RobotArm, Scanner, Transform
 from service.core.decide import RunState, StepState
 from service.core.errors import OrthocaptureError
 from service.core.model import ArtefactRef, Payload, Record, StepNote, ViewpointCaptured
@@ -61,6 +61,10 @@ class Devices(Protocol):
 
     def nominal_T_flange_camera(self) -> Transform:
         """The camera mount's drawing."""
+        ...
+
+    def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
+        """Have every device that is opened from now on reported, by its name in rig.yaml."""
         ...
 
     def reopen(self, device: Device) -> None:

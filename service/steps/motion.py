@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
-from drivers.errors import DeviceTimeoutError, SafetyStopError
+from drivers.errors import DeviceError, DeviceTimeoutError, SafetyStopError
 from drivers.interfaces import RobotArm, SettleCriteria, SettleReport
 from service.core.geometry import Array
 from service.steps.context import StepContext, StepInterruptedError
@@ -41,14 +42,24 @@ def move_and_settle(
 
     Raises SafetyStopError, DeviceTimeoutError (after stopping the arm), StepInterruptedError (arm stands still).
     """
-    robot.move_joints(target_rad, speed_rad_s=limits.speed_rad_s, acceleration_rad_s2=limits.acceleration_rad_s2)
+    try:
+        robot.move_joints(target_rad, speed_rad_s=limits.speed_rad_s, acceleration_rad_s2=limits.acceleration_rad_s2)
+        return _wait_settled(context, robot, limits, criteria)
+    except StepInterruptedError:
+        _stand_still(context, robot, criteria)
+        raise
+    except BaseException:  # a defect and Ctrl-C too: nobody watches the arm any more
+        with suppress(DeviceError):
+            robot.stop()
+        raise
+
+
+def _wait_settled(
+    context: StepContext, robot: RobotArm, limits: MotionLimits, criteria: SettleCriteria
+) -> SettleReport:
     deadline_s = context.monotonic_s() + limits.travel_timeout_s + limits.settle_timeout_s
     while True:
-        try:
-            context.checkpoint()
-        except StepInterruptedError:
-            _stand_still(context, robot, criteria)
-            raise
+        context.checkpoint()
         safety = robot.state().sample.safety
         if not safety.may_move:
             raise SafetyStopError(
@@ -60,7 +71,6 @@ def move_and_settle(
             if report.settled:
                 return report
         if context.monotonic_s() > deadline_s:
-            _stand_still(context, robot, criteria)
             raise DeviceTimeoutError(
                 "the robot did not arrive and settle in time",
                 remedy="Look for vibration of the mount or a joint that drifts",

@@ -28,12 +28,13 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Wait for a complete export that is newer than this step, keep it, let the worker find the spheres."""
+    """Wait for a complete export that is newer than the step before, keep it, let the worker find the spheres."""
     scanner = context.devices.scanner()
-    since = context.state.started_utc
+    # The technician exports, then confirms: what arrived since the step before this one ended belongs to it.
+    since = max((step.ended_utc for step in context.run.steps.values()), default="")
 
     def fresh() -> list[Any]:
-        return [e for e in scanner.exports() if _time(e.modified_utc) >= _time(since)]
+        return [e for e in scanner.exports() if not since or _time(e.modified_utc) >= _time(since)]
 
     scan = scanner.read(wait_for(context, fresh, params.wait_s, "a complete scan export"))
     measures = {f"scan_{name}": float(value) for name, value in scan.findings.items()}

@@ -26,12 +26,14 @@ class Result(Record):
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Start the timer at the operator's confirmation and let the coat settle."""
-    applied = context.monotonic_s()
-    context.note(
-        f"{params.product} applied: scan within {params.scan_within_s / 60:.0f} min, "
-        f"gone after {params.sublimates_after_s / 3600:.1f} h",
-        applied_monotonic_s=applied,
-    )
+    earlier = [note.data for note in context.state.notes if "applied_monotonic_s" in note.data]
+    applied = float(earlier[0]["applied_monotonic_s"]) if earlier else context.monotonic_s()
+    if not earlier:  # a restart does not apply the coat again
+        context.note(
+            f"{params.product} applied: scan within {params.scan_within_s / 60:.0f} min, "
+            f"gone after {params.sublimates_after_s / 3600:.1f} h",
+            applied_monotonic_s=applied,
+        )
     remaining = params.settle_s
     while remaining > 0:
         context.checkpoint()

@@ -1,0 +1,321 @@
+"""A rig in memory for tests of the runner: an arm, a camera, a light box, and an operator who answers by script."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from drivers.errors import DeviceUnavailableError, UnreachablePoseError
+from drivers.interfaces import (
+    Camera,
+    CameraSettings,
+    CapturedFile,
+    CapturedImage,
+    CtSource,
+    Device,
+    DeviceIdentity,
+    DeviceReport,
+    EnvironmentReading,
+    Lightbox,
+    Payload,
+    RobotArm,
+    RobotSample,
+    RobotState,
+    SafetyState,
+    Scanner,
+    SettleCriteria,
+    SettleReport,
+)
+from service.core.decide import AskOperator
+from service.core.errors import ConfigurationError
+from service.core.geometry import Array, Transform, from_rotation_vector, to_rotation_vector, transform
+from service.core.model import OperatorAction
+from service.core.run_state import RunState
+from service.steps.context import StationLayout
+
+TRAVEL_S = 0.02
+_RATE_HZ = 500.0
+
+
+def _nothing(_count: int) -> None:
+    pass
+
+
+@dataclass
+class BenchArm:
+    """An arm whose six joints are the flange's position and rotation vector: its kinematics are exact.
+
+    A motion takes TRAVEL_S; the stream is what the arm did, sampled at 500 Hz.
+    """
+
+    safety: SafetyState = SafetyState.NORMAL
+    on_move: Callable[[int], None] = _nothing  # called with the number of the motion once it has begun
+    reachable: Callable[[Transform], bool] = lambda _T: True
+    connected: bool = False
+    opened: int = 0
+    moves: int = 0
+    stops: int = 0
+    stopped_short: int = 0
+    configured: int = 0
+    _legs: list[tuple[float, Array, float, Array]] = field(default_factory=list[tuple[float, Array, float, Array]])
+
+    def __post_init__(self) -> None:
+        start = np.array([0.1, 0.4, 0.5, 0.0, 3.0, 0.0])
+        self._legs.append((0.0, start, time.monotonic(), start))
+
+    def open(self) -> DeviceIdentity:
+        self.connected, self.opened = True, self.opened + 1
+        return self.report().identity
+
+    def close(self) -> None:
+        self.connected = False
+
+    def report(self) -> DeviceReport:
+        return DeviceReport(DeviceIdentity("robot", "Bench arm", "A-1", "5.12", "bench", "1", "memory"))
+
+    def configure(self, payload: Payload, T_flange_tcp: Transform) -> None:
+        self.configured += 1
+
+    def state(self) -> RobotState:
+        self._answer()
+        return RobotState(self._sample(time.monotonic()), "RUNNING", self.is_moving(), 1.0)
+
+    def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
+        self._answer()
+        count = int((min(end_monotonic_s, time.monotonic() + 0.05) - start_monotonic_s) * _RATE_HZ)
+        return tuple(self._sample(start_monotonic_s + i / _RATE_HZ) for i in range(count))
+
+    def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
+        if not self.reachable(T_base_flange):
+            raise UnreachablePoseError("no joint solution for this pose", where="arm")
+        return to_rotation_vector(T_base_flange)
+
+    def move_joints(self, target_rad: Array, *, speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        self._answer()
+        now = time.monotonic()
+        self._legs.append((now, self._joints(now), now + TRAVEL_S, target_rad))
+        self.moves += 1
+        self.on_move(self.moves)
+
+    def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
+        self.move_joints(to_rotation_vector(T_base_flange), speed_rad_s=1.0, acceleration_rad_s2=1.0)
+
+    def stop(self) -> None:
+        self.stops += 1
+        if self.is_moving():
+            self.stopped_short += 1
+            now = time.monotonic()
+            here = self._joints(now)
+            self._legs.append((now, here, now, here))
+
+    def is_moving(self) -> bool:
+        return time.monotonic() < self._legs[-1][2]
+
+    def settle(self, criteria: SettleCriteria) -> SettleReport:
+        now = time.monotonic()
+        still = now - self._legs[-1][2] > criteria.window_s
+        joints = self._joints(now)
+        return SettleReport(still, 10, 0.0, 0.0, 0.0, 0.0, from_rotation_vector(joints), joints)
+
+    def set_digital_output(self, index: int, on: bool) -> None:
+        raise NotImplementedError
+
+    def _answer(self) -> None:
+        if not self.connected:
+            raise DeviceUnavailableError("the arm is not connected", where="arm")
+
+    def _joints(self, at_s: float) -> Array:
+        begun, origin, end, target = next((leg for leg in reversed(self._legs) if leg[0] <= at_s), self._legs[0])
+        share = 1.0 if at_s >= end else (at_s - begun) / (end - begun)
+        return origin + share * (target - origin)
+
+    def _sample(self, at_s: float) -> RobotSample:
+        joints, zeros = self._joints(at_s), np.zeros(6)
+        pose = from_rotation_vector(joints)
+        return RobotSample(at_s - 100.0, at_s, joints, zeros, zeros, pose, 0.0, self.safety)
+
+
+@dataclass
+class BenchCamera:
+    """A camera that writes a small real JPEG, another one each time."""
+
+    on_capture: Callable[[int], None] = _nothing  # called with the exposure's number; may raise, as a camera fails
+    exif: Callable[[CameraSettings], CameraSettings] = lambda applied: applied
+    connected: bool = False
+    opened: int = 0
+    exposures: int = 0
+    applied: CameraSettings | None = None
+
+    def open(self) -> DeviceIdentity:
+        self.connected, self.opened = True, self.opened + 1
+        return self.report().identity
+
+    def close(self) -> None:
+        self.connected, self.applied = False, None
+
+    def report(self) -> DeviceReport:
+        return DeviceReport(DeviceIdentity("camera", "Bench camera", "C-1", "2.0", "bench", "1", "memory"))
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        if not self.connected:
+            raise DeviceUnavailableError("the camera is not connected", where="camera")
+        self.applied = settings
+        return settings
+
+    def settings(self) -> CameraSettings:
+        return self.apply(self.applied or CameraSettings(8.0, 0.01, 400))
+
+    def capture(self, folder: Path) -> CapturedImage:
+        self.exposures += 1
+        trigger = time.monotonic()
+        try:
+            self.on_capture(self.exposures)
+        except DeviceUnavailableError:
+            self.connected = False
+            raise
+        if not self.connected or self.applied is None:
+            raise DeviceUnavailableError("the camera is not connected or was not set", where="camera")
+        picture = np.full((40, 60, 3), 255, dtype=np.uint8)
+        cv2.putText(picture, str(self.exposures), (5, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (0, 0, 0))
+        path = folder / f"DSC{self.exposures:05d}.JPG"
+        assert cv2.imwrite(str(path), picture)
+        data = path.read_bytes()
+        jpeg = CapturedFile(path, path.name, hashlib.sha256(data).hexdigest(), len(data), "image/jpeg")
+        return CapturedImage(
+            files=(jpeg,),
+            counter=self.exposures,
+            exif_time=f"2026:11:21 10:00:{self.exposures:02d}",
+            exif=self.exif(self.applied),
+            lens="Bench 50 mm",
+            focal_length_mm=50.0,
+            trigger_monotonic_s=trigger,
+            arrival_monotonic_s=time.monotonic(),
+        )
+
+    def preview(self) -> bytes:
+        raise NotImplementedError
+
+
+@dataclass
+class BenchLightbox:
+    """A light box with a pedal."""
+
+    presses: int = 0
+
+    def open(self) -> DeviceIdentity:
+        return self.report().identity
+
+    def close(self) -> None:
+        pass
+
+    def report(self) -> DeviceReport:
+        return DeviceReport(DeviceIdentity("lightbox", "Bench box", "L-1", "1", "bench", "1", "memory"))
+
+    def read(self) -> EnvironmentReading:
+        return EnvironmentReading(812.0, 21.5, False, time.monotonic())
+
+    def set_shutter_relay(self, closed: bool) -> None:
+        raise NotImplementedError
+
+    def pedal_presses(self) -> int:
+        return self.presses
+
+
+@dataclass
+class BenchRig:
+    """service.steps.context.Devices around these."""
+
+    arm: BenchArm = field(default_factory=BenchArm)
+    shutter: BenchCamera = field(default_factory=BenchCamera)
+    box: BenchLightbox | None = field(default_factory=BenchLightbox)
+    _on_open: Callable[[str, DeviceReport], None] | None = None
+
+    def robot(self, station: str) -> RobotArm:
+        self._open("robot", self.arm, opened=self.arm.opened > 0)
+        return self.arm
+
+    def camera(self) -> Camera:
+        self._open("camera", self.shutter, opened=self.shutter.opened > 0)
+        return self.shutter
+
+    def scanner(self) -> Scanner:
+        raise ConfigurationError("the bench has no scanner")
+
+    def ct(self) -> CtSource:
+        raise ConfigurationError("the bench has no CT")
+
+    def lightbox(self) -> Lightbox | None:
+        return self.box
+
+    def layout(self, station: str) -> StationLayout:
+        return StationLayout(station, "robot", (0.0, 0.8, 0.0), (0.0, -1.0, 0.0))
+
+    def nominal_T_flange_camera(self) -> Transform:
+        return transform(np.eye(3), np.array([0.0, 0.0, 0.1]))
+
+    def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
+        self._on_open = on_open
+
+    def reopen(self, device: Device) -> None:
+        device.close()
+        self._open("robot" if device is self.arm else "camera", device, opened=False)
+
+    def _open(self, name: str, device: Device, *, opened: bool) -> None:
+        if not opened:
+            device.open()
+            if self._on_open is not None:
+                self._on_open(name, device.report())
+
+
+Answer = Callable[[AskOperator, RunState], OperatorAction | None]
+
+
+def agree(question: AskOperator, _state: RunState) -> OperatorAction | None:
+    """Confirm with every item ticked, or sign; a question of recovery is left to the test."""
+    if question.for_ == "recovery":
+        raise AssertionError(f"an unexpected question: {question.text}")
+    return answer(question, question.for_)
+
+
+def answer(question: AskOperator, verb: str, **fields: object) -> OperatorAction:
+    """An action on the step that is asked about."""
+    full: dict[str, object] = {"action": verb, "step": question.step, **fields}
+    if verb == "confirm":
+        full.setdefault("checklist", question.checklist)
+    if verb == "sign":
+        full.setdefault("meaning", "I have read the figures")
+        full.setdefault("signed_sha256", question.sign_sha256)
+    return OperatorAction.model_validate(full)
+
+
+@dataclass
+class ScriptedOperator:
+    """Answers by (step, kind of question) from a script, one answer after the other; otherwise agrees."""
+
+    script: Mapping[tuple[str, str], list[Answer]] = field(default_factory=dict[tuple[str, str], list[Answer]])
+    name: str = "Ada"
+    on_show: Callable[[str], None] = lambda _what: None
+    asked: list[AskOperator] = field(default_factory=list[AskOperator])
+    told: list[str] = field(default_factory=list[str])
+
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
+        self.asked.append(question)
+        answers = self.script.get((question.step, question.for_), [])
+        return (answers.pop(0) if answers else agree)(question, state)
+
+    def show(self, what: str, done: int, total: int) -> None:
+        self.on_show(what)
+
+    def tell(self, message: str) -> None:
+        self.told.append(message)
+
+
+def other_settings(applied: CameraSettings) -> CameraSettings:
+    """EXIF of a camera whose ISO somebody turned."""
+    return replace(applied, iso=applied.iso * 2)

@@ -1,0 +1,579 @@
+"""A run, from its first question to its end: what the runner does, records, refuses and survives."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import TypeVar
+
+import pytest
+
+from drivers.errors import DeviceUnavailableError
+from drivers.interfaces import SafetyState
+from service.core.decide import AskOperator
+from service.core.errors import ComputeError, ConfigurationError
+from service.core.fold import fold
+from service.core.model import (
+    ActionRefused,
+    DeviceOpened,
+    DeviceTrouble,
+    JobEnqueued,
+    JobFailed,
+    OperatorAction,
+    SessionStarted,
+    StepFailed,
+    StepNote,
+    ViewpointCaptured,
+    ViewpointFailed,
+)
+from service.core.protocol import parse_protocol
+from service.core.run_state import RunState
+from service.rig import load_rig
+from service.runner import Runner
+from service.runs import recorded_rig, recorded_run, start_run
+from service.steps import params_models
+from service.store.audit import verify
+from service.store.errors import LeaseHeldError
+from service.store.store import Store
+from tests.support.bench_rig import Answer, BenchRig, ScriptedOperator, answer, other_settings
+
+PROTOCOL = """\
+id: bench
+version: "1"
+title: A small procedure
+spheres: {radius_mm: 15, registration: 10, control: 3}
+board: {columns: 4, rows: 5, square_mm: 15}
+camera: {aperture_f: 22, exposure_s: 1/50, iso: 100}
+motion: {dwell_s: 0.0}
+settle: {window_s: 0.01, timeout_s: 5}
+steps:
+  - id: fixation
+    kind: checklist
+    title: Fix the specimen
+    checklist: [wires hold, board lies]
+    gates: [{measure: checklist_items_open, max: 0}]
+    skippable: true
+  - id: capture
+    kind: viewpoint_capture
+    title: Capture
+    params:
+      purpose: dataset
+      viewpoints:
+        - station: station_1
+          prefix: v
+          arcs: [{tilt_deg: 20, azimuth_from_deg: -50, azimuth_to_deg: 50, count: 4, distance_m: 0.6}]
+    gates:
+      - {measure: viewpoints_captured, min: 3}
+      - {measure: settings_departures, max: 0}
+      - {measure: moved_during_exposure, max: 0}
+    recovery: {retries: 2, wait_s: 0}
+  - id: spraying
+    kind: timed_application
+    title: Spray
+    irreversible: true
+    sign: true
+    requires: [capture]
+    params: {product: Blue, sublimates_after_s: 60, scan_within_s: 30}
+"""
+VIEWS = ["v001", "v002", "v003", "v004"]
+CALIBRATION = """\
+  - id: intrinsics
+    kind: calibration
+    title: Calibrate
+    confirm: false
+    params:
+      solve: [intrinsics]
+      viewpoints:
+        - station: station_1
+          prefix: b
+          arcs: [{tilt_deg: 20, azimuth_from_deg: 0, azimuth_to_deg: 0, count: 1, distance_m: 0.6}]
+    gates: [{measure: rms_px, max: 0.5}]
+"""
+P = TypeVar("P")
+
+
+@dataclass
+class Bench:
+    """One run on a rig in memory."""
+
+    store: Store
+    run_id: str
+    data: Path
+    rig: BenchRig = field(default_factory=BenchRig)
+    operator: ScriptedOperator = field(default_factory=ScriptedOperator)
+
+    def run(self) -> RunState:
+        """A runner process's life."""
+        protocol, _ = recorded_run(self.store, self.run_id)
+        return Runner(
+            self.store, self.run_id, protocol, self.rig, self.operator, wait=lambda s: time.sleep(min(s, 0.002))
+        ).run()
+
+    def act(self, verb: str, **fields: object) -> None:
+        """What another terminal appends."""
+        action = OperatorAction.model_validate({"action": verb, **fields})
+        self.store.record(self.run_id, [action], actor="Grace")
+
+    def state(self) -> RunState:
+        protocol, _ = recorded_run(self.store, self.run_id)
+        return fold(protocol, self.store.events(self.run_id))
+
+    def payloads(self, kind: type[P]) -> list[P]:
+        """All payloads of a kind, in order."""
+        return [e.payload for e in self.store.events(self.run_id) if isinstance(e.payload, kind)]
+
+    def captured(self) -> list[str]:
+        """Viewpoints in the order of their exposures, repeated ones repeatedly."""
+        return [capture.viewpoint for capture in self.payloads(ViewpointCaptured)]
+
+    def script(self, step: str, kind: str, *answers: Answer) -> None:
+        """What the operator says when asked."""
+        self.operator.script = {**self.operator.script, (step, kind): list(answers)}
+
+    def must_verify(self) -> None:
+        """The evidence is whole."""
+        report = verify(self.data, self.run_id)
+        assert report.ok, report.first_fault
+
+
+def say(verb: str, **fields: object) -> Answer:
+    """An answer with the step's id, checklist or signature filled in."""
+    return lambda question, _state: answer(question, verb, **fields)
+
+
+@pytest.fixture
+def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
+    rig_file = tmp_path / "rig.yaml"
+    rig_file.write_text("name: bench\nsimulated: true\ndevices: {}\n")
+    data = tmp_path / "data"
+    with Store.open(data) as store:
+
+        def started(text: str) -> Bench:
+            loaded = parse_protocol(text.encode(), params_models(), name="bench.yaml")
+            return Bench(
+                store, start_run(store, loaded, load_rig(rig_file), operator="Ada", auto_confirm=False), data
+            )
+
+        yield started
+
+
+@pytest.fixture
+def bench(begin: Callable[[str], Bench]) -> Bench:
+    return begin(PROTOCOL)
+
+
+# --- the good day ------------------------------------------------------------------------------------------
+
+
+def test_a_run_goes_from_its_checklist_through_the_captures_to_its_end(bench: Bench) -> None:
+    state = bench.run()
+    assert state.status == "completed"
+    assert bench.captured() == VIEWS
+    assert state.deviation_count == 0
+    assert [(d.device, d.report["identity"]["serial"]) for d in bench.payloads(DeviceOpened)] == [
+        ("camera", "C-1"),
+        ("robot", "A-1"),
+    ]
+    photographs = [row for row in bench.store.artefacts(bench.run_id) if row.ref.kind == "image"]
+    assert [row.viewpoint for row in photographs] == VIEWS
+    assert len({row.ref.sha256 for row in photographs}) == len(VIEWS)
+    capture = bench.payloads(ViewpointCaptured)[0]
+    assert capture.environment == {"light_lux": 812.0, "temperature_c": 21.5}
+    assert capture.camera["counter"] == 1
+    assert capture.pose_samples > 5
+    assert bench.state() == state
+    bench.must_verify()
+
+
+def test_the_protocol_and_rig_of_a_run_are_its_evidence(bench: Bench) -> None:
+    protocol, root = recorded_run(bench.store, bench.run_id)
+    assert protocol.step_ids == ("fixation", "capture", "spraying")
+    rig = recorded_rig(bench.store, root)
+    rig.path.write_text("name: another\ndevices: {}\n")
+    with pytest.raises(ConfigurationError, match="changed since the run began"):
+        recorded_rig(bench.store, root)
+
+
+def test_a_completed_run_is_not_touched_again(bench: Bench) -> None:
+    bench.run()
+    before = bench.store.events(bench.run_id)
+    assert bench.run().status == "completed"
+    assert bench.store.events(bench.run_id) == before
+
+
+def test_one_run_has_one_runner(bench: Bench) -> None:
+    with bench.store.lease(bench.run_id, "another runner", 30), pytest.raises(LeaseHeldError):
+        bench.run()
+    assert not bench.payloads(SessionStarted)
+
+
+# --- pause, abort, redo, skip --------------------------------------------------------------------------------
+
+
+def test_pause_in_mid_motion_stops_the_arm_and_resume_goes_on_with_the_next_viewpoint(bench: Bench) -> None:
+    seen: list[tuple[bool, int]] = []
+
+    def pause(move: int) -> None:
+        if move == 3:
+            bench.act("pause")
+
+    def paused(what: str) -> None:
+        if what == "paused":
+            seen.append((bench.rig.arm.is_moving(), bench.rig.arm.moves))
+            if len(seen) == 5:
+                bench.act("resume")
+
+    bench.rig.arm.on_move, bench.operator.on_show = pause, paused
+    assert bench.run().status == "completed"
+    assert bench.rig.arm.stopped_short == 1
+    assert seen == [(False, 3)] * 5
+    assert bench.captured() == VIEWS
+
+
+def test_abort_in_mid_motion_stops_the_arm_and_ends_the_run(bench: Bench) -> None:
+    bench.rig.arm.on_move = lambda move: bench.act("abort", reason="someone stepped in") if move == 2 else None
+    state = bench.run()
+    assert (state.status, state.stop_reason) == ("aborted", "someone stepped in")
+    assert bench.rig.arm.stopped_short == 1
+    assert not bench.rig.arm.is_moving()
+    assert bench.captured() == VIEWS[:1]
+    bench.must_verify()
+
+
+def test_redo_of_a_viewpoint_while_the_arm_moves_takes_it_again_and_keeps_both(bench: Bench) -> None:
+    bench.rig.arm.on_move = lambda move: (
+        bench.act("redo", step="capture", viewpoint="v001", reason="fly on the lens") if move == 3 else None
+    )
+    state = bench.run()
+    assert state.status == "completed"
+    assert sorted(bench.captured()) == ["v001", *VIEWS]
+    assert [(s.viewpoint, s.reason) for s in state.superseded] == [("v001", "fly on the lens")]
+    assert set(state.steps["capture"].captured) == set(VIEWS)
+    assert state.steps["capture"].measures["viewpoints_captured"] == 4
+
+
+def test_redo_of_a_step_while_the_arm_moves_stops_it_and_begins_again(bench: Bench) -> None:
+    bench.rig.arm.on_move = lambda move: (
+        bench.act("redo", step="capture", reason="the lamp moved") if move == 3 else None
+    )
+    state = bench.run()
+    assert state.status == "completed"
+    assert bench.rig.arm.stopped_short == 1
+    assert bench.captured() == [*VIEWS[:2], *VIEWS]
+    assert {c.attempt for c in bench.payloads(ViewpointCaptured)[2:]} == {2}
+    assert [(s.step, sorted(s.captured)) for s in state.superseded] == [("capture", VIEWS[:2])]
+
+
+def test_skip_needs_the_protocols_leave_and_a_reason(bench: Bench) -> None:
+    bench.script("fixation", "confirm", say("skip"), say("skip", reason="fixed yesterday"))
+    bench.script("capture", "confirm", say("skip", reason="no time"))
+    state = bench.run()
+    assert state.status == "completed"
+    assert state.steps["fixation"].skipped
+    assert [(d.kind, d.step) for d in state.deviations if d.kind != "automatic"] == [
+        ("refused", "fixation"),
+        ("skip", "fixation"),
+        ("refused", "capture"),
+    ]
+    refused = bench.payloads(ActionRefused)
+    assert "needs a reason" in refused[0].why
+    assert "does not allow" in refused[1].why
+    assert bench.captured() == VIEWS
+
+
+def test_a_confirmation_without_all_ticks_is_refused_and_recorded(bench: Bench) -> None:
+    bench.script("fixation", "confirm", say("confirm", checklist=("wires hold",)))
+    assert bench.run().status == "completed"
+    (refused,) = bench.payloads(ActionRefused)
+    assert "board lies" in refused.why
+    assert any("board lies" in line for line in bench.operator.told)
+
+
+def test_an_irreversible_step_waits_for_its_captures_and_a_signature(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL.replace("recovery: {retries: 2", "skippable: true\n    recovery: {retries: 2"))
+    bench.script("capture", "confirm", say("skip", reason="no time"))
+    bench.script(
+        "spraying",
+        "recovery",
+        say("confirm"),
+        say("sign", meaning="go"),
+        say("redo", step="capture", reason="it is needed after all"),
+    )
+    # Now that the captures are there: a confirmation without signature, a signature of nothing, then the right one.
+    bench.script("spraying", "sign", say("confirm"), say("sign", signed_sha256="0" * 64))
+    state = bench.run()
+    assert state.status == "completed"
+    whys = [refused.why for refused in bench.payloads(ActionRefused)]
+    assert len(whys) == 4
+    assert "not passed: capture" in whys[0]
+    assert "signature first" in whys[2]
+    assert "another record" in whys[3]
+    (note,) = bench.payloads(StepNote)
+    assert note.note.startswith("Blue applied")
+    assert state.steps["spraying"].signed_by == "Ada"
+
+
+# --- the pedal ------------------------------------------------------------------------------------------------
+
+
+def test_the_pedal_confirms_what_is_asked_now_and_nothing_that_is_asked_later(bench: Bench) -> None:
+    box = bench.rig.box
+    assert box is not None
+
+    def press(_question: AskOperator, _state: RunState) -> None:
+        box.presses += 1
+
+    silent = 0
+
+    def nothing(_question: AskOperator, _state: RunState) -> OperatorAction | None:
+        nonlocal silent
+        silent += 1
+        return None
+
+    bench.script("fixation", "confirm", nothing, press)
+    # Somebody leans on the pedal while the robot works: that is no answer to the next question.
+    bench.rig.arm.on_move = lambda _move: press(bench.operator.asked[-1], bench.state())
+    bench.script("spraying", "confirm", nothing, nothing)
+    assert bench.run().status == "completed"
+    confirmed = [a for a in bench.payloads(OperatorAction) if a.action == "confirm"]
+    assert [(a.step, a.via) for a in confirmed] == [("fixation", "pedal"), ("capture", "cli"), ("spraying", "cli")]
+    assert confirmed[0].checklist == ("wires hold", "board lies")
+    assert silent == 3
+
+
+def test_a_run_without_a_light_box_works(bench: Bench) -> None:
+    bench.rig.box = None
+    assert bench.run().status == "completed"
+    assert bench.payloads(ViewpointCaptured)[0].environment == {}
+
+
+# --- bad days --------------------------------------------------------------------------------------------------
+
+
+def test_a_camera_that_fails_twice_is_reopened_and_loses_nothing(bench: Bench) -> None:
+    def fail(exposure: int) -> None:
+        if exposure in (2, 3):
+            raise DeviceUnavailableError("the link dropped", where="camera")
+
+    bench.rig.shutter.on_capture = fail
+    state = bench.run()
+    assert state.status == "completed"
+    assert bench.captured() == VIEWS
+    failures = bench.payloads(ViewpointFailed)
+    assert [(f.viewpoint, f.error, f.skipped) for f in failures] == [("v002", "DeviceUnavailableError", False)] * 2
+    assert bench.rig.shutter.opened == 3
+    assert len(bench.payloads(DeviceOpened)) == 4  # the record shows each reopening
+    assert not bench.payloads(StepFailed)
+
+
+def test_a_camera_that_stays_away_ends_in_a_question_and_the_run_goes_on_from_there(bench: Bench) -> None:
+    away = True
+
+    def fail(exposure: int) -> None:
+        if exposure > 1 and away:
+            raise DeviceUnavailableError("the link dropped", where="camera")
+
+    def plug_in(question: AskOperator, _state: RunState) -> OperatorAction:
+        nonlocal away
+        away = False
+        assert "the link dropped" in question.text
+        return answer(question, "confirm")
+
+    bench.rig.shutter.on_capture = fail
+    bench.script("capture", "recovery", plug_in)
+    state = bench.run()
+    assert state.status == "completed"
+    assert bench.captured() == VIEWS
+    assert [f.recovery for f in bench.payloads(StepFailed)] == ["retry", "retry", "ask"]
+    assert {t.device for t in bench.payloads(DeviceTrouble)} == {"camera"}
+
+
+def test_an_arm_whose_link_drops_is_reopened(bench: Bench) -> None:
+    def drop(move: int) -> None:
+        if move == 2:
+            bench.rig.arm.connected = False
+
+    bench.rig.arm.on_move = drop
+    assert bench.run().status == "completed"
+    assert bench.captured() == VIEWS
+    assert (bench.rig.arm.opened, bench.rig.shutter.opened) == (2, 1)
+
+
+def test_a_viewpoint_out_of_reach_is_given_up_and_recorded(bench: Bench) -> None:
+    asked = 0
+
+    def reachable(_T: object) -> bool:
+        nonlocal asked
+        asked += 1
+        return asked != 2
+
+    bench.rig.arm.reachable = reachable
+    state = bench.run()
+    assert state.status == "completed"
+    assert bench.captured() == ["v001", "v003", "v004"]
+    (failed,) = bench.payloads(ViewpointFailed)
+    assert (failed.viewpoint, failed.error, failed.skipped) == ("v002", "UnreachablePoseError", True)
+    assert [d.kind for d in state.deviations] == ["viewpoint_skipped"]
+    assert state.steps["capture"].measures["viewpoints_given_up"] == 1
+
+
+def test_a_safety_stop_asks_a_person_and_never_moves_on_by_itself(bench: Bench) -> None:
+    def stop(move: int) -> None:
+        if move == 2:
+            bench.rig.arm.safety = SafetyState.PROTECTIVE_STOP
+
+    def clear(question: AskOperator, _state: RunState) -> OperatorAction:
+        assert "protective stop" in question.text
+        assert bench.rig.arm.moves == 2
+        bench.rig.arm.safety = SafetyState.NORMAL
+        return answer(question, "confirm")
+
+    bench.rig.arm.on_move = stop
+    bench.script("capture", "recovery", clear)
+    assert bench.run().status == "completed"
+    assert [f.error for f in bench.payloads(StepFailed)] == ["SafetyStopError"]
+    assert bench.captured() == VIEWS
+
+
+def test_exif_that_departs_from_the_settings_fails_its_gate_until_the_image_is_taken_again(bench: Bench) -> None:
+    exposures = iter(range(1, 100))
+    bench.rig.shutter.exif = lambda applied: other_settings(applied) if next(exposures) == 3 else applied
+    bench.script("capture", "recovery", say("confirm"))
+    state = bench.run()
+    assert state.status == "completed"
+    question = next(q for q in bench.operator.asked if q.for_ == "recovery")
+    assert "settings_departures" in question.text
+    assert bench.captured() == [*VIEWS, "v003"]
+    verdicts = [c.verdicts["settings"] for c in bench.payloads(ViewpointCaptured)]
+    assert verdicts == [True, True, False, True, True]
+
+
+def test_a_failed_job_shows_the_workers_reason_and_a_repeated_step_enqueues_it_anew(
+    begin: Callable[[str], Bench],
+) -> None:
+    bench = begin(PROTOCOL + CALIBRATION)
+
+    def work(_what: str) -> None:
+        job = bench.store.claim_job("worker 1", 30)
+        if job is None:
+            return
+        if not bench.payloads(StepNote)[1:]:
+            bench.store.fail_job(job, OSError("no memory"), retry=True)  # the store notes it and tries again
+        elif not bench.payloads(JobFailed):
+            bench.store.fail_job(job, ComputeError("the board is seen in no image"), retry=False)
+        else:
+            result = {"camera": {"fx": 1.0}, "details": {}}
+            bench.store.finish_job(job, measures={"rms_px": 0.2}, duration_s=1.0, result=result)
+
+    def again(question: AskOperator, _state: RunState) -> OperatorAction:
+        assert "the board is seen in no image" in question.text
+        return answer(question, "confirm")
+
+    bench.operator.on_show = work
+    bench.script("intrinsics", "recovery", again)
+    state = bench.run()
+    assert state.status == "completed"
+    first, second = bench.payloads(JobEnqueued)
+    assert first.arguments == second.arguments
+    assert first.idempotency_key != second.idempotency_key
+    assert state.steps["intrinsics"].result["camera"] == {"fx": 1.0}
+    assert bench.captured() == [*VIEWS, "b001"]
+    bench.must_verify()
+
+
+def test_what_a_worker_has_computed_is_not_computed_again_after_a_crash(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL + CALIBRATION)
+
+    def work_and_die(_what: str) -> None:
+        job = bench.store.claim_job("worker 1", 30)
+        if job is not None:
+            result = {"camera": {"fx": 1.0}, "details": {}}
+            bench.store.finish_job(job, measures={"rms_px": 0.2}, duration_s=1.0, result=result)
+            raise KilledError
+
+    bench.operator.on_show = work_and_die
+    with pytest.raises(KilledError):
+        bench.run()
+    bench.operator.on_show = lambda _what: None
+    assert bench.run().status == "completed"
+    assert len(bench.payloads(JobEnqueued)) == 1
+
+
+# --- crashes ----------------------------------------------------------------------------------------------------
+
+
+class KilledError(BaseException):
+    """The process is gone."""
+
+
+def _die_before_recording(bench: Bench, monkeypatch: pytest.MonkeyPatch, nth: int) -> None:
+    record = bench.store.record
+    seen = 0
+
+    def dying(run_id: str, payloads: list[object], **fields: object) -> object:
+        nonlocal seen
+        seen += isinstance(payloads[0], ViewpointCaptured) if payloads else 0
+        if payloads and isinstance(payloads[0], ViewpointCaptured) and seen == nth:
+            raise KilledError
+        return record(run_id, payloads, **fields)  # pyright: ignore[reportArgumentType] - passed through as it came
+
+    monkeypatch.setattr(bench.store, "record", dying)
+
+
+@pytest.mark.parametrize("nth", [1, 3, 4])
+def test_killed_between_exposure_and_record_leaves_an_orphan_and_no_viewpoint_is_lost_or_doubled(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, nth: int
+) -> None:
+    with monkeypatch.context() as patch:
+        _die_before_recording(bench, patch, nth)
+        with pytest.raises(KilledError):
+            bench.run()
+    assert bench.captured() == VIEWS[: nth - 1]
+    bench.must_verify()  # orphans are no fault of the evidence
+    files = [path for path in (bench.data / "artefacts").rglob("*") if path.is_file()]
+    rows = {row.ref.sha256 for row in bench.store.artefacts(bench.run_id)}
+    assert len(files) - len(rows) == 2  # photograph and pose log
+
+    assert bench.run().status == "completed"
+    assert bench.captured() == VIEWS
+    assert [session.resumed for session in bench.payloads(SessionStarted)] == [False, True]
+    counters = [capture.camera["counter"] for capture in bench.payloads(ViewpointCaptured)]
+    assert all(earlier < later for earlier, later in pairwise(counters))
+    bench.must_verify()
+
+
+def test_a_defect_while_the_arm_moves_stops_it(bench: Bench) -> None:
+    def die(move: int) -> None:
+        if move == 2:
+            raise KilledError
+
+    bench.rig.arm.on_move = die
+    with pytest.raises(KilledError):
+        bench.run()
+    assert bench.rig.arm.stopped_short == 1
+    assert not bench.rig.arm.is_moving()
+
+
+def test_a_restart_does_not_restart_the_coats_timer(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL.replace("scan_within_s: 30}", "scan_within_s: 30, settle_s: 0.5}"))
+
+    def die(what: str) -> None:
+        if what.startswith("letting the coat"):
+            raise KilledError
+
+    bench.operator.on_show = die
+    with pytest.raises(KilledError):
+        bench.run()
+    bench.operator.on_show = lambda _what: None
+    state = bench.run()
+    (note,) = bench.payloads(StepNote)
+    assert state.steps["spraying"].result["applied_monotonic_s"] == note.data["applied_monotonic_s"]
+
+
+def test_a_run_that_was_aborted_stays_so(bench: Bench) -> None:
+    bench.act("abort", reason="wrong specimen")
+    assert bench.run().status == "aborted"
+    assert not bench.payloads(SessionStarted)
