@@ -71,7 +71,9 @@ def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
         return
     who = report.identity
     mark = "[bold green]✓" if not report.problems else "[bold yellow]![/]"
-    console.print(f"{mark} {escape(name)}[/] {escape(who.model)}, serial {escape(who.serial)}, {escape(who.firmware)}")
+    console.print(
+        f"{mark} {escape(name)}[/] {escape(who.model)}, serial {escape(who.serial)}, {escape(who.firmware)}"
+    )
     console.print(f"    {escape(who.driver)} {escape(who.driver_version)} at {escape(who.address)}")
     if report.clock_offset_s is not None:
         console.print(f"    clock offset {report.clock_offset_s:+.3f} s")

@@ -128,7 +128,9 @@ class AutomaticOperator:
         """Do what a technician would do, then say so; recorded as automatic."""
         if question.for_ == "recovery":
             raise OrthocaptureError(
-                question.text, where=f"step {question.step}", remedy="Resume the run without --auto-confirm and decide"
+                question.text,
+                where=f"step {question.step}",
+                remedy="Resume the run without --auto-confirm and decide",
             )
         base: dict[str, Any] = {"action": question.for_, "step": question.step, "via": "auto", "automatic": True}
         if question.for_ == "sign":

@@ -23,9 +23,12 @@ _IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
 def register_command(
     images: Annotated[Path, typer.Option("--images", help="Folder of the images.")],
-    camera: Annotated[Path, typer.Option("--camera", help="camera.json: width, height, fx, fy, cx, cy, k1, k2, p1, p2.")],
+    camera: Annotated[
+        Path, typer.Option("--camera", help="camera.json: width, height, fx, fy, cx, cy, k1, k2, p1, p2.")
+    ],
     poses: Annotated[
-        Path, typer.Option("--poses", help="Poses CSV (T_world_camera, metres), transforms.json or COLMAP model folder.")
+        Path,
+        typer.Option("--poses", help="Poses CSV (T_world_camera, metres), transforms.json or COLMAP model folder."),
     ],
     out: Annotated[Path, typer.Option("--out", help="The result file to write.")],
     mesh: Annotated[Path | None, typer.Option("--mesh", help="The scan with the spheres in it.")] = None,
@@ -62,12 +65,17 @@ def register_command(
             names=[file.name for file in files],
         )
         record = result.as_json(model)
-        record["spheres_mm"] = {"registration": (registration_m * 1e3).tolist(), "control": (control_m * 1e3).tolist()}
+        record["spheres_mm"] = {
+            "registration": (registration_m * 1e3).tolist(),
+            "control": (control_m * 1e3).tolist(),
+        }
         out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
         if json:
             print_json(record)
             return
-        console.print(f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms")
+        console.print(
+            f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms"
+        )
         if result.evaluation is not None:
             evaluation = result.evaluation
             console.print(

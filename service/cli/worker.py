@@ -8,7 +8,15 @@ from typing import Annotated
 
 import typer
 
-from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, progress_bar, reporting_errors
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+)
 from service.store.store import Store
 from service.worker.loop import work
 

@@ -28,7 +28,9 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
     if best is None:
         raise DataError("the run has no evaluated registration", where=summary.run_id, remedy="Finish the run first")
     if folder.exists():
-        raise DataError("the folder exists already", where=str(folder), remedy="Name a new one; nothing is overwritten")
+        raise DataError(
+            "the folder exists already", where=str(folder), remedy="Name a new one; nothing is overwritten"
+        )
     images = folder / "images"
     images.mkdir(parents=True)
     registered = summary.result("registration")["registrations"][best]

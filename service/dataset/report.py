@@ -30,7 +30,9 @@ def write_report(
         true_error_mm: by source of poses, on a simulated rig where the truth is known; marked as such.
     """
     environment = Environment(
-        loader=PackageLoader("service.dataset"), autoescape=select_autoescape(["html", "j2"]), undefined=StrictUndefined
+        loader=PackageLoader("service.dataset"),
+        autoescape=select_autoescape(["html", "j2"]),
+        undefined=StrictUndefined,
     )
     rows = [
         {**row, "paper": _PAPER.get(row["poses"]), "true_error_mm": (true_error_mm or {}).get(row["poses"])}
