@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Iterator
+import socketserver
+import threading
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from simulators.geometry import look_at
+from simulators.world import Scene
 from tests.support.camera_simulator import RunningCamera, camera_simulator
 from tests.support.camera_vendor_session import vendor_session
 
@@ -168,3 +176,48 @@ def test_init_can_be_refused() -> None:
     with camera_simulator([{"on": "init", "kind": "reject"}]) as camera:
         assert vendor_session(camera.gphoto_port, ["preview"]) == [{"error": -1}]
         assert vendor_session(camera.gphoto_port, ["value", "cameramodel"]) == ["ILCE-7RM5"]
+
+
+@contextmanager
+def world_socket(answer: dict[str, Any]) -> Generator[str]:
+    """Answers every line with the same JSON object; yields its HOST:PORT."""
+
+    class Handler(socketserver.StreamRequestHandler):
+        def handle(self) -> None:
+            for line in self.rfile:
+                assert json.loads(line) == {"op": "view"}
+                self.wfile.write(json.dumps(answer).encode() + b"\n")
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+        thread.start()
+        try:
+            yield f"127.0.0.1:{server.server_address[1]}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_pictures_of_the_world_and_their_true_pose(tmp_path: Path) -> None:
+    log = tmp_path / "truth.jsonl"
+    pose = look_at(np.array([0.0, -0.3, 0.6]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    view = {
+        "T_world_camera": pose.tolist(),
+        "intrinsics": dataclasses.asdict(Scene.generate(7).camera_intrinsics(240)),
+        "scene": {"seed": 7, "spray": False, "control_spheres": True, "board": None},
+        "light_lux": 1000.0,
+    }
+    options = ("--image-width", "240", "--exposures-log", str(log))
+    with world_socket(view) as address, camera_simulator((), "--world", address, *options) as camera:
+        capture, frame = vendor_session(camera.gphoto_port, ["capture"], ["preview"])
+    line = json.loads(log.read_text())
+    assert (frame["head"], frame["tail"]) == ("ffd8", "ffd9")
+    assert line["sha256"] == capture["sha256"]
+    assert line["T_world_camera"] == pose.tolist()
+
+
+def test_silent_world_gives_no_picture_and_the_camera_lives_on() -> None:
+    with camera_simulator((), "--world", "127.0.0.1:9") as camera:
+        _, events, model = vendor_session(camera.gphoto_port, ["trigger"], ["events", 0.8], ["value", "cameramodel"])
+    assert not [event for event in events if event[0] == "file"]
+    assert model == "ILCE-7RM5"

@@ -123,6 +123,11 @@ def test_live_view(camera: Camera) -> None:
     assert frame[-2:] == b"\xff\xd9"
 
 
+def test_live_view_waits_for_a_busy_camera() -> None:
+    with rig([{"on": "preview", "kind": "busy", "times": 2}]) as (camera, _):
+        assert camera.preview()[:2] == b"\xff\xd8"
+
+
 def test_stale_image_then_a_new_one(tmp_path: Path) -> None:
     with rig([{"on": "image", "kind": "stale", "nth": 2}]) as (camera, _):
         first = camera.capture(tmp_path)

@@ -29,6 +29,7 @@ from drivers.plugin import DriverConfig
 _LOG = logging.getLogger(__name__)
 SET_ATTEMPTS, BUSY_ATTEMPTS = 3, 5
 READ_BACK_TIMEOUT_S = 2.0
+PREVIEW_PATIENCE_S = 15.0
 LEAST_FREE_BYTES = 200_000_000  # one RAW+JPEG of 61 megapixels
 MEDIA_TYPES = {".JPG": "image/jpeg", ".JPEG": "image/jpeg", ".ARW": "image/x-sony-arw"}
 _NAME = re.compile(r"(?:capt_)?(?P<stem>[A-Za-z_]*?(?P<counter>\d+))(?P<suffix>\.\w+)$")
@@ -296,9 +297,17 @@ class GphotoCamera:
     # --- live view -----------------------------------------------------------------------------------------
 
     def preview(self) -> bytes:
-        """One live-view frame, JPEG."""
-        frame = self._link.call("Fetching a live-view frame", lambda camera: camera.capture_preview())
-        return bytes(memoryview(frame.get_data_and_size()))
+        """One live-view frame, JPEG; a busy camera is asked again for a few seconds."""
+        deadline = time.monotonic() + PREVIEW_PATIENCE_S
+        while True:
+            try:
+                frame = self._link.call("Fetching a live-view frame", lambda camera: camera.capture_preview())
+                # The frame owns the memory: a name for it keeps it alive until the bytes are copied.
+                return bytes(memoryview(frame.get_data_and_size()))
+            except DeviceBusyError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.3)
 
 
 def _parse(name: str) -> tuple[str, int, str]:

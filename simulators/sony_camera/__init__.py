@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import threading
 from pathlib import Path
 
 from simulators.serve import Termination, announce
@@ -38,8 +39,12 @@ def serve(args: argparse.Namespace) -> None:
     """Announce the address and serve until SIGTERM."""
     termination = Termination(with_parent=args.with_parent)
     options = BodyOptions(args.fast, args.first_counter, args.exposures_log, args.announce)
-    body = CameraBody(_source(args), args.faults, options)
+    source, stop = _source(args), threading.Event()
+    body = CameraBody(source, args.faults, options)
+    if isinstance(source, WorldSource):
+        threading.Thread(target=source.warm_up, args=(stop,), name="warm-up", daemon=True).start()
     with CameraServer(args.host, args.port, body, args.faults) as server:
         host, port = server.address
         announce(simulator="camera", host=host, port=port, gphoto_port=f"ptpip:{host}:{port}:{port}")
         termination.wait()
+    stop.set()

@@ -11,6 +11,7 @@ from simulators.serve import SimulatorError
 from simulators.sony_camera import codec
 from simulators.sony_camera.body import CARD_BYTES, FORMAT_ARW, FORMAT_JPEG, BusyError, CameraBody, CardFullError
 from simulators.sony_camera.properties import CONTROLS, Code, NotWritableError, RefusedValueError
+from simulators.sony_camera.scene import NotReadyError
 
 STORAGE = 0x00010001
 SHOT_HANDLE, LIVE_VIEW_HANDLE = 0xFFFFC001, 0xFFFFC002
@@ -31,6 +32,7 @@ _CODES: dict[type[Exception], int] = {
     NotWritableError: ACCESS_DENIED,
     RefusedValueError: INVALID_VALUE,
     SimulatorError: GENERAL_ERROR,
+    NotReadyError: DEVICE_BUSY,
 }
 # A real body takes milliseconds to answer a poll while it exposes; the client asks as often as it is answered.
 _POLL_WHILE_EXPOSING_S = 0.005

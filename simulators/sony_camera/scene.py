@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import json
+import logging
 import socket
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +21,14 @@ from simulators.sony_camera.properties import ExposureSettings
 
 Rgb = NDArray[np.uint8]  # (H, W, 3)
 _REFERENCE = (22.0, 1.0 / 15.0, 100.0)  # f-number, seconds, ISO at which a grey card comes out grey
+
+
+_PREVIEW_PATIENCE_S = 1.0  # libgphoto2 gives up after 2.5 s of silence
+_LOG = logging.getLogger(__name__)
+
+
+class NotReadyError(SimulatorError):
+    """The renderer is at work on something else, or still being built."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +97,15 @@ class StillLife:
         noisy = picture + rng.normal(0.0, 0.008, (height, width, 1)).astype(np.float32)
         return (np.clip(noisy, 0.0, 1.0) ** (1 / 2.2) * 255.0).astype(np.uint8)
 
+    def _full_size(self) -> Rgb:
+        # Painted at a moderate size: sixty megapixels of arithmetic would outlast the client's patience.
+        width, height = self._size
+        painted_width = min(width, 1536)
+        painted = self._picture(painted_width, round(painted_width * 2 / 3))
+        if painted_width == width:
+            return painted
+        return cast(Rgb, cv2.resize(painted, (width, height), interpolation=cv2.INTER_CUBIC))
+
     def freeze(self, counter: int) -> Moment:
         """The still life stands still; only the counter changes."""
         return Moment(counter, None, {})
@@ -94,7 +113,7 @@ class StillLife:
     def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
         """The scene at the settings' brightness, with the counter's digits."""
         if self._plain is None:
-            self._plain = self._picture(*self._size)
+            self._plain = self._full_size()
         picture = expose(self._plain, exposure_gain(settings)).copy()
         height = picture.shape[0]
         corner = (height // 20, height - height // 20)
@@ -158,6 +177,7 @@ class WorldSource:
         self._width = image_width
         self._timeout_s = timeout_s
         self._built: _Renderer | None = None
+        self._rendering = threading.Lock()  # live view and an exposure come from two threads
 
     @property
     def _renderer(self) -> _Renderer:
@@ -190,8 +210,28 @@ class WorldSource:
     def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
         """Render that view."""
         lens = {"aperture_f": settings.aperture_f, "exposure_s": settings.exposure_s, "iso": float(settings.iso)}
-        return self._renderer.render(moment.view, lens, moment.counter)
+        with self._rendering:
+            return self._renderer.render(moment.view, lens, moment.counter)
 
     def preview(self) -> Rgb:
         """Render a small frame of now."""
-        return self._renderer.preview(self._view())
+        view = self._view()
+        if not self._rendering.acquire(timeout=_PREVIEW_PATIENCE_S):
+            raise NotReadyError("the renderer is busy")
+        try:
+            return self._renderer.preview(view)
+        finally:
+            self._rendering.release()
+
+    def warm_up(self, stop: threading.Event, interval_s: float = 0.5) -> None:
+        """Build the renderer's scene as soon as the world answers, so that no client waits for it."""
+        while not stop.is_set():
+            try:
+                view = self._view()
+            except SimulatorError as error:
+                _LOG.debug("warming up: %s", error)
+                stop.wait(interval_s)
+                continue
+            with self._rendering:
+                self._renderer.preview(view)
+            return
