@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -17,6 +18,8 @@ from service.core.geometry import Array
 SRGB_TO_LINEAR = np.array(
     [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in np.arange(256) / 255.0], dtype=np.float32
 )
+
+LUMA = np.array([0.114, 0.587, 0.299])  # B, G, R: ITU-R BT.601, which JPEG uses
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,19 +67,69 @@ def sample(image: NDArray[np.float32] | NDArray[np.uint8], pixels: Array) -> NDA
     return np.asarray(top * (1 - fy) + bottom * fy, dtype=np.float32)
 
 
-def luma_patch(image: NDArray[np.uint8], pixels: Array, *, srgb: bool) -> tuple[NDArray[np.float32], Array]:
-    """Linear-light luma of the box around `pixels`, and the box's origin (2,).
+def luma_values(
+    image: NDArray[np.uint8], where: Profiles, *, srgb: bool
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Luma in linear light (K, J) along the profiles, and linear B, G, R (K, J, 3).
 
-    Luma is what JPEG stores at full resolution; the colour differences are subsampled and would shift edges.
+    Luma is what JPEG stores at full resolution; the colour differences are subsampled (and not always sited where the
+    decoder puts them): their edges are off by a tenth of a pixel and more.
     """
     h, w = image.shape[:2]
-    flat = pixels.reshape(-1, 2)
+    flat = where.pixels.reshape(-1, 2)
     low = np.clip(np.floor(flat.min(axis=0)).astype(int) - 2, 0, [w - 2, h - 2])
     high = np.clip(np.ceil(flat.max(axis=0)).astype(int) + 3, low + 2, [w, h])
-    patch = image[low[1] : high[1], low[0] : high[0]]
+    patch = np.asarray(image[low[1] : high[1], low[0] : high[0]])
     grey = np.asarray(cv2.cvtColor(patch, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-    linear = SRGB_TO_LINEAR[grey] if srgb else grey.astype(np.float32) / 255
-    return np.asarray(linear, dtype=np.float32), low.astype(np.float64)
+    at = where.pixels - low
+    if not srgb:
+        scale = np.float32(1 / 255)
+        return sample(grey, at) * scale, sample(patch, at) * scale
+    return sample(SRGB_TO_LINEAR[grey], at), sample(SRGB_TO_LINEAR[patch], at)
+
+
+def coloured_edge_profiles(colours: NDArray[np.float32], where: Profiles, blur_px: float) -> NDArray[np.float32]:
+    """(K, J) what `luma_values` gives for an edge at offset zero between the colours found on its two sides.
+
+    Luma is a sum of coded, not of linear, values: where the colours differ, the profile of a blurred edge is
+    distorted and its apparent place shifted. The shift is found by measuring these profiles and is then taken off.
+    """
+    away = np.abs(where.offsets_px) > max(2.0, 1.5 * blur_px)
+    near = np.abs(where.offsets_px) < 5.0
+    sides: list[Array] = []
+    for sign in (-1, 1):
+        pick = away & near & (np.sign(where.offsets_px) == sign)
+        mean = colours[:, pick].mean(axis=1).astype(np.float64)
+        # Texture: a few neighbours together; the outline's surroundings change slowly along it.
+        sides.append(sum((np.roll(mean, k, axis=0) for k in (-2, -1, 0, 1, 2)), np.zeros_like(mean)) / 5)
+    inside = 0.5 * (1 + erf(-where.offsets_px / (np.sqrt(2) * blur_px)))
+    light = inside[:, None] * sides[0][:, None] + (1 - inside[:, None]) * sides[1][:, None]
+    coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
+    luma = coded @ LUMA
+    linear = np.where(luma <= 0.04045, luma / 12.92, ((luma + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
+
+
+def colour_values(colours: NDArray[np.float32], where: Profiles) -> NDArray[np.float32]:
+    """(K, J) linear light along the direction in colour space in which the two sides of the outline differ most.
+
+    For outlines that luma hardly shows. Fisher's discriminant, well shrunk towards the plain difference of the
+    colours, so that the subsampled colour differences are not amplified more than they must.
+    """
+    rows = np.all(where.inside, axis=1)
+    if rows.sum() < 8:
+        return (colours @ LUMA).astype(np.float32)
+    y = colours[rows].astype(np.float64)
+    inner, outer = y[:, where.offsets_px < -1.0], y[:, where.offsets_px > 1.0]
+    step = np.median(inner.mean(axis=1) - outer.mean(axis=1), axis=0)
+    scatter = np.zeros((3, 3))
+    for side in (inner, outer):
+        # Shading changes slowly: differences of neighbours tell noise and texture without it.
+        d = (side[:, 2:] - side[:, :-2]).reshape(-1, 3) / np.sqrt(2)
+        scatter += d.T @ d / len(d)
+    scatter += np.eye(3) * max(float(np.trace(scatter)), 1e-9)
+    w = np.linalg.solve(scatter, step).astype(np.float64)
+    return (colours @ (w / max(float(np.linalg.norm(w)), 1e-12))).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +182,9 @@ class SubPixelEdges:
     blur_px: float
 
 
+BLURS_PX = (0.45, 0.6, 0.8, 1.05, 1.4, 1.9, 2.6)
+
+
 @lru_cache(maxsize=256)
 def _edge_basis(blur_px: float, radius_px: float, shifts: tuple[float, ...], offsets: tuple[float, ...]) -> Array:
     """(E, J, 4) orthonormal bases of the edge model for each shift of the edge.
@@ -154,7 +210,7 @@ def _edge_basis(blur_px: float, radius_px: float, shifts: tuple[float, ...], off
 
 
 def sub_pixel_edges(
-    linear: NDArray[np.float32], where: Profiles, radius_px: float, around_px: Array, reach_px: float
+    linear: NDArray[np.float32], where: Profiles, radius_px: float, reach_px: float, blurs_px: Sequence[float] = BLURS_PX
 ) -> SubPixelEdges:
     """Places of the edge on each profile by the least squares of a blurred matte-limb model.
 
@@ -162,8 +218,8 @@ def sub_pixel_edges(
         linear: (K, J) linear-light luma, 0..1, along the profiles.
         where: the profiles; their offsets must reach a few pixels beyond the search.
         radius_px: of the outline.
-        around_px: (K,) not used for the model, only to reject edges far from the first estimate.
         reach_px: greatest shift of the edge from the profile's middle.
+        blurs_px: standard deviations of the blur to choose from, ascending.
     """
     y = linear.astype(np.float64)
     usable = np.all(where.inside, axis=1)
@@ -172,7 +228,7 @@ def sub_pixel_edges(
     radius = float(max(2.0, round(radius_px)))
     power = np.sum(y**2, axis=1)
     best: tuple[float, float, Array] | None = None
-    for blur in (0.45, 0.6, 0.8, 1.05, 1.4, 1.9, 2.6):
+    for blur in blurs_px:
         Q = _edge_basis(blur, radius, shifts, offsets)
         cost = power[:, None] - np.sum(np.einsum("kj,ejb->keb", y, Q) ** 2, axis=2)  # (K, E)
         least = cost.min(axis=1)
@@ -201,5 +257,4 @@ def sub_pixel_edges(
     step = np.zeros(len(y))
     step[count] = np.nanmean(inner_values[count], axis=1) - np.nanmean(outer[count], axis=1)
     ok = usable & count & (at > 0) & (at < len(grid) - 1) & (sigma < 0.5) & (noise < 25 * typical)
-    ok &= np.abs(offset - around_px) < reach_px
     return SubPixelEdges(offset, sigma, step, ok, blur)

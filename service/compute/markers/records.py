@@ -24,7 +24,7 @@ class DetectionOptions:
     max_candidates: int = 60  # circles looked at more closely in one image
     min_vote: float = 0.2  # part of a circle's edge that must vote for its centre
     min_coverage: float = 0.38  # part of the outline that must be seen
-    max_rms_px: float = 0.6  # of the edge points of one outline, after rejection
+    max_rms_px: float = 1.0  # of the edge points of one outline, after rejection
     max_interior_edges: float = 0.07  # edge pixels inside a sphere over its area
     max_leak: float = 0.2  # part of the outline across which the sphere's colour goes on without an edge
     n_points: int = 200  # L, points sampled equidistantly on an outline
@@ -55,6 +55,7 @@ class SphereOutline:
     rms_px: float  # of the accepted edge points against the conic
     sigma_px: float  # robust standard deviation of one edge point
     n_edges: int
+    systematic_px: float  # of the outline as a whole, beyond the noise of its edge points
     contrast: float  # median step across the outline over full scale, linear light
     colour_bgr: tuple[float, float, float]  # median inside, 0..255
     score: float  # 0..1, how much it looks like a sphere
@@ -76,6 +77,7 @@ class Evidence:
     rms_px: float
     sigma_px: float
     n_edges: int
+    systematic_px: float
     contrast: float
     colour_bgr: tuple[float, float, float]
     score: float
@@ -100,6 +102,7 @@ def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: 
         rms_px=evidence.rms_px,
         sigma_px=evidence.sigma_px,
         n_edges=evidence.n_edges,
+        systematic_px=evidence.systematic_px,
         contrast=evidence.contrast,
         colour_bgr=evidence.colour_bgr,
         score=evidence.score,

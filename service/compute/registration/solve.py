@@ -202,7 +202,9 @@ def _assemble(
         o = outlines[i][j]
         points.append(np.column_stack([o.points, np.ones(len(o.points))]))
         # L points on a fitted conic carry the information of its n edge points, no more.
-        sigma.append(max(o.sigma_px, 0.03) / f * np.sqrt(len(o.points) / max(o.n_edges, 12)))
+        # Beyond it an outline errs as a whole; two of its parameters share each such error.
+        variance = max(o.sigma_px, 0.03) ** 2 / max(o.n_edges, 12) + o.systematic_px**2 / 2
+        sigma.append(float(np.sqrt(variance * len(o.points))) / f)
     used_groups = [int(groups[i]) for i, _, _ in members]
     first = int(groups[0])
     order = sorted(set(used_groups), key=lambda g: (g != first, g))
