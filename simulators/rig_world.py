@@ -1,0 +1,136 @@
+"""The state of the simulated laboratory and its control socket: where the arm is, what lies where, who acts."""
+
+from __future__ import annotations
+
+import json
+import socketserver
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from simulators.geometry import Array
+from simulators.world import STATIONS, Scene
+
+Act = Callable[[Mapping[str, Any]], dict[str, Any]]
+
+
+@dataclass
+class World:
+    """What changes in the laboratory. Every method may be called from any thread."""
+
+    scene: Scene
+    image_width: int
+    arms: tuple[str, ...]  # one arm that is moved between the stations, or one at each
+    start_joints_rad: Array
+    spray: bool = False
+    control_spheres: bool = True
+    board_placements: int = 0
+    board_placed: bool = False
+    pedal_presses: int = 0
+    station: str = STATIONS[0]
+    _joints: dict[str, Array] = field(default_factory=dict[str, Array])
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def arm_moved(self, arm: str, q: Array) -> None:
+        """A controller says where its joints are (6,)."""
+        with self._lock:
+            self._joints[arm] = q
+
+    @property
+    def camera_arm(self) -> str:
+        """The arm that carries the camera: with two, the one at the present station."""
+        return self.arms[STATIONS.index(self.station) % len(self.arms)]
+
+    def view(self) -> dict[str, Any]:
+        """What the camera sees now, and what the light box measures."""
+        with self._lock:
+            q = self._joints.get(self.camera_arm, self.start_joints_rad)
+            board = self.scene.board_placement(self.board_placements) if self.board_placed else None
+            return {
+                "T_world_camera": self.scene.true_camera(q, self.station).tolist(),
+                "intrinsics": self.scene.camera_intrinsics(self.image_width).to_json(),
+                "scene": {
+                    "seed": self.scene.seed,
+                    "spray": self.spray,
+                    "control_spheres": self.control_spheres,
+                    "board": None if board is None else board.tolist(),
+                },
+                "station": self.station,
+                "light_lux": self.scene.light_lux,
+                "temperature_c": self.scene.temperature_c,
+                "pedal_presses": self.pedal_presses,
+            }
+
+    def act(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """The technician's hands, as far as they only change the scene."""
+        action = request.get("action")
+        with self._lock:
+            match action:
+                case "place_board":
+                    self.board_placements += 1
+                    self.board_placed = True
+                case "remove_board":
+                    self.board_placed = False
+                case "move_robot":
+                    if request.get("station") not in STATIONS:
+                        return {"ok": False, "error": f"no station {request.get('station')!r}; {', '.join(STATIONS)}"}
+                    self.station = str(request["station"])
+                case "place_control_spheres" | "remove_control_spheres":
+                    self.control_spheres = action == "place_control_spheres"
+                case "spray":
+                    self.spray = True
+                case "press_pedal":
+                    self.pedal_presses += 1
+                case _:
+                    return {"ok": False, "error": f"hands cannot do {action!r}"}
+        return {"ok": True}
+
+
+class WorldServer(socketserver.ThreadingTCPServer):
+    """JSON lines on a loopback port: `robot` (no answer), `view`, `act`."""
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, world: World, act: Act) -> None:
+        self.world, self.act = world, act
+        super().__init__(("127.0.0.1", 0), _Client)
+
+    @property
+    def address(self) -> str:
+        """HOST:PORT."""
+        host, port = self.server_address[:2]
+        return f"{host!s}:{port}"
+
+
+class _Client(socketserver.StreamRequestHandler):
+    def handle(self) -> None:
+        server = self.server
+        assert isinstance(server, WorldServer)
+        try:
+            for line in self.rfile:
+                answer = _answer(server, line)
+                if answer is not None:
+                    self.wfile.write(json.dumps(answer).encode() + b"\n")
+        except (ConnectionError, TimeoutError):
+            return  # the other side ended; nothing of the world depends on it
+
+
+def _answer(server: WorldServer, line: bytes) -> dict[str, Any] | None:
+    try:
+        request: dict[str, Any] = json.loads(line)
+        match request.get("op"):
+            case "robot":
+                server.world.arm_moved(str(request["arm"]), np.array(request["q"], dtype=np.float64))
+                return None
+            case "view":
+                return server.world.view()
+            case "act":
+                return server.act(request)
+            case other:
+                return {"ok": False, "error": f"no operation {other!r}"}
+    except (ValueError, KeyError, TypeError) as error:
+        return {"ok": False, "error": f"bad request: {error}"}

@@ -1,0 +1,61 @@
+"""A simulated rig and the command line, as processes, for system tests."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+class _Lock:
+    """Only one rig at a time on a machine: RTDE's ports are fixed."""
+
+    def __enter__(self) -> None:
+        self._file = (Path(tempfile.gettempdir()) / "orthocapture-test-rig.lock").open("w")
+        fcntl.flock(self._file, fcntl.LOCK_EX)
+
+    def __exit__(self, *_exc: object) -> None:
+        self._file.close()
+
+
+RIG_LOCK = _Lock()
+
+
+def orthocapture(*words: str, timeout_s: float = 120) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end."""
+    return subprocess.run(
+        command(*words), cwd=REPOSITORY, capture_output=True, text=True, timeout=timeout_s, check=False
+    )
+
+
+def command(*words: str) -> list[str]:
+    """The command line that an installed `orthocapture` stands for."""
+    return [sys.executable, "-m", "service.cli.main", *words]
+
+
+@contextmanager
+def simulated_rig(folder: Path, *options: str) -> Generator[dict[str, Any]]:
+    """A rig around one scene; yields its ready line."""
+    with RIG_LOCK, (folder / "rig.log").open("w") as log:
+        process = subprocess.Popen(
+            command("simulate", "rig", "--dir", str(folder), *options),
+            cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
+        )  # fmt: skip
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line, (folder / "rig.log").read_text()
+            yield json.loads(line)
+        finally:
+            process.terminate()
+            process.wait(timeout=30)
+            if process.stdout is not None:
+                process.stdout.close()

@@ -1,0 +1,73 @@
+"""A run that is killed in the middle of the viewpoint capture goes on at the next viewpoint."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.support.rig import REPOSITORY, command, orthocapture, simulated_rig
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400), pytest.mark.xdist_group("rig")]
+
+
+def short_protocol(folder: Path) -> Path:
+    """The capture of station 1 alone, six viewpoints."""
+    protocol = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
+    capture = next(s for s in protocol["steps"] if s["id"] == "viewpoint_capture_1")
+    capture["params"]["viewpoints"][0]["arcs"] = [
+        {"tilt_deg": 25, "azimuth_from_deg": -40, "azimuth_to_deg": 40, "count": 6, "distance_m": 0.62}
+    ]
+    capture["gates"][0]["min"] = 6
+    protocol["steps"] = [capture]
+    path = folder / "short.yaml"
+    path.write_text(yaml.safe_dump(protocol))
+    return path
+
+
+def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with simulated_rig(tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3") as ready:
+        words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data), "--auto-confirm"]
+        with (tmp_path / "run.log").open("w") as log:
+            runner = subprocess.Popen(command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        wait_for_captures(data, 2, runner, tmp_path / "run.log")
+        os.kill(runner.pid, signal.SIGKILL)
+        runner.wait(timeout=10)
+        before = captured(data)
+        assert 2 <= len(before) < 6
+
+        answer = orthocapture("resume", "latest", "--data", str(data), "--auto-confirm", "--json", timeout_s=240)
+        assert answer.returncode == 0, answer.stdout + answer.stderr
+    after = captured(data)
+    assert after[: len(before)] == before
+    names = [event["artefacts"][0]["viewpoint"] for event in after]
+    assert names == [f"v1_{i:03d}" for i in range(1, 7)]
+    assert len({event["artefacts"][0]["sha256"] for event in after}) == 6
+    assert orthocapture("audit", "verify", "latest", "--data", str(data)).returncode == 0
+
+
+def wait_for_captures(data: Path, count: int, runner: subprocess.Popen[bytes], log: Path) -> None:
+    deadline_s = time.monotonic() + 180
+    while len(captured(data)) < count:
+        assert runner.poll() is None, log.read_text()
+        assert time.monotonic() < deadline_s, log.read_text()
+        time.sleep(0.3)
+
+
+def captured(data: Path) -> list[dict[str, Any]]:
+    """The capture events so far, read as an auditor reads them."""
+    if not (data / "orthocapture.sqlite").exists():
+        return []
+    answer = orthocapture("audit", "show", "latest", "--data", str(data), "--json")
+    if answer.returncode != 0:
+        return []
+    events = json.loads(answer.stdout)["events"]
+    return [event for event in events if event["kind"] == "viewpoint_captured"]
