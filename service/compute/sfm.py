@@ -55,9 +55,9 @@ class SfmOptions:
     """
 
     max_image_size: int = 3200
-    max_features: int = 6000
+    max_features: int = 3000
     first_octave: int = 0
-    neighbours: int = 10
+    neighbours: int = 8
     max_angle_deg: float = 60.0
     verification_error_px: float = 2.0
     filter_error_px: float = 1.5

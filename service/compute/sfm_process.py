@@ -167,6 +167,8 @@ def _global(job: dict[str, Any], raw: Path, _pipe: Connection) -> dict[int, pyco
     mapper = options.mapper
     mapper.num_threads = job["options"]["threads"]
     mapper.random_seed = job["options"]["seed"]
+    # Global positioning starts at random and is slow on many tracks; retriangulation brings the others back.
+    mapper.keep_max_num_tracks = max(1500, 100 * len(job["names"]))
     mapper.global_positioning.use_gpu = False
     adjustment = mapper.bundle_adjustment
     adjustment.refine_focal_length = False
