@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
 
 import pytest
 
@@ -15,7 +12,6 @@ from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import SafetyState
 from service.core.decide import AskOperator
 from service.core.errors import ComputeError, ConfigurationError
-from service.core.fold import fold
 from service.core.model import (
     ActionRefused,
     DeviceOpened,
@@ -29,55 +25,13 @@ from service.core.model import (
     ViewpointCaptured,
     ViewpointFailed,
 )
-from service.core.protocol import parse_protocol
 from service.core.run_state import RunState
-from service.rig import load_rig
-from service.runner import Runner
-from service.runs import recorded_rig, recorded_run, start_run
-from service.steps import params_models
-from service.store.audit import verify
+from service.runs import recorded_rig, recorded_run
 from service.store.errors import LeaseHeldError
 from service.store.store import Store
-from tests.support.bench_rig import Answer, BenchRig, ScriptedOperator, answer, other_settings
+from tests.support.bench_rig import Answer, answer, other_settings
+from tests.support.bench_run import PROTOCOL, Bench, begin_run
 
-PROTOCOL = """\
-id: bench
-version: "1"
-title: A small procedure
-spheres: {radius_mm: 15, registration: 10, control: 3}
-board: {columns: 4, rows: 5, square_mm: 15}
-camera: {aperture_f: 22, exposure_s: 1/50, iso: 100}
-motion: {dwell_s: 0.0}
-settle: {window_s: 0.01, timeout_s: 5}
-steps:
-  - id: fixation
-    kind: checklist
-    title: Fix the specimen
-    checklist: [wires hold, board lies]
-    gates: [{measure: checklist_items_open, max: 0}]
-    skippable: true
-  - id: capture
-    kind: viewpoint_capture
-    title: Capture
-    params:
-      purpose: dataset
-      viewpoints:
-        - station: station_1
-          prefix: v
-          arcs: [{tilt_deg: 20, azimuth_from_deg: -50, azimuth_to_deg: 50, count: 4, distance_m: 0.6}]
-    gates:
-      - {measure: viewpoints_captured, min: 3}
-      - {measure: settings_departures, max: 0}
-      - {measure: moved_during_exposure, max: 0}
-    recovery: {retries: 2, wait_s: 0}
-  - id: spraying
-    kind: timed_application
-    title: Spray
-    irreversible: true
-    sign: true
-    requires: [capture]
-    params: {product: Blue, sublimates_after_s: 60, scan_within_s: 30}
-"""
 VIEWS = ["v001", "v002", "v003", "v004"]
 CALIBRATION = """\
   - id: intrinsics
@@ -92,51 +46,6 @@ CALIBRATION = """\
           arcs: [{tilt_deg: 20, azimuth_from_deg: 0, azimuth_to_deg: 0, count: 1, distance_m: 0.6}]
     gates: [{measure: rms_px, max: 0.5}]
 """
-P = TypeVar("P")
-
-
-@dataclass
-class Bench:
-    """One run on a rig in memory."""
-
-    store: Store
-    run_id: str
-    data: Path
-    rig: BenchRig = field(default_factory=BenchRig)
-    operator: ScriptedOperator = field(default_factory=ScriptedOperator)
-
-    def run(self) -> RunState:
-        """A runner process's life."""
-        protocol, _ = recorded_run(self.store, self.run_id)
-        return Runner(
-            self.store, self.run_id, protocol, self.rig, self.operator, wait=lambda s: time.sleep(min(s, 0.002))
-        ).run()
-
-    def act(self, verb: str, **fields: object) -> None:
-        """What another terminal appends."""
-        action = OperatorAction.model_validate({"action": verb, **fields})
-        self.store.record(self.run_id, [action], actor="Grace")
-
-    def state(self) -> RunState:
-        protocol, _ = recorded_run(self.store, self.run_id)
-        return fold(protocol, self.store.events(self.run_id))
-
-    def payloads(self, kind: type[P]) -> list[P]:
-        """All payloads of a kind, in order."""
-        return [e.payload for e in self.store.events(self.run_id) if isinstance(e.payload, kind)]
-
-    def captured(self) -> list[str]:
-        """Viewpoints in the order of their exposures, repeated ones repeatedly."""
-        return [capture.viewpoint for capture in self.payloads(ViewpointCaptured)]
-
-    def script(self, step: str, kind: str, *answers: Answer) -> None:
-        """What the operator says when asked."""
-        self.operator.script = {**self.operator.script, (step, kind): list(answers)}
-
-    def must_verify(self) -> None:
-        """The evidence is whole."""
-        report = verify(self.data, self.run_id)
-        assert report.ok, report.first_fault
 
 
 def say(verb: str, **fields: object) -> Answer:
@@ -146,18 +55,8 @@ def say(verb: str, **fields: object) -> Answer:
 
 @pytest.fixture
 def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
-    rig_file = tmp_path / "rig.yaml"
-    rig_file.write_text("name: bench\nsimulated: true\ndevices: {}\n")
-    data = tmp_path / "data"
-    with Store.open(data) as store:
-
-        def started(text: str) -> Bench:
-            loaded = parse_protocol(text.encode(), params_models(), name="bench.yaml")
-            return Bench(
-                store, start_run(store, loaded, load_rig(rig_file), operator="Ada", auto_confirm=False), data
-            )
-
-        yield started
+    with Store.open(tmp_path / "data") as store:
+        yield lambda text: begin_run(store, text, tmp_path)
 
 
 @pytest.fixture
