@@ -27,9 +27,9 @@ class Cone:
         """
         a = math.cos(self.half_angle_rad) ** 2
         norm = math.sqrt(3 * a**2 - 2 * a + 1)
-        conic: Array = np.eye(3) * (a / norm)
-        conic -= self.axis[:, None] * self.axis / norm
-        return conic
+        u = [float(v) for v in self.axis]
+        entries = [[(a * (i == j) - u[i] * u[j]) / norm for j in range(3)] for i in range(3)]
+        return np.array(entries, dtype=np.float64)
 
     def frame(self) -> Array:
         """(3, 3) columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""

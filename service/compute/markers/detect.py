@@ -12,8 +12,8 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.candidates import Candidate, colour_gradient, edges, find_candidates
 from service.compute.markers.cones import Cone, angles_to, fit_cone, ransac_cone
 from service.compute.markers.edges import (
-    coloured_edge_profiles,
     colour_values,
+    coloured_edge_profiles,
     envelope_edges,
     luma_values,
     profiles,
@@ -269,6 +269,7 @@ def refine_outline(
         best is None
         or best.coverage < options.min_coverage
         or best.rms_px > options.max_rms_px
+        or best.contrast < options.min_contrast
         or best.cone.axis[2] < 0.3
     ):
         return None

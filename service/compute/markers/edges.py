@@ -101,7 +101,7 @@ def coloured_edge_profiles(colours: NDArray[np.float32], where: Profiles, blur_p
         pick = away & near & (np.sign(where.offsets_px) == sign)
         mean = colours[:, pick].mean(axis=1).astype(np.float64)
         # Texture: a few neighbours together; the outline's surroundings change slowly along it.
-        sides.append(sum((np.roll(mean, k, axis=0) for k in (-2, -1, 0, 1, 2)), np.zeros_like(mean)) / 5)
+        sides.append(np.mean([np.roll(mean, k, axis=0) for k in (-2, -1, 0, 1, 2)], axis=0))
     inside = 0.5 * (1 + erf(-where.offsets_px / (np.sqrt(2) * blur_px)))
     light = inside[:, None] * sides[0][:, None] + (1 - inside[:, None]) * sides[1][:, None]
     coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055)
@@ -210,7 +210,11 @@ def _edge_basis(blur_px: float, radius_px: float, shifts: tuple[float, ...], off
 
 
 def sub_pixel_edges(
-    linear: NDArray[np.float32], where: Profiles, radius_px: float, reach_px: float, blurs_px: Sequence[float] = BLURS_PX
+    linear: NDArray[np.float32],
+    where: Profiles,
+    radius_px: float,
+    reach_px: float,
+    blurs_px: Sequence[float] = BLURS_PX,
 ) -> SubPixelEdges:
     """Places of the edge on each profile by the least squares of a blurred matte-limb model.
 

@@ -26,6 +26,7 @@ class DetectionOptions:
     min_coverage: float = 0.38  # part of the outline that must be seen
     max_rms_px: float = 1.0  # of the edge points of one outline, after rejection
     max_interior_edges: float = 0.07  # edge pixels inside a sphere over its area
+    min_contrast: float = 0.01  # median step across the outline over full scale, linear light
     max_leak: float = 0.2  # part of the outline across which the sphere's colour goes on without an edge
     n_points: int = 200  # L, points sampled equidistantly on an outline
     srgb: bool = True  # pixel values carry the sRGB transfer curve

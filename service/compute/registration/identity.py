@@ -164,7 +164,7 @@ def _solve_group(
                 where=where,
                 remedy="Place the spheres less symmetrically, or show more of them in an image",
             )
-    support = sum(len(r.markers) > 0 for r in readings_of(best))
+    support = sum(len(m) > 0 for m in best.markers)
     n_hypotheses = sum(bool(r) for r in readings)
     agreeing = _agreeing(best, readings)
     if not metric and len(poses) > 1 and support < 2:
@@ -180,11 +180,6 @@ def _solve_group(
             remedy="Check that the poses belong to these images, their convention and their unit",
         )
     return best
-
-
-def readings_of(reading: _Reading) -> list[Assignment]:
-    """The reading as assignments without poses."""
-    return [Assignment(m) for m in reading.markers]
 
 
 def _agreeing(best: _Reading, readings: Sequence[list[Hypothesis]]) -> int:
