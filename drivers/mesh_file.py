@@ -19,9 +19,8 @@ from drivers.mesh_format import check_complete, companions, file_has_normals
 
 MeshUnit = Literal["auto", "mm", "m"]
 METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
-# Diagonal of the bounding box. To infer the unit, that of a scene with its spheres: the range is narrower than the steps
-# from millimetres to centimetres or inches, so that those are not mistaken for it. A configured unit must only be
-# credible for whatever may be scanned, a single bone too.
+# Diagonal of the bounding box. To infer the unit, that of a scene with its spheres, so that centimetres or inches are not
+# taken for millimetres. A configured unit must only be credible for whatever may be scanned, a single bone too.
 SCENE_DIAGONAL_M = (0.1, 3.0)
 OBJECT_DIAGONAL_M = (0.02, 3.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
@@ -231,8 +230,8 @@ def _unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str]:
                 f"the unit cannot be told: the bounding box is {diagonal:.6g} file units across, which is credible "
                 f"neither in millimetres nor in metres ({span})",
                 where=str(path),
-                remedy="Set the unit of the export in the scanner's software to millimetres and export again; if this is a "
-                "single object, configure its unit",
+                remedy="Set the unit of the export in the scanner's software to millimetres and export again; "
+                "if this is a single object, configure its unit",
             )
         other = "m" if fitting[0] == "mm" else "mm"
         return fitting[0], (

@@ -71,8 +71,8 @@ def surface(
         # Only possible where two neighbouring slices lie on either side of the level and none crosses it within.
         raise ComputeError(f"no surface at {threshold_hu:g} HU", remedy="Choose another threshold")
     points, triangles = _sewn(np.concatenate(vertices), np.concatenate(faces), np.concatenate(seams))
-    # scikit-image winds its faces for (k, j, i) clockwise seen from outside; the change to (i, j, k) mirrors them, and
-    # a left-handed T_ct_voxel mirrors them back.
+    # scikit-image winds its faces for (k, j, i) clockwise seen from outside; the change to (i, j, k) mirrors them,
+    # and a left-handed T_ct_voxel mirrors them back.
     if np.linalg.det(T_ct_voxel[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
     return apply(T_ct_voxel, points), np.ascontiguousarray(triangles, dtype=np.int32)
