@@ -34,8 +34,8 @@ class Cone:
     def frame(self) -> Array:
         """(3, 3) columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""
         e1 = np.array([1.0, 0.0, 0.0]) - self.axis[0] * self.axis
-        e1 /= np.linalg.norm(e1)
-        return np.stack([e1, np.cross(self.axis, e1), self.axis], axis=1)
+        e1 /= float(np.linalg.norm(e1))
+        return np.column_stack([e1, np.cross(self.axis, e1), self.axis]).astype(np.float64)
 
     def rays(self, azimuth_rad: Array, angle_rad: Array) -> Array:
         """Unit rays (..., 3) at `angle_rad` from the axis and `azimuth_rad` about it (broadcast)."""
