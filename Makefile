@@ -23,7 +23,8 @@ format: $(READY)
 
 # What docs/ holds that is made from the code: protocol schema and state diagram.
 docs: $(READY)
-	$(BIN)/python -m service.cli.docs
+	$(BIN)/orthocapture protocol schema > docs/protocol.schema.json
+	$(BIN)/orthocapture protocol diagram protocols/exvivo_spine.yaml > docs/state_machine.md
 
 bench: $(READY)
 	$(BIN)/python bench/demo_accuracy.py

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from service.core.errors import IllegalTransitionError
-from service.core.lifecycle import ABORTED, COMPLETED, PHASES, STEP_RULES, diagram, lifecycle, redo, state_name
+from service.core.lifecycle import (
+    ABORTED,
+    COMPLETED,
+    PHASES,
+    STEP_RULES,
+    lifecycle,
+    redo,
+    state_name,
+    transition_table,
+)
+from service.core.protocol_docs import lifecycle_text
+from tests.support.core import toy_protocol
 
 STEPS = ("capture", "spray_on", "scan")
 MACHINE = lifecycle(STEPS)
@@ -94,19 +107,19 @@ def test_the_machine_is_compiled_once() -> None:
     assert lifecycle(list(STEPS)) is MACHINE
 
 
-def test_the_diagram_shows_every_step_and_rule() -> None:
-    text = diagram(STEPS)
-    assert text.startswith("stateDiagram-v2\n    [*] --> capture\n")
-    for step in STEPS:
-        assert f"state {step} {{" in text
-        assert all(f"{step}_{rule.source} --> {step}_{rule.target}: {rule.trigger}" in text for rule in STEP_RULES)
-    for arrow in (
-        "capture --> spray_on: advance",
-        "scan --> capture: redo",
-        "scan --> completed: advance",
-        "capture --> paused: pause",
-        "paused --> scan: resume",
-        "paused --> aborted: abort",
-    ):
-        assert f"    {arrow}\n" in text
-    assert "paused --> capture: redo" not in text
+def test_the_diagram_shows_every_step_and_every_rule() -> None:
+    protocol = toy_protocol()
+    page = lifecycle_text(protocol)
+    assert page.count("```mermaid") == 2
+    for rule in STEP_RULES:
+        assert f"    {rule.source} --> {rule.target}: {rule.trigger}\n" in page
+    for earlier, later in pairwise(protocol.step_ids):
+        assert f"        {earlier} --> {later}: advance\n" in page
+    for arrow in ("run --> paused: pause", "paused --> run: resume", "run --> completed: advance"):
+        assert f"    {arrow}\n" in page
+    for arrow in ("run --> aborted: abort", "paused --> aborted: abort"):
+        assert page.count(f"    {arrow}\n") == 1
+    # Every trigger of the table is either drawn or, for the redos, said in words.
+    for trigger, _, _ in transition_table(protocol.step_ids):
+        assert f": {trigger}\n" in page or trigger.startswith("redo_"), trigger
+    assert "spray (irreversible)" in page

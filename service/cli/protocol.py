@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 from pathlib import Path
 from typing import Annotated
 
@@ -10,8 +9,8 @@ import typer
 from rich.markup import escape
 
 from service.cli.common import JsonOption, console, print_json, reporting_errors
-from service.core.lifecycle import diagram
-from service.core.protocol import load_protocol, protocol_json_schema
+from service.core.protocol import load_protocol
+from service.core.protocol_docs import lifecycle_text, schema_text
 from service.steps import params_models
 
 protocol_app = typer.Typer(name="protocol", help="Check a protocol file before it is used.", no_args_is_help=True)
@@ -36,11 +35,11 @@ def check_command(file: Annotated[Path, typer.Argument(help="The protocol file."
 @protocol_app.command("schema")
 def schema_command() -> None:
     """Print the JSON Schema of protocol files, for editors."""
-    typer.echo(json_module.dumps(protocol_json_schema(params_models()), indent=2, sort_keys=True))
+    typer.echo(schema_text(params_models()), nl=False)
 
 
 @protocol_app.command("diagram")
 def diagram_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
-    """Print the state machine of a protocol as a Mermaid diagram."""
+    """Print the state machine of a protocol as a page with Mermaid diagrams."""
     with reporting_errors():
-        typer.echo(diagram(load_protocol(file, params_models()).protocol.step_ids))
+        typer.echo(lifecycle_text(load_protocol(file, params_models()).protocol), nl=False)

@@ -204,25 +204,3 @@ def _compile(steps: tuple[str, ...]) -> Lifecycle:
                 if probe.trigger(trigger):
                     targets.setdefault((state, trigger), probe.state)
     return Lifecycle(state_name(steps[0], "ready"), targets, places, steps)
-
-
-def diagram(steps: Iterable[str]) -> str:
-    """Mermaid text of the same table: each step with its phases once, the pause as one state."""
-    order = tuple(steps)
-    lines = ["stateDiagram-v2", f"    [*] --> {order[0]}"]
-    for step in order:
-        lines.append(f"    state {step} {{")
-        lines.append(f"        [*] --> {step}_ready")
-        lines += [f'        state "{phase}" as {step}_{phase}' for phase in PHASES]
-        lines += [f"        {step}_{r.source} --> {step}_{r.target}: {r.trigger}" for r in STEP_RULES]
-        lines.append("    }")
-    arrows: dict[tuple[str, str, str], None] = {}  # a set that keeps its order
-    for trigger, source, target in transition_table(order):
-        source_step, target_step = source.split(SEPARATOR)[0], target.split(SEPARATOR)[0]
-        leaves = source_step != target_step and trigger != "abort"
-        if leaves and not (source_step == PAUSED and trigger != "resume"):
-            arrows[source_step, target_step, "redo" if trigger.startswith("redo_") else trigger] = None
-    lines += [f"    {source} --> {target}: {trigger}" for source, target, trigger in arrows]
-    lines += [f"    {step} --> {ABORTED}: abort" for step in (*order, PAUSED)]
-    lines += [f"    {COMPLETED} --> [*]", f"    {ABORTED} --> [*]"]
-    return "\n".join(lines) + "\n"
