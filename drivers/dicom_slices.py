@@ -159,11 +159,12 @@ def _numbers(dataset: FileDataset, name: str, count: int) -> tuple[float, ...] |
 
 def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
     """Why these slices do not make a uniform CT volume; empty if they do."""
-    if any(header.rows == 0 or header.columns == 0 for header in headers):
+    if all(header.rows == 0 or header.columns == 0 for header in headers):
         return (f"it holds no images (modality {headers[0].modality})",)
     problems: list[str] = []
     for text, bad in (
         ("localiser images", [h for h in headers if "LOCALIZER" in h.image_type]),
+        ("files that hold no image, perhaps cut short", [h for h in headers if h.rows * h.columns == 0]),
         ("files that are cut short", [h for h in headers if h.cut_short]),
         ("multi-frame images, which are not read", [h for h in headers if h.frames > 1]),
         ("colour images", [h for h in headers if h.samples > 1]),
@@ -173,7 +174,8 @@ def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
     ):
         if bad:
             problems.append(f"{text}: {_named(bad)}")
-    placed = [header for header in headers if _placed(header) and "LOCALIZER" not in header.image_type]
+    images = [header for header in headers if header.rows * header.columns > 0]
+    placed = [header for header in images if _placed(header) and "LOCALIZER" not in header.image_type]
     if placed:
         problems += _shape_problems(placed) or _position_problems(placed)
     return tuple(problems)

@@ -19,8 +19,8 @@ from drivers.mesh_format import check_complete, companions, file_has_normals
 
 MeshUnit = Literal["auto", "mm", "m"]
 METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
-# Diagonal of the bounding box. To infer the unit, that of a scene with its spheres, so that centimetres or inches are not
-# taken for millimetres. A configured unit must only be credible for whatever may be scanned, a single bone too.
+# Diagonal of the bounding box. To infer the unit, that of a scene with its spheres, so that centimetres or inches are
+# not taken for millimetres. A configured unit must only be credible for whatever may be scanned, a single bone too.
 SCENE_DIAGONAL_M = (0.1, 3.0)
 OBJECT_DIAGONAL_M = (0.02, 3.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")

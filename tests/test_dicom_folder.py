@@ -11,7 +11,7 @@ import pydicom.data
 import pytest
 import trimesh
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
-from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless, generate_uid
+from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless, generate_uid
 from scipy.spatial.transform import Rotation
 
 from drivers.dicom_folder import DRIVER, DicomFolder, DicomFolderConfig
@@ -39,7 +39,7 @@ def write_series(
     rotation: Array | None = None,
     change: Change | None = None,
     skip: tuple[int, ...] = (),
-    syntax: pydicom.uid.UID = ExplicitVRLittleEndian,
+    syntax: UID = ExplicitVRLittleEndian,
     uid: str | None = None,
     reverse: bool = False,
 ) -> Array:
@@ -90,7 +90,7 @@ OBLIQUE = Rotation.from_euler("xyz", [0.6, -2.1, 2.9]).as_matrix()
 
 @pytest.mark.parametrize("rotation", [np.eye(3), OBLIQUE, np.diag([-1.0, -1.0, 1.0]), np.diag([1.0, -1.0, -1.0])])
 @pytest.mark.parametrize("syntax", [ExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless])
-def test_voxels_lie_where_the_headers_say(tmp_path: Path, rotation: Array, syntax: pydicom.uid.UID) -> None:
+def test_voxels_lie_where_the_headers_say(tmp_path: Path, rotation: Array, syntax: UID) -> None:
     T = write_series(tmp_path / "nested" / "deep", rotation=rotation, syntax=syntax, reverse=True)
     series = only(tmp_path)
     assert series.problems == ()

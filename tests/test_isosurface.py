@@ -36,7 +36,7 @@ def signed_volume(vertices: Array, faces: NDArray[np.int32]) -> float:
 def test_sphere_is_accurate_and_faces_outwards(mirrored: bool) -> None:
     T = affine(mirrored)
     vertices, faces = surface(ball(), T, -425.0)
-    voxel = apply(np.linalg.inv(T), vertices)
+    voxel = apply(np.linalg.inv(T).astype(np.float64), vertices)
     assert np.max(np.abs(np.linalg.norm(voxel - CENTRE, axis=1) - 9.0)) < 0.06
     volume = signed_volume(vertices - vertices.mean(axis=0), faces)
     assert volume == pytest.approx(4 / 3 * np.pi * 9.0**3 * 4e-4 * 4e-4 * 6e-4, rel=0.01)

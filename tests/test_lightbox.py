@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def box(port: str | Path, timeout_s: float = 0.4) -> SerialLightbox:
 
 
 @contextmanager
-def opened(port: str | Path, timeout_s: float = 0.4) -> Iterator[SerialLightbox]:
+def opened(port: str | Path, timeout_s: float = 0.4) -> Generator[SerialLightbox]:
     driver = box(port, timeout_s)
     try:
         driver.open()
@@ -39,7 +39,7 @@ def faults(**fields: object) -> tuple[str, str]:
 
 
 @contextmanager
-def answering(reply: Callable[[bytes], bytes]) -> Iterator[str]:
+def answering(reply: Callable[[bytes], bytes]) -> Generator[str]:
     """A pseudo-terminal where every line that arrives gets `reply`."""
     master, slave = os.openpty()
     tty.setraw(slave)
@@ -151,7 +151,7 @@ def test_another_device_on_the_port() -> None:
         driver.close()
     with answering(lambda _: b"\xff\xfe\x00garbage") as port:
         driver = box(port, 0.1)
-        with pytest.raises(DeviceTimeoutError, match="it said|no usable"):
+        with pytest.raises(DeviceTimeoutError, match="no usable reply"):
             driver.open()
         driver.close()
 

@@ -237,7 +237,7 @@ def test_ct_frame_is_oblique(ct: Ct) -> None:
 
 
 def inverse_affine(T: Array) -> Array:
-    return np.linalg.inv(T)
+    return np.linalg.inv(T).astype(np.float64)
 
 
 @pytest.mark.parametrize(

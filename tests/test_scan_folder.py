@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from pydantic import ValidationError
+from trimesh.exchange.ply import export_ply
 
 from drivers.errors import DeviceError, DeviceUnavailableError, IncompleteExportError, UnreadableFileError
 from drivers.mesh_file import merge_equal, read_mesh_file
@@ -50,15 +51,15 @@ def test_ascii_stl_and_ascii_ply(tmp_path: Path) -> None:
     text = write(tmp_path, "a.stl", ascii_stl=True)
     assert read_mesh_file(text).findings["faces"] == len(SPHERE.faces)
     ply = tmp_path / "a.ply"
-    ply.write_bytes(trimesh.exchange.ply.export_ply(SPHERE, encoding="ascii"))
+    ply.write_bytes(export_ply(SPHERE, encoding="ascii"))
     assert read_mesh_file(ply).findings["faces"] == len(SPHERE.faces)
 
 
 def test_normals_of_the_file_are_kept_and_missing_ones_computed(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
-    path.write_bytes(trimesh.exchange.ply.export_ply(SPHERE, vertex_normal=True))
+    path.write_bytes(export_ply(SPHERE, vertex_normal=True))
     assert read_mesh_file(path).findings["normals_computed"] == 0
-    path.write_bytes(trimesh.exchange.ply.export_ply(SPHERE, vertex_normal=False))
+    path.write_bytes(export_ply(SPHERE, vertex_normal=False))
     assert read_mesh_file(path).findings["normals_computed"] == 1
 
 
@@ -114,7 +115,7 @@ def test_half_written_text_files_are_incomplete(tmp_path: Path) -> None:
     stl.write_bytes(stl.read_bytes()[:-200])
     refused(stl, IncompleteExportError, "endsolid")
     ply = tmp_path / "a.ply"
-    ply.write_bytes(trimesh.exchange.ply.export_ply(SPHERE, encoding="ascii").rstrip()[:-300])
+    ply.write_bytes(export_ply(SPHERE, encoding="ascii").rstrip()[:-300])
     refused(ply, IncompleteExportError, "cut short")
     obj = tmp_path / "a.obj"
     obj.write_text("# 4 vertices\n# 2 faces\nv 0 0 0\nv 100 0 0\nv 0 100 0\nv 0 0 100\nf 1 2 3\n")
@@ -249,7 +250,7 @@ def test_a_missing_folder_is_a_missing_device(tmp_path: Path) -> None:
 
 def test_merging_agrees_with_numpy() -> None:
     rng = np.random.default_rng(3)
-    vertices = rng.integers(-3, 3, (4000, 3)) * 0.1
+    vertices = rng.integers(-3, 3, (4000, 3)).astype(np.float64)
     first, index = merge_equal(vertices)
     assert len(first) == len(np.unique(vertices, axis=0))
     np.testing.assert_array_equal(vertices[first[index]], vertices)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ class Running:
 
 
 @contextmanager
-def simulator(*words: str) -> Iterator[Running]:
+def simulator(*words: str) -> Generator[Running]:
     """Run `python -m simulators WORDS…` until the block ends; its exit status must be 0."""
     command = [sys.executable, "-m", "simulators", *words]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
