@@ -1,0 +1,209 @@
+"""The documents keep what they promise: every command in them is run, and what is generated is up to date."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from service.compute.pose_files import write_camera_json, write_poses_csv
+from service.core.model import JobFailed
+from service.core.protocol import load_protocol
+from service.core.protocol_docs import lifecycle_text, schema_text
+from service.steps import params_models
+from service.store.records import NewJob
+from service.store.store import Store
+from tests.support.bench_run import record_runs
+from tests.support.sphere_images import RADIUS_M, REGISTRATION_M, render, scene
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+SCRIPTS = Path(sys.executable).parent
+SHELLS = ("sh", "bash", "shell", "console")
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_SPAN = re.compile(r"`((?:orthocapture|make|python3?|pip|\.venv/bin/\S+) [^`]+)`")
+
+
+def commands_of(text: str) -> list[str]:
+    """Every command of a document: the lines of its shell blocks, and commands between backticks."""
+    found: list[str] = []
+    for language, block in _FENCE.findall(text):
+        if language in SHELLS:
+            lines = block.replace("\\\n", " ").splitlines()
+            found += [line.removeprefix("$ ").split(" #")[0].strip() for line in lines if line.strip()]
+    found += [" ".join(span.split()) for span in _SPAN.findall(_FENCE.sub("", text))]
+    return [command for command in found if command and not command.startswith("#")]
+
+
+@dataclass(frozen=True)
+class Site:
+    """A working directory as the documents assume it: a rig file, recorded runs, a data set taken by hand."""
+
+    folder: Path
+    begun: str  # the latest run; it waits for its first confirmation
+
+    def run(self, command: str, *, typed: str = "") -> subprocess.CompletedProcess[str]:
+        """The command, to its end, as its reader would type it."""
+        words = shlex.split(command)
+        words[0] = str(SCRIPTS / words[0])
+        return subprocess.run(
+            words, cwd=self.folder, input=typed, capture_output=True, text=True, timeout=110, check=False
+        )
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    recorded = tmp_path / "recorded"
+    recorded.mkdir()
+    _, begun = record_runs(recorded)
+    (tmp_path / "runs").symlink_to(recorded / "data")
+    (tmp_path / "protocols").symlink_to(ROOT / "protocols")
+    (tmp_path / "scans").mkdir()
+    rig = "name: a small site\ndevices:\n  scanner: {driver: scan_folder, folder: scans}\n"
+    (tmp_path / "rig.yaml").write_text(rig)
+    return Site(tmp_path, begun)
+
+
+# --- how each command is run --------------------------------------------------------------------------------
+
+
+def succeeds(site: Site, command: str) -> None:
+    done = site.run(command)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def asks_and_is_aborted(site: Site, command: str) -> None:
+    """A run asks its first question; the answer typed here ends it, which is status 1: not completed."""
+    done = site.run(command, typed="abort only reading the manual\n")
+    assert done.returncode == 1, done.stderr
+    assert "Type one of: confirm" in done.stderr.replace("\n", " ")
+    assert "is aborted" in done.stdout
+
+
+def serves_until_terminated(site: Site, command: str) -> None:
+    """The worker takes a job that it has to refuse, and ends when told to."""
+    words = shlex.split(command)
+    with Store.open(site.folder / "runs") as store:
+        job = NewJob("locate_spheres", "fixation", 1, "docs", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
+        store.enqueue_job(site.begun, job, actor="test")
+        with subprocess.Popen([SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.DEVNULL) as worker:
+            try:
+                while not any(isinstance(event.payload, JobFailed) for event in store.events(site.begun)):
+                    assert worker.poll() is None
+                    time.sleep(0.1)
+            finally:
+                worker.terminate()
+            assert worker.wait(timeout=20) == 0
+
+
+def registers(site: Site, command: str) -> None:
+    """Photographs, camera, poses and mesh under the names of the command; DIR is the folder of the images."""
+    made = scene(4, 800, seed=11)
+    images = site.folder / "images"
+    images.mkdir()
+    for i in range(4):
+        picture = render(made.camera, made.centres_camera(i, REGISTRATION_M), i, oversample=2)
+        assert cv2.imwrite(str(images / f"view_{i}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    write_camera_json(site.folder / "camera.json", made.camera)
+    write_poses_csv(site.folder / "poses.csv", {f"view_{i}.jpg": T for i, T in enumerate(made.T_world_camera)})
+    spheres = [
+        trimesh.creation.icosphere(subdivisions=3, radius=1e3 * RADIUS_M).apply_translation(1e3 * centre)
+        for centre in REGISTRATION_M
+    ]
+    trimesh.util.concatenate(spheres).export(site.folder / "scan.ply")
+    done = site.run(command.replace(" DIR ", " images ") + " --json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    T = np.array(json.loads((site.folder / "result.json").read_text())["T_world_scan"])
+    assert np.abs(T - made.T_world_scan).max() < 5e-4
+
+
+Check = Callable[[Site, str], None]
+RUN_HERE: dict[str, Check] = {
+    "orthocapture protocol check protocols/exvivo_spine.yaml": succeeds,
+    "orthocapture doctor --rig rig.yaml": succeeds,
+    "orthocapture run protocols/exvivo_spine.yaml --rig rig.yaml --data runs "
+    '--operator "A. Name"': asks_and_is_aborted,
+    "orthocapture resume latest --data runs": asks_and_is_aborted,
+    "orthocapture status latest --data runs": succeeds,
+    "orthocapture act pause --run latest --data runs": succeeds,
+    "orthocapture worker --data runs": serves_until_terminated,
+    "orthocapture register --images DIR --camera camera.json --poses poses.csv --mesh scan.ply --radius-mm 15 "
+    "--out result.json": registers,
+    "orthocapture audit show latest --data runs": succeeds,
+    "orthocapture audit verify latest --data runs": succeeds,
+}
+# Commands that take minutes or a whole rig: the test of the suite that runs them.
+RUN_ELSEWHERE = {
+    "make demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
+    "make test": "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
+    "orthocapture simulate rig --scene 7 --dir rig": (
+        "tests/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
+    ),
+}
+
+
+@pytest.mark.parametrize("command", RUN_HERE)
+def test_the_command_works_as_it_is_written(site: Site, command: str) -> None:
+    RUN_HERE[command](site, command)
+
+
+def test_every_command_of_the_documents_is_run_and_none_is_listed_in_vain() -> None:
+    written = {command for document in DOCUMENTS for command in commands_of(document.read_text(encoding="utf-8"))}
+    listed = {*RUN_HERE, *RUN_ELSEWHERE}
+    assert written - listed == set(), "in the documents, but run by no test"
+    assert listed - written == set(), "listed here, but in no document"
+
+
+@pytest.mark.parametrize(("command", "test"), RUN_ELSEWHERE.items())
+def test_the_test_that_runs_it_exists(command: str, test: str) -> None:
+    file, name = test.split("::")
+    module = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    assert name in {node.name for node in module.body if isinstance(node, ast.FunctionDef)}, command
+
+
+def test_make_targets_do_what_the_documents_say() -> None:
+    """`make test` runs pytest and `make demo` the demo (tests/test_demo.py runs the same command)."""
+    for target, last in (("test", ".venv/bin/pytest"), ("demo", ".venv/bin/orthocapture demo")):
+        done = subprocess.run(
+            ["make", "--dry-run", "--no-print-directory", target],
+            cwd=ROOT, capture_output=True, text=True, timeout=30, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.splitlines()[-1] == last
+
+
+def test_commands_are_found_in_blocks_tables_and_text() -> None:
+    text = (
+        "Say `make it so`, not `orthocapture.drivers`.\n```sh\n# a note\n$ ls -l  # all\nfind . \\\n  -name x\n```\n"
+    )
+    text += "```yaml\nmake: no\n```\n| a | `orthocapture status latest` |\n"
+    assert commands_of(text) == ["ls -l", "find .    -name x", "make it so", "orthocapture status latest"]
+
+
+# --- what is generated ------------------------------------------------------------------------------------------
+
+
+def test_the_generated_documents_are_up_to_date() -> None:
+    """`make docs` makes them anew."""
+    protocol = load_protocol(ROOT / "protocols" / "exvivo_spine.yaml", params_models()).protocol
+    docs = ROOT / "docs"
+    assert (docs / "protocol.schema.json").read_text(encoding="utf-8") == schema_text(params_models())
+    assert (docs / "state_machine.md").read_text(encoding="utf-8") == lifecycle_text(protocol)
+
+
+def test_links_of_the_documents_lead_somewhere() -> None:
+    for document in DOCUMENTS:
+        for target in re.findall(r"\]\(([^)#]+)\)", document.read_text(encoding="utf-8")):
+            assert "://" in target or (document.parent / target).exists(), f"{document.name}: {target}"
