@@ -37,7 +37,9 @@ def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> Non
     with simulated_rig(tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3") as ready:
         words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data), "--auto-confirm"]
         with (tmp_path / "run.log").open("w") as log:
-            runner = subprocess.Popen(command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+            runner = subprocess.Popen(
+                command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            )
         wait_for_captures(data, 2, runner, tmp_path / "run.log")
         os.kill(runner.pid, signal.SIGKILL)
         runner.wait(timeout=10)
