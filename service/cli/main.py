@@ -2,39 +2,60 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
 
-from service.cli.audit import audit_app
-from service.cli.demo import demo_command
-from service.cli.doctor import doctor_command
-from service.cli.protocol import protocol_app
-from service.cli.register import register_command
-from service.cli.run import act_command, resume_command, run_command, status_command
-from service.cli.simulate import simulate_command
-from service.cli.worker import worker_command
+# Loaded when asked for: `status` must not wait for the numerics that `register` needs.
+_COMMANDS = {
+    "demo": "service.cli.demo:demo_command",
+    "run": "service.cli.run:run_command",
+    "resume": "service.cli.run:resume_command",
+    "act": "service.cli.run:act_command",
+    "status": "service.cli.run:status_command",
+    "worker": "service.cli.worker:worker_command",
+    "doctor": "service.cli.doctor:doctor_command",
+    "register": "service.cli.register:register_command",
+    "simulate": "service.cli.simulate:simulate_command",
+    "audit": "service.cli.audit:audit_app",
+    "protocol": "service.cli.protocol:protocol_app",
+}
+_SETTINGS: dict[str, dict[str, Any]] = {
+    "simulate": {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+}
+
+
+class _Commands(TyperGroup):
+    """The group of all commands, each imported on first use."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Names in the order of the help text."""
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The command of this name, or None."""
+        if cmd_name not in _COMMANDS:
+            return None
+        module, _, name = _COMMANDS[cmd_name].partition(":")
+        found = getattr(importlib.import_module(module), name)
+        if isinstance(found, typer.Typer):
+            return typer.main.get_group(found)
+        alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        alone.command(cmd_name, context_settings=_SETTINGS.get(cmd_name))(found)
+        return typer.main.get_command(alone)
+
 
 app = typer.Typer(
-    name="orthocapture",
-    help="Acquire a surgical vision data set that is accurate to a fraction of a millimetre, with the proof.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
+    name="orthocapture", cls=_Commands, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
 )
-app.command("demo")(demo_command)
-app.command("run")(run_command)
-app.command("resume")(resume_command)
-app.command("act")(act_command)
-app.command("status")(status_command)
-app.command("worker")(worker_command)
-app.command("doctor")(doctor_command)
-app.command("register")(register_command)
-app.command(
-    "simulate", context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
-)(simulate_command)
-app.add_typer(audit_app)
-app.add_typer(protocol_app)
+
+
+@app.callback()
+def orthocapture() -> None:
+    """Acquire a surgical vision data set that is accurate to a fraction of a millimetre, with the proof."""
 
 
 def main() -> None:
