@@ -126,8 +126,10 @@ class Station:
     def reopen(self, device: Device) -> None:
         """Close and open again, after a link dropped."""
         name = next(name for name, known in self._open.items() if known is device)
+        del self._open[name]  # if it stays away, whoever asks next begins from scratch
         device.close()
         self._connect(name, device)
+        self._open[name] = device
 
     # --- building ---
 

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from typer.testing import CliRunner, Result
 
@@ -198,6 +199,24 @@ def test_a_wrong_rig_file_is_refused_by_field(tmp_path: Path) -> None:
     assert result.exit_code == 1
     assert "stations.station_1.approach_azimuth_deg" in result.output
     assert str(rig) in result.output
+
+
+def test_a_run_that_is_told_to_end_takes_its_worker_with_it(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text("name: bench\ndevices: {}\n")
+    (tmp_path / "bench.yaml").write_text(PROTOCOL)
+    words = [COMMAND, "run", "bench.yaml", "--rig", "rig.yaml", "--data", "data"]
+    with subprocess.Popen(
+        words, cwd=tmp_path, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stderr is not None
+        while "Type one of" not in (line := run.stderr.readline()):
+            assert line, "it ended by itself"
+        workers = psutil.Process(run.pid).children(recursive=True)
+        assert workers
+        run.terminate()
+        assert run.wait(timeout=30) != 0
+    assert psutil.wait_procs(workers, timeout=5)[1] == []
+    assert answer_of(invoke("status", "--data", tmp_path / "data", "--json"))["status"] == "active"
 
 
 def test_a_worker_without_work_ends_when_told(recorded: tuple[Path, str, str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import signal
 import subprocess
 import sys
 from collections.abc import Generator
@@ -10,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
+import psutil
 import typer
 from rich.markup import escape
 from rich.table import Table
@@ -42,6 +44,8 @@ AutoOption = Annotated[
     bool, typer.Option("--auto-confirm", help="Answer every question automatically; simulated rigs only.")
 ]
 WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
+
+_WORKER_GRACE_S = 10.0
 
 
 def run_command(
@@ -179,12 +183,15 @@ def drive(store: Store, run_id: str, rig: Rig, *, data: Path, auto_confirm: bool
     else:
         operator = TerminalOperator(root.operator, protocol, display)
     station = Station(rig)
+    # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _worker(data, wanted=worker):
             return Runner(store, run_id, protocol, station, operator).run()
     finally:
         display.clear()
         station.close()
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextmanager
@@ -194,12 +201,18 @@ def _worker(data: Path, *, wanted: bool) -> Generator[None]:
         yield
         return
     command = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(data), "--with-parent", "--json"]
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    # A session of its own: Ctrl-C is for the runner, which ends its worker in order.
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
     try:
         yield
     finally:
         process.terminate()
-        process.wait(timeout=30)
+        try:
+            process.wait(timeout=_WORKER_GRACE_S)
+        except subprocess.TimeoutExpired:  # in the middle of a long job, which the next worker begins anew
+            for child in (*psutil.Process(process.pid).children(recursive=True), process):
+                child.kill()
+            process.wait()
 
 
 def _report_end(run_id: str, state: RunState, *, json: bool) -> None:
