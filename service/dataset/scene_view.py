@@ -53,7 +53,14 @@ def scene_figure(
             x=centres[:, 0], y=centres[:, 1], z=centres[:, 2], mode="markers", text=names, hoverinfo="text",
             marker={"size": 3, "color": colour}, showlegend=False,
         )  # fmt: skip
+    # The scan's frame is arbitrary: the cameras tell where up is.
+    up = np.mean([T[:3, 3] for T in cameras.values()], axis=0) - spheres_m.mean(axis=0)
+    up /= np.linalg.norm(up)
+    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    eye = 0.9 * up + 1.5 * side / np.linalg.norm(side)
+    view = {axis: dict(zip("xyz", map(float, v), strict=True)) for axis, v in (("up", up), ("eye", eye))}
     figure.update_layout(
+        scene_camera=view,
         scene={"aspectmode": "data", "xaxis_title": "x (m)", "yaxis_title": "y (m)", "zaxis_title": "z (m)"},
         margin={"l": 0, "r": 0, "t": 0, "b": 0},
         height=620,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import cv2
@@ -95,6 +96,7 @@ def evaluate(context: JobContext) -> JobAnswer:
         raise ComputeError("the control scan shows no sphere beside the registration spheres")
     table: list[dict[str, Any]] = []
     refs: list[ArtefactRef] = []
+    pictures: dict[str, Callable[[], list[ArtefactRef]]] = {}
     for source, registration in arguments["registrations"].items():
         cameras = registration["T_scan_camera"]
         seen = [i for i, image in enumerate(images) if image["viewpoint"] in cameras]
@@ -113,9 +115,13 @@ def evaluate(context: JobContext) -> JobAnswer:
                 "images": len(seen),
             }
         )
-        if source != "robot":
-            refs += _overlays(context, [images[i] for i in seen], source, mine, T_scan_camera, spheres, controls)
+        pictures[source] = partial(
+            _overlays, context, [images[i] for i in seen], source, mine, T_scan_camera, spheres, controls
+        )
     best = min(table, key=lambda row: row["mean_radial_error_mm"])
+    # The best source, and beside it the robot's own poses: the eye sees the difference.
+    for source in dict.fromkeys((best["poses"], "robot")):
+        refs += pictures[source]() if source in pictures else []
     measures = {f"{row['poses']}_mean_radial_error_mm": row["mean_radial_error_mm"] for row in table}
     measures |= {f"{row['poses']}_mean_reprojection_error_px": row["mean_reprojection_error_px"] for row in table}
     measures["best_mean_radial_error_mm"] = best["mean_radial_error_mm"]
