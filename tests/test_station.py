@@ -1,0 +1,94 @@
+"""The composition root: devices by name and by role, reported when opened, built anew when they stayed away."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DeviceError
+from drivers.interfaces import DeviceReport
+from service.core.errors import ConfigurationError
+from service.rig import load_rig
+from service.station import Station
+
+RIG = """\
+name: folders
+devices:
+  scanner: {driver: scan_folder, folder: scans}
+  ct: {driver: dicom_folder, folder: ct}
+  arm: {driver: ur, host: 127.0.0.9}
+stations:
+  station_1: {robot: arm, scene_centre_m: [0, 0.8, 0], approach_azimuth_deg: -90}
+"""
+
+
+@contextmanager
+def station_of(folder: Path, text: str = RIG) -> Generator[tuple[Station, list[str]]]:
+    (folder / "scans").mkdir()
+    (folder / "rig.yaml").write_text(text)
+    station, opened = Station(load_rig(folder / "rig.yaml")), list[str]()
+
+    def note(name: str, report: DeviceReport) -> None:
+        opened.append(f"{name}: {report.identity.kind}")
+
+    station.watch(note)
+    try:
+        yield station, opened
+    finally:
+        station.close()
+
+
+def test_a_device_is_opened_once_and_reported(tmp_path: Path) -> None:
+    with station_of(tmp_path) as (station, opened):
+        assert station.scanner() is station.scanner() is station.device("scanner")
+        assert opened == ["scanner: scanner"]
+        assert station.lightbox() is None
+
+
+def test_a_device_that_stays_away_is_built_anew_when_it_is_back(tmp_path: Path) -> None:
+    with station_of(tmp_path) as (station, opened):
+        scanner = station.scanner()
+        (tmp_path / "scans").rmdir()
+        with pytest.raises(DeviceError, match="no such folder"):
+            station.reopen(scanner)
+        with pytest.raises(DeviceError, match="no such folder"):
+            station.scanner()
+        (tmp_path / "scans").mkdir()
+        assert station.scanner().exports() == ()
+        assert opened == ["scanner: scanner"] * 2
+
+
+def test_layouts_point_from_the_scene_to_the_base(tmp_path: Path) -> None:
+    with station_of(tmp_path) as (station, _):
+        layout = station.layout("station_1")
+        assert layout.robot == "arm"
+        assert layout.approach == pytest.approx((0.0, -1.0, 0.0), abs=1e-12)
+        with pytest.raises(ConfigurationError, match="station_2"):
+            station.layout("station_2")
+
+
+def test_what_a_rig_lacks_is_named(tmp_path: Path) -> None:
+    with station_of(tmp_path) as (station, _):
+        with pytest.raises(ConfigurationError, match="exactly one camera, the rig has 0"):
+            station.camera()
+        with pytest.raises(ConfigurationError, match="T_flange_camera_nominal"):
+            station.nominal_T_flange_camera()
+        with pytest.raises(ConfigurationError, match="no device 'pump'"):
+            station.device("pump")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("robot: arm", "robot: leg", "names robot 'leg'"),
+        ("scene_centre_m: [0, 0.8, 0]", "scene_centre_m: [0, 0.8]", "scene_centre_m"),
+        ("name: folders", "name: [", "not YAML"),
+        ("name: folders", "nome: folders", "nome"),
+    ],
+)
+def test_a_wrong_rig_file_says_where(tmp_path: Path, old: str, new: str, words: str) -> None:
+    with pytest.raises(ConfigurationError, match=words), station_of(tmp_path, RIG.replace(old, new)):
+        pass
