@@ -134,7 +134,7 @@ class Surfaces:
         return self._light[control]
 
     def shade(self, eye: Array, directions: Array32, pixel_rad: float, *, control: bool, spray: bool) -> Shaded:
-        """Cast rays (N, 3), of unit depth along the camera's axis, from `eye`, world; pixel_rad is a pixel's angle."""
+        """Cast rays (N, 3), of unit depth along the camera axis, from `eye`, world; pixel_rad is a pixel angle."""
         n = len(directions)
         start = np.ascontiguousarray(np.broadcast_to(eye.astype(np.float32), (n, 3)))
         face, depth, u, v = self._caster.first(start, directions)
