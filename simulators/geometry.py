@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
+Array32 = NDArray[np.floating]  # single precision where it matters; numpy stubs lose it in mixed arithmetic
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]

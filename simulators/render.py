@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from simulators.geometry import Array, Array32, Bytes, inverse
+from simulators.geometry import Array, Array32, Bools, Bytes, Ints, inverse
 from simulators.intrinsics import Intrinsics
 from simulators.overlays import Frame, draw_calibration_board, draw_sphere
 from simulators.surfaces import Surfaces
@@ -121,7 +121,7 @@ class Renderer:
             draw_calibration_board(frame, view.T_world_board, surfaces.scene.lamp_m)
         return frame.colour
 
-    def _supersample(self, surfaces: Surfaces, view: View, frame: Frame, world: Array32, at: Array) -> None:
+    def _supersample(self, surfaces: Surfaces, view: View, frame: Frame, world: Array32, at: Ints) -> None:
         """Replace the pixels `at` (flat indices) by the mean of 3 × 3 rays."""
         if len(at) == 0:
             return
@@ -161,7 +161,7 @@ def _pixel_rays(lens: Intrinsics, top: int, bottom: int) -> Array:
     return lens.rays(np.stack([column, row], axis=-1))
 
 
-def _edges(depth: Array32, material: Bytes) -> Array:
+def _edges(depth: Array32, material: Bytes) -> Bools:
     """Pixels (H, W) where the mesh's outline or a crease crosses: depth bends, or the material changes."""
     bend = np.abs(cv2.Laplacian(np.minimum(depth, 10.0), cv2.CV_32F)) > np.float32(0.004)
     change = cv2.morphologyEx(material, cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0

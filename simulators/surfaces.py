@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from simulators.geometry import Array, Array32, Ints
+from simulators.geometry import Array, Array32, Bytes, Ints
 from simulators.lighting import Caster, vertex_light
 from simulators.noise import Noise
 from simulators.parts import Part, grid_faces, sphere_mesh, vertex_normals
@@ -37,7 +37,7 @@ class Shaded:
 
     colour: Array32
     depth: Array32
-    material: Array32
+    material: Bytes
 
 
 class MipMap:
@@ -168,7 +168,7 @@ class Surfaces:
     def _light_at(self, corners: Ints, weights: Array32, control: bool) -> Array32:
         return _interpolated(self.light(control), corners, weights)
 
-    def _sampled(self, material: Array32, uv: Array32, footprint_m: Array32) -> Array32:
+    def _sampled(self, material: Bytes, uv: Array32, footprint_m: Array32) -> Array32:
         texel = np.empty((len(uv), 4), dtype=np.float32)
         for index, texture in enumerate(self._textures):
             at = np.flatnonzero(material == index)

@@ -38,7 +38,8 @@ def specimen_texture(scene: Scene, size: int) -> Texture:
     anatomy = scene.specimen.anatomy
     length, arc = 2 * HALF_LENGTH_M, 0.30
     noise = Noise(scene.seed * 7 + 1, (size, size), (length, arc))
-    place = cv2.resize(scene.specimen.grid_m, (size, size), interpolation=cv2.INTER_LINEAR)
+    grid = cv2.resize(scene.specimen.grid_m, (size, size), interpolation=cv2.INTER_LINEAR)
+    place = np.asarray(grid, dtype=np.float64)
     x, y = place[..., 0], place[..., 1]
     wobble = noise.octaves(1, 0.012, 5)
     fine = noise.octaves(2, 0.0016, 4, 0.75)
