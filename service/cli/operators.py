@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
+import os
 import select
-import socket
-import sys
-import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from rich.console import Console
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from service.cli.hands import SimulatedHands
 from service.core.decide import AskOperator
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.model import OperatorAction
@@ -67,27 +65,46 @@ class TerminalOperator:
     name: str
     protocol: Protocol
     display: Display
+    hands: SimulatedHands
+    descriptor: int = 0  # of the terminal
     _asked: AskOperator | None = None
+    _typed: bytes = b""
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
         """Show a new question once, then look whether a line was typed."""
         if question != self._asked:
             self._asked = question
             self._print(question)
-        if not select.select([sys.stdin], [], [], 0)[0]:
+        line = self._line()
+        if line is None:
             return None
-        line = sys.stdin.readline()
-        if not line:
-            raise ConfigurationError("the terminal was closed while a question was open", remedy="Resume the run")
         verb, _, reason = line.strip().partition(" ")
-        self._asked = None
-        return self._action(question, verb or "confirm", reason.strip())
+        action = self._action(question, verb, reason.strip())
+        if action is not None:
+            self._asked = None
+            if action.action == "confirm":
+                self.hands.do(self.protocol.step(question.step), state.steps[question.step].attempt)
+        return action
+
+    def _line(self) -> str | None:
+        """A whole line, if one was typed. Not through sys.stdin: its buffer would hide further lines from select."""
+        while b"\n" not in self._typed:
+            if not select.select([self.descriptor], [], [], 0)[0]:
+                return None
+            read = os.read(self.descriptor, 4096)
+            if not read:
+                raise ConfigurationError("the terminal was closed while a question was open", remedy="Resume the run")
+            self._typed += read
+        line, _, self._typed = self._typed.partition(b"\n")
+        return line.decode(errors="replace")
 
     def _print(self, question: AskOperator) -> None:
         self.display.clear()
         step = self.protocol.step(question.step)
         lines = [question.text, *(f"  ☐ {item}" for item in question.checklist)]
         lines.append(f"\nType one of: {', '.join(question.options)} (with a reason where one is needed).")
+        if "confirm" in question.options and question.checklist:
+            lines.append("By `confirm` you say that every item of the list is done.")
         self.display.console.print(Panel("\n".join(lines), title=step.title, subtitle=step.why or None))
 
     def _action(self, question: AskOperator, verb: str, reason: str) -> OperatorAction | None:
@@ -121,8 +138,7 @@ class AutomaticOperator:
     name: str
     protocol: Protocol
     display: Display
-    hands: str | None  # HOST:PORT of the simulated technician
-    _done: set[tuple[str, int]] = field(default_factory=set[tuple[str, int]])
+    hands: SimulatedHands
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction:
         """Do what a technician would do, then say so; recorded as automatic."""
@@ -135,19 +151,8 @@ class AutomaticOperator:
         base: dict[str, Any] = {"action": question.for_, "step": question.step, "via": "auto", "automatic": True}
         if question.for_ == "sign":
             return OperatorAction(**base, meaning="automatic, simulated rig", signed_sha256=question.sign_sha256)
-        self._use_hands(question.step, state.steps[question.step].attempt)
+        self.hands.do(self.protocol.step(question.step), state.steps[question.step].attempt)
         return OperatorAction(**base, checklist=question.checklist)
-
-    def _use_hands(self, step_id: str, attempt: int) -> None:
-        if (step_id, attempt) in self._done or self.hands is None:
-            return
-        for action in self.protocol.step(step_id).simulated_hands:
-            request = {"op": "act", **action.model_dump(exclude_none=True)}
-            self.display.show(f"simulated hands: {action.action.replace('_', ' ')}", 0, 0)
-            answer = _ask_world(self.hands, request)
-            if not answer.get("ok"):
-                raise OrthocaptureError(f"the simulated technician could not {action.action}: {answer.get('error')}")
-        self._done.add((step_id, attempt))
 
     def show(self, what: str, done: int, total: int) -> None:
         """Progress."""
@@ -156,18 +161,3 @@ class AutomaticOperator:
     def tell(self, message: str) -> None:
         """News."""
         self.display.tell(message)
-
-
-def _ask_world(address: str, request: dict[str, Any]) -> dict[str, Any]:
-    host, _, port = address.rpartition(":")
-    deadline_s = time.monotonic() + 300
-    try:
-        with socket.create_connection((host, int(port)), timeout=10) as link:
-            link.settimeout(deadline_s - time.monotonic())
-            link.sendall(json.dumps(request).encode() + b"\n")
-            with link.makefile("r", encoding="utf-8") as answers:
-                return json.loads(answers.readline() or '{"ok": false, "error": "no answer"}')
-    except OSError as error:
-        raise OrthocaptureError(
-            f"the simulated technician does not answer: {error}", where=address, remedy="Start the rig again"
-        ) from error

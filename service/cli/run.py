@@ -25,6 +25,7 @@ from service.cli.common import (
     print_json,
     reporting_errors,
 )
+from service.cli.hands import SimulatedHands
 from service.cli.operators import AutomaticOperator, Display, TerminalOperator
 from service.core.actions import VERBS, record_to_sign, refuse
 from service.core.fold import fold
@@ -175,13 +176,11 @@ def drive(store: Store, run_id: str, rig: Rig, *, data: Path, auto_confirm: bool
     """Run the runner in this process, with a worker beside it, until the run ends."""
     protocol, root = recorded_run(store, run_id)
     display = Display(error_console)
+    hands = SimulatedHands(rig.section.hands if rig.section.simulated else None)
     if auto_confirm:
         require_simulated(rig)
-        operator: TerminalOperator | AutomaticOperator = AutomaticOperator(
-            root.operator, protocol, display, rig.section.hands
-        )
-    else:
-        operator = TerminalOperator(root.operator, protocol, display)
+    kind = AutomaticOperator if auto_confirm else TerminalOperator
+    operator = kind(root.operator, protocol, display, hands)
     station = Station(rig)
     # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
