@@ -66,9 +66,13 @@ class _Rig:
     # --- life ---
 
     def start(self) -> None:
-        for name in ("ct", "scans", "logs"):
-            (self.folder / name).mkdir(parents=True, exist_ok=True)
+        # First of all: stop() waits for the server's loop, and would wait for ever for one that never began.
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        try:
+            for name in ("ct", "scans", "logs"):
+                (self.folder / name).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise SimulatorError(f"the folder {self.folder} cannot be used: {error.strerror}") from error
         world = self.server.address
         joints = ",".join(f"{q:.6f}" for q in self.world.start_joints_rad)
         hosts = self._hosts()

@@ -44,20 +44,10 @@ def specimen_texture(scene: Scene, size: int) -> Texture:
     wobble = noise.octaves(1, 0.012, 5)
     fine = noise.octaves(2, 0.0016, 4, 0.75)
     speckle = noise.field(3, 0.0005)
+    pores = noise.field(7, 0.0011)
     t = np.asarray(anatomy.incision(x, y), dtype=np.float32) + np.float32(0.02) * wobble
 
-    skin = np.empty((size, size, 3), dtype=np.float32)
-    skin[:] = (0.66, 0.43, 0.34)
-    blotch = noise.octaves(4, 0.03, 5)
-    skin *= (1.0 + 0.10 * blotch + 0.09 * fine + 0.09 * speckle)[..., None]
-    skin = mixed(skin, (0.55, 0.22, 0.18), 0.5 * ramp(0.5, 1.8, noise.octaves(5, 0.018, 5)))
-    skin = mixed(skin, (0.42, 0.27, 0.20), 0.55 * ramp(0.9, 1.5, noise.octaves(6, 0.004, 3)))
-    pores = noise.field(7, 0.0011)
-    skin = mixed(skin, (0.30, 0.15, 0.10), 0.55 * ramp(1.3, 2.2, pores))
-    skin = mixed(skin, (0.20, 0.13, 0.09), _strokes(noise, 8, 5200, 0.004, 0.010, size))
-    skin = mixed(skin, (0.10, 0.10, 0.32), 0.7 * _stamp(size, scene.seed) * ramp(-1.0, 0.6, fine))
-    skin = mixed(skin, (0.28, 0.02, 0.02), 0.8 * ramp(1.2, 1.7, noise.octaves(9, 0.022, 6)))
-
+    skin = _skin(scene, noise, fine, speckle, pores)
     fat = np.empty_like(skin)
     fat[:] = (0.74, 0.58, 0.38)
     fat *= (1.0 + 0.16 * noise.octaves(10, 0.005, 4) + 0.08 * speckle)[..., None]
@@ -92,6 +82,21 @@ def specimen_texture(scene: Scene, size: int) -> Texture:
     gloss = np.where(t > 1.05, 0.10, np.where(t > 0.9, 0.5, 0.75)) + 0.5 * pool
     gloss = gloss * (0.45 + 0.55 * ramp(-0.6, 1.2, noise.octaves(18, 0.003, 4)))
     return Texture(_packed(colour, gloss.astype(np.float32)), length / size)
+
+
+def _skin(scene: Scene, noise: Noise, fine: Array32, speckle: Array32, pores: Array32) -> Array32:
+    """Mottled skin with pores, hair, inspection stamps and smears of blood (H, W, 3)."""
+    size = noise.shape[0]
+    skin = np.empty((size, size, 3), dtype=np.float32)
+    skin[:] = (0.66, 0.43, 0.34)
+    blotch = noise.octaves(4, 0.03, 5)
+    skin *= (1.0 + 0.10 * blotch + 0.09 * fine + 0.09 * speckle)[..., None]
+    skin = mixed(skin, (0.55, 0.22, 0.18), 0.5 * ramp(0.5, 1.8, noise.octaves(5, 0.018, 5)))
+    skin = mixed(skin, (0.42, 0.27, 0.20), 0.55 * ramp(0.9, 1.5, noise.octaves(6, 0.004, 3)))
+    skin = mixed(skin, (0.30, 0.15, 0.10), 0.55 * ramp(1.3, 2.2, pores))
+    skin = mixed(skin, (0.20, 0.13, 0.09), _strokes(noise, 8, 5200, 0.004, 0.010, size))
+    skin = mixed(skin, (0.10, 0.10, 0.32), 0.7 * _stamp(size, scene.seed) * ramp(-1.0, 0.6, fine))
+    return mixed(skin, (0.28, 0.02, 0.02), 0.8 * ramp(1.2, 1.7, noise.octaves(9, 0.022, 6)))
 
 
 def board_texture(scene: Scene, size: int) -> Texture:
