@@ -61,9 +61,11 @@ def test_settings_are_set_and_survive_a_session(camera: RunningCamera, widget: s
 
 
 def test_a_value_that_is_not_offered_is_refused_and_nothing_changes(camera: RunningCamera) -> None:
-    answers = vendor_session(camera.gphoto_port, ["set", "iso", "100"], ["set", "iso", "123"], ["value", "iso"])
+    # The client reads a setting from its cache for two seconds.
+    words = (["set", "iso", "100"], ["set", "iso", "123"], ["sleep", 2.2], ["value", "iso"])
+    answers = vendor_session(camera.gphoto_port, *words)
     assert answers[1] == {"error": -2}
-    assert answers[2] == "100"
+    assert answers[3] == "100"
 
 
 def test_settings_take_no_delayed_acknowledgements() -> None:

@@ -14,7 +14,7 @@ import trimesh
 
 from tests.support.rig import RIG_LOCK, orthocapture
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900), pytest.mark.xdist_group("rig")]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ import yaml
 
 from tests.support.rig import REPOSITORY, command, orthocapture, simulated_rig
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(400), pytest.mark.xdist_group("rig")]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
 
 def short_protocol(folder: Path) -> Path:
