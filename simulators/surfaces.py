@@ -193,7 +193,8 @@ class Surfaces:
         if len(at) == 0:
             return
         normal = _interpolated(self._normals32, corners[at], weights[at])
-        tiled = (uv[at] * np.float32(16.0)) % np.float32(1.0)
+        # There and back again: the ripples do not repeat seamlessly.
+        tiled = np.abs((uv[at] * np.float32(16.0)) % np.float32(2.0) - np.float32(1.0))
         normal[:, :2] += _bilinear(self._ripple, tiled)[:, :2]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         place = eye.astype(np.float32) + ray[at] * depth[at, None]

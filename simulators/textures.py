@@ -77,7 +77,9 @@ def specimen_texture(scene: Scene, size: int) -> Texture:
     # The cut ends (columns of texels next to u = 0 and 1) show muscle, fat and skin like the wound does.
     end = np.minimum(np.arange(size), np.arange(size)[::-1])[:, None] < 0.0015 * size
     colour = np.where(end[..., None], muscle, colour)
-    relief = 0.00016 * fine + 0.00035 * wobble + 0.00012 * np.where(t < 1.0, 1.8 * fibres, 1.0 * pores)
+    relief = (
+        0.00016 * fine + 0.00035 * wobble + 0.00012 * np.where(t < 1.0, 1.8 * fibres * (1 - 0.8 * is_bone), pores)
+    )
     colour *= _relief_shading(relief.astype(np.float32), length / size, arc / size)[..., None]
     gloss = np.where(t > 1.05, 0.10, np.where(t > 0.9, 0.5, 0.75)) + 0.5 * pool
     gloss = gloss * (0.45 + 0.55 * ramp(-0.6, 1.2, noise.octaves(18, 0.003, 4)))
