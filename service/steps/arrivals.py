@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import tempfile
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,9 +45,10 @@ def keep(context: StepContext, path: Path, *, device: str, kind: str, media_type
 
 def keep_array(context: StepContext, array: Any, *, device: str, kind: str, name: str) -> ArtefactRef:
     """Keep a decoded array (.npy) beside the originals, for the worker."""
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    ref = context.evidence.put_bytes(buffer.getvalue(), kind=kind, media_type="application/x-npy", original_name=name)
+    with tempfile.TemporaryDirectory(prefix="orthocapture-") as folder:
+        path = Path(folder) / name  # a CT volume of 0.4 mm voxels has a gigabyte: not through memory
+        np.save(path, array, allow_pickle=False)
+        ref = context.evidence.put_file(path, kind=kind, media_type="application/x-npy", original_name=name)
     _record(context, ref, device, f"decoded {name}")
     return ref
 
