@@ -54,8 +54,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         }
         measures = {
             "slices": float(series.slices),
-            "slice_spacing_mm": volume.spacing_m[2] * 1000,
-            "voxel_mm": max(volume.spacing_m) * 1000,
+            "slice_spacing_mm": round(volume.spacing_m[2] * 1000, 6),  # positions are decimal text of six places
+            "voxel_mm": round(max(volume.spacing_m) * 1000, 6),
         }
         job = "ct_surface"
     (answer,) = context.evidence.run_jobs(JobRequest(job, arguments))
