@@ -28,20 +28,23 @@ DEMO_TIMEOUT_S = 1800
 def main(words: Sequence[str] | None = None) -> int:
     """Run the demo on each scene; print the tables and write them. 1 if a demo failed."""
     options = arguments(words)
-    scenes = [run_demo(seed, options.image_width, options.keep) for seed in options.scenes]
-    record = {
+    about = {
         "date": options.date,
         "commit": commit(),
         "machine": machine(),
         "image_width": options.image_width,
-        "scenes": scenes,
-        "summary": summarise(scenes),
     }
     options.results.mkdir(parents=True, exist_ok=True)
     stem = options.results / f"demo_accuracy-{options.date}"
-    stem.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    text = as_markdown(record)
-    stem.with_suffix(".md").write_text(text, encoding="utf-8")
+    scenes: list[dict[str, Any]] = []
+    text = ""
+    for seed in options.scenes:
+        scenes.append(run_demo(seed, options.image_width, options.keep))
+        # Written after each scene: a bench that is interrupted has not measured for nothing.
+        record = {**about, "scenes": scenes, "summary": summarise(scenes)}
+        stem.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+        text = as_markdown(record)
+        stem.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
     return 1 if any("error" in scene for scene in scenes) else 0
 

@@ -7,7 +7,7 @@ import socketserver
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -121,7 +121,10 @@ class _Client(socketserver.StreamRequestHandler):
 
 def _answer(server: WorldServer, line: bytes) -> dict[str, Any] | None:
     try:
-        request: dict[str, Any] = json.loads(line)
+        request: object = json.loads(line)
+        if not isinstance(request, dict):
+            return {"ok": False, "error": "bad request: not a JSON object"}
+        request = cast("dict[str, Any]", request)
         match request.get("op"):
             case "robot":
                 server.world.arm_moved(str(request["arm"]), np.array(request["q"], dtype=np.float64))

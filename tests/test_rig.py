@@ -1,4 +1,4 @@
-"""The simulated rig: one world behind a socket, its children, its files, and how all of it ends."""
+"""The simulated rig as a process: its files, its world, its end; and a rig with two controllers."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import json
 import os
 import signal
 import socket
-import threading
-from collections.abc import Generator
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,150 +18,245 @@ import numpy as np
 import psutil
 import pytest
 import yaml
-from pydicom import dcmread
 
-from simulators.geometry import apply, inverse, rigid_fit
-from simulators.rig_world import World, WorldServer
-from simulators.world import SCENE_CENTRE_M, Scene
-from tests.support.rig import simulated_rig
+from service.core.model import ViewpointCaptured
+from service.rig import load_rig
+from service.station import Station
+from service.store.store import Store
+from tests.support.rig import REPOSITORY, RIG_LOCK, orthocapture, simulated_rig
 
-Q = np.array([1.4, -1.6, 1.9, -1.9, -1.57, 0.0])
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
+
+SMALL = ("--scene", "3", "--image-width", "480", "--speed-up", "4")
 
 
-class Wire:
-    """One client of the world's socket."""
+class Hands:
+    """A client of the world's socket."""
 
     def __init__(self, address: str) -> None:
-        host, _, port = address.rpartition(":")
+        host, port = address.split(":")
         self._socket = socket.create_connection((host, int(port)), timeout=60)
-        self._stream = self._socket.makefile("rwb")
+        self._lines = self._socket.makefile("r")
 
-    def send(self, line: bytes) -> None:
-        self._stream.write(line + b"\n")
-        self._stream.flush()
+    def __enter__(self) -> Hands:
+        return self
 
-    def ask(self, **request: Any) -> dict[str, Any]:
-        self.send(json.dumps(request).encode())
-        return self.answer()
-
-    def answer(self) -> dict[str, Any]:
-        return json.loads(self._stream.readline())
-
-    def close(self) -> None:
-        self._stream.close()
+    def __exit__(self, *_exc: object) -> None:
+        self._lines.close()
         self._socket.close()
 
+    def send(self, line: str) -> dict[str, Any]:
+        self._socket.sendall(line.encode() + b"\n")
+        return json.loads(self._lines.readline())
 
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return Scene.generate(7)
+    def ask(self, op: str, **fields: object) -> dict[str, Any]:
+        return self.send(json.dumps({"op": op, **fields}))
 
-
-@pytest.fixture
-def wire(scene: Scene) -> Generator[Wire]:
-    world = World(scene, 600, ("robot",), Q)
-    server = WorldServer(world, world.act)
-    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
-    client = Wire(server.address)
-    yield client
-    client.close()
-    server.shutdown()
-    server.server_close()
+    def act(self, action: str, **fields: object) -> dict[str, Any]:
+        return self.ask("act", action=action, **fields)
 
 
-def test_the_view_follows_the_arm_and_the_station(wire: Wire, scene: Scene) -> None:
-    q = Q + 0.05
-    wire.send(json.dumps({"op": "robot", "arm": "robot", "q": q.tolist(), "t": 0.0}).encode())
-    view = wire.ask(op="view")  # same connection: the joints came first
-    assert np.allclose(view["T_world_camera"], scene.true_camera(q, "station_1"))
-    assert view["intrinsics"] == scene.camera_intrinsics(600).to_json()
-    assert wire.ask(op="act", action="move_robot", station="station_2") == {"ok": True}
-    assert np.allclose(wire.ask(op="view")["T_world_camera"], scene.true_camera(q, "station_2"))
+@contextmanager
+def rig_process(folder: Path) -> Generator[tuple[subprocess.Popen[str], dict[str, Any], list[psutil.Process]]]:
+    """A rig that the test ends itself; with its ready line and all its processes."""
+    with RIG_LOCK, (folder / "rig.log").open("w") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "simulators", "rig", "--dir", str(folder), *SMALL],
+            cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        try:
+            line = process.stdout.readline()
+            assert line, (folder / "rig.log").read_text()
+            root = psutil.Process(process.pid)
+            yield process, json.loads(line), [root, *root.children(recursive=True)]
+        finally:
+            process.kill()
+            process.wait(timeout=30)
+            process.stdout.close()
 
 
-def test_hands_change_the_scene_and_refuse_what_they_cannot(wire: Wire) -> None:
-    assert wire.ask(op="view")["scene"] == {"seed": 7, "spray": False, "control_spheres": True, "board": None}
-    for action in ("place_board", "spray", "remove_control_spheres", "press_pedal"):
-        assert wire.ask(op="act", action=action) == {"ok": True}
-    view = wire.ask(op="view")
-    assert (view["scene"]["spray"], view["scene"]["control_spheres"], view["pedal_presses"]) == (True, False, 1)
-    first = np.array(view["scene"]["board"])
-    assert np.allclose(first[:3, :3] @ first[:3, :3].T, np.eye(3))
-    wire.ask(op="act", action="remove_board")
-    assert wire.ask(op="view")["scene"]["board"] is None
-    wire.ask(op="act", action="place_board")
-    assert not np.allclose(wire.ask(op="view")["scene"]["board"], first)
-    for request in ({"op": "act", "action": "dance"}, {"op": "act", "action": "move_robot", "station": "x"}):
-        answer = wire.ask(**request)
-        assert not answer["ok"]
-        assert answer["error"]
+def wait_until(fulfilled: Callable[[], bool], timeout_s: float = 20) -> bool:
+    deadline_s = time.monotonic() + timeout_s
+    while not fulfilled():
+        if time.monotonic() > deadline_s:
+            return False
+        time.sleep(0.05)
+    return True
 
 
-def test_the_truth_is_not_on_the_wire_and_nonsense_is_answered(wire: Wire) -> None:
-    assert not wire.ask(op="truth")["ok"]
-    wire.send(b"not json")
-    assert not wire.answer()["ok"]
-    assert not wire.ask(op="robot")["ok"]
-    assert "T_world_camera" in wire.ask(op="view")
+def listens(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((host, port)) == 0
 
 
-def test_scenes_are_the_same_for_a_seed_and_differ_between_seeds(scene: Scene) -> None:
-    again, other = Scene.generate(7), Scene.generate(8)
-    assert np.array_equal(again.specimen.grid_m, scene.specimen.grid_m)
-    assert np.array_equal(again.true_camera(Q, "station_2"), scene.true_camera(Q, "station_2"))
-    assert not np.allclose(other.registration_m, scene.registration_m, atol=1e-4)
-    assert not np.allclose(other.T_flange_camera, scene.T_flange_camera, atol=1e-5)
+# --- one rig ----------------------------------------------------------------------------------------------
 
 
-def test_the_arm_errs_by_what_no_shift_of_its_base_explains(scene: Scene) -> None:
-    joints = Q + np.random.default_rng(0).uniform(-0.3, 0.3, (40, 6))
-    T_base_world = inverse(scene.T_world_base["station_1"])
-    true = np.array([(T_base_world @ scene.true_flange(q, "station_1"))[:3, 3] for q in joints])
-    nominal = np.array([scene.nominal_flange(q)[:3, 3] for q in joints])
-    left = np.linalg.norm(true - apply(rigid_fit(true, nominal), nominal), axis=1)
-    # An order of magnitude above the repeatability of 0.02 mm, and not a broken arm.
-    assert 0.2e-3 < np.sqrt(np.mean(left**2)) < 1.5e-3
-
-
-def test_the_rig_serves_delivers_and_ends_with_all_its_children(tmp_path: Path, scene: Scene) -> None:
-    options = ("--scene", "7", "--image-width", "600", "--ct-voxel-mm", "3.0")
-    with simulated_rig(tmp_path, *options) as ready:
-        rig = yaml.safe_load(Path(ready["rig"]).read_text())
-        for name, station in rig["stations"].items():
-            measured = apply(scene.T_world_base[name], np.array(station["scene_centre_m"]))
-            assert np.linalg.norm(measured - SCENE_CENTRE_M) < 0.015
-        drawing = np.array(rig["T_flange_camera_nominal"])
-        off = inverse(drawing) @ scene.T_flange_camera
-        assert 0.1e-3 < np.linalg.norm(off[:3, 3]) < 3e-3
+def test_files_world_and_hands(tmp_path: Path) -> None:
+    with simulated_rig(tmp_path, *SMALL) as ready, Hands(ready["world"]) as hands:
+        # What the ready line promises is there, and the service reads it.
+        assert ready["ready"] is True
+        assert Path(ready["rig"]) == tmp_path / "rig.yaml"
+        for key in ("rig", "truth", "ct_folder", "scan_folder"):
+            assert Path(ready[key]).exists()
+        for name in ("robot", "camera", "lightbox"):
+            assert (tmp_path / "logs" / f"{name}.log").exists()
         assert (tmp_path / "lightbox").is_symlink()
-        wire = Wire(ready["world"])
-        assert wire.ask(op="act", action="ct_scan")["ok"]
-        wire.close()
-        slices = sorted((tmp_path / "ct").rglob("*.dcm"))
-        assert dcmread(slices[0]).Modality == "CT"
+        rig = load_rig(Path(ready["rig"]))
+        assert rig.section.simulated
+        assert rig.section.hands == ready["world"]
+        assert set(rig.section.stations) == {"station_1", "station_2"}
+
+        # The truth is in its file alone.
         truth = json.loads(Path(ready["truth"]).read_text())
-        assert np.allclose(np.linalg.det(np.array(truth["ct"][0]["T_world_ct"])[:3, :3]), 1.0)
-        assert np.allclose(truth["registration_m"], scene.registration_m)
-        processes = psutil.Process(_rig_process(tmp_path)).children(recursive=True)
-        assert len(processes) >= 3
-    _, alive = psutil.wait_procs(processes, timeout=10)
-    assert not alive
+        assert truth["scene"] == 3
+        assert "no operation 'truth'" in hands.ask("truth")["error"]
+        text = Path(ready["rig"]).read_text()
+        for secret in ("T_world", "dh_deltas", "registration_m", "intrinsics", "truth"):
+            assert secret not in text
+        nominal = rig.nominal_T_flange_camera()
+        offset_m = np.linalg.norm(nominal[:3, 3] - np.array(truth["T_flange_camera"])[:3, 3])
+        assert 1e-5 < offset_m < 5e-3
+        for name, section in rig.section.stations.items():
+            T_world_base = np.array(truth["T_world_base"][name])
+            centre = T_world_base[:3, :3] @ np.array(section.scene_centre_m) + T_world_base[:3, 3]
+            assert 0 < np.linalg.norm(centre - [0, 0, 0.05]) < 0.02
+
+        # Bad requests get an answer and leave the connection as it was.
+        for line in ("{", "[]", "7", '{"op": "fly"}', '{"op": "robot", "arm": "robot"}'):
+            assert hands.send(line)["ok"] is False
+        assert "juggle" in hands.act("juggle")["error"]
+        assert "station_9" in hands.act("move_robot", station="station_9")["error"]
+
+        before = hands.ask("view")
+        assert (before["scene"]["board"], before["scene"]["spray"], before["station"]) == (None, False, "station_1")
+        for action in ("place_board", "spray", "remove_control_spheres", "press_pedal"):
+            assert hands.act(action)["ok"] is True
+        assert hands.act("move_robot", station="station_2")["ok"] is True
+        after = hands.ask("view")
+        assert np.array(after["scene"]["board"]).shape == (4, 4)
+        assert (after["scene"]["spray"], after["scene"]["control_spheres"]) == (True, False)
+        assert (after["station"], after["pedal_presses"]) == ("station_2", 1)
+        # The arm has been carried to the other side of the table.
+        positions = [np.array(v["T_world_camera"])[:3, 3] for v in (before, after)]
+        assert np.linalg.norm(positions[0] - positions[1]) > 0.1
+        first = after["scene"]["board"]
+        hands.act("remove_board")
+        assert hands.ask("view")["scene"]["board"] is None
+        hands.act("place_board")
+        assert hands.ask("view")["scene"]["board"] != first
+
+        # A scan lands in the scan folder, its truth only in the truth.
+        answer = hands.act("hand_scan")
+        assert answer["ok"] is True
+        assert "truth" not in answer
+        assert (Path(ready["scan_folder"]) / answer["export"]).stat().st_size > 100_000
+        assert len(json.loads(Path(ready["truth"]).read_text())["scans"]) == 1
+
+        station = Station(rig)
+        try:
+            assert station.scanner().report().identity.kind == "scanner"
+            assert station.robot("station_1") is station.robot("station_2")
+        finally:
+            station.close()
 
 
-def test_the_children_do_not_outlive_a_killed_rig(tmp_path: Path) -> None:
-    with simulated_rig(tmp_path, "--scene", "7", "--image-width", "600"):
-        pid = _rig_process(tmp_path)
-        children = psutil.Process(pid).children(recursive=True)
-        assert len(children) >= 3
-        os.kill(pid, signal.SIGKILL)
-        _, alive = psutil.wait_procs(children, timeout=15)
-        assert not alive
+def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
+    with rig_process(tmp_path) as (process, ready, processes):
+        assert len(processes) >= 4
+        addresses = {
+            (c.laddr.ip, c.laddr.port)
+            for p in processes
+            for c in p.net_connections(kind="tcp")
+            if c.status == psutil.CONN_LISTEN
+        }
+        host, port = ready["world"].split(":")
+        assert {(host, int(port)), ("127.0.0.1", 30004)} <= addresses
+        process.terminate()
+        assert process.wait(timeout=20) == 0
+        assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)
+        assert not [address for address in addresses if listens(*address)]
+        assert not (tmp_path / "lightbox").exists()
+        assert "Traceback" not in (tmp_path / "rig.log").read_text()
 
 
-def _rig_process(folder: Path) -> int:
-    """The process of ours that simulates the rig of this folder."""
-    for process in psutil.Process().children(recursive=True):
-        words = process.cmdline()
-        if "rig" in words and str(folder) in words:
-            return process.pid
-    raise AssertionError(f"no rig serves {folder}")
+def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
+    with rig_process(tmp_path) as (process, _, processes):
+        camera = next(p for p in processes if "camera" in p.cmdline())
+        os.kill(camera.pid, signal.SIGKILL)
+        process.wait(timeout=20)
+        assert wait_until(lambda: not any(p.is_running() for p in processes))
+        log = (tmp_path / "rig.log").read_text()
+        assert "camera ended with status -9" in log
+        assert "Traceback" not in log
+
+
+def test_a_killed_rig_takes_its_devices_with_it(tmp_path: Path) -> None:
+    with rig_process(tmp_path) as (process, _, processes):
+        process.kill()
+        process.wait(timeout=10)
+        assert wait_until(lambda: not any(p.is_running() for p in processes[1:]))
+
+
+# --- two controllers --------------------------------------------------------------------------------------
+
+
+def two_station_protocol(folder: Path) -> Path:
+    """Two viewpoints at each station, and in between what moves the camera to the other one."""
+    protocol = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
+    by_id = {step["id"]: step for step in protocol["steps"]}
+    change = {
+        "id": "change",
+        "kind": "checklist",
+        "title": "Move to the other station",
+        "instructions": "Put the camera on the other arm.",
+        "checklist": ["The camera is on the other arm"],
+        "gates": [{"measure": "checklist_items_open", "max": 0, "unit": "items"}],
+        "simulated_hands": [{"action": "move_robot", "station": "station_2"}],
+    }
+    captures = by_id["viewpoint_capture_1"], by_id["viewpoint_capture_2"]
+    for step in captures:
+        step["params"]["viewpoints"][0]["arcs"] = [
+            {"tilt_deg": 25, "azimuth_from_deg": -20, "azimuth_to_deg": 20, "count": 2, "distance_m": 0.64}
+        ]
+        next(gate for gate in step["gates"] if gate["measure"] == "viewpoints_captured")["min"] = 2
+        step.pop("requires", None)
+    protocol["steps"] = [captures[0], change, captures[1]]
+    path = folder / "two_stations.yaml"
+    path.write_text(yaml.safe_dump(protocol))
+    return path
+
+
+def test_two_controllers_are_found_and_used(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with simulated_rig(tmp_path, *SMALL, "--arms", "2") as ready:
+        answer = orthocapture("doctor", "--rig", ready["rig"], "--json")
+        assert answer.returncode == 0, answer.stdout + answer.stderr
+        devices = json.loads(answer.stdout)["devices"]
+        assert devices["robot_1"]["identity"]["address"] != devices["robot_2"]["identity"]["address"]
+        assert all(devices[name]["ok"] for name in ("robot_1", "robot_2", "camera", "lightbox"))
+
+        protocol = two_station_protocol(tmp_path)
+        answer = orthocapture(
+            "run", str(protocol), "--rig", ready["rig"], "--data", str(data), "--auto-confirm", "--no-worker",
+            timeout_s=240,
+        )  # fmt: skip
+        assert answer.returncode == 0, answer.stdout + answer.stderr
+        truth = json.loads(Path(ready["truth"]).read_text())
+        exposures = [
+            json.loads(line) for line in (tmp_path / "truth_exposures.jsonl").read_text().splitlines() if line
+        ]
+    T_world_camera = {exposure["sha256"]: np.array(exposure["T_world_camera"]) for exposure in exposures}
+    with Store.open(data, create=False) as store:
+        events = store.events(store.find_run("latest"))
+    captured = [event.payload for event in events if isinstance(event.payload, ViewpointCaptured)]
+    assert [e.station for e in captured] == ["station_1"] * 2 + ["station_2"] * 2
+    T_flange_camera = np.array(truth["T_flange_camera"])
+    for event in captured:
+        true = T_world_camera[event.artefacts[0].sha256]
+        for station, T_world_base in truth["T_world_base"].items():
+            recorded = np.array(T_world_base) @ np.array(event.T_base_flange) @ T_flange_camera
+            error_m = float(np.linalg.norm(recorded[:3, 3] - true[:3, 3]))
+            # The arm's own error is below 5 mm; from the other base the camera would be somewhere else.
+            assert (error_m < 0.005) == (station == event.station), (event.viewpoint, station, error_m)
