@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from drivers.mesh_file import MeshUnit, read_mesh_file
 from drivers.plugin import DriverConfig, DriverSpec
 from drivers.scan_folder import free_bytes, require_folder
 
+_ARRIVING = "still arriving"
 # What pydicom, its plug-ins and Pillow raise for pixels that are cut short, damaged or of a codec that is missing.
 _DECODE_ERRORS = (ValueError, RuntimeError, AttributeError, KeyError, IndexError, OSError, EOFError, TypeError)
 
@@ -28,21 +31,37 @@ class DicomFolderConfig(DriverConfig):
 
     folder: Path = Field(description="where the CT suite delivers its series, in sub-folders or not")
     mesh_unit: MeshUnit = Field(default="auto", description="of segmented meshes: mm, m, or auto (from the size)")
-    stable_s: float = Field(default=10.0, ge=0, description="how long a segmented mesh must stay unchanged")
+    stable_s: float = Field(
+        default=10.0, ge=0, description="how long a series or a segmented mesh must stay unchanged; 10 s on a share"
+    )
+
+
+_FileKey = tuple[Path, int, int]  # path, size, mtime in ns
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrival:
+    """What a series consisted of, and since when this host has seen it so."""
+
+    files: frozenset[_FileKey]
+    since_s: float
 
 
 class DicomFolder:
     """drivers.interfaces.CtSource on a folder; reads, and never writes or deletes there."""
 
-    def __init__(self, config: DicomFolderConfig) -> None:
+    def __init__(self, config: DicomFolderConfig, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._config = config
-        self._watch = ExportWatch(config.folder, config.stable_s)
-        self._headers: dict[tuple[Path, int, int], SliceHeader | str] = {}
+        self._monotonic = monotonic
+        self._watch = ExportWatch(config.folder, config.stable_s, monotonic)
+        self._headers: dict[_FileKey, SliceHeader | str] = {}
+        self._arrivals: dict[str, _Arrival] = {}
 
     def open(self) -> DeviceIdentity:
-        """Check that the folder is there."""
+        """Check that the folder is there and begin to observe it."""
         require_folder(self._config.folder)
         self._watch.poll()
+        self.series()
         return self._identity()
 
     def close(self) -> None:
@@ -51,22 +70,51 @@ class DicomFolder:
     def report(self) -> DeviceReport:
         """Series found, what is wrong with them, and files that are not DICOM."""
         series = self.series()
-        problems = [f"series {one.uid} ({one.description}): {text}" for one in series for text in one.problems]
+        arriving = [one for one in series if any(text.startswith(_ARRIVING) for text in one.problems)]
+        # To arrive is no fault: what else is wrong with such a series may only be that it is not whole yet.
+        problems = [
+            f"series {one.uid} ({one.description}): {text}"
+            for one in series
+            if one not in arriving
+            for text in one.problems
+        ]
         problems += [text for text in self._headers.values() if isinstance(text, str)]
         return DeviceReport(
             identity=self._identity(),
             free_bytes=free_bytes(self._config.folder),
-            details={"series": str(len(series)), "usable": str(sum(not one.problems for one in series))},
+            details={
+                "series": str(len(series)),
+                "usable": str(sum(not one.problems for one in series)),
+                "arriving": str(len(arriving)),
+                "stable_s": f"{self._config.stable_s:g}",
+            },
             problems=tuple(problems) + self._watch.poll()[1],
         )
 
     def series(self) -> tuple[CtSeries, ...]:
-        """All series with images, those with problems too, by UID."""
+        """All series with images, those with problems too, by UID.
+
+        A series that changed less than `stable_s` ago, as this driver observed it, has the problem "still arriving":
+        a series in transfer looks complete, and short. The age of the files says nothing, since copying may keep it
+        and the clock of a share may differ.
+        """
         require_folder(self._config.folder)
         groups: dict[str, list[SliceHeader]] = {}
-        for header in self._scan():
-            groups.setdefault(header.series_uid, []).append(header)
-        return tuple(self._series(uid, headers) for uid, headers in sorted(groups.items()))
+        keys: dict[str, set[_FileKey]] = {}
+        unread: set[_FileKey] = set()  # perhaps the beginning of one more slice, of whatever series
+        for key, header in self._scan().items():
+            if isinstance(header, SliceHeader):
+                groups.setdefault(header.series_uid, []).append(header)
+                keys.setdefault(header.series_uid, set()).add(key)
+            else:
+                unread.add(key)
+        now = self._monotonic()
+        arrivals: dict[str, _Arrival] = {}
+        for uid, own in keys.items():
+            files, old = frozenset(own | unread), self._arrivals.get(uid)
+            arrivals[uid] = old if old is not None and old.files == files else _Arrival(files, now)
+        self._arrivals = arrivals
+        return tuple(self._series(uid, headers, self._arriving(uid, now)) for uid, headers in sorted(groups.items()))
 
     def read(self, series: CtSeries) -> CtVolume:
         """Read one series into Hounsfield units.
@@ -92,7 +140,7 @@ class DicomFolder:
         volume = np.empty((len(ordered), first.rows, first.columns), dtype=np.int16)
         for k, header in enumerate(ordered):
             volume[k] = _hounsfield(header)
-        return CtVolume(volume, T_ct_voxel, spacing, self._series(series.uid, ordered))
+        return CtVolume(volume, T_ct_voxel, spacing, self._series(series.uid, ordered, ()))
 
     def segmented_meshes(self) -> tuple[ScanExport, ...]:
         """Complete meshes in the folder (STL, PLY, OBJ), oldest first."""
@@ -103,12 +151,22 @@ class DicomFolder:
         """Read one of them, in metres."""
         return read_mesh_file(export.files[0], self._config.mesh_unit, export=export)
 
-    def _scan(self) -> list[SliceHeader]:
-        fresh: dict[tuple[Path, int, int], SliceHeader | str] = {}
+    def _scan(self) -> dict[_FileKey, SliceHeader | str]:
+        fresh: dict[_FileKey, SliceHeader | str] = {}
         for path in dicom_files(self._config.folder):
-            fresh[_key(path)] = self._header(path)
+            try:
+                key = _key(path)
+            except FileNotFoundError:  # renamed since the folder was listed, as transfers do at their end
+                continue
+            fresh[key] = self._header(path)
         self._headers = fresh
-        return [header for header in fresh.values() if isinstance(header, SliceHeader)]
+        return fresh
+
+    def _arriving(self, uid: str, now: float) -> tuple[str, ...]:
+        waited_s = now - self._arrivals[uid].since_s
+        if waited_s >= self._config.stable_s:
+            return ()
+        return (f"{_ARRIVING}: unchanged for {waited_s:.1f} s, waiting for {self._config.stable_s:g} s",)
 
     def _header(self, path: Path) -> SliceHeader | str:
         """The header, or why there is none; read once for a file that does not change."""
@@ -118,14 +176,14 @@ class DicomFolder:
             return f"{path.name}: cannot be opened ({error.strerror})"
         return read_header(path) if known is None else known
 
-    def _series(self, uid: str, headers: list[SliceHeader]) -> CtSeries:
+    def _series(self, uid: str, headers: list[SliceHeader], arriving: tuple[str, ...]) -> CtSeries:
         return CtSeries(
             uid=uid,
             description=headers[0].description,
             modality=headers[0].modality,
             slices=len(headers),
             files=tuple(header.path for header in headers),
-            problems=problems_of(headers),
+            problems=arriving + problems_of(headers),
         )
 
     def _identity(self) -> DeviceIdentity:
@@ -140,7 +198,7 @@ class DicomFolder:
         )
 
 
-def _key(path: Path) -> tuple[Path, int, int]:
+def _key(path: Path) -> _FileKey:
     stat = path.stat()
     return path, stat.st_size, stat.st_mtime_ns
 

@@ -16,6 +16,7 @@ _PLY_SIZES = {
     **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
     **dict.fromkeys(("double", "float64"), 8),
 }
+_NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _AGAIN = "Wait until the export has finished; if it has, export the scan again"
 _HEAD_BYTES = 64 * 1024
 _TEXTURE = re.compile(rb"^\s*(?:map_\w+|bump|disp|decal|norm|refl)\s+(.+?)\s*$", re.MULTILINE | re.IGNORECASE)
@@ -280,7 +281,9 @@ def _check_obj(path: Path) -> None:
     """An OBJ has no length and no end mark: judge its last line, and counts that the exporter wrote as comments."""
     tail = _tail(path)
     last = tail.splitlines()[-1].strip() if tail.strip() else b""
-    if not tail.endswith(b"\n") and not last.startswith(b"#"):
+    # Some exporters write no newline at the end. Then the line must be as whole as the one of its kind before it; a
+    # number that lost its last digits does not show, so a watched folder waits until the file stays as it is.
+    if not tail.endswith(b"\n") and _cut_line(tail, last):
         raise IncompleteExportError(
             f"the file ends in the middle of a line ({last[:40].decode('utf-8', 'replace')!r})",
             where=str(path),
@@ -316,3 +319,25 @@ def _check_obj(path: Path) -> None:
                 remedy="Wait if the export is still running; otherwise export a triangle mesh, not a point cloud",
             )
         raise UnreadableFileError("the file has no faces", where=str(path), remedy="Export a triangle mesh")
+
+
+def _cut_line(tail: bytes, last: bytes) -> bool:
+    """Whether the last line, which has no newline, lacks something that the line of its kind before it has."""
+    if last.startswith(b"#"):
+        return False
+    words = last.split()
+    keyword, values = words[0], words[1:]
+    if keyword not in {b"v", b"vn", b"vt", b"f", b"g", b"o", b"s", b"usemtl"} or not values:
+        return True
+    if keyword in {b"g", b"o", b"s", b"usemtl"}:
+        return False
+    before = [line.split()[1:] for line in tail.splitlines()[1:-1] if line.split()[:1] == [keyword]]
+    if keyword != b"f":
+        return not before or len(values) < len(before[-1]) or not _NUMBER.fullmatch(values[-1])
+    slashes = {value.count(b"/") for value in (before[-1] if before else values)}
+    return (
+        len(values) < 3
+        or not all(_NUMBER.fullmatch(part) for value in values for part in value.split(b"/") if part)
+        or values[-1].endswith((b"/", b"-"))
+        or {value.count(b"/") for value in values} != slashes
+    )

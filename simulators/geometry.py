@@ -40,14 +40,6 @@ def apply(T_a_b: Array, points_b: Array) -> Array:
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
-def rigid_fit(a: Array, b: Array) -> Array:
-    """T_a_b that brings points b (N, 3) closest to points a (N, 3) in the least-squares sense (Kabsch, 1976)."""
-    ca, cb = a.mean(axis=0), b.mean(axis=0)
-    U, _, Vt = np.linalg.svd((a - ca).T @ (b - cb))
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return transform(R, ca - R @ cb)
-
-
 def look_at(eye: Array, target: Array, up: Array) -> Array:
     """T_world_camera (x right, y down, z forward) at `eye`, looking at `target`, image top towards `up`."""
     z = (target - eye) / np.linalg.norm(target - eye)

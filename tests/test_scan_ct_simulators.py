@@ -255,7 +255,7 @@ def test_ct_faults_are_found(tmp_path: Path, fault: dict[str, object], words: st
     grid = Grid(np.eye(4), 4e-4, (40, 24, 16))
     volume = np.zeros(grid.shape, dtype=np.int16)
     write_series(tmp_path, volume, grid, true_frames(SEED)[0], "1.2.3", faults=plan)
-    (series,) = DicomFolder(DicomFolderConfig(folder=tmp_path)).series()
+    (series,) = DicomFolder(DicomFolderConfig(folder=tmp_path, stable_s=0.0)).series()
     assert words in " ".join(series.problems)
 
 
@@ -264,5 +264,5 @@ def test_a_ct_fault_plan_reaches_the_simulator(tmp_path: Path) -> None:
     words = ("ct", "--scene", str(SEED), "--folder", str(tmp_path), "--once", "--voxel-mm", "4", "--faults", plan)
     with simulator(*words) as running:
         assert running.process.wait(20) == 0
-    (series,) = DicomFolder(DicomFolderConfig(folder=tmp_path)).series()
+    (series,) = DicomFolder(DicomFolderConfig(folder=tmp_path, stable_s=0.0)).series()
     assert "gap: 2 slices" in " ".join(series.problems)
