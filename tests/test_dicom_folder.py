@@ -270,3 +270,22 @@ def test_every_shipped_file_is_listed_or_named_but_never_a_crash(tmp_path: Path)
         if one.modality == "MR":
             assert any("not CT" in problem for problem in one.problems)
     assert any("icc" in problem for problem in report.problems)
+
+
+def test_a_series_in_transfer_is_not_taken_for_a_short_one(tmp_path: Path) -> None:
+    """Its first slices look like a complete series; only that it stays unchanged tells."""
+    now_s = 100.0
+    folder = DicomFolder(DicomFolderConfig(folder=tmp_path, stable_s=5.0), monotonic=lambda: now_s)
+    uid = generate_uid()
+    write_series(tmp_path, skip=(3, 4), uid=uid)
+    (series,) = folder.series()
+    assert "still arriving" in series.problems[0]
+    now_s += 4.0
+    write_series(tmp_path, skip=(0, 1, 2), uid=uid)
+    now_s += 2.0  # six seconds after the first slices, but they were not the last
+    assert "still arriving" in folder.series()[0].problems[0]
+    now_s += 5.1
+    (series,) = folder.series()
+    assert series.problems == ()
+    assert series.slices == SHAPE[0]
+    assert folder.report().problems == ()
