@@ -183,7 +183,7 @@ def ct(tmp_path_factory: pytest.TempPathFactory) -> Ct:
         truth = np.array(running.ready["truth"]["T_world_ct"])
         assert running.process.wait(20) == 0
     seconds = time.monotonic() - start
-    source = DicomFolder(DicomFolderConfig(folder=folder))
+    source = DicomFolder(DicomFolderConfig(folder=folder, stable_s=0.0))
     (series,) = source.series()
     assert series.problems == ()
     return Ct(source.read(series), truth, seconds)

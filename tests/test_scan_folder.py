@@ -230,6 +230,34 @@ def test_an_export_counts_when_it_has_stopped_changing(tmp_path: Path) -> None:
     assert scanner.exports() == ()
 
 
+def test_an_obj_without_a_newline_at_its_end_counts_once_it_is_stable(tmp_path: Path) -> None:
+    whole = write(tmp_path, "template.obj").read_bytes().rstrip()
+    (tmp_path / "template.obj").unlink()
+    scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, stable_s=0.15))
+    path = tmp_path / "scan.obj"
+    path.write_bytes(whole)
+    assert scanner.exports() == ()
+    assert "waiting" in scanner.pending()[0]
+    time.sleep(0.2)
+    (export,) = scanner.exports()
+    assert scanner.read(export).findings["faces"] == len(SPHERE.faces)
+
+
+@pytest.mark.parametrize(
+    "end", ["f 1 2", "f 1//1 2//2 3/", "f 1//1 2//2 3//", "f 1//1 2//2 3", "f", "v 1.0 2.0", "vn 0"]
+)
+def test_an_obj_that_ends_within_a_line_is_incomplete(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "scan.obj"
+    head = "v 0 0 0\nv 900 0 0\nv 0 900 0\nvn 0 0 1\nvn 0 0 1\nvn 0 0 1\nf 1//1 2//2 3//3\n"
+    path.write_text(head + "f 3//3 2//2 1//1")
+    assert read_mesh_file(path, "mm").findings["faces"] == 2
+    path.write_text(head + end)
+    refused(path, IncompleteExportError, "middle of a line", "mm")
+    announced = tmp_path / "announced.obj"
+    announced.write_text("# 3 faces\n" + head + "f 3//3 2//2 1//1")
+    refused(announced, IncompleteExportError, "2 faces of 3", "mm")
+
+
 def test_bad_exports_stay_pending_with_the_reason(tmp_path: Path) -> None:
     trimesh.PointCloud(SPHERE.vertices).export(tmp_path / "points.ply")
     (tmp_path / ".hidden.ply").write_bytes(b"ply")
