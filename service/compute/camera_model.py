@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -25,6 +26,12 @@ class CameraModel:
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, float]) -> CameraModel:
+        """The camera of a recorded result: its fields by name, the image size perhaps as floats."""
+        rest = {name: value for name, value in record.items() if name not in ("width", "height")}
+        return cls(int(record["width"]), int(record["height"]), **rest)
 
     @property
     def matrix(self) -> Array:

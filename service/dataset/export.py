@@ -35,8 +35,7 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
     images.mkdir(parents=True)
     registered = summary.result("registration")["registrations"][best]
     calibrated = next(s.result for s in summary.state.steps.values() if s.result.get("camera"))
-    intrinsics = dict(calibrated["camera"])
-    camera = CameraModel(int(intrinsics.pop("width")), int(intrinsics.pop("height")), **intrinsics)
+    camera = CameraModel.from_record(calibrated["camera"])
     poses: dict[str, Transform] = {}
     sources: dict[str, str] = {}
     for capture in summary.captures():

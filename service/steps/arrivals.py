@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import tempfile
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -78,7 +77,6 @@ def _record(context: StepContext, ref: ArtefactRef, device: str, note: str) -> N
         attempt=context.attempt,
         viewpoint=None,
         who=context.operator,
-        at_utc=datetime.now(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z"),
         monotonic_s=context.monotonic_s(),
     )
     payload = FilesKept(step=context.step.id, attempt=context.attempt, device=device, note=note, artefacts=(ref,))

@@ -7,7 +7,6 @@ import json
 import tempfile
 from collections.abc import Sequence, Set
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -197,7 +196,6 @@ def _expose(
         and pose.spread_rad <= criteria.rotation_peak_to_peak_rad,
         "settings": settings_agree(image.exif, wanted),
     }
-    now = datetime.now(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
     rows = tuple(
         NewArtefact(
             ref=ref,
@@ -206,7 +204,6 @@ def _expose(
             attempt=context.attempt,
             viewpoint=viewpoint.name,
             who=context.operator,
-            at_utc=now,
             monotonic_s=image.trigger_monotonic_s,
         )
         for ref in refs

@@ -50,8 +50,7 @@ class JobContext:
 
     def camera(self) -> CameraModel:
         """The job's camera."""
-        camera = dict(self.arguments["camera"])
-        return CameraModel(int(camera.pop("width")), int(camera.pop("height")), **camera)
+        return CameraModel.from_record(self.arguments["camera"])
 
 
 Handler = Callable[[JobContext], JobAnswer]
