@@ -1,4 +1,4 @@
-"""Rendered captures for benchmarks: images, camera, poses, joints, scan and truth of a simulated scene in one folder."""
+"""Rendered captures for benchmarks: images, camera, poses, scan and truth of a simulated scene in one folder."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Shot:
 
 
 def plan_shots(scene: Scene, views: int) -> list[Shot]:
-    """Views from both stations on two arcs, 14° and 32° from the vertical, a little irregular as in a real capture."""
+    """Views from both stations on two arcs, 14° and 32° from the vertical, a little irregular as in reality."""
     rng = np.random.default_rng([scene.seed, 0xBE4C])
     shots: list[Shot] = []
     for station, side in zip(STATIONS, (-1.0, 1.0), strict=True):
@@ -66,9 +66,9 @@ def plan_shots(scene: Scene, views: int) -> list[Shot]:
 def render_scene(seed: int, width: int, views: int, *, cache: Path = CACHE, workers: int = 1) -> Path:
     """The folder with the rendered capture; made when it is not there yet.
 
-    `images/`, `camera.json` (the true intrinsics), `poses.csv` (true T_world_camera), `robot_poses.csv` (T_base_flange
-    as the controller reports it), `joints.csv`, `stations.csv`, `spheres.json` (true centres, scan frame), `scan.ply`
-    (millimetres) and `truth.json` (T_world_scan, T_flange_camera, T_world_base).
+    `images/`, `camera.json` (the true intrinsics), `poses.csv` (true T_world_camera), `robot_poses.csv`
+    (T_base_flange as the controller reports it), `joints.csv`, `stations.csv`, `spheres.json` (true centres, scan
+    frame), `scan.ply` (millimetres) and `truth.json` (T_world_scan, T_flange_camera, T_world_base).
     """
     folder = cache / f"scene{seed:02d}_{width}_{views}"
     if (folder / "truth.json").is_file():

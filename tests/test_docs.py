@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.compute.pose_files import write_camera_json, write_poses_csv
+from service.compute.poses.pose_files import write_camera_json, write_poses_csv
 from service.core.model import JobFailed
 from service.core.protocol import load_protocol
 from service.core.protocol_docs import lifecycle_text, schema_text

@@ -8,14 +8,14 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.camera_model import CameraModel
-from service.compute.intrinsics import (
+from service.compute.calibration.intrinsics import (
     board_points,
     calibrate_intrinsics,
     detect_board,
     half_turn,
     locate_board,
 )
+from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from tests.support.textured_scene import TEXEL_M, Slab, camera_of_width, render

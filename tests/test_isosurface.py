@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from drivers.mesh_file import mesh_findings
-from service.compute.isosurface import surface
+from service.compute.surfaces.isosurface import surface
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, transform
 

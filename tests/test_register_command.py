@@ -16,7 +16,12 @@ from typer.testing import CliRunner, Result
 
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
-from service.compute.pose_files import write_camera_json, write_colmap_text, write_poses_csv, write_transforms_json
+from service.compute.poses.pose_files import (
+    write_camera_json,
+    write_colmap_text,
+    write_poses_csv,
+    write_transforms_json,
+)
 from service.core.geometry import apply, inverse, look_at
 from simulators.render import REFERENCE, Renderer
 from simulators.scan_formats import encode

@@ -17,7 +17,7 @@ from drivers.errors import IncompleteExportError
 from drivers.interfaces import Array, CtVolume, ScannedMesh
 from drivers.mesh_file import read_mesh_file
 from drivers.scan_folder import ScanFolder, ScanFolderConfig
-from service.compute.isosurface import surface
+from service.compute.surfaces.isosurface import surface
 from service.core.geometry import apply, inverse
 from simulators.ct_suite import true_frames, write_series
 from simulators.ct_volume import Grid

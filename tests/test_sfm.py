@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.compute.camera_model import CameraModel
-from service.compute.sfm import SfmModel, SfmOptions, choose_pairs, reconstruct
+from service.compute.poses.sfm import SfmModel, SfmOptions, choose_pairs, reconstruct
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Transform, align_points, apply
 from tests.support.textured_scene import camera_of_width, render, ring_of_poses, slabs

@@ -12,9 +12,9 @@ import typer
 
 from drivers.mesh_file import MeshUnit, read_mesh_file
 from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
-from service.compute.mesh_spheres import locate_spheres
 from service.compute.pipeline import detect_all, register_images
-from service.compute.pose_files import read_camera_json, read_poses, read_spheres_json
+from service.compute.poses.pose_files import read_camera_json, read_poses, read_spheres_json
+from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array
 

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from service.compute.camera_model import CameraModel
-from service.compute.pose_files import write_camera_json, write_poses_csv, write_transforms_json
+from service.compute.poses.pose_files import write_camera_json, write_poses_csv, write_transforms_json
 from service.core.errors import DataError
 from service.core.geometry import Transform
 from service.dataset.summary import RunSummary

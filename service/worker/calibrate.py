@@ -13,9 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from service.compute.hand_eye import calibrate_hand_eye
+from service.compute.calibration.hand_eye import calibrate_hand_eye
+from service.compute.calibration.intrinsics import calibrate_intrinsics, detect_board, half_turn, locate_board
 from service.compute.images import read_image
-from service.compute.intrinsics import calibrate_intrinsics, detect_board, half_turn, locate_board
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 from service.worker.job import JobAnswer, JobContext

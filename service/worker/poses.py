@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.compute.sfm import SfmOptions, reconstruct
+from service.compute.poses.sfm import SfmOptions, reconstruct
 from service.worker.job import JobAnswer, JobContext
 
 

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.constellations import match_constellations
 from service.compute.images import read_image
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.records import SphereOutline
@@ -21,6 +20,7 @@ from service.compute.registration.evaluation import evaluate as evaluate_control
 from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment
 from service.compute.registration.solve import RegistrationResult
+from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
 from service.core.model import ArtefactRef

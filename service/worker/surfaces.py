@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.constellations import match_constellations
-from service.compute.isosurface import surface
-from service.compute.mesh_spheres import MeshSphere
-from service.compute.mesh_spheres import locate_spheres as find_spheres
+from service.compute.surfaces.constellations import match_constellations
+from service.compute.surfaces.isosurface import surface
+from service.compute.surfaces.mesh_spheres import MeshSphere
+from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres
 from service.core.geometry import Array
 from service.worker.job import JobAnswer, JobContext
 

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from service.compute.camera_model import CameraModel
-from service.compute.colmap_convention import from_colmap_pose, to_colmap_camera
+from service.compute.poses.colmap_convention import from_colmap_pose, to_colmap_camera
 
 
 def main(stage: str, job: dict[str, Any], pipe: Connection) -> None:

@@ -13,8 +13,8 @@ from typing import Any, cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.compute import colmap_files
 from service.compute.camera_model import CameraModel
+from service.compute.poses import colmap_files
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, from_quaternion, transform
 

@@ -275,7 +275,7 @@ def _check_features(
 
 def _child(stage: str, job: dict[str, Any], pipe: Connection) -> None:
     """Import pycolmap in the child only: its import takes over the process's signal handlers."""
-    importlib.import_module("service.compute.sfm_process").main(stage, job, pipe)
+    importlib.import_module("service.compute.poses.sfm_process").main(stage, job, pipe)
 
 
 def _run(stage: str, job: dict[str, Any], report: Progress, timeout_s: float) -> dict[str, Any]:

@@ -47,7 +47,7 @@ def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> obj
 
 def _read(folder: str) -> dict[str, Transform] | str:
     colmap = importlib.import_module("pycolmap")
-    convention = importlib.import_module("service.compute.colmap_convention")
+    convention = importlib.import_module("service.compute.poses.colmap_convention")
     colmap.logging.minloglevel = colmap.logging.FATAL.value
     try:
         model = colmap.Reconstruction(folder)
@@ -59,7 +59,7 @@ def _read(folder: str) -> dict[str, Transform] | str:
 
 def _write(folder: str, camera: CameraModel, T_world_camera: dict[str, Transform]) -> str | None:
     colmap = importlib.import_module("pycolmap")
-    convention = importlib.import_module("service.compute.colmap_convention")
+    convention = importlib.import_module("service.compute.poses.colmap_convention")
     colmap.logging.minloglevel = colmap.logging.FATAL.value
     model = colmap.Reconstruction()
     model.add_camera_with_trivial_rig(convention.to_colmap_camera(camera))

@@ -1,0 +1,1 @@
+"""Camera intrinsics and hand-eye from images of a calibration board."""

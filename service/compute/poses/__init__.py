@@ -1,0 +1,1 @@
+"""Camera poses: structure from motion, and the files that hold poses."""

@@ -1,0 +1,1 @@
+"""Spheres and surfaces in scans and CT volumes."""
