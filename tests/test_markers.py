@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.cones import Cone, cone_ellipse, cone_of_sphere, fit_cone, ransac_cone
 from service.compute.markers.detect import detect_spheres, refine_outline
 from service.compute.markers.records import DetectionOptions, SphereOutline
@@ -168,6 +172,15 @@ def test_record_is_whole() -> None:
     assert np.allclose(found.centre_camera_m(RADIUS_M), centre, atol=0.003)
     assert 0.4 < found.coverage <= 1
     assert 0 < found.rms_px < 0.3
+
+
+def test_an_outline_survives_its_record() -> None:
+    cam = camera(1024)
+    (found,) = detect_spheres(render(cam, np.array([[0.05, 0.02, 0.6]]), 4), cam)
+    again = outline_from_record(json.loads(json.dumps(outline_record(found))), cam)
+    for name in (field.name for field in dataclasses.fields(SphereOutline) if field.name != "cone"):
+        assert np.array_equal(getattr(again, name), getattr(found, name)), name
+    assert np.array_equal(again.cone.axis, found.cone.axis)
 
 
 def test_wrong_size_is_refused() -> None:

@@ -74,7 +74,8 @@ def exact_outlines(
         (pixels > margin_px) & (pixels < np.array([made.camera.width, made.camera.height]) - margin_px), axis=1
     )
     order = rng.permutation(np.nonzero(inside & (c[:, 2] > 0.1))[0])
-    evidence = Evidence(1.0, 0.1, max(noise_px, 0.02) * 10, 300, 0.02, 0.3, (180.0, 180.0, 180.0), 0.9)
+    covariance = np.eye(3) * (max(noise_px, 0.02) / made.camera.fx) ** 2
+    evidence = Evidence(1.0, 0.1, max(noise_px, 0.02) * 10, 300, 0.02, 0.3, (180.0, 180.0, 180.0), 0.9, covariance)
     out: list[SphereOutline] = []
     for k in order:
         cone = cone_of_sphere(c[k], RADIUS_M)
@@ -88,7 +89,7 @@ def exact_outlines(
 def false_outlines(cam: CameraModel, n: int, seed: int = 0) -> tuple[SphereOutline, ...]:
     """Detections of things that are no spheres, at random places, of likely sizes."""
     rng = np.random.default_rng(seed)
-    evidence = Evidence(0.8, 0.2, 0.2, 200, 0.05, 0.2, (120.0, 120.0, 120.0), 0.6)
+    evidence = Evidence(0.8, 0.2, 0.2, 200, 0.05, 0.2, (120.0, 120.0, 120.0), 0.6, np.eye(3) * (0.1 / cam.fx) ** 2)
     out: list[SphereOutline] = []
     for _ in range(n):
         pixel = rng.uniform([0, 0], [cam.width, cam.height])[None]

@@ -17,6 +17,7 @@ _EVIDENCE = tuple(field.name for field in dataclasses.fields(Evidence))
 def outline_record(outline: SphereOutline) -> dict[str, Any]:
     """An outline as JSON data."""
     record: dict[str, Any] = {name: getattr(outline, name) for name in _EVIDENCE}
+    record["cone_covariance"] = outline.cone_covariance.tolist()
     record["axis"] = outline.cone.axis.tolist()
     record["half_angle_rad"] = float(outline.cone.half_angle_rad)
     record["centre_px"] = list(outline.centre_px)
@@ -27,7 +28,9 @@ def outline_record(outline: SphereOutline) -> dict[str, Any]:
 
 def outline_from_record(record: dict[str, Any], camera: CameraModel) -> SphereOutline:
     """The outline again, its points sampled anew on the same conic."""
-    evidence = Evidence(**{name: _value(record[name]) for name in _EVIDENCE})
+    values = {name: _value(record[name]) for name in _EVIDENCE}
+    values["cone_covariance"] = np.array(record["cone_covariance"], dtype=np.float64)
+    evidence = Evidence(**values)
     cone = Cone(np.array(record["axis"]), float(record["half_angle_rad"]))
     return outline_from_cone(cone, camera, DetectionOptions().n_points, evidence)
 

@@ -105,14 +105,21 @@ def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> C
         local = rays @ frame
         azimuth = np.arctan2(local[:, 1], local[:, 0])
         residual = angles_to(cone, rays)
-        # Tilting the axis by t towards azimuth p shortens the distance of a ray at azimuth q by t cos(p - q).
-        J = np.stack([-np.cos(azimuth), -np.sin(azimuth), -np.ones(len(rays))], axis=1)
+        J = distance_gradient(azimuth)
         step = np.linalg.lstsq(J * w[:, None], -residual * w, rcond=None)[0]
         axis = cone.axis + frame[:, :2] @ step[:2]
         cone = Cone(axis / np.linalg.norm(axis), cone.half_angle_rad + float(step[2]))
         if float(np.abs(step).max()) < 1e-12:
             break
     return cone
+
+
+def distance_gradient(azimuth_rad: Array) -> Array:
+    """(N, 3) change of the angular distance of rays at these azimuths with the axis's shift along frame() and h.
+
+    Tilting the axis by t towards azimuth p shortens the distance of a ray at azimuth q by t cos(p - q).
+    """
+    return np.stack([-np.cos(azimuth_rad), -np.sin(azimuth_rad), -np.ones(len(azimuth_rad))], axis=1)
 
 
 def cones_through(triples: Array) -> tuple[Array, Array]:

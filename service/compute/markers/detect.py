@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.candidates import Candidate, colour_gradient, edges, find_candidates
-from service.compute.markers.cones import Cone, angles_to, fit_cone, ransac_cone
+from service.compute.markers.cones import Cone, angles_to, distance_gradient, fit_cone, ransac_cone
 from service.compute.markers.edges import (
     colour_values,
     coloured_edge_profiles,
@@ -27,6 +27,7 @@ from service.core.geometry import Array
 POOR_LUMA_PX = 0.3  # sigma of an edge point above which the outline is also tried in colour
 MOST_SHIFT_PX = 0.5  # between colours that shift the luma edge more than this, the edge is not used
 # Measured on rendered scenes with exact truth: what stays of an outline's error when its noise has averaged out.
+NOISE_CORRELATION = 2.0  # neighbouring profiles share pixels: edge points over independent ones
 LUMA_SYSTEMATIC_PX, COLOUR_SYSTEMATIC_PX = 0.06, 0.15
 
 
@@ -276,8 +277,9 @@ def refine_outline(
     middle = camera.project(best.cone.axis[None])[0]
     colour = _median_colour(image_bgr, middle, 0.5 * best.cone.half_angle_rad * camera.fx)
     evidence = Evidence(
-        best.coverage, best.rms_px, best.sigma_px, best.n_edges, best.systematic_px, best.contrast, colour, score
-    )
+        best.coverage, best.rms_px, best.sigma_px, best.n_edges, best.systematic_px, best.contrast, colour, score,
+        best.covariance,
+    )  # fmt: skip
     return outline_from_cone(best.cone, camera, options.n_points, evidence)
 
 
@@ -292,6 +294,7 @@ class _Measured:
     n_edges: int
     contrast: float
     systematic_px: float
+    covariance: Array
 
 
 def _measure(
@@ -323,7 +326,11 @@ def _measure(
     fitted, used, coverage, sigma_px, rms_px = result
     contrast = float(np.median(np.abs(found.step[used])))
     systematic = COLOUR_SYSTEMATIC_PX if by_colour else LUMA_SYSTEMATIC_PX
-    return _Measured(fitted, coverage, sigma_px, rms_px, int(used.sum()), contrast, systematic)
+    spread = (sigma_px / camera.fx) ** 2 * NOISE_CORRELATION
+    J = distance_gradient(where.azimuth_rad[used])
+    noise = np.asarray(np.linalg.inv(J.T @ J), dtype=np.float64) * spread
+    covariance = noise + np.eye(3) * (systematic / camera.fx) ** 2
+    return _Measured(fitted, coverage, sigma_px, rms_px, int(used.sum()), contrast, systematic, covariance)
 
 
 def _robust_cone(

@@ -43,6 +43,10 @@ class SphereOutline:
     `points` are (L, 2) undistorted normalised coordinates (z = 1), equidistant on the fitted conic, and
     `points_px` the same in pixels of an ideal pinhole with the camera's K. `centre_px` is the conic's centre in the
     image as captured; it is not the projection of the sphere's centre, whose direction is `cone.axis`.
+
+    `cone_covariance` (3, 3), rad²: of the displacement of the cone's axis along the first and the second column of
+    `cone.frame()` and of the half angle, in this order (true axis ~ axis + frame[:, :2] @ d[:2], true half angle ~
+    half angle + d[2]). It holds the noise of the edge points and what is systematic within one outline.
     """
 
     points: Array = field(repr=False)
@@ -60,6 +64,7 @@ class SphereOutline:
     contrast: float  # median step across the outline over full scale, linear light
     colour_bgr: tuple[float, float, float]  # median inside, 0..255
     score: float  # 0..1, how much it looks like a sphere
+    cone_covariance: Array = field(repr=False)
 
     def captured_px(self, camera: CameraModel) -> Array:
         """(L, 2) the outline in pixels of the image as captured (with distortion)."""
@@ -82,6 +87,7 @@ class Evidence:
     contrast: float
     colour_bgr: tuple[float, float, float]
     score: float
+    cone_covariance: Array  # (3, 3), see SphereOutline
 
 
 def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: Evidence) -> SphereOutline:
@@ -107,4 +113,5 @@ def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: 
         contrast=evidence.contrast,
         colour_bgr=evidence.colour_bgr,
         score=evidence.score,
+        cone_covariance=evidence.cone_covariance,
     )
