@@ -27,7 +27,7 @@ docs: $(READY)
 	$(BIN)/orthocapture protocol diagram protocols/exvivo_spine.yaml > docs/state_machine.md
 
 bench: $(READY)
-	$(BIN)/python bench/demo_accuracy.py
+	$(BIN)/python -m bench.demo_accuracy
 
 # A new lock: needs uv (pip install uv).
 lock:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -15,7 +13,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-REPOSITORY = Path(__file__).parents[1]
+from bench.machine import REPOSITORY, commit, machine
+
 RESULTS = Path(__file__).parent / "results"
 MEASURES = (  # name in the demo's table, heading
     ("mean_radial_error_mm", "mean radial error (mm)"),
@@ -129,27 +128,6 @@ def as_markdown(record: Mapping[str, Any]) -> str:
             figures = " | ".join(f"{row[key]['median']:.3f}, {row[key]['worst']:.3f}" for key, _ in MEASURES)
             lines.append(f"| {source} | {figures} |")
     return "\n".join(lines) + "\n"
-
-
-def machine() -> dict[str, Any]:
-    """What the durations hold for."""
-    cpu = Path("/proc/cpuinfo")
-    models = [s for s in cpu.read_text().splitlines() if s.startswith("model name")] if cpu.exists() else []
-    return {
-        "processor": models[0].split(":", 1)[1].strip() if models else platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "memory_gb": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
-        "system": platform.system(),
-        "python": platform.python_version(),
-    }
-
-
-def commit() -> str:
-    """The revision that was measured, `+` behind it when files of the working tree differ from it."""
-    answer = subprocess.run(
-        ["git", "describe", "--always", "--dirty=+"], cwd=REPOSITORY, capture_output=True, text=True, check=False
-    )
-    return answer.stdout.strip() or "unknown"
 
 
 if __name__ == "__main__":
