@@ -18,6 +18,7 @@ _COMMANDS = {
     "status": "service.cli.run:status_command",
     "worker": "service.cli.worker:worker_command",
     "doctor": "service.cli.doctor:doctor_command",
+    "calibrate": "service.cli.calibrate:calibrate_app",
     "register": "service.cli.register:register_command",
     "simulate": "service.cli.simulate:simulate_command",
     "audit": "service.cli.audit:audit_app",
