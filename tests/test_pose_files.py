@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -149,7 +151,8 @@ def test_camera_json(tmp_path: Path) -> None:
         read_camera_json(path, (640, 480))
     good: dict[str, Any] = json.loads(path.read_text())
     for change, message in (
-        ({"k3": 0.1}, "unknown k3"),
+        ({"k7": 0.1}, "unknown k7"),
+        ({"k3": "small"}, "k3 is 'small'"),
         ({"fx": None}, "missing fx"),
         ({"fx": "wide"}, "fx is 'wide'"),
         ({"fx": -3.0}, "positive"),
@@ -158,6 +161,22 @@ def test_camera_json(tmp_path: Path) -> None:
         path.write_text(json.dumps({k: v for k, v in document.items() if v is not None}))
         with pytest.raises(DataError, match=message):
             read_camera_json(path)
+
+
+def test_more_distortion_goes_through_the_files_that_can_hold_it(tmp_path: Path) -> None:
+    camera = dataclasses.replace(CAMERA, k3=0.02, k4=0.01, k5=-0.004, k6=0.001)
+    path = tmp_path / "camera.json"
+    write_camera_json(path, camera)
+    assert read_camera_json(path) == camera
+    pixels = np.random.default_rng(0).uniform(0, 1024, (50, 2))
+    rays = np.column_stack([camera.normalise(pixels), np.ones(50)])
+    np.testing.assert_allclose(camera.project(rays), pixels, atol=1e-6)
+    reference = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0].reshape(-1, 2)
+    np.testing.assert_allclose(camera.project(rays), reference, atol=1e-9)
+    write_colmap_text(tmp_path / "model", camera, {"a.jpg": np.eye(4)})
+    assert "FULL_OPENCV" in (tmp_path / "model" / "cameras.txt").read_text()
+    with pytest.raises(DataError, match="rational"):
+        write_transforms_json(tmp_path / "t.json", camera, {"a.jpg": np.eye(4)})
 
 
 def test_spheres_json(tmp_path: Path) -> None:

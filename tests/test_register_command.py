@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 from dataclasses import dataclass
@@ -63,7 +64,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     folder = tmp_path_factory.mktemp("capture")
     scene = Scene.generate(SEED)
     lens = scene.camera_intrinsics(WIDTH)
-    camera = CameraModel(**{name: getattr(lens, name) for name in CameraModel.__dataclass_fields__})
+    camera = CameraModel(**dataclasses.asdict(lens))
     renderer = Renderer(WIDTH)
     poses: dict[str, Array] = {}
     (folder / "images").mkdir()

@@ -1,4 +1,4 @@
-"""The pinhole camera with two radial and two tangential distortion terms (OpenCV conventions)."""
+"""The pinhole camera with OpenCV's distortion: k1, k2, p1, p2, and k3 … k6 where a calibration asks for them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,15 @@ import numpy as np
 from service.core.geometry import Array
 
 
+_OPTIONAL = ("k3", "k4", "k5", "k6")
+
+
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """Intrinsics in pixels for images of width × height; pixel centres lie at integer coordinates."""
+    """Intrinsics in pixels for images of width × height; pixel centres lie at integer coordinates.
+
+    The distortion is OpenCV's: radial (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶), tangential p1, p2.
+    """
 
     width: int
     height: int
@@ -26,12 +32,21 @@ class CameraModel:
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+    k5: float = 0.0
+    k6: float = 0.0
 
     @classmethod
     def from_record(cls, record: Mapping[str, float]) -> CameraModel:
         """The camera of a recorded result: its fields by name, the image size perhaps as floats."""
         rest = {name: value for name, value in record.items() if name not in ("width", "height")}
         return cls(int(record["width"]), int(record["height"]), **rest)
+
+    def record(self) -> dict[str, float]:
+        """The camera as `from_record` reads it; k3 … k6 only where one is not zero."""
+        fields = dataclasses.asdict(self)
+        return {name: value for name, value in fields.items() if name not in _OPTIONAL or value != 0}
 
     @property
     def matrix(self) -> Array:
@@ -40,14 +55,16 @@ class CameraModel:
 
     @property
     def distortion(self) -> Array:
-        """(4,) k1, k2, p1, p2."""
-        return np.array([self.k1, self.k2, self.p1, self.p2])
+        """(4,) k1, k2, p1, p2; (5,) with k3, (8,) with k3 … k6, where these are not zero."""
+        terms = np.array([self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6])
+        return terms if terms[5:].any() else terms[:5] if self.k3 else terms[:4]
 
     def project(self, points_camera: Array) -> Array:
         """Distorted pixels (N, 2) of points (N, 3) in the camera frame."""
         xy = points_camera[:, :2] / points_camera[:, 2:]
         r2 = np.sum(xy**2, axis=1)
-        radial = 1.0 + r2 * (self.k1 + r2 * self.k2)
+        radial = 1.0 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        radial /= 1.0 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
         x, y = xy[:, 0], xy[:, 1]
         xd = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
         yd = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y

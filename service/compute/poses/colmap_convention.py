@@ -13,10 +13,11 @@ HALF_PIXEL = 0.5  # COLMAP's first pixel spans 0..1, so its centre lies at 0.5; 
 
 
 def to_colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
-    """COLMAP's OPENCV camera of our calibrated one."""
+    """COLMAP's OPENCV camera of our calibrated one; FULL_OPENCV where it has more than k1, k2, p1, p2."""
+    more = [camera.k3, camera.k4, camera.k5, camera.k6]
     return pycolmap.Camera(
         camera_id=camera_id,
-        model="OPENCV",
+        model="FULL_OPENCV" if any(more) else "OPENCV",
         width=camera.width,
         height=camera.height,
         params=[
@@ -28,6 +29,7 @@ def to_colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera
             camera.k2,
             camera.p1,
             camera.p2,
+            *(more if any(more) else []),
         ],
     )
 
@@ -41,8 +43,9 @@ def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
     p = [float(v) for v in camera.params]
     size = (int(camera.width), int(camera.height))
     name = camera.model_name
-    if name == "OPENCV":
-        fx, fy, cx, cy, k1, k2, p1, p2 = p
+    more: list[float] = []
+    if name in {"OPENCV", "FULL_OPENCV"}:
+        fx, fy, cx, cy, k1, k2, p1, p2, *more = p
     elif name == "PINHOLE":
         (fx, fy, cx, cy), (k1, k2, p1, p2) = p, (0.0,) * 4
     elif name in {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"}:
@@ -53,9 +56,9 @@ def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
         raise DataError(
             f"camera model {name} is not supported",
             where=f"camera {camera.camera_id}",
-            remedy="export the model with an OPENCV, RADIAL, SIMPLE_RADIAL or PINHOLE camera",
+            remedy="export the model with an OPENCV, FULL_OPENCV, RADIAL, SIMPLE_RADIAL or PINHOLE camera",
         )
-    return CameraModel(*size, fx, fy, cx - HALF_PIXEL, cy - HALF_PIXEL, k1, k2, p1, p2)
+    return CameraModel(*size, fx, fy, cx - HALF_PIXEL, cy - HALF_PIXEL, k1, k2, p1, p2, *more)
 
 
 def to_colmap_pose(T_world_camera: Transform) -> pycolmap.Rigid3d:

@@ -22,6 +22,12 @@ _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # how far a quaternion's length may be from 1: files with four decimals pass
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y up, z backward
 _CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+_MORE_DISTORTION = ("k3", "k4", "k5", "k6")
+#: What `calibrate intrinsics` writes beside the camera into the same file.
+CALIBRATION_KEYS = (
+    "model", "board", "rms_px", "per_view_rms_px", "sigma", "sigma_px", "n_views", "excluded", "covariance", "coverage",
+    "cross_validation", "uncertainty", "residuals", "optics", "warnings",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +189,17 @@ def _rotation(matrix: Array, where: str) -> Array:
 
 
 def write_transforms_json(path: Path, camera: CameraModel, T_world_camera: Mapping[str, Transform]) -> None:
-    """Write poses and camera as nerfstudio's transforms.json (OPENCV model, OpenGL camera axes)."""
+    """Write poses and camera as nerfstudio's transforms.json (OPENCV model, OpenGL camera axes).
+
+    Raises:
+        DataError: the camera has rational distortion, which that format cannot hold.
+    """
+    if camera.k4 or camera.k5 or camera.k6:
+        raise DataError(
+            "transforms.json cannot hold the rational distortion k4, k5, k6",
+            where=str(path),
+            remedy="calibrate with the model opencv4 or opencv5",
+        )
     document = {
         "camera_model": "OPENCV",
         "w": camera.width,
@@ -197,6 +213,7 @@ def write_transforms_json(path: Path, camera: CameraModel, T_world_camera: Mappi
         "k2": camera.k2,
         "p1": camera.p1,
         "p2": camera.p2,
+        **({"k3": camera.k3} if camera.k3 else {}),
         "frames": [
             {"file_path": name, "transform_matrix": (T @ _OPENGL).tolist()} for name, T in T_world_camera.items()
         ],
@@ -240,16 +257,19 @@ def write_colmap_text(folder: Path, camera: CameraModel, T_world_camera: Mapping
 
 
 def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> CameraModel:
-    """Camera from {"width","height","fx","fy","cx","cy","k1","k2","p1","p2"} (OpenCV conventions).
+    """Camera from {"width","height","fx","fy","cx","cy","k1","k2","p1","p2"} (OpenCV conventions), perhaps k3 … k6.
+
+    A file that `calibrate intrinsics` wrote holds what it knows of the calibration beside these; any other key is
+    refused, since it may change what the numbers mean.
 
     Raises:
         DataError: a key is missing, unknown or not a number, or the size is not the images' (width, height).
     """
     document = _object(path)
-    _check_keys(document, set(_CAMERA_KEYS), set(), path)
+    _check_keys(document, set(_CAMERA_KEYS), {*_MORE_DISTORTION, *CALIBRATION_KEYS}, path)
     values: dict[str, float] = {}
-    for key in _CAMERA_KEYS:
-        value = document[key]
+    for key in (*_CAMERA_KEYS, *_MORE_DISTORTION):
+        value = document.get(key, 0.0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise DataError(f"{key} is {value!r}, not a number", where=str(path), remedy=f"correct {key}")
         values[key] = value
@@ -262,13 +282,12 @@ def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> C
             where=str(path),
             remedy="use images of the calibrated size, or calibrate at theirs",
         )
-    return CameraModel(*size, *(float(values[k]) for k in _CAMERA_KEYS[2:]))
+    return CameraModel(*size, *(float(values[k]) for k in (*_CAMERA_KEYS, *_MORE_DISTORTION)[2:]))
 
 
 def write_camera_json(path: Path, camera: CameraModel) -> None:
     """Write a camera as `read_camera_json` reads it."""
-    document = {key: getattr(camera, key) for key in _CAMERA_KEYS}
-    path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(camera.record(), indent=2) + "\n", encoding="utf-8")
 
 
 def read_spheres_json(path: Path) -> SphereFile:
