@@ -24,6 +24,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from service.compute.camera_model import CameraModel
+from service.compute.poses.tracks import Tracks
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 
@@ -32,6 +33,7 @@ logger = logging.getLogger(__name__)
 _TABLES = {"extract": "SELECT COUNT(*) FROM keypoints", "match": "SELECT COUNT(*) FROM two_view_geometries"}
 
 Mapper = Literal["incremental", "global"]
+Refine = Literal["nothing", "principal_point", "intrinsics"]
 Progress = Callable[[str, int, int], None]  # stage, done, total (total 0: unknown)
 
 
@@ -50,6 +52,7 @@ class SfmOptions:
         min_track: views a point needs to take part in the final bundle adjustment.
         loss_px: scale of the final bundle adjustment's robust (Cauchy) loss.
         threads: of extraction, matching and bundle adjustment.
+        refine: what the final bundle adjustment may change in the calibrated camera.
         seed: of every random choice.
         timeout_s: after which one stage is given up.
     """
@@ -64,6 +67,7 @@ class SfmOptions:
     min_track: int = 3
     loss_px: float = 0.5
     threads: int = 2
+    refine: Refine = "nothing"
     seed: int = 1
     timeout_s: float = 3600.0
 
@@ -75,7 +79,8 @@ class SfmModel:
     Attributes:
         mapper: which mapper made it.
         T_world_camera: pose of each registered image.
-        points_world: (P, 3) triangulated points.
+        tracks: triangulated points and their observations; images in the order of T_world_camera.
+        camera: as given, or refined.
         mean_reprojection_error_px: mean distance of all observations.
         mean_track_length: observations for each point.
         n_registered: images in the model.
@@ -87,7 +92,8 @@ class SfmModel:
 
     mapper: Mapper
     T_world_camera: dict[str, Transform]
-    points_world: Array
+    tracks: Tracks = field(repr=False)
+    camera: CameraModel
     mean_reprojection_error_px: float
     mean_track_length: float
     n_registered: int
@@ -95,6 +101,11 @@ class SfmModel:
     n_models: int
     folder: Path
     seconds: dict[str, float] = field(default_factory=dict[str, float])
+
+    @property
+    def points_world(self) -> Array:
+        """(P, 3) triangulated points."""
+        return self.tracks.points
 
 
 def reconstruct(
@@ -114,7 +125,7 @@ def reconstruct(
 
     Args:
         images: file of each image by name, or files whose names are unique.
-        camera: calibrated at the images' size; held fixed.
+        camera: calibrated at the images' size; held fixed unless the options refine it.
         workspace: folder for the database, the models and COLMAP's log; made if missing.
         mapper: COLMAP's incremental mapper or the global one (GLOMAP).
         T_world_camera_prior: rough poses in one frame (from the robot) that choose the pairs to match; images
@@ -364,10 +375,13 @@ def _model(
             where=os.fspath(workspace),
             remedy="check the images' overlap, sharpness and texture",
         )
+    position = {names.index(name): k for k, name in enumerate(poses)}
+    image = np.array([position[int(i)] for i in outcome["track_image"]], dtype=np.int64)
     return SfmModel(
         mapper,
         poses,
-        outcome["points"],
+        Tracks(image, outcome["track_point"], outcome["track_pixels"], outcome["points"]),
+        CameraModel(**outcome["camera"]),
         outcome["error_px"],
         outcome["track_length"],
         len(poses),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import shutil
 from collections.abc import Callable
@@ -13,7 +14,12 @@ import numpy as np
 import pycolmap
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.colmap_convention import from_colmap_pose, to_colmap_camera
+from service.compute.poses.colmap_convention import (
+    from_colmap_camera,
+    from_colmap_pixels,
+    from_colmap_pose,
+    to_colmap_camera,
+)
 
 
 def main(stage: str, job: dict[str, Any], pipe: Connection) -> None:
@@ -47,7 +53,7 @@ def _extract(job: dict[str, Any], _pipe: Connection) -> dict[str, Any]:
     extraction.sift.first_octave = options["first_octave"]
     camera = to_colmap_camera(CameraModel(**job["camera"]))
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "OPENCV"
+    reader.camera_model = camera.model_name
     reader.camera_params = ",".join(repr(float(p)) for p in camera.params)
     workspace = Path(job["workspace"])
     pycolmap.extract_features(
@@ -109,7 +115,7 @@ def _map(job: dict[str, Any], pipe: Connection) -> dict[str, Any]:
     raw.mkdir()
     models = (_incremental if job["mapper"] == "incremental" else _global)(job, raw, pipe)
     if not models:
-        return {"poses": {}, "points": np.empty((0, 3)), "error_px": np.inf, "track_length": 0.0, "n_models": 0}
+        return {"poses": {}, "error_px": np.inf, "n_models": 0}
     best = max(models.values(), key=lambda m: m.num_reg_images())
     _refine(best, job)
     index = {name: k for k, name in enumerate(job["internal"])}
@@ -124,10 +130,31 @@ def _map(job: dict[str, Any], pipe: Connection) -> dict[str, Any]:
     best.write_binary(final)
     return {
         "poses": poses,
-        "points": np.array([p.xyz for p in best.points3D.values()]).reshape(-1, 3),
+        "camera": dataclasses.asdict(from_colmap_camera(best.cameras[best.image(best.reg_image_ids()[0]).camera_id])),
+        **_tracks(best, {job["names"][k]: k for k in poses}),
         "error_px": float(best.compute_mean_reprojection_error()),
         "track_length": float(best.compute_mean_track_length()),
         "n_models": len(models),
+    }
+
+
+def _tracks(model: pycolmap.Reconstruction, index: dict[str, int]) -> dict[str, Any]:
+    """Points (P, 3), and image index, point index and our pixels of every observation."""
+    number = {point_id: k for k, point_id in enumerate(model.points3D)}
+    image_index: list[int] = []
+    points: list[int] = []
+    pixels: list[Any] = []
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        for observation in image.get_observation_points2D():
+            image_index.append(index[image.name])
+            points.append(number[observation.point3D_id])
+            pixels.append(observation.xy)
+    return {
+        "points": np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3),
+        "track_image": np.array(image_index, dtype=np.int64),
+        "track_point": np.array(points, dtype=np.int64),
+        "track_pixels": from_colmap_pixels(np.array(pixels).reshape(-1, 2)),
     }
 
 
@@ -180,13 +207,14 @@ def _global(job: dict[str, Any], raw: Path, _pipe: Connection) -> dict[int, pyco
 
 
 def _refine(model: pycolmap.Reconstruction, job: dict[str, Any]) -> None:
-    """Drop doubtful observations, then adjust poses and points to convergence with the camera held."""
+    """Drop doubtful observations, then adjust poses and points, and the camera if wanted, to convergence."""
     settings = job["options"]
     scale = _reduction(job)
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = False
-    options.refine_principal_point = False
-    options.refine_extra_params = False
+    # A principal point that is held wrong turns the cameras by its angle, so intrinsics are refined with it or not.
+    options.refine_focal_length = settings["refine"] == "intrinsics"
+    options.refine_principal_point = settings["refine"] != "nothing"
+    options.refine_extra_params = settings["refine"] == "intrinsics"
     options.print_summary = False
     options.min_track_length = settings["min_track"]
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY

@@ -1,0 +1,207 @@
+"""Solves a bundle adjustment robustly, estimates its variance components, and gives the covariance of its poses."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+
+from service.compute.poses.bundle import Data, Normal, Rows, Sigmas, State, linearise, moved, normal_equations
+from service.core.errors import ComputeError
+from service.core.geometry import Array
+
+_CAUCHY = {"tracks": 2.4, "spheres": 3.0, "robot_position": 3.0, "robot_rotation": 3.0}  # scale, in sigmas
+_SETTLED = 1e-7  # relative change of the cost at which an adjustment has converged
+_MOST_STEPS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The adjusted state.
+
+    Attributes:
+        state: cameras, points, bases, camera.
+        sigmas: of the components, estimated.
+        weights: robust weight of each measurement, by component.
+        covariance: (n, n) of the frame parameters, points eliminated.
+        chi2: reduced chi square of each component, robust weights applied, by its own redundancy.
+        redundancy: of each component; all of them and the number of parameters add up to the number of rows.
+        steps: linearisations that it took.
+    """
+
+    state: State
+    sigmas: Sigmas
+    weights: dict[str, Array]
+    covariance: Array
+    chi2: dict[str, float]
+    redundancy: dict[str, float]
+    steps: int
+
+
+def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solution:
+    """Levenberg–Marquardt with Cauchy weights, the components' variances estimated between rounds.
+
+    Variances by Förstner's estimate: each component's weighted squares over its redundancy (Koch, Parameter
+    Estimation and Hypothesis Testing in Linear Models, 3.6).
+
+    Raises:
+        ComputeError: it does not converge, or something is not determined by the data.
+    """
+    steps = 0
+    chi2: dict[str, float] = {}
+    redundancy: dict[str, float] = {}
+    weights: dict[str, Array] = {}
+    covariance = np.empty((0, 0))
+    for turn in range(rounds):
+        state, used = _descend(state, data, sigmas)
+        steps += used
+        rows = linearise(state, data, sigmas)
+        weights = _weights(rows)
+        weighted = {name: r.weighted(weights[name]) for name, r in rows.items()}
+        normal = normal_equations(list(weighted.values()))
+        covariance = _inverse(normal.schur)
+        redundancy = _redundancy(weighted, normal, covariance)
+        chi2 = {
+            name: float(np.sum(r.squares)) / max(redundancy[name], 1e-3) / (_EXPECTED[name][0] if name in _EXPECTED else 1)
+            for name, r in weighted.items()
+        }
+        if turn + 1 < rounds:
+            sigmas = _estimated(sigmas, chi2, redundancy)
+        else:
+            covariance = _clustered(weighted, normal, redundancy)
+    return Solution(state, sigmas, weights, covariance, chi2, redundancy, steps)
+
+
+def _descend(state: State, data: Data, sigmas: Sigmas) -> tuple[State, int]:
+    damping, cost = 1e-6, math.inf
+    rows = linearise(state, data, sigmas)
+    cost = _cost(rows)
+    for step in range(1, _MOST_STEPS + 1):
+        weights = _weights(rows)
+        normal = normal_equations([r.weighted(weights[name]) for name, r in rows.items()], damping)
+        candidate = moved(state, data, *normal.step(damping))
+        after = linearise(candidate, data, sigmas)
+        new = _cost(after)
+        if not math.isfinite(new):
+            raise ComputeError("the bundle adjustment diverged", remedy="check the camera, the poses and the spheres")
+        if new <= cost:
+            settled = cost - new <= _SETTLED * cost
+            state, rows, cost, damping = candidate, after, new, max(damping / 10, 1e-9)
+            if settled:
+                return state, step
+        elif new - cost <= _SETTLED * cost:
+            return state, step
+        else:
+            damping *= 30
+            if damping > 1e6:
+                return state, step
+    return state, _MOST_STEPS
+
+
+def _weights(rows: dict[str, Rows]) -> dict[str, Array]:
+    """Cauchy weights of the measurements of each component; prior knowledge is not doubted."""
+    return {
+        name: 1 / (1 + r.squares / _CAUCHY[name] ** 2) if name in _CAUCHY else np.ones(len(r.squares))
+        for name, r in rows.items()
+    }
+
+
+def _cost(rows: dict[str, Rows]) -> float:
+    total = 0.0
+    for name, r in rows.items():
+        if name in _CAUCHY:
+            c2 = _CAUCHY[name] ** 2
+            total += float(np.sum(c2 * np.log1p(r.squares / c2)))
+        else:
+            total += float(np.sum(r.squares))
+    return total
+
+
+def _inverse(schur: Array) -> Array:
+    diagonal = np.diag(schur)
+    if np.any(diagonal <= 0):
+        raise ComputeError("a camera or a base is not determined by the data")
+    d = 1 / np.sqrt(diagonal)
+    scaled = schur * np.outer(d, d)
+    values = np.linalg.eigvalsh(scaled)
+    if values[0] <= 1e-13 * values[-1]:
+        raise ComputeError(
+            "the adjustment is not determined: frame, scale or a camera is free",
+            remedy="Use images that share texture and show at least three spheres",
+        )
+    return np.linalg.inv(scaled) * np.outer(d, d)
+
+
+def _redundancy(weighted: dict[str, Rows], normal: Normal, covariance: Array) -> dict[str, float]:
+    """Rows of each component less the parameters that they determine."""
+    out: dict[str, float] = {}
+    cross = normal.cross
+    left = float(sum(len(r.residual) for r in weighted.values()) - len(covariance) - cross.shape[1])
+    for name, r in weighted.items():
+        if name == "tracks":
+            continue
+        J = r.frame.toarray()
+        if r.point.nnz:
+            # A point's increment is -V^-1 W^T of the cameras' increment, plus what its own rows allow.
+            used = np.unique(r.point.indices // 3)
+            columns = (3 * used[:, None] + np.arange(3)).ravel()
+            inverse = normal.inverse_blocks.tocsr()[columns][:, columns].toarray()
+            P = r.point[:, columns].toarray()
+            G = inverse @ cross[:, columns].T.toarray()
+            full = J - P @ G
+            taken = np.einsum("ij,jk,ik->", full, covariance, full) + np.einsum("ij,jk,ik->", P, inverse, P)
+        else:
+            taken = np.einsum("ij,jk,ik->", J, covariance, J)
+        out[name] = len(r.residual) - float(taken)
+        left -= out[name]
+    return {"tracks": left, **out}
+
+
+def _estimated(sigmas: Sigmas, chi2: dict[str, float], redundancy: dict[str, float]) -> Sigmas:
+    """Sigmas for the next round; a component with next to no redundancy keeps its own."""
+
+    def factor(name: str) -> float:
+        return math.sqrt(chi2[name]) if redundancy.get(name, 0) >= 6 and chi2[name] > 0 else 1.0
+
+    return dataclasses.replace(
+        sigmas,
+        track_px=sigmas.track_px * factor("tracks"),
+        sphere=max(0.3, sigmas.sphere * factor("spheres")),
+        robot_m=max(1e-6, sigmas.robot_m * factor("robot_position")),
+        robot_rad=max(1e-6, sigmas.robot_rad * factor("robot_rotation")),
+    )
+
+
+def _clustered(weighted: dict[str, Rows], normal: Normal, redundancy: dict[str, float]) -> Array:
+    """Covariance of the frame parameters that stays honest where the errors of one track are alike.
+
+    The sandwich H^-1 M H^-1: M sums the squared scores of whole tracks, and takes the other components at their word.
+    """
+    tracks = weighted["tracks"]
+    point = tracks.point.indices[tracks.point.indptr[:-1]] // 3
+    n_rows, n_points = len(tracks.residual), int(point.max()) + 1
+    inner = Rows(tracks.residual, tracks.frame, tracks.point[:, : 3 * n_points].tocsr(), tracks.size)
+    information = normal_equations([inner]).schur
+    spread = csr_matrix((tracks.residual, (point, np.arange(n_rows))), shape=(n_points, n_rows))
+    scores = (spread @ tracks.frame).tocsr()
+    meat = (scores.T @ scores).toarray() * n_rows / max(redundancy["tracks"], 1.0)
+    _, weight, slope = _EXPECTED["tracks"]
+    rest = normal.schur - information
+    bread = _inverse(rest + information * slope / weight)
+    return bread @ (rest + meat) @ bread
+
+
+def _expectations(scale: float, dimensions: int) -> tuple[float, float, float]:
+    """Per dimension, of Gaussian residuals under Cauchy weights w: E[w s], E[w], and the mean slope of w r."""
+    s = np.linspace(0.0, 80.0, 20001)[1:]
+    density = s ** (dimensions / 2 - 1) * np.exp(-s / 2)
+    density /= density.sum()
+    w = 1 / (1 + s / scale**2)
+    slope = w - 2 * s / dimensions * w**2 / scale**2
+    return float(density @ (w * s)) / dimensions, float(density @ w), float(density @ slope)
+
+
+_EXPECTED = {name: _expectations(scale, 2 if name == "tracks" else 3) for name, scale in _CAUCHY.items()}
