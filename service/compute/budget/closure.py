@@ -1,0 +1,168 @@
+"""Loop closures: the same spheres measured by images, scan and CT, compared with what their covariances predict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.cost import cone_residuals, skew
+from service.compute.registration.identity import Assignment
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, align_points, apply, transform
+
+_MAX_STEPS = 20
+_OUTLIER_SIGMA = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class SeenSphere:
+    """A sphere located from images alone: centre (3,) and covariance (3, 3) in the scan frame, metres."""
+
+    centre_m: Array
+    covariance_m2: Array = field(repr=False)
+    n_images: int
+
+
+@dataclass(frozen=True, slots=True)
+class Closure:
+    """Two measurements of the same spheres.
+
+    Attributes:
+        n: spheres compared.
+        rms_m: root mean square of the distances (3D), after the alignment if there is one.
+        predicted_m: what the covariances predict for it.
+        normalised_chi2: squared Mahalanobis distance a degree of freedom; near 1 when the covariances are right.
+        residuals_m: (n, 3) of a over b in the frame of a.
+        significance: (n,) Mahalanobis distance of each sphere's residual, as a number of standard deviations.
+    """
+
+    n: int
+    rms_m: float
+    predicted_m: float
+    normalised_chi2: float
+    residuals_m: Array = field(repr=False)
+    significance: Array = field(repr=False)
+
+
+def locate_in_images(
+    outlines: Sequence[Sequence[SphereOutline]],
+    assignments: Sequence[Assignment],
+    T_scan_camera: Array,
+    starts_scan_m: Array,
+    radius_m: float,
+    *,
+    least_images: int = 3,
+) -> dict[int, SeenSphere]:
+    """Centres of spheres from their outlines and the registered cameras, each sphere alone.
+
+    Weighted least squares of the cones' three numbers (`cone_residuals`); an outline further than 4 sigma from the
+    others of its sphere is left out. The covariance is that of the outlines, inflated where they scatter more.
+
+    Args:
+        outlines: per image.
+        assignments: per image, outline → index into `starts_scan_m`.
+        T_scan_camera: (N, 4, 4), metric.
+        starts_scan_m: (M, 3) about where the spheres are.
+        radius_m: of the spheres.
+        least_images: spheres seen in fewer are not returned.
+    """
+    seen: dict[int, list[tuple[int, SphereOutline]]] = {}
+    for i, assignment in enumerate(assignments):
+        for j, m in assignment.markers.items():
+            seen.setdefault(m, []).append((i, outlines[i][j]))
+    found = {
+        m: _intersect(mine, T_scan_camera, starts_scan_m[m], radius_m, least_images)
+        for m, mine in sorted(seen.items())
+        if len(mine) >= least_images
+    }
+    return {m: sphere for m, sphere in found.items() if sphere.n_images >= least_images}
+
+
+def _intersect(
+    seen: Sequence[tuple[int, SphereOutline]], T_scan_camera: Array, start: Array, radius_m: float, least: int
+) -> SeenSphere:
+    T = T_scan_camera[[i for i, _ in seen]]
+    axes = np.array([o.cone.axis for _, o in seen])
+    frames = np.array([o.cone.frame()[:, :2] for _, o in seen])
+    half = np.array([o.cone.half_angle_rad for _, o in seen])
+    whiten = np.array([np.linalg.inv(np.linalg.cholesky(o.cone_covariance)) for _, o in seen])
+    centre, keep, factor = start.copy(), np.ones(len(seen), dtype=bool), 1.0
+    information: Array = np.eye(3)
+    for _ in range(_MAX_STEPS):
+        camera_m = np.einsum("oji,oj->oi", T[:, :3, :3], centre - T[:, :3, 3])
+        r, D = cone_residuals(axes, frames, half, camera_m, radius_m)
+        r = np.einsum("oij,oj->oi", whiten, r)
+        J = whiten @ D @ T[:, :3, :3].transpose(0, 2, 1)
+        square = np.sum(r**2, axis=1)
+        factor = max(1.0, float(np.median(square)) / 2.366)  # the median of chi square with three degrees of freedom
+        nearest = np.argsort(square)[:least]
+        keep = square < 3 * factor * _OUTLIER_SIGMA**2
+        keep[nearest] = True
+        information = np.einsum("oki,okj->ij", J[keep], J[keep])
+        step = -np.linalg.solve(information, np.einsum("oki,ok->i", J[keep], r[keep]))
+        centre = centre + step
+        if float(np.linalg.norm(step)) < 1e-9:
+            break
+    return SeenSphere(centre, factor * np.linalg.inv(information).astype(np.float64), int(keep.sum()))
+
+
+def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> Closure:
+    """Closure of measurements (n, 3) of the same points in the same frame, with covariances (n, 3, 3) in m²."""
+    r = a - b
+    C = covariance_a + covariance_b
+    square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(C), r)
+    return Closure(
+        len(a),
+        float(np.sqrt(np.mean(np.sum(r**2, axis=1)))),
+        float(np.sqrt(np.mean(np.trace(C, axis1=1, axis2=2)))),
+        float(square.sum()) / (3 * len(a)),
+        r,
+        np.sqrt(square),
+    )
+
+
+def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> tuple[Closure, Transform]:
+    """Closure of two constellations (n, 3) of the same spheres in frames of their own, and T_a_b.
+
+    The alignment is weighted by the covariances (n, 3, 3), m²; six degrees of freedom are taken off.
+
+    Raises:
+        ComputeError: fewer than four spheres: nothing is left to compare.
+    """
+    if len(a) < 4:
+        raise ComputeError(f"{len(a)} common spheres close no loop; four are needed")
+    T_a_b, _ = align_points(a, b)
+    covariance = np.zeros((len(a), 3, 3))
+    information = np.zeros((6, 6))
+    r = np.zeros_like(a)
+    slope = np.zeros((len(a), 3, 6))
+    for _ in range(_MAX_STEPS):
+        R = T_a_b[:3, :3]
+        covariance = covariance_a + R @ covariance_b @ R.T
+        weight = np.linalg.inv(covariance)
+        turned = b @ R.T
+        r = a - apply(T_a_b, b)
+        slope = np.concatenate([np.broadcast_to(np.eye(3), (len(a), 3, 3)), -skew(turned)], axis=2)
+        information = np.einsum("nki,nkl,nlj->ij", slope, weight, slope)
+        step = np.linalg.solve(information, np.einsum("nki,nkl,nl->i", slope, weight, r))
+        T_a_b = transform(Rotation.from_rotvec(step[3:]).as_matrix() @ R, T_a_b[:3, 3] + step[:3])
+        if float(np.abs(step).max()) < 1e-12:
+            break
+    left = covariance - slope @ np.linalg.inv(information) @ slope.transpose(
+        0, 2, 1
+    )  # of a residual, the alignment being fitted
+    square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(covariance), r)
+    single = np.einsum("ni,nij,nj->n", r, np.linalg.pinv(left), r)
+    closure = Closure(
+        len(a),
+        float(np.sqrt(np.mean(np.sum(r**2, axis=1)))),
+        float(np.sqrt(np.mean(np.trace(left, axis1=1, axis2=2)))),
+        float(square.sum()) / (3 * len(a) - 6),
+        r,
+        np.sqrt(single),
+    )
+    return closure, T_a_b
