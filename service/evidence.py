@@ -12,7 +12,7 @@ from service.core.decide import advance, fold
 from service.core.errors import ComputeError, IntegrityError
 from service.core.model import ArtefactRef, Event, Payload, ViewpointCaptured
 from service.core.protocol import Protocol
-from service.core.run_state import RunState
+from service.core.run_state import JobState, RunState
 from service.steps.context import JobRequest, JobResult
 from service.store.leases import RunLease
 from service.store.records import NewArtefact, NewJob
@@ -107,14 +107,29 @@ class StepEvidence:
                 return tuple(JobResult(mine[key].measures, mine[key].artefacts, mine[key].result) for key in keys)
             self.wait(0.2)
 
+    def enqueue(self, request: JobRequest, name: str) -> None:
+        """See service.steps.context.Evidence."""
+        key = self._named_key(request.kind, name)
+        if all(job.idempotency_key != key for job in self.jobs(self.step)):
+            job = NewJob(request.kind, self.step, self.attempt, key, request.arguments)
+            self.log.store.record(self.log.run_id, [], actor="runner", jobs=[job], lease=self.lease)
+
+    def jobs(self, step_id: str) -> tuple[JobState, ...]:
+        """See service.steps.context.Evidence."""
+        jobs = self.log.refresh().steps[step_id].jobs.values()
+        return tuple(sorted(jobs, key=lambda job: job.enqueued_seq))
+
     def _key(self, request: JobRequest) -> str:
         """The same for the same work: after a restart or a retry its result is used, not computed again.
 
         A redo of the step begins a new generation; a job that has failed is tried anew when the step is repeated.
         """
+        arguments = hashlib.sha256(json.dumps(request.arguments, sort_keys=True).encode()).hexdigest()[:16]
+        return self._named_key(request.kind, arguments)
+
+    def _named_key(self, kind: str, name: str) -> str:
         state = self.log.refresh()
         generation = sum(past.step == self.step and past.viewpoint is None for past in state.superseded)
-        arguments = hashlib.sha256(json.dumps(request.arguments, sort_keys=True).encode()).hexdigest()[:16]
-        key = f"{self.step}/{generation}/{request.kind}/{arguments}/"
+        key = f"{self.step}/{generation}/{kind}/{name}/"
         jobs = state.steps[self.step].jobs.values()
         return key + str(sum(job.idempotency_key.startswith(key) and job.status == "failed" for job in jobs))

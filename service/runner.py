@@ -208,6 +208,7 @@ class Runner:
             monotonic_s=self.monotonic_s,
             wait=self.wait,
             operator=self.operator.name,
+            tell=self.operator.tell,
         )
         try:
             checkpoint()

@@ -167,7 +167,9 @@ def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
         return Retry(now.step, now.attempt + 1, "the operator asked for it", 0.0)
     if now.failure is None:
         failed = "; ".join(describe(verdict) for verdict in now.verdicts if not verdict.passed)
-        return _ask(protocol, state, "recovery", f"Outside its limits: {failed}")
+        # What the step itself suggests, if it knows a way: further viewpoints that would bring the numbers within.
+        advice = next((str(note.data["advice"]) for note in reversed(now.notes) if "advice" in note.data), "")
+        return _ask(protocol, state, "recovery", f"Outside its limits: {failed}" + (f". {advice}" if advice else ""))
     why = f"{now.failure.error}: {now.failure.message}"
     match now.failure.recovery:
         case "retry":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import tempfile
-from collections.abc import Sequence, Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,13 +61,19 @@ class CaptureTotals:
 
 
 def capture_viewpoints(
-    context: StepContext, viewpoints: Sequence[Viewpoint], T_flange_camera: Transform, *, image_kind: str
+    context: StepContext,
+    viewpoints: Sequence[Viewpoint],
+    T_flange_camera: Transform,
+    *,
+    image_kind: str,
+    on_captured: Callable[[], None] = lambda: None,
 ) -> CaptureTotals:
     """Capture every viewpoint that this attempt has not captured yet, in order.
 
     Args:
         T_flange_camera: the best known mounting; decides only where the camera goes, not where it was.
         image_kind: artefact kind of the photographs (`image`, `board_image`, `control_image`).
+        on_captured: called after each image that is in the record; must return at once.
 
     Raises DeviceError when a viewpoint fails for good, StepInterruptedError on pause.
     """
@@ -86,6 +92,8 @@ def capture_viewpoints(
         except UnreachablePoseError as error:
             context.evidence.record(_failed(context, viewpoint, error, skipped=True))
             given_up.add(viewpoint.name)
+        else:
+            on_captured()
         taken.add(viewpoint.name)
     context.progress("viewpoints", len(viewpoints), len(viewpoints))
     captures = context.evidence.captures(context.step.id)

@@ -13,6 +13,7 @@ from service.core.errors import OrthocaptureError
 from service.core.model import ArtefactRef, Payload, Record, StepNote, ViewpointCaptured
 from service.core.protocol import Protocol as LabProtocol
 from service.core.protocol import Step
+from service.core.run_state import JobState
 from service.store.records import NewArtefact
 
 P = TypeVar("P", bound=Record)
@@ -116,6 +117,14 @@ class Evidence(Protocol):
         """Enqueue jobs (once, whatever restarts) and wait for the worker's results, in order."""
         ...
 
+    def enqueue(self, request: JobRequest, name: str) -> None:
+        """Enqueue a job without waiting for it, once for each `name` (and again after it has failed)."""
+        ...
+
+    def jobs(self, step_id: str) -> tuple[JobState, ...]:
+        """The jobs of a step, as they stand at this moment, in the order in which they were enqueued."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
@@ -132,6 +141,7 @@ class StepContext:
     monotonic_s: Callable[[], float]
     wait: Callable[[float], None]
     operator: str
+    tell: Callable[[str], None]  # one line of news for the operator
 
     @property
     def state(self) -> StepState:

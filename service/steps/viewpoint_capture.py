@@ -7,14 +7,16 @@ from typing import Literal
 from service.core.model import Record
 from service.steps.capture import capture_viewpoints
 from service.steps.context import StepContext, StepKind, StepOutcome
-from service.steps.viewpoints import ViewpointSet, plan_viewpoints
+from service.steps.live import Live, LiveAnalysis
+from service.steps.viewpoints import ViewpointSet, denser_viewpoints, plan_viewpoints
 
 
 class Params(Record):
-    """Which viewpoints, and what the images are for."""
+    """Which viewpoints, what the images are for, and what is to be known of them while they are taken."""
 
     purpose: Literal["dataset", "control"]
     viewpoints: tuple[ViewpointSet, ...]
+    live: Live | None = None
 
 
 class Result(Record):
@@ -25,20 +27,31 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Capture every viewpoint set of this step."""
+    """Capture every viewpoint set of this step, and the viewpoints that an earlier attempt found wanting."""
     plan = [
         viewpoint
         for viewpoint_set in params.viewpoints
         for viewpoint in plan_viewpoints(viewpoint_set, context.devices.layout(viewpoint_set.station))
     ]
+    live = LiveAnalysis.begin(context, params.live)
+    last = params.viewpoints[-1]
+    extra = denser_viewpoints(last, context.devices.layout(last.station))
+    if live is not None:
+        wanted = live.suggested()
+        plan += [viewpoint for viewpoint in extra if viewpoint.name in wanted]
     totals = capture_viewpoints(
         context,
         plan,
         context.devices.nominal_T_flange_camera(),
         image_kind="image" if params.purpose == "dataset" else "control_image",
+        on_captured=(lambda: None) if live is None else live.look,
     )
+    measures = totals.measures()
+    if live is not None:
+        taken = {viewpoint.name for viewpoint in plan}
+        measures |= live.summary(last.station, [(v, 0.0) for v in extra if v.name not in taken])
     result = Result(purpose=params.purpose, captured=totals.captured)
-    return StepOutcome(measures=totals.measures(), result=result.model_dump())
+    return StepOutcome(measures=measures, result=result.model_dump())
 
 
 KIND = StepKind("viewpoint_capture", Params, Result, execute)

@@ -63,6 +63,9 @@ class Viewpoint:
 
 
 _UP = np.array([0.0, 0.0, 1.0])
+_DENSER_TILTS_DEG = (5.0, 15.0, 25.0, 35.0, 42.0)
+_DENSER_AZIMUTHS_DEG = (-80.0, -60.0, -40.0, -20.0, 0.0, 20.0, 40.0, 60.0, 80.0)
+_APART_M = 0.03  # a view nearer to a planned one adds little
 
 
 def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
@@ -93,6 +96,27 @@ def plan_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple
             f"viewpoint set {viewpoint_set.prefix!r} is empty", remedy="Give it at least one arc in the protocol"
         )
     return tuple(viewpoints)
+
+
+def denser_viewpoints(viewpoint_set: ViewpointSet, layout: StationLayout) -> tuple[Viewpoint, ...]:
+    """Further viewpoints of the same kind that a step may suggest: a grid of tilts and azimuths at its distance.
+
+    A viewpoint is named by its place, `v2_t25-40` for a tilt of 25° and an azimuth of −40°, so that the name says
+    the same in every attempt.
+    """
+    distance_m = float(np.median([arc.distance_m for arc in viewpoint_set.arcs]))
+    planned = [v.T_base_camera[:3, 3] for v in plan_viewpoints(viewpoint_set, layout)]
+    out: list[Viewpoint] = []
+    for tilt in _DENSER_TILTS_DEG:
+        for azimuth in _DENSER_AZIMUTHS_DEG:
+            arc = Arc(tilt_deg=tilt, azimuth_from_deg=azimuth, azimuth_to_deg=azimuth, count=1, distance_m=distance_m)
+            single = viewpoint_set.model_copy(update={"arcs": (arc,), "rolls_deg": (0.0,), "aim_spread_m": 0.0})
+            (viewpoint,) = plan_viewpoints(single, layout)
+            eye = viewpoint.T_base_camera[:3, 3]
+            if min(float(np.linalg.norm(eye - other)) for other in planned) > _APART_M:
+                name = f"{viewpoint_set.prefix}t{tilt:02.0f}{azimuth:+03.0f}"
+                out.append(Viewpoint(name, layout.name, viewpoint.T_base_camera))
+    return tuple(out)
 
 
 def flange_target(T_base_camera: Transform, T_flange_camera: Transform) -> Transform:

@@ -19,6 +19,7 @@ from service.store.records import Job, NewArtefact
 from service.store.store import Store
 from service.worker.calibrate import calibrate
 from service.worker.job import Handler, JobContext
+from service.worker.live import coverage_points, live_summary, live_view
 from service.worker.poses import structure_from_motion
 from service.worker.registering import detect_spheres, evaluate, register
 from service.worker.surfaces import ct_surface, locate_spheres
@@ -28,7 +29,18 @@ _LEASE_S = 30.0
 
 HANDLERS: Mapping[str, Handler] = {
     handler.__name__: handler
-    for handler in (calibrate, ct_surface, locate_spheres, structure_from_motion, detect_spheres, register, evaluate)
+    for handler in (
+        calibrate,
+        ct_surface,
+        locate_spheres,
+        structure_from_motion,
+        detect_spheres,
+        register,
+        evaluate,
+        coverage_points,
+        live_view,
+        live_summary,
+    )
 }
 
 

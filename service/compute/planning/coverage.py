@@ -1,0 +1,232 @@
+"""How much of the specimen's surface the images have seen: sample points, and ray casting against the CT's surface.
+
+The whole is what can be seen at all from a dome of directions above: what lies inside, underneath or in folds that no
+camera reaches is not counted as missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from service.compute.camera_model import CameraModel
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, apply, inverse, look_at
+
+_CELL_M = 0.0025  # of the occluder
+_LIFT_M = 0.002  # above the simplified surface, so that it does not hide its own points
+_BOARD_M = 0.004  # thickness of the layer that counts as the board
+_CLEAR_OF_SPHERES = 1.4  # radii
+_DOME_TILTS_DEG = (0.0, 20.0, 40.0, 55.0)
+_MARGIN_M = 0.08  # of the surface kept around the spheres
+
+
+@dataclass(frozen=True, slots=True)
+class CoverageLimits:
+    """When a view counts for a point."""
+
+    max_angle_deg: float = 65.0  # between the surface's normal and the direction to the camera
+    max_distance_m: float = 1.0
+    min_views: int = 2
+
+
+@dataclass(frozen=True)
+class CoverageSurface:
+    """Points of the specimen with their outward normals, and what may hide them; all in the frame of the scan."""
+
+    points_m: Array = field(repr=False)  # (N, 3)
+    normals: Array = field(repr=False)  # (N, 3)
+    occluder_vertices_m: Array = field(repr=False)
+    occluder_faces: NDArray[np.int64] = field(repr=False)
+
+    @cached_property
+    def rays(self) -> Any:
+        """The ray caster of the occluder; None where there is none."""
+        if len(self.occluder_faces) == 0:
+            return None
+        return RayMeshIntersector(trimesh.Trimesh(self.occluder_vertices_m, self.occluder_faces, process=False))
+
+    def free(self, origins: Array, target: Array) -> NDArray[np.bool_]:
+        """Whether the way from origins (K, 3) to `target` (3,) or targets (K, 3) is free (K,)."""
+        if self.rays is None or len(origins) == 0:
+            return np.ones(len(origins), dtype=bool)
+        return ~np.asarray(self.rays.intersects_any(origins, target - origins), dtype=bool)
+
+
+def coverage_surface(
+    vertices_m: Array,
+    faces: NDArray[np.int32],
+    spheres_m: Array,
+    radius_m: float,
+    limits: CoverageLimits,
+    *,
+    n_points: int = 3000,
+    seed: int = 0,
+) -> CoverageSurface:
+    """Sample what can be seen of the specimen from above.
+
+    Args:
+        vertices_m, faces: surface of the scene (V, 3), (F, 3) with outward winding, spheres and board included.
+        spheres_m: (M, 3) around the specimen; it lies within their hull, seen from above.
+
+    Raises:
+        ComputeError: no surface lies between the spheres.
+    """
+    centre = spheres_m.mean(axis=0)
+    low, high = spheres_m.min(axis=0) - _MARGIN_M, spheres_m.max(axis=0) + _MARGIN_M
+    near = np.all((vertices_m > low) & (vertices_m < high), axis=1)
+    mesh_faces = np.asarray(faces, dtype=np.int64)
+    mesh_faces = mesh_faces[near[mesh_faces].all(axis=1)]
+    if len(mesh_faces) < 100:
+        raise ComputeError("the surface does not reach the spheres", remedy="Check the frame and unit of the mesh")
+    triangles = vertices_m[mesh_faces]
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    area = np.linalg.norm(cross, axis=1)
+    up = _up(spheres_m, triangles.mean(axis=1), area)
+    rng = np.random.default_rng(seed)
+    picked = rng.choice(len(triangles), size=40 * n_points, p=area / area.sum())
+    u, v = rng.random(len(picked)), rng.random(len(picked))
+    fold = u + v > 1
+    u[fold], v[fold] = 1 - u[fold], 1 - v[fold]
+    t = triangles[picked]
+    points = t[:, 0] + u[:, None] * (t[:, 1] - t[:, 0]) + v[:, None] * (t[:, 2] - t[:, 0])
+    normals = cross[picked] / area[picked][:, None]
+    keep = _between(points, spheres_m, radius_m, up) & ~_on_board(points, normals, up, centre) & (normals @ up > -0.5)
+    points, normals = points[keep][: 2 * n_points], normals[keep][: 2 * n_points]
+    vertices, simple = _simplified(vertices_m, mesh_faces)
+    whole = CoverageSurface(points, normals, vertices, simple)
+    visible = np.zeros(len(points), dtype=bool)
+    reach = min(0.65, 0.9 * limits.max_distance_m)
+    for eye in _dome(centre, up, reach):
+        visible |= seen(whole, eye, limits)
+    if visible.sum() < 50:
+        raise ComputeError("between the spheres there is no surface that can be seen from above")
+    chosen = np.nonzero(visible)[0][:n_points]
+    return CoverageSurface(points[chosen], normals[chosen], vertices, simple)
+
+
+def dome_surface(spheres_m: Array, radius_m: float, *, n_points: int = 800) -> CoverageSurface:
+    """Stand-in where there is no CT: a flat dome between the spheres, with nothing that hides it."""
+    centre = spheres_m.mean(axis=0)
+    axes = np.linalg.svd(spheres_m - centre)[2]
+    k = np.arange(n_points) + 0.5
+    angle, r = np.pi * (1 + np.sqrt(5)) * k, np.sqrt(k / n_points)
+    extent = 0.7 * np.abs((spheres_m - centre) @ axes.T).max(axis=0)[:2]
+    height = max(2 * radius_m, 0.03)
+    local = np.column_stack([extent[0] * r * np.cos(angle), extent[1] * r * np.sin(angle), height * (1 - r**2)])
+    slope = np.column_stack(
+        [2 * height * local[:, 0] / extent[0] ** 2, 2 * height * local[:, 1] / extent[1] ** 2, np.ones(n_points)]
+    )
+    if np.linalg.det(axes) < 0:
+        axes[2] *= -1
+    normals = slope / np.linalg.norm(slope, axis=1, keepdims=True)
+    return CoverageSurface(centre + local @ axes, normals @ axes, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+
+
+def seen(
+    surface: CoverageSurface,
+    eye_m: Array,
+    limits: CoverageLimits,
+    T_scan_camera: Transform | None = None,
+    camera: CameraModel | None = None,
+) -> NDArray[np.bool_]:
+    """Which points (N,) a camera at `eye_m` (3,) sees at a good angle; with a camera, only those in its image."""
+    way = eye_m - surface.points_m
+    distance = np.linalg.norm(way, axis=1)
+    facing = np.einsum("ni,ni->n", way, surface.normals) / distance
+    good = (facing >= np.cos(np.radians(limits.max_angle_deg))) & (distance <= limits.max_distance_m)
+    if camera is not None and T_scan_camera is not None:
+        inside = apply(inverse(T_scan_camera), surface.points_m)
+        ahead = inside[:, 2] > 0.05
+        pixels = np.full((len(inside), 2), -1.0)
+        pixels[ahead] = camera.project(inside[ahead])
+        good &= ahead & np.all((pixels >= 0) & (pixels <= [camera.width - 1, camera.height - 1]), axis=1)
+    index = np.nonzero(good)[0]
+    good[index] = surface.free(surface.points_m[index] + _LIFT_M * surface.normals[index], eye_m)
+    return good
+
+
+def covered_fraction(views: Sequence[NDArray[np.bool_]], min_views: int) -> float:
+    """Share of the points that at least `min_views` of the views (N,) have seen; 0 without views."""
+    if not views:
+        return 0.0
+    return float(np.mean(np.sum(views, axis=0) >= min_views))
+
+
+def _up(spheres_m: Array, middles: Array, area: Array) -> Array:
+    """Away from the board: the spheres stand on it, and most of the surface around them is its."""
+    normal = np.linalg.svd(spheres_m - spheres_m.mean(axis=0))[2][2]
+    below = (np.average(middles, axis=0, weights=area) - spheres_m.mean(axis=0)) @ normal
+    return np.asarray(normal if below < 0 else -normal, dtype=np.float64)
+
+
+def _plane_axes(up: Array) -> Array:
+    e1 = np.cross(up, [1.0, 0.0, 0.0] if abs(up[0]) < 0.9 else [0.0, 1.0, 0.0])
+    e1 /= np.linalg.norm(e1)
+    return np.stack([e1, np.cross(up, e1)])
+
+
+def _between(points: Array, spheres_m: Array, radius_m: float, up: Array) -> NDArray[np.bool_]:
+    """Within the hull of the spheres seen from above, and neither on a sphere nor on its post."""
+    axes = _plane_axes(up)
+    flat, feet = points @ axes.T, spheres_m @ axes.T
+    hull = ConvexHull(feet)
+    inside = np.all(flat @ hull.equations[:, :2].T + hull.equations[:, 2] <= 0, axis=1)
+    for sphere, foot in zip(spheres_m, feet, strict=True):
+        inside &= np.linalg.norm(points - sphere, axis=1) > _CLEAR_OF_SPHERES * radius_m
+        below = (np.linalg.norm(flat - foot, axis=1) < radius_m) & ((points - sphere) @ up < 0)
+        inside &= ~below
+    return inside
+
+
+def _on_board(points: Array, normals: Array, up: Array, centre: Array) -> NDArray[np.bool_]:
+    """Points of the plane on which the specimen lies, if one stands out among the heights of level surface."""
+    height = (points - centre) @ up
+    level = np.abs(normals @ up) > 0.97
+    if level.sum() < 50:
+        return np.zeros(len(points), dtype=bool)
+    edges = np.arange(height[level].min(), height[level].max() + 2 * _BOARD_M, _BOARD_M / 2)
+    count = np.histogram(height[level], edges)[0]
+    fullest = int(np.argmax(count))
+    if count[fullest] < 0.1 * level.sum():
+        return np.zeros(len(points), dtype=bool)
+    middle = 0.5 * (edges[fullest] + edges[fullest + 1])
+    return height < middle + _BOARD_M
+
+
+def _dome(centre: Array, up: Array, distance_m: float) -> list[Array]:
+    """Eye positions on the dome."""
+    axes = _plane_axes(up)
+    eyes: list[Array] = []
+    for tilt in np.radians(_DOME_TILTS_DEG):
+        count = 1 if tilt == 0 else 12
+        for azimuth in np.arange(count) * 2 * np.pi / count:
+            sideways = np.cos(azimuth) * axes[0] + np.sin(azimuth) * axes[1]
+            eyes.append(centre + distance_m * (np.cos(tilt) * up + np.sin(tilt) * sideways))
+    return eyes
+
+
+def dome_cameras(centre: Array, up: Array, distance_m: float) -> list[Transform]:
+    """Cameras (4, 4) on the dome that look at the centre."""
+    axes = _plane_axes(up)
+    return [look_at(eye, centre, axes[0]) for eye in _dome(centre, up, distance_m)]
+
+
+def _simplified(vertices_m: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices joined within cells of _CELL_M: fine enough for shadows; millions of faces take a second."""
+    cells = np.floor(vertices_m[faces.ravel()] / _CELL_M).astype(np.int64)
+    cells -= cells.min(axis=0)
+    extent = cells.max(axis=0) + 1
+    key = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    _, first, index = np.unique(key, return_index=True, return_inverse=True)
+    joined = index.reshape(-1, 3)
+    solid = (joined[:, 0] != joined[:, 1]) & (joined[:, 1] != joined[:, 2]) & (joined[:, 0] != joined[:, 2])
+    return vertices_m[faces.ravel()[first]], np.unique(joined[solid], axis=0)

@@ -1,0 +1,166 @@
+"""What images tell about the pose of the scan, and the target error that follows: measured views and planned ones.
+
+A view is one measurement of the pose of the scan in the base frame: its outlines have an information matrix I (6, 6)
+and the pose of the camera has a covariance P (6, 6), which all spheres of the view share. Both are of a perturbation
+(d, w) of the scan about the scene's centre c: p → c + d + exp(w) (p − c), in base axes, metres and radians. The
+registration weights views by I, so the covariance of its answer is H⁻¹ (Σ I + I P I) H⁻¹ with H = Σ I (the sandwich
+of weighted least squares with errors that a group shares).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from service.compute.markers.cones import Cone
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.cost import skew
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, apply, inverse
+
+_PRIOR_VIEWS = 2.0  # as many views' worth of belief in the arm's nominal scatter
+_OUTLIER = 25.0  # squared Mahalanobis distance of an outline from the solution, arm's scatter included
+
+
+@dataclass(frozen=True, slots=True)
+class ViewInformation:
+    """One view: information (6, 6) of its outlines, and where they alone would put the scan (6,), as (d, w)."""
+
+    information: Array = field(repr=False)
+    offset: Array
+    spheres: int
+
+
+@dataclass(frozen=True, slots=True)
+class TargetError:
+    """The covariance (6, 6) of the scan's pose about `centre_m`, and the scatter P (6, 6) of the camera poses."""
+
+    centre_m: Array  # (3,) base frame
+    covariance: Array = field(repr=False)
+    pose_covariance: Array = field(repr=False)
+
+    def at_m(self, points_m: Array) -> Array:
+        """Standard deviation (N,) in 3D of points (N, 3) of the base frame."""
+        return point_sigmas_m(self.covariance, points_m - self.centre_m)
+
+
+def view_information(
+    T_base_camera: Transform,
+    T_base_scan: Transform,
+    outlines: Sequence[SphereOutline],
+    markers: Mapping[int, int],
+    spheres_m: Array,
+    radius_m: float,
+    centre_m: Array,
+    pose_sigma_m: float,
+) -> ViewInformation:
+    """What the assigned outlines of one image say about T_base_scan, linearised there.
+
+    Args:
+        markers: outline → sphere.
+        spheres_m: (M, 3) in the scan frame.
+        centre_m: (3,) base frame.
+        pose_sigma_m: the arm's nominal scatter; an outline that contradicts the solution by much more is left out.
+    """
+    base = apply(T_base_scan, spheres_m)
+    normal, b, used = np.zeros((6, 6)), np.zeros(6), 0
+    for o, m in markers.items():
+        outline = outlines[o]
+        J, predicted, half = cone_jacobian(T_base_camera, base[m], centre_m, radius_m, outline.cone.frame())
+        residual = np.append(outline.cone.frame()[:, :2].T @ predicted, half - outline.cone.half_angle_rad)
+        slack = pose_sigma_m**2 * (J[:, :3] @ J[:, :3].T)
+        if residual @ np.linalg.solve(outline.cone_covariance + slack, residual) > _OUTLIER:
+            continue
+        weight = np.linalg.inv(outline.cone_covariance)
+        normal += J.T @ weight @ J
+        b -= J.T @ weight @ residual
+        used += 1
+    offset = np.linalg.lstsq(normal, b, rcond=1e-12)[0] if used >= 3 else np.full(6, np.nan)
+    return ViewInformation(normal, np.asarray(offset, dtype=np.float64), used)
+
+
+def predicted_information(
+    T_base_camera: Transform, spheres_base_m: Array, radius_m: float, centre_m: Array, cone_covariance: Array
+) -> Array:
+    """Information (6, 6) that a view of these spheres (K, 3) will have, with outlines of this covariance (3, 3)."""
+    normal = np.zeros((6, 6))
+    weight = np.linalg.inv(cone_covariance)
+    for sphere in spheres_base_m:
+        J, _, _ = cone_jacobian(T_base_camera, sphere, centre_m, radius_m, None)
+        normal += J.T @ weight @ J
+    return normal
+
+
+def cone_jacobian(
+    T_base_camera: Transform, sphere_base_m: Array, centre_m: Array, radius_m: float, frame: Array | None
+) -> tuple[Array, Array, float]:
+    """Derivative (3, 6) of a sphere's cone by (d, w), with its axis (3,) and half angle as predicted.
+
+    The cone's rows are the axis along the first two columns of `frame` (3, 3) (None: any frame about the axis) and
+    the half angle asin(r / |c|).
+    """
+    R = T_base_camera[:3, :3].T
+    c = apply(inverse(T_base_camera), sphere_base_m)
+    distance = float(np.linalg.norm(c))
+    u = c / distance
+    if frame is None:
+        frame = Cone(u, 0.0).frame()
+    move = R @ np.hstack([np.eye(3), -skew(sphere_base_m - centre_m)])  # (3, 6) of c
+    across = frame[:, :2].T @ (np.eye(3) - np.outer(u, u)) / distance
+    size = -radius_m / (distance * np.sqrt(distance**2 - radius_m**2)) * u
+    return np.vstack([across, size]) @ move, u, float(np.arcsin(radius_m / distance))
+
+
+def pose_scatter(views: Sequence[ViewInformation], sigma_m: float, sigma_rad: float) -> Array:
+    """Covariance P (6, 6) of the camera poses of a station: the scatter of the views, on top of the nominal one.
+
+    Args:
+        views: their offsets scatter by the arm's error and by their outlines' noise.
+        sigma_m, sigma_rad: nominal scatter in 3D, which counts as much as two views.
+    """
+    nominal = np.diag([sigma_m**2 / 3] * 3 + [sigma_rad**2 / 3] * 3)
+    offsets = np.array([v.offset for v in views if v.spheres >= 4]).reshape(-1, 6)
+    if len(offsets) < 2:
+        return nominal
+    deviations = offsets - offsets.mean(axis=0)
+    scatter = deviations.T @ deviations
+    return (_PRIOR_VIEWS * nominal + scatter) / (_PRIOR_VIEWS + len(offsets) - 1)
+
+
+def pose_covariance(informations: Iterable[Array], P: Array) -> Array:
+    """Covariance (6, 6) of the scan's pose from views of these informations (6, 6) and pose errors P each.
+
+    Raises:
+        ComputeError: the views together do not determine the pose.
+    """
+    normal, middle = np.zeros((6, 6)), np.zeros((6, 6))
+    for information in informations:
+        normal += information
+        middle += information + information @ P @ information
+    d = np.sqrt(np.diag(normal))
+    if not np.all(d > 0) or np.linalg.cond(normal / np.outer(d, d)) > 1e12:
+        raise ComputeError(
+            "the views do not determine the pose of the scan", remedy="Take images that show more spheres"
+        )
+    inverse_normal = np.linalg.inv(normal / np.outer(d, d)) / np.outer(d, d)
+    return inverse_normal @ middle @ inverse_normal
+
+
+def target_error(
+    views: Sequence[ViewInformation], centre_m: Array, *, sigma_m: float, sigma_rad: float
+) -> TargetError:
+    """The error of the registration from these views of one station, their own scatter included.
+
+    Raises:
+        ComputeError: the views do not determine the pose.
+    """
+    P = pose_scatter(views, sigma_m, sigma_rad)
+    return TargetError(centre_m, pose_covariance([v.information for v in views], P), P)
+
+
+def point_sigmas_m(covariance: Array, points_m: Array) -> Array:
+    """Standard deviation (N,) in 3D of points (N, 3) relative to the centre, for a covariance (6, 6) of (d, w)."""
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points_m), 3, 3)), -skew(points_m)], axis=2)
+    return np.sqrt(np.einsum("nij,jk,nik->n", J, covariance, J))

@@ -1,0 +1,229 @@
+"""What the images say while they are being taken: one job an image, none of which the capture waits for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from service.core.errors import ComputeError, ConfigurationError
+from service.core.gates import limits as gate_text
+from service.core.model import Record, ViewpointCaptured
+from service.core.protocol import Gate
+from service.core.run_state import JobState
+from service.steps.context import JobRequest, StepContext
+from service.steps.inputs import artefact_of, result_of
+from service.steps.viewpoints import Viewpoint
+
+ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
+SUGGESTION = "suggested_viewpoints"  # name of the note that a retry of the step reads
+
+
+class CoverageRule(Record):
+    """When a view counts for a point of the specimen's surface."""
+
+    min_views: Annotated[int, Field(ge=1)] = 2
+    max_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 65.0
+    max_distance_m: Annotated[float, Field(gt=0)] = 1.0
+
+
+class Live(Record):
+    """What the numbers after each image are computed from."""
+
+    calibration: str  # step with the intrinsics
+    hand_eye: str  # step with T_flange_camera
+    spheres_of: str  # step with the spheres and, for the coverage, the surface: the CT
+    images_of: tuple[str, ...] = ()  # earlier capture steps that count too
+    aim_mm: Annotated[float, Field(gt=0)] = 0.35  # of the suggestions, where no gate says it
+    arm_sigma_mm: Annotated[float, Field(gt=0)] = 1.0  # scatter of the robot's poses before any image tells
+    arm_sigma_mrad: Annotated[float, Field(gt=0)] = 1.0
+    coverage: CoverageRule = CoverageRule()
+    wait_s: Annotated[float, Field(ge=0)] = 60.0  # at the end of the step, for images still being looked at
+
+
+@dataclass
+class LiveAnalysis:
+    """The live numbers of one execution of one capture step."""
+
+    context: StepContext
+    params: Live
+    shared: Mapping[str, Any]
+    told: set[str] = field(default_factory=set[str])
+
+    @classmethod
+    def begin(cls, context: StepContext, params: Live | None) -> LiveAnalysis | None:
+        """Gather what earlier steps found; None, with a note, where one of them was skipped."""
+        if params is None:
+            return None
+        try:
+            spheres = result_of(context, params.spheres_of)["spheres_m"]
+            camera = result_of(context, params.calibration)["camera"]
+            T_flange_camera = result_of(context, params.hand_eye)["T_flange_camera"]
+            mesh = artefact_of(context, params.spheres_of, "ct_mesh").sha256
+        except ConfigurationError as error:
+            context.note("no_live_numbers", why=str(error))
+            context.tell(f"no numbers while capturing: {error}")
+            return None
+        limits = params.coverage.model_dump()
+        shared: dict[str, Any] = {
+            "camera": camera,
+            "T_flange_camera": T_flange_camera,
+            "spheres_m": spheres,
+            "radius_m": context.protocol.spheres.radius_mm / 1000,
+            "arm_sigma_m": params.arm_sigma_mm / 1000,
+            "arm_sigma_rad": params.arm_sigma_mrad / 1000,
+            "limits": limits,
+        }
+        analysis = cls(context, params, shared)
+        if not any(job.kind == "coverage_points" for job in analysis._jobs("coverage_points")):
+            arguments = {"mesh": mesh, "limits": limits, **{k: shared[k] for k in ("spheres_m", "radius_m")}}
+            context.evidence.enqueue(JobRequest("coverage_points", arguments), "specimen")
+        analysis.told = {job.job for job in analysis._jobs("live_view") if job.status != "enqueued"}
+        return analysis
+
+    def look(self) -> None:
+        """Have every new image looked at, and tell what is known of the earlier ones. Returns at once."""
+        begun = {job.arguments["image"]["sha256"] for job in self._jobs("live_view")}
+        for capture in self.context.evidence.captures(self.context.step.id):
+            sha256 = capture.artefacts[0].sha256
+            if sha256 in begun or not all(capture.verdicts.values()):
+                continue
+            image = {
+                "viewpoint": capture.viewpoint,
+                "station": capture.station,
+                "sha256": sha256,
+                "T_base_flange": [list(row) for row in capture.T_base_flange],
+            }
+            earlier = [job.artefacts[0].sha256 for job in self._finished()]
+            arguments = {**self.shared, "image": image, "surface": self._surface(), "earlier": earlier}
+            self.context.evidence.enqueue(JobRequest("live_view", arguments), sha256)
+        self._tell()
+
+    def summary(self, station: str, candidates: Sequence[tuple[Viewpoint, float]]) -> dict[str, float]:
+        """Wait, up to a limit, for the last images; the measures of the gate. A shortfall becomes a suggestion.
+
+        Args:
+            station: where the robot stands.
+            candidates: viewpoints that could be taken there in addition, with the time to get there.
+        """
+        self._wait()
+        error_gate, coverage_gate = self._gate(ERROR), self._gate(COVERAGE)
+        limit_mm = error_gate.max if error_gate and error_gate.max is not None else self.params.aim_mm
+        least = coverage_gate.min if coverage_gate and coverage_gate.min is not None else 0.0
+        request = JobRequest(
+            "live_summary",
+            {
+                **self.shared,
+                "surface": self._surface(),
+                "views": [job.artefacts[0].sha256 for job in self._finished()],
+                "station": station,
+                "limit_m": limit_mm / 1000,
+                "min_coverage": least,
+                "candidates": [
+                    {"name": v.name, "T_base_camera": v.T_base_camera.tolist(), "travel_s": travel_s}
+                    for v, travel_s in candidates
+                ],
+            },
+        )
+        try:
+            (answer,) = self.context.evidence.run_jobs(request)
+        except ComputeError as error:
+            self.context.note("no_live_numbers", why=str(error))
+            return {}
+        for why in answer.result["reasons"].values():
+            self.context.tell(why)
+        failed = [gate for gate in self.context.step.gates if _fails(gate, answer.measures)]
+        suggestions = answer.result["next_best_views"]
+        if failed and suggestions:
+            self._suggest(failed, answer.measures, suggestions)
+        return dict(answer.measures)
+
+    def suggested(self) -> set[str]:
+        """Names of the viewpoints that earlier attempts of this step found wanting."""
+        notes = [note for note in self.context.state.notes if note.note == SUGGESTION]
+        return {str(view["viewpoint"]) for note in notes for view in note.data["viewpoints"]}
+
+    def _suggest(
+        self, failed: Sequence[Gate], measures: Mapping[str, float], suggestions: Sequence[Mapping[str, Any]]
+    ) -> None:
+        last = suggestions[-1]
+        names = ", ".join(str(view["viewpoint"]) for view in suggestions)
+        short = "; ".join(
+            f"{gate.measure} is {measures[gate.measure]:.3g} {gate.unit}, needed {gate_text(gate.min, gate.max)}"
+            for gate in failed
+            if gate.measure in measures
+        )
+        advice = (
+            f"{short}. Confirm to take {len(suggestions)} more views ({names}): the error is then predicted to be "
+            f"{last['predicted_error_mm']:.3f} mm and the coverage {100 * last['coverage']:.0f} %"
+        )
+        self.context.note(SUGGESTION, advice=advice, viewpoints=list(suggestions))
+        self.context.tell(advice)
+
+    def _gate(self, measure: str) -> Gate | None:
+        return next((gate for gate in self.context.step.gates if gate.measure == measure), None)
+
+    def _jobs(self, kind: str) -> list[JobState]:
+        steps = dict.fromkeys((*self.params.images_of, self.context.step.id))
+        return [job for step in steps for job in self.context.evidence.jobs(step) if job.kind == kind]
+
+    def _finished(self) -> list[JobState]:
+        """The answers for images that still count, in the order of capture."""
+        by_image = {j.arguments["image"]["sha256"]: j for j in self._jobs("live_view") if j.status == "finished"}
+        captures: list[ViewpointCaptured] = []
+        for step in dict.fromkeys((*self.params.images_of, self.context.step.id)):
+            captures += self.context.evidence.captures(step)
+        hashes = [capture.artefacts[0].sha256 for capture in captures]
+        return [by_image[sha256] for sha256 in hashes if sha256 in by_image]
+
+    def _surface(self) -> str | None:
+        done = [job for job in self._jobs("coverage_points") if job.status == "finished"]
+        return done[-1].artefacts[0].sha256 if done else None
+
+    def _wait(self) -> None:
+        deadline_s = self.context.monotonic_s() + self.params.wait_s
+        while True:
+            self.context.checkpoint()
+            self.look()
+            waiting = [j for kind in ("live_view", "coverage_points") for j in self._jobs(kind)]
+            left = sum(job.status == "enqueued" for job in waiting)
+            if not left:
+                return
+            if self.context.monotonic_s() > deadline_s:
+                self.context.note("live_numbers_late", images=left)
+                return
+            self.context.progress("looking at the last images", len(waiting) - left, len(waiting))
+            self.context.wait(0.1)
+
+    def _tell(self) -> None:
+        for job in self._jobs("live_view"):
+            if job.status != "enqueued" and job.job not in self.told:
+                self.told.add(job.job)
+                self.context.tell(describe_view(job))
+
+
+def describe_view(job: JobState) -> str:
+    """`v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`: one line on one image."""
+    if job.status == "failed":
+        return f"{job.arguments['image']['viewpoint']}: could not be looked at: {job.message}"
+    m = job.measures
+    expected = f"/{m['spheres_expected']:.0f}" if "spheres_expected" in m else ""
+    parts = [f"{m['spheres_seen']:.0f}{expected} spheres"]
+    if "outline_rms_px" in m:
+        parts.append(f"{m['outline_rms_px']:.2f} px")
+    if ERROR in m:
+        parts.append(f"predicted error {m[ERROR]:.3f} mm")
+    if COVERAGE in m:
+        parts.append(f"coverage {100 * m[COVERAGE]:.0f} %")
+    if job.result.get("reason"):
+        parts.append(str(job.result["reason"]))
+    return f"{job.result['viewpoint']}: {', '.join(parts)}"
+
+
+def _fails(gate: Gate, measures: Mapping[str, float]) -> bool:
+    if gate.measure not in (ERROR, COVERAGE):
+        return False
+    value = measures.get(gate.measure)
+    return value is None or (gate.max is not None and value > gate.max) or (gate.min is not None and value < gate.min)
