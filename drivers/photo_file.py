@@ -34,6 +34,9 @@ class ExifRecord:
     orientation: int  # 1 when absent
     width: int
     height: int
+    lens_serial: str = ""
+    focus_distance_m: float | None = None  # as far as the lens tells; many do not
+    focus_mode: str = ""  # in the maker's words
 
     def settings(self, *, focus_mode: str, image_quality: str) -> CameraSettings:
         """Aperture, time and ISO of the file with two settings that EXIF has no standard tag for.
@@ -55,6 +58,16 @@ _KEYS = {
     "model": ("Exif.Image.Model", "Exif.Image.UniqueCameraModel"),
     "serial": ("Exif.Photo.BodySerialNumber", "Exif.Image.CameraSerialNumber"),
     "lens": ("Exif.Photo.LensModel",),
+    "lens_serial": ("Exif.Photo.LensSerialNumber",),
+    "focus_distance": ("Exif.Photo.SubjectDistance", "Exif.Image.SubjectDistance"),
+    "focus_mode": (
+        "Exif.Sony1.FocusMode",
+        "Exif.Sony2.FocusMode",
+        "Exif.Nikon3.Focus",
+        "Exif.CanonCs.FocusMode",
+        "Exif.Fujifilm.FocusMode",
+        "Exif.Panasonic.FocusMode",
+    ),
     "aperture": ("Exif.Photo.FNumber", "Exif.Image.FNumber"),
     "exposure": ("Exif.Photo.ExposureTime", "Exif.Image.ExposureTime"),
     "iso": ("Exif.Photo.ISOSpeedRatings", "Exif.Image.ISOSpeedRatings", "Exif.Photo.RecommendedExposureIndex"),
@@ -86,6 +99,9 @@ def read_exif(path: Path) -> ExifRecord:
             orientation=_integer(exif, "orientation") or 1,
             width=int(image.pixelWidth()),
             height=int(image.pixelHeight()),
+            lens_serial=_text(exif, "lens_serial"),
+            focus_distance_m=_number(exif, "focus_distance"),
+            focus_mode=_text(exif, "focus_mode"),
         )
     except exiv2.Exiv2Error as error:
         raise UnreadableFileError(

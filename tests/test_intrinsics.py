@@ -8,20 +8,17 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.intrinsics import (
-    board_points,
-    calibrate_intrinsics,
-    detect_board,
-    half_turn,
-    locate_board,
-)
+from service.compute.calibration.board import Board, BoardView, board_points, detect_board, half_turn
+from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_board
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from tests.support.textured_scene import TEXEL_M, Slab, camera_of_width, render
 
 COLUMNS, ROWS, SQUARE_M = 16, 23, 0.015
+BOARD = Board(COLUMNS, ROWS, SQUARE_M)
 CAMERA = camera_of_width(960)
+SIZE = (CAMERA.width, CAMERA.height)
 BORDER = 80  # texels of white around the squares
 
 
@@ -61,6 +58,10 @@ def _corners(camera: CameraModel, pose: Transform, sigma_px: float, rng: np.rand
     T_world_board = transform(Rotation.from_euler("x", np.pi), np.array([-centre[0], centre[1], 0.0]))
     points = apply(inverse(pose) @ T_world_board, board_points(COLUMNS, ROWS, SQUARE_M))
     return camera.project(points) + rng.normal(0, sigma_px, (len(points), 2))
+
+
+def _views(corners: list[Array]) -> list[BoardView]:
+    return [BoardView(np.arange(len(view)), view) for view in corners]
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +127,7 @@ def test_camera_is_recovered_within_its_sigma() -> None:
     poses = _poses(25, 40)
     views = [_corners(CAMERA, T, 0.05, rng) for T in poses]
     views[4] = views[4] + rng.normal(0, 3.0, views[4].shape)  # a moved board
-    result = calibrate_intrinsics(views, SQUARE_M, COLUMNS, ROWS, (CAMERA.width, CAMERA.height))
+    result = calibrate_intrinsics(_views(views), BOARD, SIZE)
     assert [e.index for e in result.excluded] == [4]
     assert 4 not in result.views
     assert 0.05 < result.rms_px < 0.09  # two-dimensional: √2 · 0.05
@@ -154,11 +155,11 @@ def test_locate_board_agrees_with_the_corners() -> None:
 
 def test_views_that_determine_nothing_are_refused() -> None:
     rng = np.random.default_rng(1)
-    size = (CAMERA.width, CAMERA.height)
+    flat = _views([_corners(CAMERA, T, 0.05, rng) for T in _poses(12, 2)])
     with pytest.raises(ComputeError, match="same tilt"):
-        calibrate_intrinsics([_corners(CAMERA, T, 0.05, rng) for T in _poses(12, 2)], SQUARE_M, COLUMNS, ROWS, size)
-    few = [_corners(CAMERA, T, 0.05, rng) for T in _poses(3, 40)]
-    with pytest.raises(ComputeError, match="3 usable board views"):
-        calibrate_intrinsics(few, SQUARE_M, COLUMNS, ROWS, size)
+        calibrate_intrinsics(flat, BOARD, SIZE)
+    few = _views([_corners(CAMERA, T, 0.05, rng) for T in _poses(3, 40)])
+    with pytest.raises(ComputeError, match="2 usable board views"):
+        calibrate_intrinsics(few[:2], BOARD, SIZE)
     with pytest.raises(DataError, match="view 1"):
-        calibrate_intrinsics([few[0], few[1][:-1]], SQUARE_M, COLUMNS, ROWS, size)
+        calibrate_intrinsics([few[0], BoardView(few[1].indices, few[1].corners[:-1])], BOARD, SIZE)

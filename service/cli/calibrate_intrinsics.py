@@ -2,65 +2,226 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json as json_module
+import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-import cv2
-import numpy as np
 import typer
+from rich.markup import escape
 
+from drivers.errors import UnreadableFileError
+from drivers.photo_file import read_exif
 from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
-from service.compute.calibration.intrinsics import calibrate_intrinsics, detect_board
-from service.compute.images import read_image
+from service.compute.calibration.adjustment import LensModel
+from service.compute.calibration.board import Board, Pattern
+from service.compute.calibration.board_images import UsableViews, find_boards, usable_views
+from service.compute.calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
+from service.compute.calibration.intrinsics_record import intrinsics_record
+from service.compute.calibration.optics import Optics, compare_optics
+from service.compute.calibration.plots import calibration_plots
+from service.compute.calibration.uncertainty import ProjectionUncertainty, board_distance_m, projection_uncertainty
+from service.compute.calibration.validation import (
+    MIN_VIEWS_TO_VALIDATE,
+    CrossValidation,
+    calibration_warnings,
+    cross_validate,
+)
 from service.core.errors import ComputeError, DataError
 
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+_IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+_DEPARTURES_SHOWN = 8
 
 
 def intrinsics_command(
     images: Annotated[Path, typer.Option("--images", help="Folder of the board images.")],
-    board: Annotated[str, typer.Option("--board", help="COLUMNSxROWS of inner corners, such as 16x23.")],
-    square_mm: Annotated[float, typer.Option("--square-mm", help="Side of a square.")],
+    board: Annotated[
+        str,
+        typer.Option(
+            "--board",
+            metavar="COLSxROWS",
+            help="Inner corners, where four squares meet: 16x23 for a board of 17 × 24 squares; of a ChArUco board "
+            "too. Of circles: in a row, and rows.",
+        ),
+    ],
+    square_mm: Annotated[
+        float, typer.Option("--square-mm", help="Side of a square; of circles the distance between two rows.")
+    ],
     out: Annotated[Path, typer.Option("--out", help="The camera.json to write.")],
+    pattern: Annotated[Pattern, typer.Option("--pattern", help="What is printed.")] = "checkerboard",
+    marker_mm: Annotated[
+        float | None,
+        typer.Option("--marker-mm", help="Side of a ChArUco marker; without: ¾ of a square."),
+    ] = None,
+    dictionary: Annotated[str, typer.Option("--dictionary", help="Of the ChArUco markers.")] = "DICT_5X5_1000",
+    model: Annotated[
+        LensModel,
+        typer.Option("--model", help="Distortion: none, k1 k2, + p1 p2, + k3, rational k1 … k6."),
+    ] = "opencv4",
+    distance_m: Annotated[
+        float | None, typer.Option("--distance-m", help="Of the specimen; without: where the board was.")
+    ] = None,
+    capture_images: Annotated[
+        Path | None,
+        typer.Option("--capture-images", help="Folder of images to be used with this camera: was the lens the same?"),
+    ] = None,
+    report: Annotated[Path | None, typer.Option("--report", help="Folder for plots (PNG).")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Calibrate the camera's focal lengths, principal point and distortion from images of a flat board."""
+    """Calibrate a camera from images of a flat board, and say how far to trust it."""
     with reporting_errors(json):
-        columns, _, rows = board.lower().partition("x")
-        if not (columns.isdigit() and rows.isdigit()):
-            raise typer.BadParameter(f"--board takes COLUMNSxROWS such as 16x23, not {board!r}")
-        files = sorted(file for file in images.glob("*") if file.suffix.lower() in _SUFFIXES)
-        if not files:
-            raise DataError("no image in this folder", where=str(images), remedy="JPEG, PNG or TIFF files are read")
-        found: list[np.ndarray] = []
-        excluded: list[dict[str, str]] = []
-        names: list[str] = []
-        size = (0, 0)
+        seen = Board(
+            *_counts(board), square_mm * 1e-3, pattern, None if marker_mm is None else marker_mm * 1e-3, dictionary
+        )
+        files = image_files(images)
         with progress_bar(quiet=json) as progress:
-            for done, file in enumerate(files, start=1):
-                grey = np.asarray(cv2.cvtColor(read_image(file), cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-                size = (grey.shape[1], grey.shape[0])
-                try:
-                    found.append(detect_board(grey, int(columns), int(rows)))
-                    names.append(file.name)
-                except ComputeError as error:
-                    excluded.append({"image": file.name, "reason": error.what})
-                progress("board images", done, len(files))
-        result = calibrate_intrinsics(found, square_mm * 1e-3, int(columns), int(rows), size)
-        excluded += [{"image": names[view.index], "reason": view.reason} for view in result.excluded]
-        record = {
-            **dataclasses.asdict(result.camera),
-            "rms_px": result.rms_px,
-            "per_view_rms_px": dict(zip((names[k] for k in result.views), result.per_view_rms_px.tolist(), strict=True)),
-            "sigma": dict(result.sigma),
-            "n_views": len(result.views),
-            "excluded": excluded,
+            found = find_boards(
+                files,
+                seen,
+                workers=os.cpu_count() or 1,
+                progress=lambda done, total: progress("board images", done, total),
+            )
+        views = usable_views(found)
+        try:
+            result = calibrate_intrinsics(views.views, seen, views.size, model=model)
+        except ComputeError as error:
+            raise _with_reasons(error, views, files) from error
+        validation = cross_validate(result) if len(result.views) >= MIN_VIEWS_TO_VALIDATE else None
+        uncertainty = projection_uncertainty(result, board_distance_m(result) if distance_m is None else distance_m)
+        used = [views.indices[k] for k in result.views]
+        excluded = dict(views.excluded) | {views.indices[view.index]: view.reason for view in result.excluded}
+        optics, departures = _optics([files[k] for k in used], capture_images)
+        warnings = [*calibration_warnings(result, validation, uncertainty), *departures]
+        record: dict[str, Any] = {
+            **result.camera.record(),
+            **intrinsics_record(
+                result,
+                validation,
+                uncertainty,
+                warnings,
+                [files[k].name for k in used],
+                {files[k].name: excluded[k] for k in sorted(excluded)},
+            ),
+            "optics": optics,
         }
-        out.write_text(json_module.dumps(record, indent=1) + "\n", encoding="utf-8")
+        _write(out, json_module.dumps(record, indent=1, allow_nan=False) + "\n")
+        if report is not None:
+            _write_plots(report, result, uncertainty)
         if json:
             print_json(record)
             return
-        console.print(f"{len(result.views)} views, {result.rms_px:.3f} px rms")
+        _tell(record, result, validation, uncertainty)
         console.print(f"written: {out}")
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Image files of a folder, by name. Raises DataError when there are none."""
+    if not folder.is_dir():
+        raise DataError("the image folder does not exist", where=str(folder))
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGE_SUFFIXES)
+    if not files:
+        raise DataError("no image in this folder", where=str(folder), remedy="JPEG, PNG or TIFF files are read")
+    return files
+
+
+def _counts(board: str) -> tuple[int, int]:
+    columns, _, rows = board.lower().replace("×", "x").partition("x")
+    if not (columns.isdigit() and rows.isdigit()):
+        raise typer.BadParameter(f"--board takes COLSxROWS such as 16x23, not {board!r}")
+    return int(columns), int(rows)
+
+
+def _with_reasons(error: ComputeError, views: UsableViews, files: Sequence[Path]) -> ComputeError:
+    """The refusal with the images that were not even offered to the solver."""
+    reasons = "".join(f"; {files[k].name}: {reason}" for k, reason in sorted(views.excluded.items())[:5])
+    return ComputeError(error.what + reasons, where=error.where, remedy=error.remedy)
+
+
+def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[dict[str, Any], list[str]]:
+    """What changed between the images, as a record and as warnings."""
+    calibrated = [optics_of(file) for file in calibration]
+    within = compare_optics(calibrated, calibrated)
+    record: dict[str, Any] = {"calibration_departures": [str(departure) for departure in within.departures]}
+    warnings = _departure_warnings("changed during the calibration", record["calibration_departures"])
+    if capture_folder is not None:
+        comparison = compare_optics(calibrated, [optics_of(file) for file in image_files(capture_folder)])
+        record |= {
+            "capture_departures": [str(departure) for departure in comparison.departures],
+            "capture_images": list(comparison.images),
+            "compared": list(comparison.compared),
+            "not_stated": list(comparison.unknown),
+        }
+        warnings += _departure_warnings("is not as it was calibrated", record["capture_departures"])
+        # Width and height are always there; without focal length and aperture nothing is known of the lens.
+        if not {"focal_length_mm", "aperture_f"} & set(comparison.compared):
+            warnings.append("the images state neither focal length nor aperture: a change would not be seen")
+    return record, warnings
+
+
+def _departure_warnings(what: str, departures: Sequence[str]) -> list[str]:
+    shown = [f"the lens {what}: {departure}" for departure in departures[:_DEPARTURES_SHOWN]]
+    more = len(departures) - len(shown)
+    return [*shown, f"the lens {what}: {more} more departures"] if more else shown
+
+
+def optics_of(file: Path) -> Optics:
+    """What the file's EXIF says of its optics.
+
+    Raises:
+        DataError: the file is no picture.
+    """
+    try:
+        exif = read_exif(file)
+    except UnreadableFileError as error:
+        raise DataError(error.what, where=error.where, remedy=error.remedy) from error
+    return Optics(
+        image=file.name,
+        width=exif.width,
+        height=exif.height,
+        focal_length_mm=exif.focal_length_mm,
+        aperture_f=exif.aperture_f,
+        focus_distance_m=exif.focus_distance_m,
+        focus_mode=exif.focus_mode,
+        lens=exif.lens,
+        lens_serial=exif.lens_serial,
+        body=f"{exif.make} {exif.model}".strip(),
+        body_serial=exif.body_serial,
+    )
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise DataError(f"the file cannot be written: {error.strerror}", where=str(path)) from error
+
+
+def _write_plots(folder: Path, result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, png in calibration_plots(result, uncertainty).items():
+            (folder / name).write_bytes(png)
+    except OSError as error:
+        raise DataError(f"the report cannot be written: {error.strerror}", where=str(folder)) from error
+
+
+def _tell(
+    record: dict[str, Any],
+    result: IntrinsicsResult,
+    validation: CrossValidation | None,
+    uncertainty: ProjectionUncertainty,
+) -> None:
+    held_out = "" if validation is None else f", {validation.five_fold_rms_px:.3f} px held out"
+    console.print(f"{len(result.views)} views, {result.rms_px:.3f} px rms{held_out}")
+    for name in result.parameters:
+        console.print(f"  {name:<3} {getattr(result.camera, name):14.6g} ± {result.sigma[name]:.2g}")
+    console.print(
+        f"projection at {uncertainty.distance_m:.2f} m known to {uncertainty.centre_px:.3f} px "
+        f"({uncertainty.centre_mm:.4f} mm) in the centre, {uncertainty.worst_px:.3f} px "
+        f"({uncertainty.worst_mm:.4f} mm) at worst"
+    )
+    for view in record["excluded"]:
+        console.print(f"[yellow]left out[/] {escape(view['image'])}: {escape(view['reason'])}")
+    for warning in record["warnings"]:
+        console.print(f"[yellow]warning[/] {escape(warning)}")

@@ -11,7 +11,6 @@ import numpy as np
 
 from service.core.geometry import Array
 
-
 _OPTIONAL = ("k3", "k4", "k5", "k6")
 
 

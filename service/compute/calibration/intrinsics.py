@@ -1,25 +1,47 @@
-"""Checkerboard corners and the calibration of the camera's intrinsics from them."""
+"""The camera's intrinsics from views of a board, with their covariance and the views that do not fit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from service.compute.calibration.adjustment import (
+    PARAMETER_COUNT,
+    PARAMETERS,
+    Adjustment,
+    LensModel,
+    adjust,
+    fit_pose,
+    pose_matrix,
+    start,
+    start_pose,
+)
+from service.compute.calibration.board import Board, BoardView, board_points, detect_board, half_turn
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, transform
+from service.core.geometry import Array, Transform
 
-_SEARCH_WIDTHS = (1200, 2400)  # px; the board is searched for at these sizes, then measured at full size
-_COVERAGE_GRID = (12, 8)
-_MIN_VIEWS = 5
+__all__ = [
+    "ExcludedView",
+    "IntrinsicsResult",
+    "board_points",
+    "calibrate_intrinsics",
+    "detect_board",
+    "half_turn",
+    "locate_board",
+    "locate_view",
+]
+
+COVERAGE_GRID = (12, 8)
+_MIN_VIEWS = 3
+_MIN_CORNERS = 8
 _MIN_TILT_SPREAD_DEG = 10.0
-_SIGMA_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+_OUTLIER = 3.0  # times the median error of all views
+_OUTLIER_FLOOR_PX = 0.02
+_MIN_VIEWS_TO_JACKKNIFE = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,217 +58,251 @@ class IntrinsicsResult:
 
     Attributes:
         camera: the camera at the images' size.
+        model: which distortion was estimated.
+        board: what was seen.
         rms_px: root mean square of all corners' reprojection errors (two-dimensional).
         views: (N,) input indices of the views used.
+        corners: (N) their corners.
         per_view_rms_px: (N,).
-        sigma: standard deviation of each parameter (px, or 1 for the distortion), from corner noise alone.
+        parameters: (P) names, in the order of the covariance.
+        covariance: (P, P), px and 1. From the corners' noise, as large as their residuals show it, times `inflation`.
+        inflation: how many times larger the variance is than from independent corners, 1 at least: the corners of one
+            image err together (light, flatness of the board, the model of the lens), and the jackknife over images
+            shows by how much.
+        sigma: standard deviation of each parameter, the roots of the covariance's diagonal.
+        sigma_independent: the same from corner noise alone, as most programs state it.
+        sigma_jackknife: the same from the spread of solutions without one image each; NaN of fewer than 6 views.
+        leave_one_out: (N, P) change of the parameters when one view is left out (one Newton step).
+        sigma_corner_px: standard deviation of one coordinate of a corner, from the residuals.
         T_camera_board: (N, 4, 4); board frame: x along the columns, y along the rows, z away from the camera.
         coverage: share of the image's 12 × 8 cells that hold a corner of some view.
+        coverage_map: (8, 12) corners in each cell.
         tilt_deg: (N,) angle between the board's normal and the optical axis.
+        tilt_spread_deg: largest angle between the normals of two views.
         excluded: views left out, with reasons.
+        adjustment: the solution's equations.
     """
 
     camera: CameraModel
+    model: LensModel
+    board: Board
     rms_px: float
     views: NDArray[np.int64]
+    corners: tuple[BoardView, ...]
     per_view_rms_px: Array
+    parameters: tuple[str, ...]
+    covariance: Array
+    inflation: float
     sigma: dict[str, float]
+    sigma_independent: dict[str, float]
+    sigma_jackknife: dict[str, float]
+    leave_one_out: Array
+    sigma_corner_px: float
     T_camera_board: Array
     coverage: float
+    coverage_map: NDArray[np.int64]
     tilt_deg: Array
+    tilt_spread_deg: float
     excluded: tuple[ExcludedView, ...]
-
-
-def board_points(columns: int, rows: int, square_m: float) -> Array:
-    """(columns · rows, 3) inner corners in the board frame, row after row."""
-    y, x = np.mgrid[:rows, :columns]
-    return np.stack([x.ravel() * square_m, y.ravel() * square_m, np.zeros(x.size)], axis=1)
-
-
-def half_turn(columns: int, rows: int, square_m: float) -> Transform | None:
-    """T_board_turned of a board that looks the same after half a turn; None if its colours tell which end is up.
-
-    A board with one even and one odd number of inner corners has opposite colours at opposite corners.
-    """
-    if (columns + rows) % 2:
-        return None
-    centre = np.array([(columns - 1) * square_m, (rows - 1) * square_m, 0.0])
-    return transform(Rotation.from_euler("z", np.pi), centre)
-
-
-def detect_board(image_grey: NDArray[np.uint8], columns: int, rows: int) -> Array:
-    """Inner corners (columns · rows, 2) in pixels, row after row.
-
-    The board is searched for on a reduced copy and its corners are refined at full size. A board with one even
-    and one odd corner count is always numbered from the same physical corner: the square between the first
-    corners of the first two rows is dark.
-
-    Raises:
-        DataError: not a grey 8-bit image.
-        ComputeError: the whole board is not visible.
-    """
-    if image_grey.ndim != 2 or image_grey.dtype != np.uint8:
-        raise DataError(f"the board is searched for in grey 8-bit images, not {image_grey.shape} {image_grey.dtype}")
-    found = _search(image_grey, columns, rows)
-    grid = found.reshape(rows, columns, 2)
-    spacing = min(
-        float(np.linalg.norm(np.diff(grid, axis=0), axis=2).min()),
-        float(np.linalg.norm(np.diff(grid, axis=1), axis=2).min()),
-    )
-    # The window must not reach the next corner's edges, nor be so large that distortion bends them.
-    half = int(np.clip(0.4 * spacing, 2, 30))
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
-    start = found.astype(np.float32).reshape(-1, 1, 2)
-    refined = cv2.cornerSubPix(image_grey, start.copy(), (half, half), (-1, -1), criteria).astype(np.float64)
-    corners = refined.reshape(-1, 2)
-    if np.abs(corners - found).max() > 0.5 * spacing:
-        raise ComputeError("corners of the board drifted while they were refined", remedy="take a sharper image")
-    if (columns + rows) % 2 and not _first_square_is_dark(image_grey, corners.reshape(rows, columns, 2)):
-        corners = corners[::-1].copy()
-    return corners
-
-
-def _search(image: NDArray[np.uint8], columns: int, rows: int) -> Array:
-    height, width = image.shape
-    flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
-    tried: list[int] = []
-    for target in _SEARCH_WIDTHS:
-        factor = min(1.0, target / max(width, height))
-        if factor < 1.0:
-            small = cv2.resize(image, (round(width * factor), round(height * factor)), interpolation=cv2.INTER_AREA)
-        else:
-            small = image
-        tried.append(small.shape[1])
-        found, corners = cv2.findChessboardCornersSB(small, (columns, rows), flags=flags)
-        if found:
-            scale = np.array([width / small.shape[1], height / small.shape[0]])
-            return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
-        if factor == 1.0:
-            break
-    raise ComputeError(
-        f"no board of {columns} × {rows} inner corners in the image (searched at widths {tried})",
-        remedy="the whole board must be visible, sharp and evenly lit; check columns and rows (inner corners)",
-    )
-
-
-def _first_square_is_dark(image: NDArray[np.uint8], grid: Array) -> bool:
-    """Compare the mean brightness at the centres of the squares of either colour."""
-    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
-    x = np.clip(centres[..., 0].round().astype(int), 0, image.shape[1] - 1)
-    y = np.clip(centres[..., 1].round().astype(int), 0, image.shape[0] - 1)
-    value = image[y, x].astype(np.float64)
-    row, column = np.indices(value.shape)
-    even = (row + column) % 2 == 0
-    return bool(value[even].mean() < value[~even].mean())
+    adjustment: Adjustment
 
 
 def calibrate_intrinsics(
-    corners: Sequence[Array], square_m: float, columns: int, rows: int, size: tuple[int, int]
+    views: Sequence[BoardView], board: Board, size: tuple[int, int], *, model: LensModel = "opencv4"
 ) -> IntrinsicsResult:
-    """Calibrate fx, fy, cx, cy, k1, k2, p1, p2 from board views (Zhang's method; OpenCV's calibrateCamera).
+    """Calibrate a camera from views of a flat board.
 
-    Views whose error stands out (more than three times the median) are left out, one round after another, and named.
+    Source: Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000, with OpenCV's distortion.
+
+    Views whose error stands out (more than three times the median) are left out, the worst first, and named; one that
+    fits the final camera after all comes back. Corners that stand out within a view count less (Huber).
 
     Args:
-        corners: of each view, (columns · rows, 2) as from `detect_board`.
-        square_m: side of a square.
-        columns: inner corners in a row.
-        rows: inner corners in a column.
-        size: width and height of the images.
+        views: as from `find_board`.
+        board: what they show.
+        size: width and height of the images, px.
+        model: pinhole (no distortion), radial2 (k1, k2), opencv4 (and p1, p2), opencv5 (and k3), rational (k1 … k6).
 
     Raises:
-        DataError: a view has another number of corners.
+        DataError: a view's corners do not belong to this board.
         ComputeError: too few views, or views so alike in tilt that the focal length is not determined.
     """
-    for index, view in enumerate(corners):
-        if view.shape != (columns * rows, 2) or not np.isfinite(view).all():
-            raise DataError(f"{view.shape} corners instead of ({columns * rows}, 2)", where=f"view {index}")
-    points = board_points(columns, rows, square_m).astype(np.float32)
-    used = list(range(len(corners)))
-    excluded: list[ExcludedView] = []
-    while True:
-        if len(used) < _MIN_VIEWS:
-            raise ComputeError(
-                f"{len(used)} usable board views, at least {_MIN_VIEWS} are needed"
-                + "".join(f"; view {e.index}: {e.reason}" for e in excluded),
-                remedy="take more board images with different tilts",
-            )
-        _check_tilt(corners, used, points, size)
-        flags = cv2.CALIB_FIX_K3
-        rms, K, distortion, rvecs, tvecs, deviation, _, per_view = cv2.calibrateCameraExtended(
-            [points] * len(used),
-            [corners[k].astype(np.float32).reshape(-1, 1, 2) for k in used],
-            size,
-            np.eye(3),
-            np.zeros(5),
-            flags=flags,
-            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10),
-        )
-        view_rms = np.asarray(per_view, dtype=np.float64).ravel()
-        limit = max(3 * float(np.median(view_rms)), 0.02)
-        worst = [k for k, value in enumerate(view_rms) if value > limit]
-        if not worst:
-            break
-        excluded += [
-            ExcludedView(used[k], f"error {view_rms[k]:.2f} px, median {np.median(view_rms):.2f} px") for k in worst
-        ]
-        used = [index for k, index in enumerate(used) if k not in worst]
-    poses = np.stack([_pose(r, t) for r, t in zip(rvecs, tvecs, strict=True)])
-    k1, k2, p1, p2 = (float(v) for v in np.asarray(distortion).ravel()[:4])
-    camera = CameraModel(*size, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), k1, k2, p1, p2)
-    sigma = {name: float(v) for name, v in zip(_SIGMA_NAMES, np.asarray(deviation).ravel(), strict=False)}
+    points = board.points()
+    used: list[int] = []
+    reasons: dict[int, str] = {}
+    for index, view in enumerate(views):
+        _check_view(view, len(points), index)
+        if len(view.indices) < _MIN_CORNERS:
+            reasons[index] = f"{len(view.indices)} corners of the board, at least {_MIN_CORNERS} are needed"
+        else:
+            used.append(index)
+    solution, used = _solve_without_outliers(views, points, size, model, used, reasons)
+    seen = tuple(views[k] for k in used)
+    count = PARAMETER_COUNT[model]
+    names = PARAMETERS[:count]
+    corners_used = sum(len(view.indices) for view in seen)
+    freedom = 2 * corners_used - count - 6 * len(used)
+    variance = sum(float(view.weighted @ view.weighted) for view in solution.views) / max(freedom, 1)
+    normal = np.sum([view.normal for view in solution.views], axis=0)
+    independent = np.linalg.inv(normal) * variance
+    left_out = leave_one_out(solution)
+    inflation, jackknife = _inflation(independent, left_out)
+    covariance = independent * inflation
+    poses = solution.T_camera_board()
+    counts = _coverage_map([view.corners for view in seen], size)
+    squares = sum(float(view.residual @ view.residual) for view in solution.views)
     return IntrinsicsResult(
-        camera,
-        float(rms),
-        np.array(used, dtype=np.int64),
-        view_rms,
-        sigma,
-        poses,
-        _coverage([corners[k] for k in used], size),
-        np.degrees(np.arccos(np.clip(np.abs(poses[:, 2, 2]), 0, 1))),
-        tuple(excluded),
+        camera=solution.camera,
+        model=model,
+        board=board,
+        rms_px=float(np.sqrt(squares / corners_used)),
+        views=np.array(used, dtype=np.int64),
+        corners=seen,
+        per_view_rms_px=np.array([view.rms_px for view in solution.views]),
+        parameters=names,
+        covariance=covariance,
+        inflation=inflation,
+        sigma=_sigma(names, covariance),
+        sigma_independent=_sigma(names, independent),
+        sigma_jackknife=_sigma(names, jackknife),
+        leave_one_out=left_out,
+        sigma_corner_px=float(np.sqrt(variance)),
+        T_camera_board=poses,
+        coverage=np.count_nonzero(counts) / counts.size,
+        coverage_map=counts,
+        tilt_deg=np.degrees(np.arccos(np.clip(np.abs(poses[:, 2, 2]), 0, 1))),
+        tilt_spread_deg=_largest_angle_deg(poses[:, :3, 2]),
+        excluded=tuple(ExcludedView(index, reasons[index]) for index in sorted(reasons)),
+        adjustment=solution,
     )
 
 
 def locate_board(
     corners: Array, square_m: float, columns: int, rows: int, camera: CameraModel
 ) -> tuple[Transform, float]:
+    """T_camera_board of one whole checkerboard and a calibrated camera, and its RMS reprojection error in px.
+
+    Raises:
+        ComputeError: no pose explains the corners.
+    """
+    return locate_view(BoardView(np.arange(columns * rows), corners), Board(columns, rows, square_m), camera)
+
+
+def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Transform, float]:
     """T_camera_board of one view of a calibrated camera, and its RMS reprojection error in px.
 
     Raises:
         ComputeError: no pose explains the corners.
     """
-    points = board_points(columns, rows, square_m)
-    done, rvec, tvec = cv2.solvePnP(points, corners, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_IPPE)
-    if not done:
-        raise ComputeError("the board's pose could not be computed", remedy="check the corner counts")
-    rvec, tvec = cv2.solvePnPRefineLM(points, corners, camera.matrix, camera.distortion, rvec, tvec)
-    T = _pose(rvec, tvec)
-    residual = camera.project(points @ T[:3, :3].T + T[:3, 3]) - corners
-    return T, float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+    points = board.points()
+    pose, rms_px = fit_pose(view, points, camera, start_pose(view, points, camera))
+    return pose_matrix(pose), rms_px
 
 
-def _pose(rvec: npt.ArrayLike, tvec: npt.ArrayLike) -> Transform:
-    """Our transform of OpenCV's pair of vectors."""
-    return transform(Rotation.from_rotvec(np.asarray(rvec, np.float64).ravel()), np.asarray(tvec, np.float64).ravel())
+def leave_one_out(solution: Adjustment) -> Array:
+    """(N, P) how the parameters change without each view: one Newton step of the equations at the solution.
+
+    Without view i the gradient at the solution is minus this view's share, g_i, and the normal matrix lacks its
+    share, S_i: d = (S - S_i)^-1 g_i. NaN where the other views do not determine the camera.
+    """
+    normal = np.sum([view.normal for view in solution.views], axis=0)
+    scale = np.sqrt(np.diag(normal))
+    changes = np.full((len(solution.views), len(scale)), np.nan)
+    for k, view in enumerate(solution.views):
+        rest = (normal - view.normal) / np.outer(scale, scale)
+        if np.linalg.eigvalsh(rest)[0] > 1e-12:
+            changes[k] = np.linalg.solve(rest, view.gradient / scale) / scale
+    return changes
 
 
-def _check_tilt(
-    corners: Sequence[Array], used: list[int], points: NDArray[np.float32], size: tuple[int, int]
-) -> None:
+def _solve_without_outliers(
+    views: Sequence[BoardView],
+    points: Array,
+    size: tuple[int, int],
+    model: LensModel,
+    used: list[int],
+    reasons: dict[int, str],
+) -> tuple[Adjustment, list[int]]:
+    """The solution, the views it rests on; `reasons` gains the others."""
+    count = PARAMETER_COUNT[model]
+    suspects: list[int] = []
+    begin: tuple[CameraModel, Array] | None = None
+    while True:
+        if len(used) < _MIN_VIEWS:
+            raise ComputeError(
+                f"{len(used)} usable board views, at least {_MIN_VIEWS} are needed"
+                + "".join(f"; view {index}: {reasons[index]}" for index in sorted(reasons)),
+                remedy="take more board images with different tilts",
+            )
+        chosen = [views[k] for k in used]
+        if begin is None:
+            _check_tilt(chosen, points, size)
+            begin = start(chosen, points, size, model)
+        solution = adjust(chosen, points, size, *begin, parameters=count)
+        errors = np.array([view.rms_px for view in solution.views])
+        limit = max(_OUTLIER * float(np.median(errors)), _OUTLIER_FLOOR_PX)
+        # One bad view raises the error of good ones: only those near the worst leave in one round.
+        bad = (errors > limit) & (errors > 0.5 * errors.max())
+        if not bad.any():
+            break
+        for k in np.flatnonzero(bad):
+            reasons[used[k]] = f"error {errors[k]:.2f} px, median {np.median(errors):.2f} px"
+        suspects += [used[k] for k in np.flatnonzero(bad)]
+        used = [index for k, index in enumerate(used) if not bad[k]]
+        begin = None
+    back = [k for k in suspects if _fits(views[k], points, solution.camera, limit)]
+    if not back:
+        return solution, used
+    for index in back:
+        del reasons[index]
+    used = sorted([*used, *back])
+    chosen = [views[k] for k in used]
+    poses = np.stack([start_pose(view, points, solution.camera) for view in chosen])
+    return adjust(chosen, points, size, solution.camera, poses, parameters=count), used
+
+
+def _fits(view: BoardView, points: Array, camera: CameraModel, limit_px: float) -> bool:
+    return fit_pose(view, points, camera, start_pose(view, points, camera))[1] <= limit_px
+
+
+def _check_view(view: BoardView, count: int, index: int) -> None:
+    corners, indices = view.corners, view.indices
+    if corners.ndim != 2 or corners.shape != (len(indices), 2) or len(indices) > count:
+        raise DataError(f"{corners.shape} corners instead of ({count}, 2)", where=f"view {index}")
+    if not np.isfinite(corners).all() or len(np.unique(indices)) != len(indices):
+        raise DataError("a corner is not finite, or is there twice", where=f"view {index}")
+    if len(indices) and (indices.min() < 0 or indices.max() >= count):
+        raise DataError(f"a corner's index is outside of the board's {count}", where=f"view {index}")
+
+
+def _inflation(independent: Array, left_out: Array) -> tuple[float, Array]:
+    """How much larger the jackknife's covariance is, averaged over all directions, and that covariance (P, P).
+
+    The form of the covariance is taken from the corners, its size from the images: a dozen images do not determine
+    a matrix of 8 × 8. Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11.
+    """
+    n, count = left_out.shape
+    if n < _MIN_VIEWS_TO_JACKKNIFE or not np.isfinite(left_out).all():
+        return 1.0, np.full_like(independent, np.nan)
+    offset = left_out - left_out.mean(axis=0)
+    jackknife = (n - 1) / n * offset.T @ offset
+    ratio = float(np.trace(np.linalg.solve(independent, jackknife))) / count
+    return max(1.0, ratio), jackknife
+
+
+def _sigma(names: Sequence[str], covariance: Array) -> dict[str, float]:
+    return {name: float(np.sqrt(v)) for name, v in zip(names, np.diag(covariance), strict=True)}
+
+
+def _check_tilt(views: Sequence[BoardView], points: Array, size: tuple[int, int]) -> None:
     """Parallel boards leave the focal length undetermined: refuse before the solver invents one.
 
     Perspective is judged by rough poses under a nominal lens, which is good enough for an angle between normals.
     """
     focal = 1.2 * max(size)
-    K = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]])
-    normals: list[Array] = []
-    for k in used:
-        done, rvec, tvec = cv2.solvePnP(points, corners[k], K, np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
-        if done:
-            normals.append(_pose(rvec, tvec)[:3, 2])
-    stack = np.array(normals)
-    spread = float(np.degrees(np.arccos(np.clip((stack @ stack.T).min(), -1, 1)))) if normals else 0.0
+    camera = CameraModel(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)
+    normals = np.stack([pose_matrix(start_pose(view, points, camera))[:3, 2] for view in views])
+    spread = _largest_angle_deg(normals)
     if spread < _MIN_TILT_SPREAD_DEG:
         raise ComputeError(
             f"all board views have nearly the same tilt (normals within {spread:.1f}°): focal length undetermined",
@@ -254,7 +310,13 @@ def _check_tilt(
         )
 
 
-def _coverage(corners: Sequence[Array], size: tuple[int, int]) -> float:
-    cells = np.array(_COVERAGE_GRID)
-    index = np.clip((np.concatenate(corners) / np.array(size) * cells).astype(int), 0, cells - 1)
-    return len(np.unique(index, axis=0)) / int(cells.prod())
+def _largest_angle_deg(directions: Array) -> float:
+    return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1))))
+
+
+def _coverage_map(corners: Sequence[Array], size: tuple[int, int]) -> NDArray[np.int64]:
+    """(rows, columns) corners in each cell of the image."""
+    edges = [np.linspace(-0.5, size[k] - 0.5, COVERAGE_GRID[k] + 1) for k in (1, 0)]
+    everything = np.concatenate(corners)
+    inside = np.clip(everything, -0.5, np.array(size) - 0.5)
+    return np.histogram2d(inside[:, 1], inside[:, 0], bins=[edges[0], edges[1]])[0].astype(np.int64)

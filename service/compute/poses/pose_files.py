@@ -24,9 +24,10 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y u
 _CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 _MORE_DISTORTION = ("k3", "k4", "k5", "k6")
 #: What `calibrate intrinsics` writes beside the camera into the same file.
-CALIBRATION_KEYS = (
-    "model", "board", "rms_px", "per_view_rms_px", "sigma", "sigma_px", "n_views", "excluded", "covariance", "coverage",
-    "cross_validation", "uncertainty", "residuals", "optics", "warnings",
+_CALIBRATION_KEYS = (
+    "model", "board", "n_views", "images", "rms_px", "per_view_rms_px", "excluded", "sigma", "sigma_independent",
+    "sigma_jackknife", "sigma_corner_px", "inflation", "covariance", "coverage", "tilt", "cross_validation",
+    "uncertainty", "warnings", "optics",
 )  # fmt: skip
 
 
@@ -266,7 +267,7 @@ def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> C
         DataError: a key is missing, unknown or not a number, or the size is not the images' (width, height).
     """
     document = _object(path)
-    _check_keys(document, set(_CAMERA_KEYS), {*_MORE_DISTORTION, *CALIBRATION_KEYS}, path)
+    _check_keys(document, set(_CAMERA_KEYS), {*_MORE_DISTORTION, *_CALIBRATION_KEYS}, path)
     values: dict[str, float] = {}
     for key in (*_CAMERA_KEYS, *_MORE_DISTORTION):
         value = document.get(key, 0.0)

@@ -1,0 +1,309 @@
+"""Calibration boards and their points in images: checkerboard, ChArUco, asymmetric circle grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array, Transform, transform
+
+Pattern = Literal["checkerboard", "charuco", "circles"]
+Grey = NDArray[np.uint8]
+
+_SEARCH_WIDTHS = (1200, 2400)  # px; the board is searched for at these sizes, then measured at full size
+_CHARUCO_WIDTHS = (1600, 3200)  # its markers are smaller than squares
+_REACH = 0.4  # of the shortest distance between two corners: the window must not see the next corner's edges
+_MAX_HALF = 30  # px; beyond this a window gains nothing and lens distortion bends the edges in it
+_MIN_CHARUCO_CORNERS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A flat board of columns × rows points.
+
+    Attributes:
+        columns: of inner corners (where four squares meet) of a checkerboard or ChArUco board, one less than its
+            squares; of circles in a row of an asymmetric grid.
+        rows: the same along the other side.
+        square_m: side of a square; of an asymmetric circle grid the distance between two rows, which is half the
+            distance between two circles of a row (OpenCV's convention).
+        pattern: what is printed.
+        marker_m: side of a ChArUco board's markers; None: three quarters of a square.
+        dictionary: of a ChArUco board's markers, one of OpenCV's names.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+    pattern: Pattern = "checkerboard"
+    marker_m: float | None = None
+    dictionary: str = "DICT_5X5_1000"
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < 3 or not 0 < self.square_m < 10:
+            raise DataError(
+                f"a board of {self.columns} × {self.rows} points {self.square_m * 1e3:g} mm apart cannot be used",
+                remedy="give its inner corners (3 × 3 at least) and the side of a square",
+            )
+        if self.pattern == "charuco" and not 0 < self._marker_m() < self.square_m:
+            raise DataError("a ChArUco marker is smaller than its square", remedy="give the marker's side")
+
+    def points(self) -> Array:
+        """(columns · rows, 3) in the board frame, row after row: x along the columns, y along the rows."""
+        if self.pattern != "circles":
+            return board_points(self.columns, self.rows, self.square_m)
+        row, column = np.mgrid[: self.rows, : self.columns]
+        x = (2 * column + row % 2).ravel() * self.square_m
+        return np.stack([x, row.ravel() * self.square_m, np.zeros(x.size)], axis=1)
+
+    def half_turn(self) -> Transform | None:
+        """T_board_turned if the board looks the same after half a turn; None if it shows which end is up."""
+        if self.pattern == "charuco" or (self.pattern == "circles" and self.rows % 2):
+            return None
+        if self.pattern == "circles":
+            return transform(Rotation.from_euler("z", np.pi), self.points().max(axis=0))
+        return half_turn(self.columns, self.rows, self.square_m)
+
+    def _marker_m(self) -> float:
+        return 0.75 * self.square_m if self.marker_m is None else self.marker_m
+
+    def charuco(self, *, legacy: bool = False) -> cv2.aruco.CharucoBoard:
+        """OpenCV's description of a ChArUco board; `legacy` as OpenCV printed it before 4.6.
+
+        Raises:
+            DataError: an unknown dictionary, or one with too few markers.
+        """
+        identifier = getattr(cv2.aruco, self.dictionary, None)
+        if not self.dictionary.startswith("DICT_") or not isinstance(identifier, int):
+            raise DataError(f"{self.dictionary} is no marker dictionary of OpenCV", remedy="such as DICT_5X5_1000")
+        dictionary = cv2.aruco.getPredefinedDictionary(identifier)
+        if len(dictionary.bytesList) < (self.columns + 1) * (self.rows + 1) // 2:
+            raise DataError(
+                f"{self.dictionary} has {len(dictionary.bytesList)} markers, fewer than this board",
+                remedy="name the dictionary that the board was printed with",
+            )
+        size = (self.columns + 1, self.rows + 1)
+        board = cv2.aruco.CharucoBoard(size, self.square_m, self._marker_m(), dictionary)
+        board.setLegacyPattern(legacy)
+        return board
+
+    def reach(self) -> float:
+        """How far from a corner, in squares, nothing but this corner's own edges is printed."""
+        if self.pattern == "charuco":
+            return min(_REACH, 0.9 * (1 - self._marker_m() / self.square_m) / 2)
+        return _REACH
+
+
+@dataclass(frozen=True, slots=True)
+class BoardView:
+    """The points of a board that one image shows.
+
+    Attributes:
+        indices: (M,) into `Board.points()`.
+        corners: (M, 2) pixels.
+    """
+
+    indices: NDArray[np.int64]
+    corners: Array
+
+
+def board_points(columns: int, rows: int, square_m: float) -> Array:
+    """(columns · rows, 3) inner corners in the board frame, row after row."""
+    y, x = np.mgrid[:rows, :columns]
+    return np.stack([x.ravel() * square_m, y.ravel() * square_m, np.zeros(x.size)], axis=1)
+
+
+def half_turn(columns: int, rows: int, square_m: float) -> Transform | None:
+    """T_board_turned of a board that looks the same after half a turn; None if its colours tell which end is up.
+
+    A board with one even and one odd number of inner corners has opposite colours at opposite corners.
+    """
+    if (columns + rows) % 2:
+        return None
+    centre = np.array([(columns - 1) * square_m, (rows - 1) * square_m, 0.0])
+    return transform(Rotation.from_euler("z", np.pi), centre)
+
+
+def find_board(image_grey: Grey, board: Board) -> BoardView:
+    """Every point of the board that the image shows, measured at full size.
+
+    A checkerboard or circle grid must be seen whole; a ChArUco board may be cut or covered in part.
+
+    Raises:
+        DataError: not a grey 8-bit image, or a board that cannot be.
+        ComputeError: the board is not visible.
+    """
+    _check(image_grey)
+    if board.pattern == "checkerboard":
+        corners = detect_board(image_grey, board.columns, board.rows)
+        return BoardView(np.arange(len(corners)), corners)
+    return _find_charuco(image_grey, board) if board.pattern == "charuco" else _find_circles(image_grey, board)
+
+
+def detect_board(image_grey: Grey, columns: int, rows: int) -> Array:
+    """Inner corners (columns · rows, 2) of a checkerboard in pixels, row after row.
+
+    The board is searched for on a reduced copy and its corners are refined at full size. A board with one even
+    and one odd corner count is always numbered from the same physical corner: the square between the first
+    corners of the first two rows is dark.
+
+    Raises:
+        DataError: not a grey 8-bit image.
+        ComputeError: the whole board is not visible.
+    """
+    _check(image_grey)
+    found = _search_checkerboard(image_grey, columns, rows)
+    corners = _refine(image_grey, found, _grid_spacing(found.reshape(rows, columns, 2)), _REACH)
+    if (columns + rows) % 2 and not _first_square_is_dark(image_grey, corners.reshape(rows, columns, 2)):
+        corners = corners[::-1].copy()
+    return corners
+
+
+def _check(image: Grey) -> None:
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise DataError(f"the board is searched for in grey 8-bit images, not {image.shape} {image.dtype}")
+
+
+def _reduced(image: Grey, target: int) -> tuple[Grey, Array]:
+    """A copy at most `target` wide or high, and the factors from its pixels to the image's."""
+    height, width = image.shape
+    factor = min(1.0, target / max(width, height))
+    if factor == 1.0:
+        return image, np.ones(2)
+    size = (round(width * factor), round(height * factor))
+    small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return small, np.array([width / size[0], height / size[1]])
+
+
+def _search_checkerboard(image: Grey, columns: int, rows: int) -> Array:
+    tried: list[int] = []
+    # Reduced first; then larger, for small boards; then with local contrast, for shadows and glare.
+    for target, even in ((_SEARCH_WIDTHS[0], False), (_SEARCH_WIDTHS[1], False), (_SEARCH_WIDTHS[0], True)):
+        small, scale = _reduced(image, target)
+        if small.shape[1] in tried and not even:
+            continue
+        tried.append(small.shape[1])
+        if even:
+            small = np.asarray(cv2.createCLAHE(4.0, (8, 8)).apply(cv2.GaussianBlur(small, (0, 0), 1.0)), np.uint8)
+        found, corners = cv2.findChessboardCornersSB(small, (columns, rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        if found:
+            return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
+    raise ComputeError(
+        f"no board of {columns} × {rows} inner corners in the image (searched at widths {sorted(set(tried))})",
+        remedy="the whole board must be visible, sharp and evenly lit; check columns and rows (inner corners)",
+    )
+
+
+def _grid_spacing(grid: Array) -> float:
+    """Shortest distance between neighbours of a (rows, columns, 2) grid, px."""
+    return min(
+        float(np.linalg.norm(np.diff(grid, axis=0), axis=2).min()),
+        float(np.linalg.norm(np.diff(grid, axis=1), axis=2).min()),
+    )
+
+
+def _refine(image: Grey, found: Array, spacing_px: float, reach: float) -> Array:
+    """Corners at full size, by the point whose directions to all pixels are normal to their gradients.
+
+    Four squares meet point-symmetrically, so neither gamma nor blur moves this point.
+    Source: Förstner and Gülch 1987, as OpenCV's cornerSubPix has it.
+    """
+    half = int(np.clip(reach * spacing_px, 2, _MAX_HALF))
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
+    start = found.astype(np.float32).reshape(-1, 1, 2)
+    refined = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), criteria)
+    corners = np.asarray(refined, dtype=np.float64).reshape(-1, 2)
+    if np.abs(corners - found).max() > 0.5 * spacing_px:
+        raise ComputeError("corners of the board drifted while they were refined", remedy="take a sharper image")
+    return corners
+
+
+def _first_square_is_dark(image: Grey, grid: Array) -> bool:
+    """Compare the mean brightness at the centres of the squares of either colour."""
+    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    x = np.clip(centres[..., 0].round().astype(int), 0, image.shape[1] - 1)
+    y = np.clip(centres[..., 1].round().astype(int), 0, image.shape[0] - 1)
+    value = image[y, x].astype(np.float64)
+    row, column = np.indices(value.shape)
+    even = (row + column) % 2 == 0
+    return bool(value[even].mean() < value[~even].mean())
+
+
+def _find_charuco(image: Grey, board: Board) -> BoardView:
+    """Identify corners by their markers on a reduced copy, then refine them at full size."""
+    for target in _CHARUCO_WIDTHS:
+        small, scale = _reduced(image, target)
+        for legacy in (False, True):
+            found, identifiers, _, _ = cv2.aruco.CharucoDetector(board.charuco(legacy=legacy)).detectBoard(small)
+            # Annotated as always there; None when no marker is seen.
+            if identifiers is not None and len(identifiers) >= _MIN_CHARUCO_CORNERS:  # pyright: ignore[reportUnnecessaryComparison]
+                indices = np.asarray(identifiers, dtype=np.int64).ravel()
+                corners = (np.asarray(found, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
+                return _charuco_view(image, board, indices, corners)
+        if small is image:
+            break
+    raise ComputeError(
+        f"fewer than {_MIN_CHARUCO_CORNERS} corners of the ChArUco board in the image",
+        remedy="check columns and rows (inner corners), the dictionary, sharpness and light",
+    )
+
+
+def _charuco_view(image: Grey, board: Board, indices: NDArray[np.int64], corners: Array) -> BoardView:
+    H, _ = cv2.findHomography(board.points()[indices, :2], corners, cv2.RANSAC, 0.3 * _scatter(corners))
+    if H is None:  # pyright: ignore[reportUnnecessaryComparison]
+        raise ComputeError("the ChArUco corners lie on no plane", remedy="more of the board must be visible")
+    grid = cv2.perspectiveTransform(board.points()[None, :, :2], H)[0].reshape(board.rows, board.columns, 2)
+    row, column = np.divmod(indices, board.columns)
+    part = np.asarray(grid, dtype=np.float64)[row.min() : row.max() + 1, column.min() : column.max() + 1]
+    if min(part.shape[:2]) < 2:
+        raise ComputeError("only one row of the ChArUco board is seen", remedy="more of the board must be visible")
+    refined = _refine(image, corners, _grid_spacing(part), board.reach())
+    return BoardView(indices, refined)
+
+
+def _scatter(corners: Array) -> float:
+    """A length that grows with the spacing of the corners, px."""
+    return float(np.sqrt(np.prod(np.ptp(corners, axis=0)) / len(corners)))
+
+
+def _find_circles(image: Grey, board: Board) -> BoardView:
+    """Find an asymmetric grid of dark circles on a reduced copy, then the centroid of each at full size."""
+    flags = cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
+    for target in _SEARCH_WIDTHS:
+        small, scale = _reduced(image, target)
+        settings = cv2.SimpleBlobDetector.Params()
+        settings.minArea, settings.maxArea = 20, small.size / (4 * board.columns * board.rows)
+        settings.minDistBetweenBlobs = 4
+        detector = cv2.SimpleBlobDetector.create(settings)
+        found, centres = cv2.findCirclesGrid(small, (board.columns, board.rows), flags=flags, blobDetector=detector)
+        if found:
+            start = (np.asarray(centres, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
+            return BoardView(np.arange(len(start)), _centroids(image, start))
+        if small is image:
+            break
+    raise ComputeError(
+        f"no asymmetric grid of {board.columns} × {board.rows} circles in the image",
+        remedy="the whole grid must be visible; OpenCV counts the circles of one row and then the rows",
+    )
+
+
+def _centroids(image: Grey, start: Array) -> Array:
+    """Centroid (N, 2) of each dark circle's share of every pixel."""
+    distance = np.linalg.norm(start[:, None] - start[None], axis=2) + np.diag(np.full(len(start), np.inf))
+    half = int(0.5 * distance.min())
+    out = start.copy()
+    for k, (x, y) in enumerate(start.round().astype(int)):
+        patch = image[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1].astype(np.float64)
+        dark, bright = np.percentile(patch, (2, 95))
+        share = np.clip((bright - patch) / max(bright - dark, 1.0), 0, 1)
+        share[share < 0.2] = 0  # paper's texture and noise, which would pull to the patch's centre
+        rows, columns = np.indices(share.shape)
+        out[k] = np.array([np.sum(columns * share), np.sum(rows * share)]) / share.sum()
+        out[k] += [max(x - half, 0), max(y - half, 0)]
+    return out

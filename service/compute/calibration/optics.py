@@ -1,0 +1,111 @@
+"""Whether images were taken with the lens as it was calibrated: focus, aperture, zoom, lens, body, size."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from service.core.errors import DataError
+
+# Relative steps that are no change: EXIF rounds focal lengths and apertures; focus encoders read in coarse steps.
+_TOLERANCE = {"focal_length_mm": 0.005, "aperture_f": 0.02, "focus_distance_m": 0.02}
+_FIELDS = (
+    "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "lens", "lens_serial",
+    "body", "body_serial",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Optics:
+    """What an image file says of the optics it was taken with; None or "" where it does not say."""
+
+    image: str
+    width: int | None = None
+    height: int | None = None
+    focal_length_mm: float | None = None
+    aperture_f: float | None = None
+    focus_distance_m: float | None = None
+    focus_mode: str = ""
+    lens: str = ""
+    lens_serial: str = ""
+    body: str = ""
+    body_serial: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class OpticsDeparture:
+    """One property of one image that is not as it was at the calibration."""
+
+    image: str
+    field: str
+    calibrated: str
+    found: str
+
+    def __str__(self) -> str:
+        return f"{self.image}: {self.field} {self.found}, calibrated at {self.calibrated}"
+
+
+@dataclass(frozen=True, slots=True)
+class OpticsComparison:
+    """The departures, and which properties the files do not tell (so nobody knows)."""
+
+    departures: tuple[OpticsDeparture, ...]
+    compared: tuple[str, ...]
+    unknown: tuple[str, ...]
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Names of the images that depart, each once, in order."""
+        return tuple(dict.fromkeys(departure.image for departure in self.departures))
+
+
+def compare_optics(calibration: Sequence[Optics], capture: Sequence[Optics]) -> OpticsComparison:
+    """Hold images against those of the calibration, property by property.
+
+    The calibrated value is the one that most of the calibration's images state. Focus, aperture and zoom move the
+    focal length and the distortion; another lens, body or image size is another camera. Exposure time and ISO do not
+    matter. With `capture` the calibration's own images, it is the calibration that is examined for changes within.
+
+    Args:
+        calibration: of the images that the camera was calibrated from.
+        capture: of the images it is to be used for.
+
+    Raises:
+        DataError: no image on one of the two sides.
+    """
+    if not calibration or not capture:
+        raise DataError(
+            "no images to compare the optics of", remedy="give the calibration's and the capture's images"
+        )
+    departures: list[OpticsDeparture] = []
+    compared: list[str] = []
+    for field in _FIELDS:
+        stated = [getattr(optics, field) for optics in calibration]
+        stated = [value for value in stated if value not in (None, "")]
+        found = [(optics.image, getattr(optics, field)) for optics in capture]
+        found = [(image, value) for image, value in found if value not in (None, "")]
+        if not stated or not found:
+            continue
+        compared.append(field)
+        reference = Counter(stated).most_common(1)[0][0]
+        departures += [
+            OpticsDeparture(image, field, _text(reference), _text(value))
+            for image, value in found
+            if not _same(field, value, reference)
+        ]
+    order = {optics.image: k for k, optics in enumerate(capture)}
+    departures.sort(key=lambda departure: order[departure.image])
+    unknown = tuple(field for field in _FIELDS if field not in compared)
+    return OpticsComparison(tuple(departures), tuple(compared), unknown)
+
+
+def _same(field: str, value: object, reference: object) -> bool:
+    tolerance = _TOLERANCE.get(field)
+    if tolerance is None or not isinstance(value, int | float) or not isinstance(reference, int | float):
+        return value == reference
+    return abs(value - reference) <= tolerance * abs(reference)
+
+
+def _text(value: object) -> str:
+    return f"{value:g}" if isinstance(value, int | float) else str(value)
