@@ -46,13 +46,13 @@ def _error_mm(T: Transform) -> float:
     return float(np.linalg.norm(T[:3, 3] - T_FLANGE_CAMERA[:3, 3]) * 1e3)
 
 
-@pytest.mark.parametrize("method", ["park", "daniilidis", "tsai", "horaud", "andreff"])
+@pytest.mark.parametrize("method", ["weighted", "park", "daniilidis", "tsai", "horaud", "andreff"])
 def test_exact_data_gives_the_exact_answer(method: Method) -> None:
     result = calibrate_hand_eye(*_session(12), method=method, bootstrap=5)
     assert _error_mm(result.T_flange_camera) < 1e-6
     np.testing.assert_allclose(result.T_base_board, T_BASE_BOARD, atol=1e-9)
     assert result.method == method
-    assert set(result.methods) == {"park", "daniilidis", "tsai", "horaud", "andreff"}
+    assert set(result.methods) == {"weighted", "park", "daniilidis", "tsai", "horaud", "andreff"}
     assert result.spread_mm < 1e-5
     assert result.held_out_mm.max() < 1e-5
 

@@ -2,30 +2,51 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from service.compute.calibration.arm_correction import ArmCorrection
+from service.compute.calibration.closed_form import (
+    CLOSED_FORMS,
+    all_closed_forms,
+    deviation,
+    distance,
+    mean_pose,
+    observability,
+    untwist,
+)
+from service.compute.calibration.hand_eye_fit import (
+    Answer,
+    ArmTerms,
+    Measured,
+    Method,
+    arm_is_possible,
+    arm_noise,
+    arm_outliers,
+    find_outliers,
+    fit_closed_form,
+    fit_method,
+    fit_with_arm,
+    held_out,
+    turned_back,
+)
+from service.compute.calibration.kinematics import ArmModel
+from service.compute.calibration.reprojection import BoardCorners, board_covariance, resample_reprojection
+from service.compute.calibration.weighted import Noise, resample
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, transform
+from service.core.geometry import Array, Transform
 
-Method = Literal["park", "daniilidis", "tsai", "horaud", "andreff"]
+__all__ = ["BoardCorners", "BoardPlacement", "HandEyeResult", "Method", "calibrate_hand_eye", "place_board"]
 
-_METHODS: dict[Method, int] = {
-    "park": cv2.CALIB_HAND_EYE_PARK,
-    "daniilidis": cv2.CALIB_HAND_EYE_DANIILIDIS,
-    "tsai": cv2.CALIB_HAND_EYE_TSAI,
-    "horaud": cv2.CALIB_HAND_EYE_HORAUD,
-    "andreff": cv2.CALIB_HAND_EYE_ANDREFF,
-}
-_MIN_VIEWS = 6
-_MIN_ROTATION_DEG = 15.0  # largest rotation between two views
-_MIN_SECOND_AXIS_DEG = 4.0  # root mean square rotation about the second best axis
 _FOLDS = 5
+_FEW = 24  # up to so many views twice the folds: a fifth less would change the answer
+_WORTH = 0.9  # an arm's correction is used when the held-out error falls below this share
+_MIN_DISTINCT = 4  # views in a bootstrap replicate
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,16 +54,22 @@ class HandEyeResult:
     """T_flange_camera and what tells whether to trust it; arrays are over the N views.
 
     Attributes:
-        T_flange_camera: the calibration.
-        T_base_board: where the board lay (mean over the views).
+        T_flange_camera: the calibration; goes with poses corrected by `arm_correction`, where there is one.
+        T_base_board: where the board lay.
         method: of T_flange_camera.
-        methods: T_flange_camera by every method that gave an answer.
+        methods: T_flange_camera by every method that gave an answer, the arm taken as it reports itself.
         spread_mm: largest distance of another method's translation from the chosen one's (Tsai's and Andreff's
             included, which are the weakest: a large spread warns of a weak data set).
         spread_deg: the same for the rotation.
         sigma_mm: bootstrap standard deviation of the translation (root of the summed variances), over images.
         sigma_deg: bootstrap standard deviation of the rotation.
-        residual_mm: (N,) how far the board, placed by each view, is from its mean place.
+        covariance: (6, 6) of T_flange_camera by the bootstrap: (d in metres, w in radians) in the flange's axes.
+        formal_covariance: (6, 6) as the fit's own noise model predicts it; None unless the method is weighted.
+        robot_noise_mm: standard deviation for each axis of what is left of the robot's position error; None
+            unless the method is weighted, as the next.
+        robot_noise_deg: of its rotation.
+        corner_sigma_px: noise of the corners; None if only board poses were given.
+        residual_mm: (N,) how far the board, placed by each view, is from its place, at the board's middle.
         residual_deg: (N,) the same for its orientation.
         held_out_mm: (N,) as residual_mm, but each view judged by a calibration without its fold.
         held_out_deg: (N,).
@@ -50,6 +77,11 @@ class HandEyeResult:
         second_axis_deg: root mean square rotation about the second best axis.
         condition: of the translation's linear system; one rotation axis makes it infinite.
         turned: (N,) views whose board pose was turned by half a turn.
+        excluded: views that no fit used, with the reason.
+        arm_correction: the arm's systematic error, if joints were given and the correction pays.
+        arm_held_out_mm: root mean square of held_out_mm for each model of the arm that was tried ("none" is the
+            arm as it reports itself).
+        T_flange_camera_uncorrected: to go with poses as the robot reports them.
     """
 
     T_flange_camera: Transform
@@ -60,6 +92,11 @@ class HandEyeResult:
     spread_deg: float
     sigma_mm: float
     sigma_deg: float
+    covariance: Array
+    formal_covariance: Array | None
+    robot_noise_mm: float | None
+    robot_noise_deg: float | None
+    corner_sigma_px: float | None
     residual_mm: Array
     residual_deg: Array
     held_out_mm: Array
@@ -68,6 +105,10 @@ class HandEyeResult:
     second_axis_deg: float
     condition: float
     turned: tuple[bool, ...]
+    excluded: dict[int, str]
+    arm_correction: ArmCorrection | None
+    arm_held_out_mm: dict[ArmTerms, float]
+    T_flange_camera_uncorrected: Transform
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,61 +132,201 @@ def calibrate_hand_eye(
     T_base_flange: Array,
     T_camera_board: Array,
     *,
-    method: Method = "park",
+    method: Method = "weighted",
+    corners: BoardCorners | None = None,
+    joints_rad: Array | None = None,
+    arm: ArmModel | None = None,
     T_board_turned: Transform | None = None,
-    bootstrap: int = 60,
+    bootstrap: int = 100,
     seed: int = 0,
 ) -> HandEyeResult:
-    """Solve T_base_flange · T_flange_camera · T_camera_board = constant over the views.
+    """Solve T_base_flange · T_flange_camera · T_camera_board = T_base_board over the views.
 
-    Source: Park and Martin, "Robot sensor calibration: solving AX = XB on the Euclidean group", IEEE TRA 10(5),
-    1994, as OpenCV implements it; it is the least disturbed by an arm whose kinematics are slightly wrong.
+    `weighted`, the default, weighs robot and images by the noise that the data show in each (weighted.py); a closed
+    form weighs nothing, and `reprojection` blames the images for the robot's errors. With joints and the arm's model,
+    the weighted fit also estimates the arm's systematic error and keeps it when held-out views say that it gains.
 
     Args:
         T_base_flange: (N, 4, 4) from the robot.
         T_camera_board: (N, 4, 4) from the images.
-        method: which of OpenCV's methods gives the answer; all others are computed for comparison.
-        T_board_turned: the half turn of a board that looks the same upside down (`intrinsics.half_turn`); views
-            that were numbered from the other end are then turned so that they agree with the robot.
+        method: which one gives the answer; the others are computed for comparison.
+        corners: the boards' corners: gives the board poses' covariance; `reprojection` cannot do without.
+        joints_rad: (N, 6) as recorded with the poses.
+        arm: model of the arm, with `joints_rad`.
+        T_board_turned: the half turn of a board that looks the same upside down (`half_turn`); views that were
+            numbered from the other end are then turned so that they agree with the robot.
         bootstrap: number of resamples.
         seed: of the resampling and of the folds.
 
     Raises:
-        DataError: arrays that do not belong together, or are not finite.
-        ComputeError: too few views, too little rotation, or rotation about one axis only.
+        DataError: arrays that do not belong together, or are not finite; joints of another arm.
+        ComputeError: too few views, too little rotation, rotation about one axis only, or more than a third of the
+            images in disagreement with the robot.
     """
+    data = _measured(T_base_flange, T_camera_board, corners, joints_rad, arm)
+    spread, second, condition = observability(data.hands)
+    turned = np.zeros(len(data.hands), dtype=bool)
+    if T_board_turned is not None:
+        turned = untwist(data.hands, data.boards, T_board_turned)[1]
+    straight, sigma_px = _straightened(data, turned, T_board_turned)
+    rng = np.random.default_rng(seed)
+    excluded = find_outliers(straight, rng)
+    keep = ~np.isin(np.arange(len(data.hands)), list(excluded))
+    plain = fit_method(straight.take(keep), method)
+    if T_board_turned is not None and (again := turned_back(straight, plain, T_board_turned)).any():
+        # The vote of all pairs can err for a view; its neighbours' common answer does not.
+        turned = turned ^ again
+        straight, sigma_px = _straightened(data, turned, T_board_turned)
+        excluded = find_outliers(straight, rng)
+        keep = ~np.isin(np.arange(len(data.hands)), list(excluded))
+        plain = fit_method(straight.take(keep), method)
+    if not all(np.isfinite(observability(straight.hands[keep]))):
+        raise ComputeError("the remaining views do not determine the answer")
+
+    point = np.zeros(3) if corners is None else corners.points_m.mean(axis=0)
+    folds = np.random.default_rng(seed).permutation(len(keep)) % min(
+        _FOLDS if len(keep) > _FEW else 2 * _FOLDS, len(keep)
+    )
+    outcomes: dict[ArmTerms, tuple[Answer, Array, Array]] = {
+        "none": (plain, *held_out(straight, keep, method, "none", (plain, None), folds, point))
+    }
+    if method == "weighted" and arm_is_possible(straight.take(keep)):
+        for terms in ("geometry", "geometry+gears"):
+            noise = arm_noise(straight.take(keep), plain, terms)
+            answer, used, noise = _arm_answer(straight, keep, plain, terms, noise)
+            errors = held_out(straight, used, method, terms, (plain, noise), folds, point)
+            outcomes[terms] = (answer, *errors)
+    rms: dict[ArmTerms, float] = {k: float(np.sqrt(np.mean(v[1][keep] ** 2))) for k, v in outcomes.items()}
+    best = min(rms, key=lambda k: rms[k])
+    chosen = best if rms[best] < _WORTH * rms["none"] else "none"
+    answer, held_mm, held_deg = outcomes[chosen]
+    residual = deviation(straight.placed(answer), answer.T_base_board, point)
+    methods = _methods(straight.take(keep), method, plain)
+    distances = [distance(T, plain.T_flange_camera) for T in methods.values()]
+    covariance = _bootstrap(straight.take(keep), method, answer, bootstrap, np.random.default_rng(seed))
+    return HandEyeResult(
+        T_flange_camera=answer.T_flange_camera,
+        T_base_board=answer.T_base_board,
+        method=method,
+        methods=methods,
+        spread_mm=max(mm for mm, _ in distances),
+        spread_deg=max(deg for _, deg in distances),
+        sigma_mm=1e3 * float(np.sqrt(np.trace(covariance[:3, :3]))),
+        sigma_deg=float(np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))),
+        covariance=covariance,
+        formal_covariance=None if answer.fit is None else answer.fit.covariance[:6, :6],
+        robot_noise_mm=None if answer.noise is None else 1e3 * answer.noise.robot_m,
+        robot_noise_deg=None if answer.noise is None else float(np.degrees(answer.noise.robot_rad)),
+        corner_sigma_px=sigma_px,
+        residual_mm=residual[0],
+        residual_deg=residual[1],
+        held_out_mm=held_mm,
+        held_out_deg=held_deg,
+        rotation_spread_deg=spread,
+        second_axis_deg=second,
+        condition=condition,
+        turned=tuple(bool(t) for t in turned),
+        excluded=excluded,
+        arm_correction=answer.correction,
+        arm_held_out_mm=rms,
+        T_flange_camera_uncorrected=plain.T_flange_camera,
+    )
+
+
+def _measured(
+    T_base_flange: Array,
+    T_camera_board: Array,
+    corners: BoardCorners | None,
+    joints_rad: Array | None,
+    arm: ArmModel | None,
+) -> Measured:
     hands = np.asarray(T_base_flange, dtype=np.float64)
     boards = np.asarray(T_camera_board, dtype=np.float64)
     if hands.ndim != 3 or hands.shape[1:] != (4, 4) or hands.shape != boards.shape:
         raise DataError(f"robot poses {hands.shape} and board poses {boards.shape} do not belong together")
     if not (np.isfinite(hands).all() and np.isfinite(boards).all()):
         raise DataError("a robot pose or a board pose is not finite")
-    spread, second, condition = _observability(hands)
-    turned = np.zeros(len(hands), dtype=bool)
+    if corners is not None and len(corners.corners_px) != len(hands):
+        raise DataError(f"corners of {len(corners.corners_px)} views for {len(hands)} poses")
+    joints = None if joints_rad is None else np.asarray(joints_rad, dtype=np.float64)
+    if joints is not None and (joints.shape != (len(hands), 6) or not np.isfinite(joints).all()):
+        raise DataError(f"joints {joints.shape} instead of ({len(hands)}, 6) finite numbers")
+    return Measured(hands, boards, np.zeros((len(hands), 6, 6)), corners, joints, arm)
+
+
+def _straightened(
+    data: Measured, turned: NDArray[np.bool_], T_board_turned: Transform | None
+) -> tuple[Measured, float | None]:
+    """The views with half-turned boards turned back, their corners renumbered, and the boards' covariance."""
+    boards, corners = data.boards, data.corners
     if T_board_turned is not None:
-        boards, turned = _untwist(hands, boards, T_board_turned)
-    X = _solve(hands, boards, method)
-    base_board = _mean_pose(hands @ X @ boards)
-    residual = _deviation(hands @ X @ boards, base_board)
-    methods = _all_methods(hands, boards, {method: X})
-    distances = [_distance(T, X) for T in methods.values()]
-    sigma = _bootstrap(hands, boards, method, X, bootstrap, np.random.default_rng(seed))
-    held_out = _held_out(hands, boards, method, np.random.default_rng(seed))
-    return HandEyeResult(
-        X,
-        base_board,
-        method,
-        methods,
-        max(mm for mm, _ in distances),
-        max(deg for _, deg in distances),
-        *sigma,
-        *residual,
-        *held_out,
-        spread,
-        second,
-        condition,
-        tuple(bool(t) for t in turned),
-    )
+        boards = np.where(turned[:, None, None], boards @ T_board_turned, boards)
+    if corners is None:
+        return dataclasses.replace(data, boards=boards), None
+    pixels = np.where(turned[:, None, None], corners.corners_px[:, ::-1], corners.corners_px)
+    corners = BoardCorners(corners.points_m, pixels, corners.camera)
+    covariance, sigma_px = board_covariance(corners, boards)
+    return dataclasses.replace(data, boards=boards, corners=corners, covariance=covariance), sigma_px
+
+
+def _arm_answer(
+    data: Measured, keep: NDArray[np.bool_], plain: Answer, terms: ArmTerms, noise: Noise
+) -> tuple[Answer, NDArray[np.bool_], Noise]:
+    """The fit with the arm's errors; views that only it shows to be wrong have no say in it."""
+    good = data.take(keep)
+    answer = fit_with_arm(good, plain, terms, noise)
+    wrong = arm_outliers(answer)
+    if not wrong.any() or np.mean(wrong) > 0.2:
+        return answer, keep, noise
+    used = keep.copy()
+    used[np.flatnonzero(keep)[wrong]] = False
+    good = data.take(used)
+    noise = arm_noise(good, plain, terms)
+    return fit_with_arm(good, plain, terms, noise), used, noise
+
+
+def _methods(data: Measured, method: Method, answer: Answer) -> dict[Method, Transform]:
+    """T_flange_camera by every method that has an answer."""
+    answers: dict[Method, Transform] = {method: answer.T_flange_camera}
+    for name, T in all_closed_forms(data.hands, data.boards).items():
+        answers.setdefault(name, T)
+    others: tuple[Method, ...] = ("weighted", "reprojection")
+    for other in others:
+        if other not in answers and (other != "reprojection" or data.corners is not None):
+            try:
+                answers[other] = fit_method(data, other).T_flange_camera
+            except ComputeError:  # a comparison that fails is no reason to lose the answer
+                continue
+    return answers
+
+
+def _bootstrap(data: Measured, method: Method, answer: Answer, count: int, rng: np.random.Generator) -> Array:
+    """(6, 6) covariance of T_flange_camera over resamples of whole images.
+
+    It holds for systematic errors that differ from pose to pose too.
+    """
+    n = len(data.hands) if answer.views is None else len(answer.views.T_base_flange)
+    picks = [rng.integers(0, n, n) for _ in range(count)]
+    picks = [pick for pick in picks if len(np.unique(pick)) >= _MIN_DISTINCT]
+    counts = np.array([np.bincount(pick, minlength=n) for pick in picks], dtype=np.float64)
+    X = answer.T_flange_camera
+    if method in CLOSED_FORMS:
+        replicas = [fit_closed_form(_repeat(data, pick), method).T_flange_camera for pick in picks]
+        turns = [Rotation.from_matrix(T[:3, :3] @ X[:3, :3].T).as_rotvec() for T in replicas]
+        steps = np.array([[*(T[:3, 3] - X[:3, 3]), *w] for T, w in zip(replicas, turns, strict=True)])
+    elif method == "reprojection":
+        assert data.corners is not None
+        steps = resample_reprojection(data.hands, data.corners, X, answer.T_base_board, counts)
+    else:
+        assert answer.views is not None
+        assert answer.noise is not None
+        assert answer.fit is not None
+        steps = resample(answer.views, answer.noise, answer.fit, counts)
+    return np.cov(steps[:, :6].T)
+
+
+def _repeat(data: Measured, pick: NDArray[np.int64]) -> Measured:
+    return Measured(data.hands[pick], data.boards[pick], data.covariance[pick], None, None, None)
 
 
 def place_board(T_base_flange: Array, T_camera_board: Array, T_flange_camera: Transform) -> BoardPlacement:
@@ -161,138 +342,55 @@ def place_board(T_base_flange: Array, T_camera_board: Array, T_flange_camera: Tr
             f"robot poses {T_base_flange.shape} and board poses {T_camera_board.shape} do not belong together"
         )
     placed = T_base_flange @ T_flange_camera @ T_camera_board
-    mean = _mean_pose(placed)
-    residual_mm, residual_deg = _deviation(placed, mean)
+    mean = mean_pose(placed)
+    residual_mm, residual_deg = deviation(placed, mean)
     n = len(placed)
     sigma = float(np.sqrt(np.sum(residual_mm**2) / max(n - 1, 1) / n))
     return BoardPlacement(mean, residual_mm, residual_deg, sigma)
 
 
-def _observability(hands: Array) -> tuple[float, float, float]:
-    """Largest relative rotation, RMS rotation about the second axis (both degrees), and the condition number.
+def as_json(result: HandEyeResult, images: list[str]) -> dict[str, Any]:
+    """The result for hand_eye.json: 4×4 transforms in metres, errors in mm and degrees, views by name."""
 
-    Raises:
-        ComputeError: the translation cannot be determined from these rotations.
-    """
-    n = len(hands)
-    if n < _MIN_VIEWS:
-        raise ComputeError(
-            f"{n} views for the hand-eye calibration, at least {_MIN_VIEWS} are needed",
-            remedy="take more board images",
-        )
-    i, j = np.triu_indices(n, 1)
-    relative = np.swapaxes(hands[i, :3, :3], 1, 2) @ hands[j, :3, :3]
-    vectors = Rotation.from_matrix(relative).as_rotvec()
-    spread = float(np.degrees(np.linalg.norm(vectors, axis=1).max()))
-    axes = np.degrees(np.sqrt(np.maximum(np.linalg.eigvalsh(vectors.T @ vectors / len(vectors)), 0)))
-    second = float(axes[1])
-    if spread < _MIN_ROTATION_DEG:
-        raise ComputeError(
-            f"the flange turned by {spread:.1f}° at most, {_MIN_ROTATION_DEG:.0f}° are needed",
-            remedy="tilt the camera to several sides of the board, 40° or more in all",
-        )
-    if second < _MIN_SECOND_AXIS_DEG:
-        raise ComputeError(
-            f"the flange turned about one axis only ({axes[2]:.1f}° about it, {second:.1f}° about any other): "
-            "the camera's position along this axis is undetermined",
-            remedy="tilt the camera about a second axis too",
-        )
-    system = (np.eye(3) - relative).reshape(-1, 3)
-    return spread, second, float(np.linalg.cond(system))
+    def per_view(values: Array) -> dict[str, float]:
+        return {name: float(v) for name, v in zip(images, values, strict=True)}
 
-
-def _untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Array, NDArray[np.bool_]]:
-    """Turn the views that were numbered from the board's other end, so that all agree with the robot.
-
-    Between two views the flange and the camera must turn by the same angle. Which choice fits each pair better
-    gives a signed graph; its leading eigenvector splits the views in two groups, and the larger one is kept.
-    """
-    n = len(hands)
-    turned = boards @ T_board_turned
-    vote = np.zeros((n, n))
-    for i in range(n):
-        arm = _angles(np.swapaxes(hands[i : i + 1, :3, :3], 1, 2) @ hands[:, :3, :3])
-        same = _angles(boards[i, :3, :3] @ np.swapaxes(boards[:, :3, :3], 1, 2))
-        other = _angles(boards[i, :3, :3] @ np.swapaxes(turned[:, :3, :3], 1, 2))
-        vote[i] = np.clip(np.abs(arm - other) - np.abs(arm - same), -0.2, 0.2)
-    np.fill_diagonal(vote, 0.0)
-    leading = np.linalg.eigh(vote + vote.T)[1][:, -1]
-    flip = leading < 0 if np.count_nonzero(leading < 0) * 2 <= n else leading >= 0
-    return np.where(flip[:, None, None], turned, boards), flip
-
-
-def _angles(rotations: Array) -> Array:
-    return np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
-
-
-def _solve(hands: Array, boards: Array, method: Method) -> Transform:
-    # By keyword: a fifth positional argument of calibrateHandEye silently means something else.
-    R, t = cv2.calibrateHandEye(
-        R_gripper2base=list(hands[:, :3, :3]),
-        t_gripper2base=list(hands[:, :3, 3]),
-        R_target2cam=list(boards[:, :3, :3]),
-        t_target2cam=list(boards[:, :3, 3]),
-        method=_METHODS[method],
-    )
-    rotation, translation = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel()
-    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()):
-        raise ComputeError(f"hand-eye calibration by {method} has no answer", remedy="take views with more rotation")
-    return transform(rotation, translation)
-
-
-def _all_methods(hands: Array, boards: Array, known: dict[Method, Transform]) -> dict[Method, Transform]:
-    answers = dict(known)
-    for method in _METHODS:
-        if method not in answers:
-            try:
-                answers[method] = _solve(hands, boards, method)
-            except (cv2.error, ComputeError):  # a comparison that fails is no reason to lose the answer
-                continue
-    return answers
-
-
-def _mean_pose(poses: Array) -> Transform:
-    return transform(Rotation.from_matrix(poses[:, :3, :3]).mean(), poses[:, :3, 3].mean(axis=0))
-
-
-def _deviation(poses: Array, mean: Transform) -> tuple[Array, Array]:
-    """Distance in mm and angle in degrees of poses (N, 4, 4) from `mean`."""
-    offset = inverse(mean) @ poses
-    angle = Rotation.from_matrix(offset[:, :3, :3]).magnitude()
-    return np.linalg.norm(offset[:, :3, 3], axis=1) * 1e3, np.degrees(angle)
-
-
-def _distance(a: Transform, b: Transform) -> tuple[float, float]:
-    offset = inverse(a) @ b
-    return float(np.linalg.norm(offset[:3, 3]) * 1e3), float(np.degrees(rotation_angle_rad(offset)))
-
-
-def _bootstrap(
-    hands: Array, boards: Array, method: Method, X: Transform, count: int, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Spread over resamples of whole images: holds for systematic errors that differ between poses too."""
-    shifts: list[Array] = []
-    turns: list[Array] = []
-    for _ in range(count):
-        pick = rng.integers(0, len(hands), len(hands))
-        if len(np.unique(pick)) < 4:
-            continue
-        offset = inverse(X) @ _solve(hands[pick], boards[pick], method)
-        shifts.append(offset[:3, 3])
-        turns.append(Rotation.from_matrix(offset[:3, :3]).as_rotvec())
-    if len(shifts) < 2:
-        return float("nan"), float("nan")
-    shift_mm = np.sqrt(np.var(np.array(shifts), axis=0, ddof=1).sum()) * 1e3
-    return float(shift_mm), float(np.degrees(np.sqrt(np.var(np.array(turns), axis=0, ddof=1).sum())))
-
-
-def _held_out(hands: Array, boards: Array, method: Method, rng: np.random.Generator) -> tuple[Array, Array]:
-    n = len(hands)
-    fold = rng.permutation(n) % min(_FOLDS, n)
-    mm, deg = np.zeros(n), np.zeros(n)
-    for k in range(int(fold.max()) + 1):
-        test, train = fold == k, fold != k
-        X = _solve(hands[train], boards[train], method)
-        place = _mean_pose(hands[train] @ X @ boards[train])
-        mm[test], deg[test] = _deviation(hands[test] @ X @ boards[test], place)
-    return mm, deg
+    away = {name: distance(T, result.methods[result.method]) for name, T in result.methods.items()}
+    correction = result.arm_correction
+    return {
+        "T_flange_camera": result.T_flange_camera.tolist(),
+        "T_base_board": result.T_base_board.tolist(),
+        "method": result.method,
+        "sigma": {
+            "mm": result.sigma_mm,
+            "deg": result.sigma_deg,
+            "covariance": result.covariance.tolist(),
+            "formal_covariance": None if result.formal_covariance is None else result.formal_covariance.tolist(),
+        },
+        "residuals": {
+            "mm": per_view(result.residual_mm),
+            "deg": per_view(result.residual_deg),
+            "held_out_mm": per_view(result.held_out_mm),
+            "held_out_deg": per_view(result.held_out_deg),
+        },
+        "methods": {
+            name: {"T_flange_camera": T.tolist(), "distance_mm": away[name][0], "distance_deg": away[name][1]}
+            for name, T in result.methods.items()
+        },
+        "spread": {"mm": result.spread_mm, "deg": result.spread_deg},
+        "noise": {
+            "robot_mm": result.robot_noise_mm,
+            "robot_deg": result.robot_noise_deg,
+            "corner_px": result.corner_sigma_px,
+        },
+        "motion": {
+            "rotation_spread_deg": result.rotation_spread_deg,
+            "second_axis_deg": result.second_axis_deg,
+            "condition": result.condition,
+        },
+        "excluded": {images[i]: reason for i, reason in result.excluded.items()},
+        "turned": [name for name, turned in zip(images, result.turned, strict=True) if turned],
+        "arm_correction": None if correction is None else correction.as_json(),
+        "arm_held_out_rms_mm": dict(result.arm_held_out_mm),
+        "T_flange_camera_uncorrected": result.T_flange_camera_uncorrected.tolist(),
+    }

@@ -1,0 +1,166 @@
+"""Hand-eye in closed form (OpenCV's five methods), what the motion determines, and half-turned boards."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, transform
+
+ClosedForm = Literal["park", "daniilidis", "tsai", "horaud", "andreff"]
+
+CLOSED_FORMS: dict[ClosedForm, int] = {
+    "park": cv2.CALIB_HAND_EYE_PARK,
+    "daniilidis": cv2.CALIB_HAND_EYE_DANIILIDIS,
+    "tsai": cv2.CALIB_HAND_EYE_TSAI,
+    "horaud": cv2.CALIB_HAND_EYE_HORAUD,
+    "andreff": cv2.CALIB_HAND_EYE_ANDREFF,
+}
+MIN_VIEWS = 6
+_MIN_ROTATION_DEG = 15.0  # largest rotation between two views
+_MIN_SECOND_AXIS_DEG = 4.0  # root mean square rotation about the second best axis
+_SUBSETS, _SUBSET_SIZE = 24, 8
+
+
+def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transform:
+    """T_flange_camera of poses T_base_flange and T_camera_board, both (N, 4, 4), N ≥ 3.
+
+    Source: Park and Martin 1994, Daniilidis 1999, Tsai and Lenz 1989, Horaud and Dornaika 1995, Andreff et al. 1999,
+    as OpenCV implements them.
+
+    Raises:
+        ComputeError: no finite answer.
+    """
+    # By keyword: a fifth positional argument of calibrateHandEye silently means something else.
+    R, t = cv2.calibrateHandEye(
+        R_gripper2base=list(hands[:, :3, :3]),
+        t_gripper2base=list(hands[:, :3, 3]),
+        R_target2cam=list(boards[:, :3, :3]),
+        t_target2cam=list(boards[:, :3, 3]),
+        method=CLOSED_FORMS[method],
+    )
+    rotation, translation = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel()
+    # Andreff's answer is a rotation only as far as the data are exact.
+    U, scale, Vt = np.linalg.svd(np.nan_to_num(rotation))
+    if not (np.isfinite(rotation).all() and np.isfinite(translation).all()) or scale[2] < 0.1:
+        raise ComputeError(f"hand-eye calibration by {method} has no answer", remedy="take views with more rotation")
+    return transform(U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt, translation)
+
+
+def all_closed_forms(hands: Array, boards: Array) -> dict[ClosedForm, Transform]:
+    """T_flange_camera by every method that has an answer."""
+    answers: dict[ClosedForm, Transform] = {}
+    for method in CLOSED_FORMS:
+        try:
+            answers[method] = solve_closed_form(hands, boards, method)
+        except (cv2.error, ComputeError):  # a comparison that fails is no reason to lose the answer
+            continue
+    return answers
+
+
+def observability(hands: Array) -> tuple[float, float, float]:
+    """Largest relative rotation, RMS rotation about the second best axis (both degrees), and the condition number.
+
+    Raises:
+        ComputeError: the translation cannot be determined from these rotations.
+    """
+    n = len(hands)
+    if n < MIN_VIEWS:
+        raise ComputeError(
+            f"{n} views for the hand-eye calibration, at least {MIN_VIEWS} are needed",
+            remedy="take more board images",
+        )
+    i, j = np.triu_indices(n, 1)
+    relative = np.swapaxes(hands[i, :3, :3], 1, 2) @ hands[j, :3, :3]
+    vectors = Rotation.from_matrix(relative).as_rotvec()
+    spread = float(np.degrees(np.linalg.norm(vectors, axis=1).max()))
+    axes = np.degrees(np.sqrt(np.maximum(np.linalg.eigvalsh(vectors.T @ vectors / len(vectors)), 0)))
+    second = float(axes[1])
+    if spread < _MIN_ROTATION_DEG:
+        raise ComputeError(
+            f"the flange turned by {spread:.1f}° at most, {_MIN_ROTATION_DEG:.0f}° are needed",
+            remedy="tilt the camera to several sides of the board, 40° or more in all",
+        )
+    if second < _MIN_SECOND_AXIS_DEG:
+        raise ComputeError(
+            f"the flange turned about one axis only ({axes[2]:.1f}° about it, {second:.1f}° about any other): "
+            "the camera's position along this axis is undetermined",
+            remedy="tilt the camera about a second axis too",
+        )
+    system = (np.eye(3) - relative).reshape(-1, 3)
+    return spread, second, float(np.linalg.cond(system))
+
+
+def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Array, NDArray[np.bool_]]:
+    """Turn the views that were numbered from the board's other end, so that all agree with the robot.
+
+    Between two views the flange and the camera must turn by the same angle. Which choice fits each pair better
+    gives a signed graph; its leading eigenvector splits the views in two groups, and the larger one is kept.
+    """
+    n = len(hands)
+    turned = boards @ T_board_turned
+    vote = np.zeros((n, n))
+    for i in range(n):
+        arm = _angles(np.swapaxes(hands[i : i + 1, :3, :3], 1, 2) @ hands[:, :3, :3])
+        same = _angles(boards[i, :3, :3] @ np.swapaxes(boards[:, :3, :3], 1, 2))
+        other = _angles(boards[i, :3, :3] @ np.swapaxes(turned[:, :3, :3], 1, 2))
+        vote[i] = np.clip(np.abs(arm - other) - np.abs(arm - same), -0.2, 0.2)
+    np.fill_diagonal(vote, 0.0)
+    leading = np.linalg.eigh(vote + vote.T)[1][:, -1]
+    flip = leading < 0 if np.count_nonzero(leading < 0) * 2 <= n else leading >= 0
+    return np.where(flip[:, None, None], turned, boards), flip
+
+
+def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> tuple[Transform, Transform]:
+    """T_flange_camera and T_base_board by Park from the subset of views that suits half of all views best.
+
+    Least median over random subsets (Rousseeuw 1984) and all views: a few images with a wrong pose have no say.
+    """
+    n = len(hands)
+    picks = [np.arange(n)]
+    picks += [rng.choice(n, min(_SUBSET_SIZE, n), replace=False) for _ in range(_SUBSETS if n > _SUBSET_SIZE else 0)]
+    best: tuple[float, Transform, Array] | None = None
+    for pick in picks:
+        try:
+            X = solve_closed_form(hands[pick], boards[pick], "park")
+        except (cv2.error, ComputeError):
+            continue
+        placed = hands @ X @ boards
+        mm, _ = deviation(placed, mean_pose(placed[pick]))
+        median = float(np.median(mm))
+        if best is None or median < best[0]:
+            best = (median, X, mm)
+    if best is None:
+        raise ComputeError("hand-eye calibration has no answer", remedy="take views with more rotation")
+    keep = np.argsort(best[2], kind="stable")[: max(MIN_VIEWS, (3 * n) // 4)]
+    answer = solve_closed_form(hands[keep], boards[keep], "park")
+    return answer, mean_pose((hands @ answer @ boards)[keep])
+
+
+def mean_pose(poses: Array) -> Transform:
+    """Mean position and mean rotation of poses (N, 4, 4)."""
+    return transform(Rotation.from_matrix(poses[:, :3, :3]).mean(), poses[:, :3, 3].mean(axis=0))
+
+
+def deviation(poses: Array, mean: Transform, point_m: Array | None = None) -> tuple[Array, Array]:
+    """Distance in mm (of the origin, or of a point (3,) in the poses' frame) and angle in degrees from `mean`."""
+    offset = inverse(mean) @ poses
+    angle = Rotation.from_matrix(offset[:, :3, :3]).magnitude()
+    point = np.zeros(3) if point_m is None else point_m
+    moved = offset[:, :3, :3] @ point + offset[:, :3, 3] - point
+    return np.linalg.norm(moved, axis=1) * 1e3, np.degrees(angle)
+
+
+def distance(a: Transform, b: Transform) -> tuple[float, float]:
+    """Between two poses, in mm and degrees."""
+    offset = inverse(a) @ b
+    return float(np.linalg.norm(offset[:3, 3]) * 1e3), float(np.degrees(rotation_angle_rad(offset)))
+
+
+def _angles(rotations: Array) -> Array:
+    return np.arccos(np.clip((np.trace(rotations, axis1=1, axis2=2) - 1) / 2, -1, 1))
