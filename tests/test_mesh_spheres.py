@@ -126,7 +126,7 @@ def test_wrong_unit_finds_nothing() -> None:
 
 
 def test_not_a_mesh() -> None:
-    with pytest.raises(DataError, match="no faces"):
+    with pytest.raises(ComputeError, match="no surface"):
         locate_spheres(np.zeros((10, 3)), np.empty((0, 3), dtype=np.int64), RADIUS)
     with pytest.raises(DataError, match="does not have"):
         locate_spheres(np.zeros((3, 3)), np.array([[0, 1, 7]]), RADIUS)

@@ -1,25 +1,29 @@
-"""Finds spheres of known radius in a scan or CT mesh without initial guesses, and measures their centres."""
+"""Finds spheres of known radius in a scan, a CT mesh or a point cloud, and measures their centres."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from service.compute.surfaces.sphere_candidates import candidates, rough_centre, vote_peaks
+from service.compute.surfaces.sphere_fit import Samples, SphereFit, fit_sphere, sample_weights
+from service.compute.surfaces.sphere_noise import CentreUncertainty, centre_uncertainties
+from service.compute.surfaces.surfels import CHUNK, IntArray, Surfels, surfels
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 
-IntArray = NDArray[np.int64]
-
-_SURFEL = 1 / 8  # surface cell over which normals are averaged, in radii
-_VOTE = 1 / 6  # cell of the voting grid, in radii
-_MIN_VOTE = 0.04  # votes a candidate needs, as a fraction of the whole sphere
-_MAX_CANDIDATES = 200
-_MIN_NORMAL_COSINE = 0.7  # between vertex normal and radius; below it a vertex is not the sphere's
-_MIN_VERTICES = 12
-_SIEVE_VERTICES = 1500  # enough to tell whether a candidate is a sphere
+_SURFEL = 0.2  # surface cell over which normals are averaged, in radii
+_HOOD = 1.3  # radii around a centre in which its sphere's surface lies
+_MOST_SAMPLES = 5000  # of one sphere: beyond, neighbours repeat each other's noise
+_NEAR_MISSES = 6
+_MIXED = 0.2  # |orientation| below which the normals say nothing
+_MAX_RADIUS_SIGMA = 0.15  # in radii; a radius that is known less is no evidence of a sphere
+_ROUGHER = 2.5  # times the rms of the best covered spheres: noise of one mesh is not so different between spheres
+_SEED_REACH = 1.6  # a seed is a rough centre or a point on the surface: the centre is within so many radii
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,16 +33,18 @@ class MeshSphere:
     Attributes:
         centre_m: (3,) in the mesh's frame.
         covariance: (3, 3) of the centre, m²; accounts for errors that neighbouring vertices share.
-        rms_m: area-weighted root mean square distance of the inlying vertices from the surface.
+        rms_m: weighted root mean square distance of the inlying vertices from the surface.
         radius_residual_m: radius of a free sphere fit to the same vertices, minus the known radius.
+        radius_sigma_m: standard deviation of that.
         coverage: solid angle of the inlying surface, as a fraction of the whole sphere.
-        n: number of inlying vertices.
+        n: number of inlying vertices (of a dense mesh, of those that served).
     """
 
     centre_m: Array
     covariance: Array
     rms_m: float
     radius_residual_m: float
+    radius_sigma_m: float
     coverage: float
     n: int
 
@@ -47,26 +53,21 @@ class MeshSphere:
 class SphereLimits:
     """What a sphere must satisfy to be accepted; lengths as fractions of the radius.
 
-    A cap of 60° half angle covers 0.25 of its sphere, one of 45° covers 0.15.
+    A cap of half angle a covers (1 - cos a) / 2 of its sphere: 0.067 at 30°, 0.15 at 45°, 0.25 at 60°.
+    The radius may also miss the known one by three of its sigmas: a small cap determines it badly.
     """
 
-    min_coverage: float = 0.14
+    min_coverage: float = 0.05
     max_rms: float = 0.025
-    max_radius_residual: float = 0.05
+    max_radius_residual: float = 0.04
+    max_flank: float = 0.3
+    max_form: float = 0.012
 
 
 @dataclass(frozen=True, slots=True)
-class _Surface:
-    """A mesh with the per-vertex quantities that the fits need."""
-
-    vertices: Array  # (V, 3)
-    faces: IntArray  # (F, 3)
-    area_normals: Array  # (F, 3), length = face area, outward if the mesh is
-    vertex_area_normals: Array  # (V, 3), sums over the adjacent faces
-    vertex_area: Array  # (V,), a third of the adjacent faces
-    faces_by_vertex: IntArray  # (F,) faces ordered by their first vertex
-    first_face: IntArray  # (V + 1,) where a vertex's faces begin in that order
-    tree: cKDTree
+class _Candidate:
+    fit: SphereFit
+    reasons: tuple[str, ...]  # why it is refused; none: accepted
 
 
 def locate_spheres(
@@ -75,263 +76,289 @@ def locate_spheres(
     radius_m: float,
     expected: int | None = None,
     limits: SphereLimits | None = None,
+    *,
+    normals: Array | None = None,
+    seeds_m: Array | None = None,
 ) -> tuple[MeshSphere, ...]:
-    """Locate every sphere of radius `radius_m` in the mesh, best covered first.
+    """Locate every sphere of radius `radius_m` in a mesh or point cloud, best covered first.
 
-    Patches of surface vote for a centre one radius behind them; each peak of votes is fitted by a robust
-    known-radius fit and accepted by its coverage, its residual and the radius of a free fit. A mesh whose faces
-    are turned inside out is handled; dents of the same radius are not taken for spheres.
+    Cells of surface vote for a centre one radius away; each peak of votes is fitted by a robust known-radius fit and
+    accepted by its coverage, its residuals (also against the other spheres'), the radius of a free fit, and that the surface ends with the sphere
+    instead of going on smoothly, as a cylinder's or an ellipsoid's does. Caps of 30° half angle suffice where noise
+    lets them. Winding may be inverted as a whole or for single spheres; a dent is told from a sphere by the
+    majority's winding, in a cloud without normals not at all.
 
     Args:
-        vertices_m: (V, 3).
-        faces: (F, 3) vertex indices.
+        vertices_m: (V, 3); vertices may be repeated, as in STL.
+        faces: (F, 3) vertex indices; (0, 3) for a point cloud, whose points are then measured.
         radius_m: the spheres' radius.
         expected: how many there must be; None accepts any number from one on.
         limits: what an accepted sphere must satisfy.
+        normals: (V, 3) unit normals of a point cloud's points, if it has them.
+        seeds_m: (K, 3) points at or near each sphere (rough centre or a point picked on it): only these are
+            searched, and the result is in their order.
 
     Raises:
-        DataError: no faces, indices out of range or vertices that are not finite.
-        ComputeError: no sphere, or another number than expected.
+        DataError: not a mesh, indices out of range or vertices that are not finite.
+        ComputeError: no sphere, another number than expected, or a seed without a sphere; the message names what
+            was found, and the near misses with what speaks against each.
     """
     bounds = limits or SphereLimits()
-    surface = _prepare(vertices_m, faces)
-    found: list[MeshSphere] = []
-    near: list[MeshSphere] = []
-    # Outward faces by convention; an inside-out mesh shows its spheres only under the other sign.
-    for sign in (1.0, -1.0):
-        accepted, rejected = _locate(surface, radius_m, sign, bounds)
-        if len(accepted) > len(found):
-            found, near = accepted, rejected
-        elif not found:
-            near += rejected
-        if found and (expected is None or len(found) >= expected):
-            break
+    vertices, triangles = _checked(vertices_m, faces, normals)
+    patches = surfels(vertices, triangles, normals, _SURFEL * radius_m)
+    if len(patches.area) == 0:
+        raise ComputeError("found 0 spheres: the mesh has no surface", remedy="check the mesh's unit")
+    tree = cKDTree(patches.position)
+    if seeds_m is not None:
+        return _at_seeds(np.atleast_2d(seeds_m), vertices, triangles, patches, tree, radius_m, bounds)
+    starts = candidates(patches, tree, radius_m, bounds.min_coverage)
+    fits = _fits(starts, vertices, triangles, patches, tree, radius_m)
+    found, refused, uncertainties = _judge(fits, radius_m, bounds, expected)
     if not found or (expected is not None and len(found) != expected):
-        wanted = "any" if expected is None else str(expected)
-        listing = "; ".join(_describe(s) for s in found) or "none"
-        almost = "; ".join(_describe(s) for s in near[:6])
-        raise ComputeError(
-            f"found {len(found)} spheres of radius {radius_m * 1e3:.2f} mm in the mesh, expected {wanted}: {listing}"
-            + (f". Refused candidates: {almost}" if almost else ""),
-            remedy="check the mesh's unit and the radius, and that every sphere was scanned on at least a third",
-        )
-    return tuple(found)
+        raise _wrong_count(found, refused, radius_m, expected)
+    spheres = [_sphere(fit, worth) for fit, worth in zip(found, uncertainties, strict=True)]
+    return tuple(sorted(spheres, key=lambda s: -s.coverage))
 
 
-def _describe(sphere: MeshSphere) -> str:
-    x, y, z = sphere.centre_m * 1e3
-    return (
-        f"({x:.1f}, {y:.1f}, {z:.1f}) mm coverage {sphere.coverage:.2f} rms {sphere.rms_m * 1e3:.2f} mm "
-        f"radius {sphere.radius_residual_m * 1e3:+.2f} mm"
-    )
-
-
-def _prepare(vertices_m: Array, faces: NDArray[np.integer]) -> _Surface:
+def _checked(vertices_m: Array, faces: NDArray[np.integer], normals: Array | None) -> tuple[Array, IntArray]:
     vertices = np.ascontiguousarray(vertices_m, dtype=np.float64)
-    triangles = np.ascontiguousarray(faces, dtype=np.int64)
+    triangles = np.asarray(faces)
+    if triangles.size == 0:
+        triangles = np.empty((0, 3), dtype=np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
         raise DataError(
             f"vertices {vertices.shape} and faces {triangles.shape} are not a triangle mesh",
             remedy="export triangles, with vertices (V, 3) and faces (F, 3)",
         )
-    if len(triangles) == 0:
-        raise DataError("the mesh has no faces", remedy="export a surface mesh, not a point cloud")
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
+    if len(vertices) < 3:
+        raise DataError("the mesh has no surface", remedy="export it again")
+    if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(vertices)):
         raise DataError("the mesh's faces refer to vertices that it does not have", remedy="export it again")
     if not np.isfinite(vertices).all():
         raise DataError("the mesh has vertices that are not finite", remedy="export it again")
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    area_normals = np.cross(b - a, c - a) / 2
-    area = np.linalg.norm(area_normals, axis=1)
-    flat = triangles.ravel()
-    count = len(vertices)
-    vertex_area: Array = np.bincount(flat, np.repeat(area / 3, 3), count).astype(np.float64)
-    vertex_normals: Array = np.stack(
-        [np.bincount(flat, np.repeat(area_normals[:, k], 3), count).astype(np.float64) for k in range(3)], axis=1
-    )
-    # Unbalanced and uncompacted: builds three times faster, and scans are no adversaries.
-    tree = cKDTree(vertices, balanced_tree=False, compact_nodes=False)
-    order = np.argsort(triangles[:, 0], kind="stable")
-    first = np.searchsorted(triangles[order, 0], np.arange(count + 1))
-    return _Surface(vertices, triangles, area_normals, vertex_normals, vertex_area, order, first, tree)
+    if normals is not None and np.shape(normals) != vertices.shape:
+        raise DataError(f"normals {np.shape(normals)} for vertices {vertices.shape}", remedy="export it again")
+    return vertices, triangles
 
 
-def _locate(
-    surface: _Surface, radius: float, sign: float, limits: SphereLimits
-) -> tuple[list[MeshSphere], list[MeshSphere]]:
-    """Accepted spheres and near misses for one orientation of the faces."""
-    candidates = _vote(surface, radius, sign)
-    if len(candidates) == 0:
-        return [], []
-    neighbourhoods = surface.tree.query_ball_point(candidates, 1.3 * radius)
-    spheres: list[MeshSphere] = []
-    for candidate, neighbours in zip(candidates, neighbourhoods, strict=True):
-        hood = np.asarray(neighbours, dtype=np.int64)
-        # A thinned fit sieves the candidates and starts the full one close by.
-        thinned = hood[:: max(1, len(hood) // _SIEVE_VERTICES)]
-        rough = _fit(surface, thinned, candidate, radius, sign=sign, band=0.25 * radius)
-        if rough is None or any(np.linalg.norm(rough.centre - s.centre_m) < 1e-3 * radius for s in spheres):
+# --- samples --------------------------------------------------------------------------------------------
+
+
+def _fits(
+    starts: Array, vertices: Array, faces: IntArray, patches: Surfels, tree: cKDTree, radius: float
+) -> list[SphereFit]:
+    """The final fit from each coarse centre (K, 3), without those that dissolve."""
+    if len(starts) == 0:
+        return []
+    points, weight = _surroundings(starts, vertices, faces, radius)
+    order = np.argsort(points[:, 0], kind="stable")
+    points, weight = points[order], weight[order]
+    rng = np.random.default_rng(0)
+    fits: list[SphereFit] = []
+    for start in starts:
+        a, b = np.searchsorted(points[:, 0], [start[0] - _HOOD * radius, start[0] + _HOOD * radius])
+        near = np.flatnonzero(np.sum((points[a:b] - start) ** 2, axis=1) < (_HOOD * radius) ** 2) + a
+        if len(near) > _MOST_SAMPLES:
+            near = np.sort(rng.choice(near, _MOST_SAMPLES, replace=False))
+        if len(near) == 0:
             continue
-        fit = _fit(surface, hood, rough.centre, radius, sign=sign, band=2 * rough.band)
+        own = weight[near] if len(faces) else sample_weights(points[near], 0.15 * radius)
+        own = np.minimum(own, 2 * float(np.median(own)))  # long facets of a post end in vertices near the sphere
+        nearest = tree.query(points[near])[1]
+        samples = Samples(points[near], patches.normal[nearest], patches.outward[nearest], own)
+        fit = fit_sphere(samples, start, radius, 0.1 * radius)
         if fit is not None:
-            spheres.append(_measure(surface, hood, fit, radius, sign))
-    spheres.sort(key=lambda s: s.coverage, reverse=True)
-    accepted: list[MeshSphere] = []
-    rejected: list[MeshSphere] = []
-    for sphere in spheres:
-        good = (
-            sphere.coverage >= limits.min_coverage
-            and sphere.rms_m <= limits.max_rms * radius
-            and abs(sphere.radius_residual_m) <= limits.max_radius_residual * radius
-        )
-        bucket = accepted if good else rejected
-        # Two solid spheres are two radii apart; several candidates may have run into the same one.
-        if all(np.linalg.norm(sphere.centre_m - s.centre_m) > radius for s in (*accepted, *bucket)):
-            bucket.append(sphere)
-    return accepted, [s for s in rejected if s.coverage > 0.5 * limits.min_coverage]
+            fits.append(fit)
+    return fits
 
 
-def _vote(surface: _Surface, radius: float, sign: float) -> Array:
-    """Candidate centres (K, 3), strongest first."""
-    corners = surface.vertices[surface.faces]
-    centroid = corners.mean(axis=1)
-    normal = surface.area_normals * sign
-    area = np.linalg.norm(normal, axis=1)
-    # Surfels: a cell of space and the main direction of the normal, so that the two sides of a sheet stay apart
-    # and noise in single faces averages out whatever the density of the mesh.
-    axis = np.abs(normal).argmax(axis=1)
-    side = axis * 2 + (np.take_along_axis(normal, axis[:, None], axis=1)[:, 0] > 0)
-    key, _ = _cells(centroid, _SURFEL * radius)
-    _, group = np.unique(key * 6 + side, return_inverse=True)
-    n = int(group.max()) + 1
-    weight = np.bincount(group, area, n)
-    keep = weight > 0
-    position = np.stack([np.bincount(group, centroid[:, k] * area, n) for k in range(3)], axis=1)[keep]
-    direction = np.stack([np.bincount(group, normal[:, k], n) for k in range(3)], axis=1)[keep]
-    weight = weight[keep]
-    length = np.linalg.norm(direction, axis=1)
-    steady = length > 0.5 * weight
-    position, direction, weight = position[steady], direction[steady], weight[steady]
-    if len(weight) == 0:
-        return np.empty((0, 3))
-    votes = position / weight[:, None] - radius * direction / length[steady, None]
-
-    key, size = _cells(votes, _VOTE * radius)
-    cells, group = np.unique(key, return_inverse=True)
-    mass = np.bincount(group, weight, len(cells))
-    moment = np.stack([np.bincount(group, votes[:, k] * weight, len(cells)) for k in range(3)], axis=1)
-    total, centre = mass.copy(), moment.copy()
-    for offset in _neighbour_offsets(size):
-        at = np.searchsorted(cells, cells + offset)
-        at[at == len(cells)] = 0
-        hit = cells[at] == cells + offset
-        total[hit] += mass[at[hit]]
-        centre[hit] += moment[at[hit]]
-    strong = np.flatnonzero(total > _MIN_VOTE * 4 * np.pi * radius**2)
-    strong = strong[np.argsort(-total[strong])]
-    peaks = centre[strong] / total[strong, None]
-    picked: list[Array] = []
-    free = np.ones(len(peaks), dtype=bool)
-    for k, peak in enumerate(peaks):
-        if not free[k]:
-            continue
-        picked.append(peak)
-        free &= np.linalg.norm(peaks - peak, axis=1) > 0.4 * radius
-        if len(picked) == _MAX_CANDIDATES:
-            break
-    return np.asarray(picked).reshape(-1, 3)
+def _surroundings(starts: Array, vertices: Array, faces: IntArray, radius: float) -> tuple[Array, Array]:
+    """Vertices (N, 3) near any of the centres, and the area that each stands for: one pass, whatever their number."""
+    low, high = starts.min(axis=0) - 2 * radius, starts.max(axis=0) + 2 * radius
+    cell = max(0.5 * radius, float(np.max(high - low)) / 300)
+    size = np.ceil((high - low) / cell).astype(np.int64) + 1
+    reach = _HOOD * radius + cell
+    marked = np.zeros(tuple(size), dtype=np.bool_)
+    for start in starts:
+        a = np.maximum(np.floor((start - reach - low) / cell).astype(int), 0)
+        b = np.floor((start + reach - low) / cell).astype(int) + 1
+        marked[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = True
+    near = np.zeros(len(vertices), dtype=np.bool_)
+    for begin in range(0, len(vertices), CHUNK):
+        part = vertices[begin : begin + CHUNK]
+        inside = np.flatnonzero(np.all((part > low) & (part < high), axis=1))
+        i, j, k = ((part[inside] - low) / cell).astype(np.int64).T
+        near[begin + inside] = marked[i, j, k]
+    if len(faces) == 0:
+        points = vertices[near]
+        return points, np.ones(len(points))
+    area = np.zeros(len(vertices))
+    for begin in range(0, len(faces), CHUNK):
+        part = faces[begin : begin + CHUNK]
+        part = part[near[part[:, 0]]]
+        a, b, c = (vertices[part[:, k]] for k in range(3))
+        third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+        for k in range(3):
+            np.add.at(area, part[:, k], third)
+    near &= area > 0
+    return vertices[near], area[near]
 
 
-def _cells(points: Array, cell: float) -> tuple[IntArray, IntArray]:
-    """Keys of the cubic cells of points (N, 3), and the grid's size (3,) that neighbour offsets need."""
-    index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64) + 1
-    size = index.max(axis=0) + 2
-    return (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2], size
+# --- judgement ------------------------------------------------------------------------------------------
 
 
-def _neighbour_offsets(size: IntArray) -> list[int]:
-    steps = (-1, 0, 1)
-    offsets = [int((i * size[1] + j) * size[2] + k) for i in steps for j in steps for k in steps]
-    return [offset for offset in offsets if offset]
+def _shape_reasons(fit: SphereFit, radius: float, limits: SphereLimits) -> list[str]:
+    reasons: list[str] = []
+    if fit.coverage < limits.min_coverage:
+        reasons.append(f"covers {fit.coverage:.3f} of the sphere, {limits.min_coverage:g} is needed")
+    if fit.rms > limits.max_rms * radius:
+        reasons.append(f"rms {fit.rms * 1e3:.2f} mm, at most {limits.max_rms * radius * 1e3:.2f}")
+    if fit.flank > limits.max_flank:
+        reasons.append("the surface goes on smoothly beyond it: not a sphere of this radius")
+    if fit.form > limits.max_form * radius:
+        reasons.append(f"departs from a sphere's form by {fit.form * 1e3:.2f} mm")
+    return reasons
 
 
-@dataclass(frozen=True, slots=True)
-class _Fit:
-    """A finished robust fit over a neighbourhood of n vertices."""
-
-    centre: Array
-    band: float  # residual beyond which a vertex has no weight
-    weights: Array  # (n,) robust weight × area, m²
-
-
-def _fit(surface: _Surface, hood: IntArray, start: Array, radius: float, *, sign: float, band: float) -> _Fit | None:
-    """Known-radius Tukey fit from a candidate centre; None when the candidate dissolves."""
-    points = surface.vertices[hood]
-    normals = surface.vertex_area_normals[hood] * sign
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-    area = surface.vertex_area[hood]
-    centre = start.copy()
-    weights = np.zeros(len(points))
-    for _ in range(30):
-        ray = points - centre
-        distance = np.linalg.norm(ray, axis=1)
-        unit = ray / np.maximum(distance, 1e-300)[:, None]
-        residual = distance - radius
-        eligible = (np.abs(residual) < band) & (np.sum(unit * normals, axis=1) > _MIN_NORMAL_COSINE)
-        if np.count_nonzero(eligible) < _MIN_VERTICES:
-            return None
-        weights = np.where(eligible, (1 - (residual / band) ** 2) ** 2, 0.0) * area
-        weighted = unit * weights[:, None]
-        H = weighted.T @ unit
-        if np.linalg.eigvalsh(H)[0] < 1e-3 * np.trace(H):
-            return None
-        step = np.linalg.solve(H, weighted.T @ residual)
-        centre = centre + step
-        if np.linalg.norm(centre - start) > 0.7 * radius:
-            return None
-        # Tukey's constant for 95 % efficiency; the floor keeps a perfect mesh from losing its vertices.
-        spread = 1.4826 * float(np.median(np.abs(residual[eligible])))
-        target = max(4.685 * spread, 5e-3 * radius)
-        if np.linalg.norm(step) < 1e-7 * radius and target >= 0.95 * band:
-            break
-        band = float(np.clip(target, 0.5 * band, band))
-    return _Fit(centre, band, weights)
+def _radius_reasons(fit: SphereFit, sigma: float, radius: float, limits: SphereLimits) -> list[str]:
+    if not np.isfinite(fit.radius_residual) or sigma > _MAX_RADIUS_SIGMA * radius:
+        return ["too small a cap for its noise to tell the radius"]
+    if abs(fit.radius_residual) > max(limits.max_radius_residual * radius, 3 * sigma):
+        return [f"radius {fit.radius_residual * 1e3:+.2f} ± {sigma * 1e3:.2f} mm off"]
+    return []
 
 
-def _measure(surface: _Surface, hood: IntArray, fit: _Fit, radius: float, sign: float) -> MeshSphere:
-    """Residual, coverage, covariance and free radius of a finished fit."""
-    inlier = fit.weights > 0
-    points, w = surface.vertices[hood[inlier]], fit.weights[inlier]
-    ray = points - fit.centre
-    distance = np.linalg.norm(ray, axis=1)
-    u, r = ray / distance[:, None], distance - radius
-    H_inverse = np.linalg.inv((u * w[:, None]).T @ u)
-    # Scanner and voxel errors are shared by neighbours, so scores are summed over patches before they are
-    # squared (a cluster-robust sandwich); single vertices would promise far too much.
-    patch, _ = _cells(points, radius / 5)
-    _, group = np.unique(patch, return_inverse=True)
-    score = np.stack([np.bincount(group, w * r * u[:, k]) for k in range(3)], axis=1)
-    # One linearised step in centre and radius is exact enough this close to the solution.
-    J = np.concatenate([u, np.ones((len(u), 1))], axis=1)
-    free = np.linalg.lstsq(J * np.sqrt(w)[:, None], r * np.sqrt(w), rcond=None)[0]
+def _judge(
+    fits: list[SphereFit], radius: float, limits: SphereLimits, expected: int | None
+) -> tuple[list[SphereFit], list[_Candidate], tuple[CentreUncertainty, ...]]:
+    """Accepted fits with their uncertainties, and the near misses, best covered first."""
+    ranked = sorted(fits, key=lambda f: -f.coverage)
+    refused: list[_Candidate] = []
+    good: list[SphereFit] = []
+    for fit in ranked:
+        reasons = _shape_reasons(fit, radius, limits)
+        if reasons:
+            refused.append(_Candidate(fit, tuple(reasons)))
+        elif all(_apart(fit, other, radius) for other in good):
+            good.append(fit)
+    if len(good) >= 4:
+        usual = _ROUGHER * float(np.median([f.rms for f in good[: (len(good) + 1) // 2]])) + 3e-3 * radius
+        refused += [
+            _Candidate(f, (f"rms {f.rms * 1e3:.2f} mm, much rougher than the best covered spheres",))
+            for f in good
+            if f.rms > usual
+        ]
+        good = [f for f in good if f.rms <= usual]
+    worth = _uncertainties(good, radius)
+    sound: list[SphereFit] = []
+    for fit, uncertainty in zip(good, worth, strict=True):
+        reasons = _radius_reasons(fit, uncertainty.radius_sigma, radius, limits)
+        if reasons:
+            refused.append(_Candidate(fit, tuple(reasons)))
+        else:
+            sound.append(fit)
+    accepted = _oriented(sound, expected)
+    refused += [
+        _Candidate(fit, ("concave: its normals point the other way than the other spheres'",))
+        for fit in sound
+        if all(fit is not other for other in accepted)
+    ]
+    misses: list[_Candidate] = []
+    for candidate in sorted(refused, key=lambda c: (len(c.reasons), -c.fit.coverage)):
+        others = (*accepted, *(m.fit for m in misses))
+        if all(_apart(candidate.fit, other, radius) for other in others):
+            misses.append(candidate)
+    return accepted, misses, _uncertainties(accepted, radius)
+
+
+def _apart(a: SphereFit, b: SphereFit, radius: float) -> bool:
+    # Two solid spheres are two radii apart; several candidates may have run into the same one.
+    return float(np.linalg.norm(a.centre - b.centre)) > radius
+
+
+def _oriented(fits: list[SphereFit], expected: int | None) -> list[SphereFit]:
+    """Spheres without the dents: by the winding of the most, unless only single spheres wound differently fit the
+    expected number."""
+    outward = [f for f in fits if f.orientation > -_MIXED]
+    inward = [f for f in fits if f.orientation < _MIXED]
+    for choice in (outward, inward, fits):
+        if len(choice) == expected:
+            return choice
+    return outward if len(outward) >= len(inward) else inward
+
+
+def _uncertainties(fits: Sequence[SphereFit], radius: float) -> tuple[CentreUncertainty, ...]:
+    if not fits:
+        return ()
+    return centre_uncertainties([f.patches for f in fits], [f.radius_residual for f in fits], radius)
+
+
+def _sphere(fit: SphereFit, worth: CentreUncertainty) -> MeshSphere:
     return MeshSphere(
-        centre_m=fit.centre,
-        covariance=H_inverse @ (score.T @ score) @ H_inverse,
-        rms_m=float(np.sqrt(np.sum(w * r * r) / np.sum(w))),
-        radius_residual_m=float(free[3]),
-        coverage=_coverage(surface, hood[inlier], fit.centre, sign),
-        n=int(np.count_nonzero(inlier)),
+        fit.centre, worth.covariance, fit.rms, fit.radius_residual, worth.radius_sigma, fit.coverage, fit.n
     )
 
 
-def _coverage(surface: _Surface, inliers: IntArray, centre: Array, sign: float) -> float:
-    """Solid angle of the faces whose vertices are all inliers, over 4π."""
-    begin, end = surface.first_face[inliers], surface.first_face[inliers + 1]
-    lengths = end - begin
-    within = np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    faces = surface.faces_by_vertex[np.repeat(begin, lengths) + within]
-    faces = faces[np.isin(surface.faces[faces, 1:], inliers).all(axis=1)]
-    ray = surface.vertices[surface.faces[faces]].mean(axis=1) - centre
-    distance = np.linalg.norm(ray, axis=1)
-    angle = np.sum(ray * surface.area_normals[faces] * sign, axis=1) / np.maximum(distance, 1e-300) ** 3
-    return float(min(np.sum(np.maximum(angle, 0.0)) / (4 * np.pi), 1.0))
+def _describe(fit: SphereFit) -> str:
+    x, y, z = fit.centre * 1e3
+    return f"({x:.1f}, {y:.1f}, {z:.1f}) mm coverage {fit.coverage:.2f} rms {fit.rms * 1e3:.2f} mm"
+
+
+def _wrong_count(
+    found: Sequence[SphereFit], refused: Sequence[_Candidate], radius: float, expected: int | None
+) -> ComputeError:
+    wanted = "any" if expected is None else str(expected)
+    listing = "; ".join(_describe(f) for f in found) or "none"
+    almost = "; ".join(f"{_describe(c.fit)} ({', '.join(c.reasons)})" for c in refused[:_NEAR_MISSES])
+    return ComputeError(
+        f"found {len(found)} spheres of radius {radius * 1e3:.2f} mm in the mesh, expected {wanted}: {listing}"
+        + (f". Refused candidates: {almost}" if almost else ""),
+        remedy="check the mesh's unit and the radius, and that every sphere was scanned over a cap of 60° at least; "
+        "scan again what was refused, or give seeds",
+    )
+
+
+# --- seeds ----------------------------------------------------------------------------------------------
+
+
+def _at_seeds(
+    seeds: Array,
+    vertices: Array,
+    faces: IntArray,
+    patches: Surfels,
+    tree: cKDTree,
+    radius: float,
+    limits: SphereLimits,
+) -> tuple[MeshSphere, ...]:
+    """The sphere at each seed, in their order."""
+    if seeds.ndim != 2 or seeds.shape[1] != 3 or not np.isfinite(seeds).all():
+        raise DataError(f"seeds {seeds.shape} are not points (K, 3)", remedy="give x, y, z of a point at each sphere")
+    peaks = vote_peaks(patches, radius)
+    chosen: list[SphereFit] = []
+    for number, seed in enumerate(seeds):
+        distance = np.linalg.norm(peaks - seed, axis=1)
+        close = peaks[np.argsort(distance)][: int(np.sum(distance < _SEED_REACH * radius))]
+        surfel = int(tree.query(seed)[1])
+        beside = [seed + side * radius * patches.normal[surfel] for side in (1.0, -1.0)]
+        starts = [rough_centre(patches, tree, s, radius, limits.min_coverage) for s in (*close, seed, *beside)]
+        usable = np.array([s for s in starts if s is not None]).reshape(-1, 3)
+        fits = [
+            f
+            for f in _fits(usable, vertices, faces, patches, tree, radius)
+            if np.linalg.norm(f.centre - seed) < _SEED_REACH * radius
+        ]
+        accepted, refused, _ = _judge(fits, radius, limits, None)
+        if not accepted:
+            why = f"; {_describe(refused[0].fit)}: {', '.join(refused[0].reasons)}" if refused else ""
+            x, y, z = seed * 1e3
+            raise ComputeError(
+                f"no sphere of radius {radius * 1e3:.2f} mm at seed {number} ({x:.1f}, {y:.1f}, {z:.1f}) mm{why}",
+                remedy="give a point on the sphere or near its centre, in the mesh's frame",
+            )
+        best = min(accepted, key=lambda f: abs(float(np.linalg.norm(f.centre - seed)) - 0.5 * radius))
+        for other, fit in enumerate(chosen):
+            if not _apart(best, fit, radius):
+                raise ComputeError(f"seeds {other} and {number} are at the same sphere", remedy="give one for each")
+        chosen.append(best)
+    worth = _uncertainties(chosen, radius)
+    return tuple(_sphere(fit, w) for fit, w in zip(chosen, worth, strict=True))

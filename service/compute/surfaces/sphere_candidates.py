@@ -1,0 +1,113 @@
+"""Where spheres of a radius may be: surface elements vote for centres, and a coarse fit sieves the candidates."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from service.compute.surfaces.surfels import Surfels, grid_keys
+from service.core.geometry import Array
+
+IntArray = NDArray[np.int64]
+
+_VOTE = 1 / 6  # cell of the voting grid, in radii
+_MIN_VOTE = 0.025  # votes a candidate needs, as a fraction of the whole sphere
+_MAX_CANDIDATES = 600
+_APART = 0.4  # of candidates, in radii
+_HOOD = 1.35  # radii around a candidate in which the sphere's surface is looked for
+_MIN_COSINE = 0.7  # between normal and radius; below it a surfel is not the sphere's
+_BAND = 0.05  # of the coarse fit, in radii; surfels have little noise left
+_FLANK = 0.12  # in radii beyond that: where another shape goes on smoothly
+_FLANK_COSINE = 0.88
+_ROUGH_RMS = 0.013  # of the coarse fit, in radii
+_MOST_FLANK = 0.6  # of its area over that of the inliers
+
+
+def candidates(patches: Surfels, tree: cKDTree, radius: float, min_coverage: float) -> Array:
+    """Centres (K, 3) around which the surface is roughly a sphere over at least `min_coverage` of it."""
+    found: list[Array] = []
+    for peak in vote_peaks(patches, radius):
+        centre = rough_centre(patches, tree, peak, radius, min_coverage)
+        if centre is not None and all(np.linalg.norm(centre - c) > 0.05 * radius for c in found):
+            found.append(centre)
+    return np.array(found).reshape(-1, 3)
+
+
+def vote_peaks(patches: Surfels, radius: float) -> Array:
+    """Candidate centres (K, 3), strongest first; every surfel votes on both of its sides."""
+    votes = np.concatenate([patches.position - radius * patches.normal, patches.position + radius * patches.normal])
+    if len(votes) == 0:
+        return np.empty((0, 3))
+    weight = np.concatenate([patches.area, patches.area])
+    cell = _VOTE * radius
+    low = votes.min(axis=0)
+    size = np.floor((votes.max(axis=0) - low) / cell).astype(np.int64) + 3
+    cells, group = np.unique(grid_keys(votes, low, size, cell), return_inverse=True)
+    mass = np.bincount(group, weight, len(cells))
+    moment = np.stack([np.bincount(group, votes[:, k] * weight, len(cells)) for k in range(3)], axis=1)
+    total, centre = mass.copy(), moment.copy()
+    steps = (-1, 0, 1)
+    for offset in (int((i * size[1] + j) * size[2] + k) for i in steps for j in steps for k in steps):
+        if offset == 0:
+            continue
+        at = np.searchsorted(cells, cells + offset)
+        at[at == len(cells)] = 0
+        hit = cells[at] == cells + offset
+        total[hit] += mass[at[hit]]
+        centre[hit] += moment[at[hit]]
+    strong = np.flatnonzero(total > _MIN_VOTE * 4 * np.pi * radius**2)
+    strong = strong[np.argsort(-total[strong], kind="stable")]
+    peaks = centre[strong] / total[strong, None]
+    picked: list[Array] = []
+    free = np.ones(len(peaks), dtype=bool)
+    for k, peak in enumerate(peaks):
+        if not free[k]:
+            continue
+        picked.append(peak)
+        if len(picked) == _MAX_CANDIDATES:
+            break
+        free[k:] &= np.linalg.norm(peaks[k:] - peak, axis=1) > _APART * radius
+    return np.array(picked).reshape(-1, 3)
+
+
+def rough_centre(patches: Surfels, tree: cKDTree, start: Array, radius: float, min_coverage: float) -> Array | None:
+    """Known-radius fit to the surfels near `start`; None where they are not a sphere."""
+    hood = np.asarray(tree.query_ball_point(start, _HOOD * radius), dtype=np.int64)
+    if len(hood) < 5:
+        return None
+    points, normals, area = patches.position[hood], patches.normal[hood], patches.area[hood]
+    centre, band = start, 0.3 * radius
+    for _ in range(15):
+        ray = points - centre
+        distance = np.linalg.norm(ray, axis=1)
+        unit = ray / np.maximum(distance, 1e-300)[:, None]
+        residual = distance - radius
+        eligible = (np.abs(residual) < band) & (np.abs(np.sum(unit * normals, axis=1)) > _MIN_COSINE)
+        if np.count_nonzero(eligible) < 5:
+            return None
+        weights = np.where(eligible, (1 - (residual / band) ** 2) ** 2, 0.0) * area
+        weighted = unit * weights[:, None]
+        H = weighted.T @ unit
+        if np.linalg.eigvalsh(H)[0] < 1e-3 * np.trace(H):
+            return None
+        step = np.linalg.solve(H, weighted.T @ residual)
+        centre = centre + step
+        if np.linalg.norm(centre - start) > radius:
+            return None
+        done = np.linalg.norm(step) < 1e-4 * radius and band <= 1.001 * _BAND * radius
+        if done:
+            break
+        band = max(_BAND * radius, 0.7 * band)
+    inlier = weights > 0
+    coverage = float(np.sum(area[inlier])) / (4 * np.pi * radius**2)
+    beyond = (np.abs(residual) >= band) & (np.abs(residual) < band + _FLANK * radius)
+    beyond &= np.abs(np.sum(unit * normals, axis=1)) > _FLANK_COSINE
+    rms = float(np.sqrt(np.sum(weights * residual**2) / np.sum(weights)))
+    if (
+        coverage < 0.6 * min_coverage
+        or rms > _ROUGH_RMS * radius
+        or np.sum(area[beyond]) > _MOST_FLANK * np.sum(area[inlier])
+    ):
+        return None
+    return centre

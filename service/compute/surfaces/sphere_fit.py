@@ -1,0 +1,200 @@
+"""Robust fit of a sphere of known radius to the vertices of a mesh or the points of a cloud, and what it is worth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.core.geometry import Array
+
+IntArray = NDArray[np.int64]
+
+MIN_SAMPLES = 12
+_MIN_COSINE = 0.85  # between normal and radius; below it a sample is not the sphere's
+_FLANK = 0.12  # beyond the inliers, in radii: where a surface of another shape goes on
+_FLANK_COSINE = 0.88
+_PATCH = 0.27  # cell over which residuals are averaged, in radii
+_MOST_PATCHES = 70
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Points on the surface near one candidate.
+
+    Vertices, not facets, carry the measurement: a facet of a sphere of edge e lies up to e²/(8 R) inside of it, which
+    moves the centre of a cap by as much, while its vertices lie on it.
+
+    Attributes:
+        points: (N, 3).
+        normals: (N, 3) unit, of either sign, averaged over the neighbourhood.
+        outward: (N, 3) the normals that the data state (0 where none), averaged over the neighbourhood.
+        weight: (N,) area that each stands for; of points without faces, relative.
+    """
+
+    points: Array
+    normals: Array
+    outward: Array
+    weight: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Patches:
+    """Residuals of one fit, averaged over cells of surface: what the noise model sees.
+
+    Attributes:
+        unit: (P, 3) directions from the centre.
+        residual: (P,) distance from the surface, m, outward positive.
+        weight: (P,) sums of the samples' weights.
+        white: (P,) variance of the average when the samples' variance is 1 and they are independent.
+    """
+
+    unit: Array
+    residual: Array
+    weight: Array
+    white: Array
+
+
+@dataclass(frozen=True, slots=True)
+class SphereFit:
+    """A finished fit.
+
+    Attributes:
+        centre: (3,).
+        band: residual beyond which a sample has no weight, m.
+        rms: weighted root mean square distance of the inliers, m.
+        radius_residual: radius of a free fit minus the known one, m; NaN when the inliers do not determine it.
+        coverage: solid angle of the inliers, as a fraction of the whole sphere.
+        orientation: 1 when the stated normals point away from the centre, -1 towards it, 0 when they contradict
+            one another or there are none.
+        flank: area of the surface that goes on smoothly beyond the inliers, over theirs: a sphere ends, or meets
+            something at an angle.
+        form: rms of the averaged residuals from a free sphere, m: shape that is not a sphere's.
+        n: number of inliers.
+        patches: averaged residuals.
+    """
+
+    centre: Array
+    band: float
+    rms: float
+    radius_residual: float
+    coverage: float
+    orientation: float
+    flank: float
+    form: float
+    n: int
+    patches: Patches
+
+
+def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> SphereFit | None:
+    """Tukey fit of a known radius from a centre that is right to `band`; None when the candidate dissolves."""
+    points, area = samples.points, samples.weight
+    centre = start.copy()
+    weights = np.zeros(len(points))
+    unit, residual, cosine = np.zeros_like(points), np.zeros(len(points)), np.zeros(len(points))
+    for _ in range(40):
+        ray = points - centre
+        distance = np.linalg.norm(ray, axis=1)
+        unit = ray / np.maximum(distance, 1e-300)[:, None]
+        residual = distance - radius
+        cosine = np.abs(np.sum(unit * samples.normals, axis=1))
+        eligible = (np.abs(residual) < band) & (cosine > _MIN_COSINE)
+        if np.count_nonzero(eligible) < MIN_SAMPLES:
+            return None
+        weights = np.where(eligible, (1 - (residual / band) ** 2) ** 2, 0.0) * area
+        weighted = unit * weights[:, None]
+        H = weighted.T @ unit
+        if np.linalg.eigvalsh(H)[0] < 1e-3 * np.trace(H):
+            return None
+        step = np.linalg.solve(H, weighted.T @ residual)
+        centre = centre + step
+        if np.linalg.norm(centre - start) > 0.5 * radius:
+            return None
+        # Tukey's constant for 95 % efficiency; the floor keeps a perfect mesh from losing its vertices.
+        spread = 1.4826 * float(np.median(np.abs(residual[eligible])))
+        target = max(4.685 * spread, 5e-3 * radius)
+        if np.linalg.norm(step) < 1e-7 * radius and target >= 0.95 * band:
+            break
+        band = float(np.clip(target, 0.6 * band, band))
+    inlier = weights > 0
+    u, r, w = unit[inlier], residual[inlier], weights[inlier]
+    beyond = (np.abs(residual) >= band) & (np.abs(residual) < band + _FLANK * radius) & (cosine > _FLANK_COSINE)
+    patches = _patches(u, r, w)
+    outward = np.sum(samples.outward[inlier] * u, axis=1)
+    stated = np.linalg.norm(samples.outward[inlier], axis=1)
+    orientation = float(np.sum(w * outward) / max(np.sum(w * stated), 1e-300)) if np.any(stated > 0) else 0.0
+    return SphereFit(
+        centre=centre,
+        band=band,
+        rms=float(np.sqrt(np.sum(w * r * r) / np.sum(w))),
+        radius_residual=_free_radius(u, r, w),
+        coverage=coverage(u),
+        orientation=orientation,
+        flank=float(np.sum(area[beyond]) / np.sum(area[inlier])),
+        form=_form(patches),
+        n=int(np.count_nonzero(inlier)),
+        patches=patches,
+    )
+
+
+def _free_radius(u: Array, r: Array, w: Array) -> float:
+    # One linearised step in centre and radius is exact enough this close to the solution.
+    J = np.concatenate([u, np.ones((len(u), 1))], axis=1)
+    H = (J * w[:, None]).T @ J
+    if np.linalg.eigvalsh(H)[0] < 1e-7 * np.trace(H):
+        return float("nan")
+    return float(np.linalg.solve(H, (J * w[:, None]).T @ r)[3])
+
+
+def _form(patches: Patches) -> float:
+    J = np.concatenate([patches.unit, np.ones((len(patches.unit), 1))], axis=1)
+    root = np.sqrt(patches.weight)
+    x = np.linalg.lstsq(J * root[:, None], patches.residual * root, rcond=1e-6)[0]
+    return float(np.sqrt(np.sum(patches.weight * (patches.residual - J @ x) ** 2) / np.sum(patches.weight)))
+
+
+def _patches(u: Array, r: Array, w: Array) -> Patches:
+    cell = _PATCH
+    while True:
+        index = np.floor((u + 1.0) / cell).astype(np.int64)
+        _, group = np.unique((index[:, 0] * 64 + index[:, 1]) * 64 + index[:, 2], return_inverse=True)
+        n = int(group.max()) + 1
+        if n <= _MOST_PATCHES:
+            break
+        cell *= 1.15
+    total = np.bincount(group, w, n)
+    kept = total > 0.02 * float(np.median(total))
+    direction = np.stack([np.bincount(group, w * u[:, k], n) for k in range(3)], axis=1)[kept]
+    return Patches(
+        unit=direction / np.linalg.norm(direction, axis=1, keepdims=True),
+        residual=(np.bincount(group, w * r, n) / total)[kept],
+        weight=total[kept],
+        white=(np.bincount(group, w * w, n) / total**2)[kept],
+    )
+
+
+def coverage(u: Array) -> float:
+    """Fraction of the whole sphere that directions (N, 3) occupy: counted in cells of a cube's faces, so that a
+    density that varies or a shell that is there twice makes no difference."""
+    n = int(np.clip(np.sqrt(len(u) / 24), 2, 20))
+    axis = np.abs(u).argmax(axis=1)
+    rows = np.arange(len(u))
+    major = u[rows, axis]
+    other = np.stack([u[rows, (axis + 1) % 3], u[rows, (axis + 2) % 3]], axis=1) / np.abs(major)[:, None]
+    # Equal angles, not equal lengths, along the cube's faces: cells of nearly equal solid angle.
+    i, j = np.minimum(((np.arctan(other) / (np.pi / 2) + 0.5) * n).astype(np.int64), n - 1).T
+    cells = np.unique(((axis * 2 + (major > 0)) * n + i) * n + j)
+    middle = np.tan((np.arange(n) + 0.5 - n / 2) * (np.pi / 2 / n)) ** 2
+    a, b = middle[:, None], middle[None]
+    solid = (1 + a) * (1 + b) / (1 + a + b) ** 1.5
+    return float(np.sum(solid.ravel()[cells % (n * n)]) / (6 * np.sum(solid)))
+
+
+def sample_weights(points: Array, cell: float) -> Array:
+    """Weights (N,) of points without faces: a cell of surface counts once, however many points lie in it."""
+    index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    key = (index[:, 0] * (1 << 20) + index[:, 1]) * (1 << 20) + index[:, 2]
+    _, group, count = np.unique(key, return_inverse=True, return_counts=True)
+    # A cell that the surface only grazes holds few points: half of the median density at least.
+    return 1.0 / np.maximum(count[group], 0.5 * float(np.median(count)))
