@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.budget.closure import compare_in_frame, compare_shapes, locate_in_images
+from service.compute.budget.closure import Alignment, compare_in_frame, compare_shapes, locate_in_images
 from service.compute.budget.error_budget import (
     ErrorBudget,
     MeasuredSpheres,
@@ -81,10 +81,10 @@ def test_shapes_are_compared_whatever_their_frames(seed: int) -> None:
     b = measured(REGISTRATION_M, seed + 1)
     here, _ = compare_shapes(a.centres_m, a.covariance_m2, b.centres_m, b.covariance_m2)
     turned_covariance = T[:3, :3] @ b.covariance_m2 @ T[:3, :3].T
-    there, T_a_b = compare_shapes(a.centres_m, a.covariance_m2, apply(T, b.centres_m), turned_covariance)
+    there, alignment = compare_shapes(a.centres_m, a.covariance_m2, apply(T, b.centres_m), turned_covariance)
     assert there.normalised_chi2 == pytest.approx(here.normalised_chi2, rel=1e-4)
     assert there.rms_m == pytest.approx(here.rms_m, rel=1e-4)
-    np.testing.assert_allclose(apply(T_a_b, apply(T, b.centres_m)), a.centres_m, atol=8 * SIGMA_M)
+    np.testing.assert_allclose(apply(alignment.T_a_b, apply(T, b.centres_m)), a.centres_m, atol=8 * SIGMA_M)
 
 
 def test_closures_are_near_one_when_the_covariances_are_right_and_name_the_sphere_that_moved() -> None:
@@ -109,10 +109,10 @@ def test_three_spheres_close_no_loop() -> None:
 
 def budget_of(seed: int, stated_m: float = SIGMA_M) -> ErrorBudget:
     """A budget from exact outlines with noise, a noisy scan and a noisy CT."""
-    made = scene(10, seed=seed)
+    made = scene(6, seed=seed)
     every = np.vstack([REGISTRATION_M, CONTROL_M])
     scan = measured(every, seed, stated_m=stated_m)
-    seen = [exact_outlines(made, i, every, noise_px=0.05, seed=seed)[0] for i in range(10)]
+    seen = [exact_outlines(made, i, every, noise_px=0.05, seed=seed)[0] for i in range(6)]
     solved = register_images(
         seen, made.T_world_camera, made.camera, scan.centres_m[:10], RADIUS_M, control_centres_m=scan.centres_m[10:]
     )
@@ -126,22 +126,23 @@ def budget_of(seed: int, stated_m: float = SIGMA_M) -> ErrorBudget:
         apply(transform(Rotation.random(rng=np.random.default_rng(seed)), np.ones(3)), REGISTRATION_M), seed
     )
     centre = REGISTRATION_M.mean(axis=0)
+    placed = Alignment(registration.T_world_scan, registration.covariance)
     return ErrorBudget(
-        contributions(registration, centre, scanned, ct),
-        (control_observation(registration, found, controls), *loop_observations(places, scanned, ct)),
+        contributions(registration.sigma_components_m(centre), scanned, ct),
+        (control_observation(placed, found, controls), *loop_observations(places, scanned, ct)),
     )
 
 
 def test_the_budget_sums_its_parts_and_agrees_with_what_is_observed() -> None:
     chi2: dict[str, list[float]] = {}
-    for seed in range(8):
+    for seed in range(5):
         budget = budget_of(seed)
         counted = [c.sigma_m for c in budget.contributions if c.counted]
         assert budget.total_m == pytest.approx(np.sqrt(np.sum(np.square(counted))))
         assert [c.name for c in budget.contributions if not c.counted] == ["ct"]
         for observation in budget.observations:
             chi2.setdefault(observation.name, []).append(observation.normalised_chi2)
-    assert set(chi2) == {"control spheres", "camera ↔ scan", "scan ↔ CT", "camera ↔ CT", "CT → scan → camera → CT"}
+    assert set(chi2) == {"control spheres", "camera ↔ scan", "scan ↔ CT", "camera ↔ CT"}
     for name in ("control spheres", "camera ↔ scan", "scan ↔ CT", "camera ↔ CT"):
         assert 0.4 < np.mean(chi2[name]) < 2, name
 

@@ -48,6 +48,24 @@ class Closure:
     significance: Array = field(repr=False)
 
 
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """T_a_b and its covariance (6, 6) of (d, w): exp(w) R, t + d, axes of a, metres and radians."""
+
+    T_a_b: Transform
+    covariance: Array = field(repr=False)
+
+    def covariance_at_m2(self, points_b_m: Array) -> Array:
+        """(n, 3, 3) in the axes of a: what the alignment's error does to points (n, 3) of b."""
+        J = place_jacobian(points_b_m @ self.T_a_b[:3, :3].T)
+        return J @ self.covariance @ J.transpose(0, 2, 1)
+
+
+def place_jacobian(turned: Array) -> Array:
+    """(n, 3, 6) by which (d, w) of a pose moves points that it has turned to (n, 3), its translation not added."""
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -skew(turned)], axis=2)
+
+
 def locate_in_images(
     outlines: Sequence[Sequence[SphereOutline]],
     assignments: Sequence[Assignment],
@@ -125,8 +143,8 @@ def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Arra
     )
 
 
-def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> tuple[Closure, Transform]:
-    """Closure of two constellations (n, 3) of the same spheres in frames of their own, and T_a_b.
+def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> tuple[Closure, Alignment]:
+    """Closure of two constellations (n, 3) of the same spheres in frames of their own, and T_a_b that aligns them.
 
     The alignment is weighted by the covariances (n, 3, 3), m²; six degrees of freedom are taken off.
 
@@ -146,7 +164,7 @@ def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array)
         weight = np.linalg.inv(covariance)
         turned = b @ R.T
         r = a - apply(T_a_b, b)
-        slope = np.concatenate([np.broadcast_to(np.eye(3), (len(a), 3, 3)), -skew(turned)], axis=2)
+        slope = place_jacobian(turned)
         information = np.einsum("nki,nkl,nlj->ij", slope, weight, slope)
         step = np.linalg.solve(information, np.einsum("nki,nkl,nl->i", slope, weight, r))
         T_a_b = transform(Rotation.from_rotvec(step[3:]).as_matrix() @ R, T_a_b[:3, 3] + step[:3])
@@ -165,4 +183,4 @@ def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array)
         r,
         np.sqrt(single),
     )
-    return closure, T_a_b
+    return closure, Alignment(T_a_b, np.linalg.inv(information).astype(np.float64))

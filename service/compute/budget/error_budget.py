@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.compute.budget.closure import Closure, SeenSphere, compare_in_frame, compare_shapes
-from service.compute.registration.result import RegistrationResult
-from service.core.geometry import Array, apply
+from service.compute.budget.closure import Alignment, Closure, SeenSphere, compare_in_frame, compare_shapes
+from service.core.geometry import Array
 
 HONEST = (0.5, 2.0)  # normalised chi square between these: the covariances say what is observed
 
@@ -101,16 +100,16 @@ class ErrorBudget:
 
 
 def contributions(
-    registration: RegistrationResult, target_scan_m: Array, scan: MeasuredSpheres, ct: MeasuredSpheres | None
+    registration_m: Mapping[str, float], scan: MeasuredSpheres, ct: MeasuredSpheres | None
 ) -> tuple[Contribution, ...]:
-    """Every source at a target point (3,) of the scan.
+    """Every source at a target: `registration_m` holds the registration's components there, as 3D sigmas.
 
     The total is that of a point of the scan's surface in the images: the registration's components and the scan's own
     noise. The CT counts where its surface is used; it is listed.
     """
     out = [
         Contribution(name, sigma_m, _HOW.get(name, "component of the registration's covariance"))
-        for name, sigma_m in registration.sigma_components_m(target_scan_m).items()
+        for name, sigma_m in registration_m.items()
     ]
     out.append(
         Contribution("scan", scan.surface_rms_m, "rms distance of the scan's points on the spheres from the spheres")
@@ -122,19 +121,23 @@ def contributions(
 
 
 def control_observation(
-    registration: RegistrationResult, seen: Mapping[int, SeenSphere], control: MeasuredSpheres
+    registration: Alignment, seen: Mapping[int, SeenSphere], control: MeasuredSpheres
 ) -> Observation:
-    """Control spheres where the images see them, against where scan and registration say they are (scan frame)."""
+    """Control spheres where the images see them, against where scan and registration say they are.
+
+    Args:
+        registration: T_world_scan with its covariance.
+        seen: located in the images through the registered cameras, by index into `control`; scan frame.
+        control: measured by the scanner; scan frame.
+    """
     index = sorted(seen)
-    R = registration.T_world_scan[:3, :3]
-    predicted = np.array(
-        [R.T @ registration.covariance_at_m2(control.centres_m[m]) @ R + control.covariance_m2[m] for m in index]
-    )
+    R = registration.T_a_b[:3, :3]
+    uncertain = R.T @ registration.covariance_at_m2(control.centres_m[index]) @ R
     closure = compare_in_frame(
         np.array([seen[m].centre_m for m in index]),
         np.array([seen[m].covariance_m2 for m in index]),
         control.centres_m[index],
-        predicted,
+        uncertain + control.covariance_m2[index],
     )
     return _observation(
         "control spheres", closure, "spheres that took no part in the registration, located in the images alone"
@@ -145,6 +148,8 @@ def loop_observations(
     seen: Mapping[int, SeenSphere], scan: MeasuredSpheres, ct_in_scan_order: MeasuredSpheres | None
 ) -> tuple[Observation, ...]:
     """Closures camera ↔ scan, scan ↔ CT and camera ↔ CT of the spheres that each pair shares, shapes compared.
+
+    Three pairs, not one way round: alignments on the same spheres undo one another whatever their errors are.
 
     Args:
         seen: by index into the scan's spheres, located in the images.
@@ -168,22 +173,7 @@ def loop_observations(
     if len(shared) >= 4:
         rows = [index.index(m) for m in shared]
         out.append(_shapes("camera ↔ CT", _pick(images, rows), _pick(ct_in_scan_order, shared)))
-        out.append(_loop(_pick(images, rows), _pick(scan, shared), _pick(ct_in_scan_order, shared)))
     return tuple(out)
-
-
-def _loop(images: MeasuredSpheres, scan: MeasuredSpheres, ct: MeasuredSpheres) -> Observation:
-    """Once round: CT → scan → camera → CT, where the spheres' centre ends up."""
-    steps = [(ct, scan), (scan, images), (images, ct)]
-    centre = ct.centres_m.mean(axis=0)
-    place, variance = centre, 0.0
-    for a, b in steps:
-        _, T_b_a = compare_shapes(b.centres_m, b.covariance_m2, a.centres_m, a.covariance_m2)
-        place = apply(T_b_a, place)
-        variance += float(np.mean(np.trace(a.covariance_m2 + b.covariance_m2, axis1=1, axis2=2))) / len(a.centres_m)
-    gap = float(np.linalg.norm(place - centre))
-    how = "displacement of the spheres' centre after the three alignments; they share measurements"
-    return Observation("CT → scan → camera → CT", gap, float(np.sqrt(variance)), gap**2 / variance, 1, how)
 
 
 def _pick(spheres: MeasuredSpheres, index: Sequence[int]) -> MeasuredSpheres:
