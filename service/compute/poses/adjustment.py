@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 
 from service.compute.poses.bundle import Data, Normal, Rows, Sigmas, State, linearise, moved, normal_equations
@@ -14,7 +15,8 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 _CAUCHY = {"tracks": 2.4, "spheres": 3.0, "robot_position": 3.0, "robot_rotation": 3.0}  # scale, in sigmas
-_SETTLED = 1e-7  # relative change of the cost at which an adjustment has converged
+_SETTLED = 0.2  # change of the cost, which is a chi square of all residuals, at which an adjustment has converged
+_NEARLY = 5.0  # the same while the variances are still being estimated
 _MOST_STEPS = 40
 
 
@@ -51,14 +53,14 @@ def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solut
         ComputeError: it does not converge, or something is not determined by the data.
     """
     steps = 0
+    sigmas = _first_guess(state, data, sigmas)
     chi2: dict[str, float] = {}
     redundancy: dict[str, float] = {}
     weights: dict[str, Array] = {}
     covariance = np.empty((0, 0))
     for turn in range(rounds):
-        state, used = _descend(state, data, sigmas)
+        state, rows, used = _descend(state, data, sigmas, _SETTLED if turn + 1 == rounds else _NEARLY)
         steps += used
-        rows = linearise(state, data, sigmas)
         weights = _weights(rows)
         weighted = {name: r.weighted(weights[name]) for name, r in rows.items()}
         normal = normal_equations(list(weighted.values()))
@@ -75,8 +77,18 @@ def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solut
     return Solution(state, sigmas, weights, covariance, chi2, redundancy, steps)
 
 
-def _descend(state: State, data: Data, sigmas: Sigmas) -> tuple[State, int]:
-    damping, cost = 1e-6, math.inf
+def _first_guess(state: State, data: Data, sigmas: Sigmas) -> Sigmas:
+    """The tracks' sigma from the median of their residuals, so that robust weights mean something from the start."""
+    squares = linearise(state, dataclasses.replace(data, sightings=None, robot=None, lens_covariance=None), sigmas)[
+        "tracks"
+    ].squares
+    return dataclasses.replace(
+        sigmas, track_px=max(0.02, sigmas.track_px * math.sqrt(float(np.median(squares)) / (2 * math.log(2))))
+    )
+
+
+def _descend(state: State, data: Data, sigmas: Sigmas, settled: float) -> tuple[State, dict[str, Rows], int]:
+    damping = 1e-6
     rows = linearise(state, data, sigmas)
     cost = _cost(rows)
     for step in range(1, _MOST_STEPS + 1):
@@ -88,17 +100,17 @@ def _descend(state: State, data: Data, sigmas: Sigmas) -> tuple[State, int]:
         if not math.isfinite(new):
             raise ComputeError("the bundle adjustment diverged", remedy="check the camera, the poses and the spheres")
         if new <= cost:
-            settled = cost - new <= _SETTLED * cost
+            enough = cost - new <= settled
             state, rows, cost, damping = candidate, after, new, max(damping / 10, 1e-9)
-            if settled:
-                return state, step
-        elif new - cost <= _SETTLED * cost:
-            return state, step
+            if enough:
+                return state, rows, step
+        elif new - cost <= settled:
+            return state, rows, step
         else:
             damping *= 30
             if damping > 1e6:
-                return state, step
-    return state, _MOST_STEPS
+                return state, rows, step
+    return state, rows, _MOST_STEPS
 
 
 def _weights(rows: dict[str, Rows]) -> dict[str, Array]:
@@ -148,7 +160,7 @@ def _redundancy(weighted: dict[str, Rows], normal: Normal, covariance: Array) ->
             # A point's increment is -V^-1 W^T of the cameras' increment, plus what its own rows allow.
             used = np.unique(r.point.indices // 3)
             columns = (3 * used[:, None] + np.arange(3)).ravel()
-            inverse = normal.inverse_blocks.tocsr()[columns][:, columns].toarray()
+            inverse = block_diag(*normal.inverse_blocks[used])
             P = r.point[:, columns].toarray()
             G = inverse @ cross[:, columns].T.toarray()
             full = J - P @ G

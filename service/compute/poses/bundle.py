@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_matrix, coo_matrix, csr_matrix, vstack
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, vstack
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
@@ -21,6 +21,7 @@ from service.core.geometry import Array
 
 Index = NDArray[np.int64]
 LENS = ("fx", "fy", "cx", "cy")
+_CHUNK = 2000  # points eliminated at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +116,9 @@ class Normal:
 
     schur: Array  # (n, n)
     gradient: Array  # (n,)
-    cross: csr_matrix  # (n, 3 Q)
-    inverse_blocks: bsr_matrix  # (3 Q, 3 Q) of the points
-    point_gradient: Array  # (3 Q,)
+    cross: csc_matrix  # (n, 3 Q)
+    inverse_blocks: Array  # (Q, 3, 3) of the points
+    point_gradient: Array  # (Q, 3)
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Increment of the frame parameters (n,) and of the points (Q, 3)."""
@@ -125,8 +126,8 @@ class Normal:
         d = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         scaled = self.schur * np.outer(d, d) + damping * np.eye(len(d))
         frame = -d * np.linalg.solve(scaled, d * self.gradient)
-        points = -(self.inverse_blocks @ (self.point_gradient + self.cross.T @ frame))
-        return frame, points.reshape(-1, 3)
+        right = self.point_gradient + (self.cross.T @ frame).reshape(-1, 3)
+        return frame, -np.einsum("qij,qj->qi", self.inverse_blocks, right)
 
 
 def normal_equations(rows: list[Rows], damping: float = 0.0) -> Normal:
@@ -146,11 +147,18 @@ def normal_equations(rows: list[Rows], damping: float = 0.0) -> Normal:
     blocks[:] = V.data
     trace = np.trace(blocks, axis1=1, axis2=2)
     blocks += (damping + 1e-12) * trace[:, None, None] / 3 * np.eye(3)
-    inverse = bsr_matrix((np.linalg.inv(blocks), np.arange(n_points), np.arange(n_points + 1)))
-    W = (A.T @ B).tocsr()
-    point_gradient = B.T @ r
-    schur = (A.T @ A - (W @ inverse) @ W.T).toarray()
-    return Normal(schur, A.T @ r - W @ (inverse @ point_gradient), W, inverse, point_gradient)
+    inverse = np.linalg.inv(blocks)
+    W = (A.T @ B).tocsc()
+    point_gradient = (B.T @ r).reshape(-1, 3)
+    schur = (A.T @ A).toarray()
+    half = np.linalg.cholesky(inverse)
+    for first in range(0, n_points, _CHUNK):  # dense pieces: far faster than products of sparse matrices
+        mine = slice(first, min(first + _CHUNK, n_points))
+        piece = W[:, 3 * mine.start : 3 * mine.stop].toarray().reshape(len(schur), -1, 3)
+        piece = np.einsum("npi,pij->npj", piece, half[mine]).reshape(len(schur), -1)
+        schur -= piece @ piece.T
+    gradient = A.T @ r - W @ np.einsum("qij,qj->qi", inverse, point_gradient).ravel()
+    return Normal(schur, gradient, W, inverse, point_gradient)
 
 
 def moved(state: State, data: Data, frame: Array, points: Array) -> State:
