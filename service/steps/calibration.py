@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from service.core.errors import ConfigurationError
 from service.core.model import Record
@@ -27,6 +27,8 @@ class Result(Record):
     camera: dict[str, float]
     T_flange_camera: tuple[tuple[float, ...], ...] | None = None
     T_base_board: tuple[tuple[float, ...], ...] | None = None
+    hand_eye: dict[str, Any] | None = None  # the whole record: covariance, residuals, methods, the arm's correction
+    robots: tuple[str, ...] = ()  # devices whose flange carried the camera
     details: dict[str, object]
 
 
@@ -54,12 +56,13 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         raise ConfigurationError(
             "the protocol describes no calibration board", where=context.protocol.id, remedy="Add a section `board`"
         )
+    images = captured_images(context, [source])
     (answer,) = context.evidence.run_jobs(
         JobRequest(
             "calibrate",
             {
                 "solve": list(params.solve),
-                "images": captured_images(context, [source]),
+                "images": images,
                 "columns": board.columns,
                 "rows": board.rows,
                 "square_m": board.square_mm / 1000,
@@ -67,7 +70,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
             },
         )
     )
-    result = Result.model_validate(answer.result)
+    robots = {context.devices.layout(image["station"]).robot for image in images}
+    result = Result.model_validate({**answer.result, "robots": sorted(robots)})
     return StepOutcome({**measures, **answer.measures}, answer.artefacts, result.model_dump(mode="json"))
 
 

@@ -52,8 +52,24 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[dict[
                     "station": capture.station,
                     "sha256": photograph.sha256,
                     "T_base_flange": [list(row) for row in capture.T_base_flange],
+                    "joints_rad": list(capture.joints_rad),
                 }
             )
     if not images:
         raise ConfigurationError(f"no usable image from {', '.join(step_ids)}", where=f"step {context.step.id}")
     return images
+
+
+def hand_eye_of(context: StepContext, step_id: str, stations: Iterable[str]) -> dict[str, Any]:
+    """What turns the robot's poses into camera poses, as job arguments (worker/robot_poses.py).
+
+    The arm's correction is of one arm: it names the stations where that arm stood.
+    """
+    result = result_of(context, step_id)
+    correction = (result.get("hand_eye") or {}).get("arm_correction")
+    if correction is not None:
+        robots = set(result["robots"])
+        mine = sorted({station for station in stations if context.devices.layout(station).robot in robots})
+        kept = ("model", "arm", "dh_deltas", "gear_cos_rad", "gear_sin_rad", "observed", "T_flange_camera")
+        correction = {key: correction[key] for key in kept} | {"stations": mine}
+    return {"T_flange_camera": result["T_flange_camera"], "arm_correction": correction}

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from service.core.model import Record
 from service.steps.context import JobRequest, JobResult, StepContext, StepKind, StepOutcome
-from service.steps.inputs import captured_images, result_of
+from service.steps.inputs import captured_images, hand_eye_of, result_of
 
 
 class StructureFromMotion(Record):
@@ -40,8 +40,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     """Detect spheres and reconstruct poses, then register each source."""
     images = captured_images(context, [*params.images_of, *params.control_images_of])
     camera = result_of(context, params.calibration)["camera"]
-    T_flange_camera = result_of(context, params.hand_eye)["T_flange_camera"]
-    shared = {"images": images, "camera": camera, "T_flange_camera": T_flange_camera}
+    hand_eye = hand_eye_of(context, params.hand_eye, (image["station"] for image in images))
+    shared = {"images": images, "camera": camera, **hand_eye}
     mappers = {"colmap": "incremental", "glomap": "global"}
     (detected,) = context.evidence.run_jobs(JobRequest("detect_spheres", shared))
     markers = {

@@ -11,8 +11,10 @@ import numpy as np
 from service.compute.calibration.board import Board
 from service.compute.calibration.board_images import UsableViews, find_boards, usable_views
 from service.compute.calibration.hand_eye import calibrate_hand_eye
+from service.compute.calibration.hand_eye_record import board_corners, hand_eye_record
 from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_view
 from service.compute.calibration.intrinsics_record import intrinsics_record
+from service.compute.calibration.kinematics import matching_arm
 from service.compute.calibration.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.calibration.validation import MIN_VIEWS_TO_VALIDATE, calibration_warnings, cross_validate
 from service.compute.camera_model import CameraModel
@@ -43,21 +45,55 @@ def calibrate(context: JobContext) -> JobAnswer:
         camera = context.camera()
     result: dict[str, Any] = {"camera": camera.record(), "details": details}
     if "hand_eye" in arguments["solve"]:
-        T_camera_board = np.array([locate_view(view, board, camera)[0] for view in usable.views])
-        T_base_flange = np.array([images[i]["T_base_flange"] for i in seen])
-        answer = calibrate_hand_eye(T_base_flange, T_camera_board, T_board_turned=board.half_turn())
-        result["T_flange_camera"] = answer.T_flange_camera.tolist()
-        result["T_base_board"] = answer.T_base_board.tolist()
-        measures |= {
-            "hand_eye_sigma_mm": answer.sigma_mm,
-            "hand_eye_sigma_deg": answer.sigma_deg,
-            "hand_eye_held_out_mm": float(np.median(answer.held_out_mm)),
-            "hand_eye_held_out_deg": float(np.median(answer.held_out_deg)),
-            "rotation_spread_deg": answer.rotation_spread_deg,
-        }
-        details["hand_eye_methods_spread_mm"] = answer.spread_mm
+        answer, hand_eye_measures = _hand_eye(images, usable, board, camera)
+        result |= answer
+        measures |= hand_eye_measures
     ref = context.keep_json({**result, "measures": measures}, kind="calibration", name="calibration.json")
     return JobAnswer(measures, (ref,), result)
+
+
+def _hand_eye(
+    images: Sequence[dict[str, Any]], usable: UsableViews, board: Board, camera: CameraModel
+) -> tuple[dict[str, Any], dict[str, float]]:
+    """What later steps need and the whole record, and measures for gates."""
+    used = [images[i] for i in usable.indices]
+    T_base_flange = np.array([image["T_base_flange"] for image in used])
+    T_camera_board = np.array([locate_view(view, board, camera)[0] for view in usable.views])
+    joints = np.array([image.get("joints_rad", ()) for image in used], dtype=np.float64)
+    arm = matching_arm(joints, T_base_flange) if joints.shape == (len(used), 6) else None
+    solved = calibrate_hand_eye(
+        T_base_flange,
+        T_camera_board,
+        corners=board_corners(usable.views, board, camera),
+        joints_rad=None if arm is None else joints,
+        arm=arm,
+        T_board_turned=board.half_turn(),
+    )
+    record = hand_eye_record(solved, [image["viewpoint"] for image in used])
+    best = solved if solved.corrected is None else solved.corrected
+    measures = {
+        # Of the answer that the registration uses: with the arm's correction, where there is one.
+        "hand_eye_sigma_mm": best.sigma_mm,
+        "hand_eye_sigma_deg": best.sigma_deg,
+        "hand_eye_held_out_mm": float(np.median(best.held_out_mm)),
+        "hand_eye_held_out_deg": float(np.median(best.held_out_deg)),
+        "hand_eye_uncorrected_held_out_mm": float(np.median(solved.held_out_mm)),
+        "hand_eye_arm_corrected": float(solved.corrected is not None),
+        "hand_eye_excluded": float(len(solved.excluded)),
+        "hand_eye_methods_spread_mm": solved.spread_mm,
+        "hand_eye_condition": solved.condition,
+        "rotation_spread_deg": solved.rotation_spread_deg,
+    }
+    if best.robot_noise_mm is not None and best.robot_noise_deg is not None:
+        measures |= {"robot_noise_mm": best.robot_noise_mm, "robot_noise_deg": best.robot_noise_deg}
+    if solved.corner_sigma_px is not None:
+        measures["corner_sigma_px"] = solved.corner_sigma_px
+    answer = {
+        "T_flange_camera": record["T_flange_camera"],
+        "T_base_board": record["T_base_board"],
+        "hand_eye": record,
+    }
+    return answer, measures
 
 
 def _intrinsics(
@@ -73,7 +109,7 @@ def _intrinsics(
         validation,
         uncertainty,
         calibration_warnings(solved, validation, uncertainty),
-        [names[usable.indices[k]] for k in solved.views],
+        [names[usable.indices[k]] for k in solved.views.tolist()],
         {names[k]: excluded[k] for k in sorted(excluded)},
     )
     measures = {

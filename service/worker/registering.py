@@ -25,6 +25,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
 from service.core.model import ArtefactRef
 from service.worker.job import JobAnswer, JobContext
+from service.worker.robot_poses import robot_camera_poses
 
 
 def detect_spheres(context: JobContext) -> JobAnswer:
@@ -135,10 +136,8 @@ def _poses(context: JobContext) -> tuple[Array, list[int], list[dict[str, Any]]]
     arguments = context.arguments
     images = arguments["images"]
     if arguments["poses"] == "robot":
-        T_flange_camera = np.array(arguments["T_flange_camera"])
         stations = sorted({image["station"] for image in images})
-        poses = np.array([np.array(image["T_base_flange"]) @ T_flange_camera for image in images])
-        return poses, [stations.index(image["station"]) for image in images], images
+        return robot_camera_poses(arguments, images), [stations.index(image["station"]) for image in images], images
     model = context.input_json(arguments["model"])["T_world_camera"]
     images = [image for image in images if image["viewpoint"] in model]
     return np.array([model[image["viewpoint"]] for image in images]), [0] * len(images), images

@@ -41,7 +41,16 @@ from service.compute.calibration.weighted import Noise, resample
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 
-__all__ = ["BoardCorners", "BoardPlacement", "HandEyeResult", "Method", "calibrate_hand_eye", "place_board"]
+__all__ = [
+    "BoardCorners",
+    "BoardPlacement",
+    "CorrectedHandEye",
+    "HandEyeAnswer",
+    "HandEyeResult",
+    "Method",
+    "calibrate_hand_eye",
+    "place_board",
+]
 
 _FOLDS = 5
 _FEW = 24  # up to so many views twice the folds: a fifth less would change the answer
@@ -50,17 +59,12 @@ _MIN_DISTINCT = 4  # views in a bootstrap replicate
 
 
 @dataclass(frozen=True, slots=True)
-class HandEyeResult:
-    """T_flange_camera and what tells whether to trust it; arrays are over the N views.
+class HandEyeAnswer:
+    """T_flange_camera, T_base_board and what tells whether to trust them; arrays are over the N views.
 
     Attributes:
-        T_flange_camera: the calibration; goes with poses corrected by `arm_correction`, where there is one.
+        T_flange_camera: the calibration.
         T_base_board: where the board lay.
-        method: of T_flange_camera.
-        methods: T_flange_camera by every method that gave an answer, the arm taken as it reports itself.
-        spread_mm: largest distance of another method's translation from the chosen one's (Tsai's and Andreff's
-            included, which are the weakest: a large spread warns of a weak data set).
-        spread_deg: the same for the rotation.
         sigma_mm: bootstrap standard deviation of the translation (root of the summed variances), over images.
         sigma_deg: bootstrap standard deviation of the rotation.
         covariance: (6, 6) of T_flange_camera by the bootstrap: (d in metres, w in radians) in the flange's axes.
@@ -68,47 +72,73 @@ class HandEyeResult:
         robot_noise_mm: standard deviation for each axis of what is left of the robot's position error; None
             unless the method is weighted, as the next.
         robot_noise_deg: of its rotation.
-        corner_sigma_px: noise of the corners; None if only board poses were given.
         residual_mm: (N,) how far the board, placed by each view, is from its place, at the board's middle.
         residual_deg: (N,) the same for its orientation.
         held_out_mm: (N,) as residual_mm, but each view judged by a calibration without its fold.
         held_out_deg: (N,).
-        rotation_spread_deg: largest rotation between two views.
-        second_axis_deg: root mean square rotation about the second best axis.
-        condition: of the translation's linear system; one rotation axis makes it infinite.
-        turned: (N,) views whose board pose was turned by half a turn.
-        excluded: views that no fit used, with the reason.
-        arm_correction: the arm's systematic error, if joints were given and the correction pays.
-        arm_held_out_mm: root mean square of held_out_mm for each model of the arm that was tried ("none" is the
-            arm as it reports itself).
-        T_flange_camera_uncorrected: to go with poses as the robot reports them.
     """
 
     T_flange_camera: Transform
     T_base_board: Transform
-    method: Method
-    methods: dict[Method, Transform]
-    spread_mm: float
-    spread_deg: float
     sigma_mm: float
     sigma_deg: float
     covariance: Array
     formal_covariance: Array | None
     robot_noise_mm: float | None
     robot_noise_deg: float | None
-    corner_sigma_px: float | None
     residual_mm: Array
     residual_deg: Array
     held_out_mm: Array
     held_out_deg: Array
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectedHandEye(HandEyeAnswer):
+    """The answer that goes with poses corrected by `correction` (`corrected_T_base_flange`).
+
+    Attributes:
+        correction: the arm's systematic error.
+        terms: which of its parameters were estimated.
+    """
+
+    correction: ArmCorrection
+    terms: ArmTerms
+
+
+@dataclass(frozen=True, slots=True)
+class HandEyeResult(HandEyeAnswer):
+    """The answer that goes with the robot's poses as it reports them, and all that was learnt on the way.
+
+    Attributes:
+        method: of T_flange_camera.
+        methods: T_flange_camera by every method that gave an answer.
+        spread_mm: largest distance of another method's translation from the chosen one's (Tsai's and Andreff's
+            included, which are the weakest: a large spread warns of a weak data set).
+        spread_deg: the same for the rotation.
+        corner_sigma_px: noise of the corners; None if only board poses were given.
+        rotation_spread_deg: largest rotation between two views.
+        second_axis_deg: root mean square rotation about the second best axis.
+        condition: of the translation's linear system; one rotation axis makes it infinite.
+        turned: (N,) views whose board pose was turned by half a turn.
+        excluded: views that no fit used, with the reason.
+        corrected: the answer with the arm's systematic error estimated; None if no joints were given or it does not
+            pay on held-out views.
+        arm_held_out_mm: root mean square of held_out_mm for each model of the arm that was tried ("none" is the
+            arm as it reports itself).
+    """
+
+    method: Method
+    methods: dict[Method, Transform]
+    spread_mm: float
+    spread_deg: float
+    corner_sigma_px: float | None
     rotation_spread_deg: float
     second_axis_deg: float
     condition: float
     turned: tuple[bool, ...]
     excluded: dict[int, str]
-    arm_correction: ArmCorrection | None
+    corrected: CorrectedHandEye | None
     arm_held_out_mm: dict[ArmTerms, float]
-    T_flange_camera_uncorrected: Transform
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,40 +227,60 @@ def calibrate_hand_eye(
             errors = held_out(straight, used, method, terms, (plain, noise), folds, point)
             outcomes[terms] = (answer, *errors)
     rms: dict[ArmTerms, float] = {k: float(np.sqrt(np.mean(v[1][keep] ** 2))) for k, v in outcomes.items()}
-    best = min(rms, key=lambda k: rms[k])
-    chosen = best if rms[best] < _WORTH * rms["none"] else "none"
-    answer, held_mm, held_deg = outcomes[chosen]
-    residual = deviation(straight.placed(answer), answer.T_base_board, point)
-    methods = _methods(straight.take(keep), method, plain)
+    best = min(rms, key=lambda terms: rms[terms])
+    corrected: CorrectedHandEye | None = None
+    good = straight.take(keep)
+    if rms[best] < _WORTH * rms["none"]:
+        answer, *errors = outcomes[best]
+        assert answer.correction is not None
+        quality = _quality(straight, good, method, answer, (errors[0], errors[1]), point, bootstrap, seed)
+        corrected = CorrectedHandEye(**quality, correction=answer.correction, terms=best)
+    methods = _methods(good, method, plain)
     distances = [distance(T, plain.T_flange_camera) for T in methods.values()]
-    covariance = _bootstrap(straight.take(keep), method, answer, bootstrap, np.random.default_rng(seed))
     return HandEyeResult(
-        T_flange_camera=answer.T_flange_camera,
-        T_base_board=answer.T_base_board,
+        **_quality(straight, good, method, plain, outcomes["none"][1:], point, bootstrap, seed),
         method=method,
         methods=methods,
         spread_mm=max(mm for mm, _ in distances),
         spread_deg=max(deg for _, deg in distances),
-        sigma_mm=1e3 * float(np.sqrt(np.trace(covariance[:3, :3]))),
-        sigma_deg=float(np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))),
-        covariance=covariance,
-        formal_covariance=None if answer.fit is None else answer.fit.covariance[:6, :6],
-        robot_noise_mm=None if answer.noise is None else 1e3 * answer.noise.robot_m,
-        robot_noise_deg=None if answer.noise is None else float(np.degrees(answer.noise.robot_rad)),
         corner_sigma_px=sigma_px,
-        residual_mm=residual[0],
-        residual_deg=residual[1],
-        held_out_mm=held_mm,
-        held_out_deg=held_deg,
         rotation_spread_deg=spread,
         second_axis_deg=second,
         condition=condition,
         turned=tuple(bool(t) for t in turned),
         excluded=excluded,
-        arm_correction=answer.correction,
+        corrected=corrected,
         arm_held_out_mm=rms,
-        T_flange_camera_uncorrected=plain.T_flange_camera,
     )
+
+
+def _quality(
+    data: Measured,
+    good: Measured,
+    method: Method,
+    answer: Answer,
+    errors: tuple[Array, Array],
+    point_m: Array,
+    bootstrap: int,
+    seed: int,
+) -> dict[str, Any]:
+    """The fields of a HandEyeAnswer."""
+    residual = deviation(data.placed(answer), answer.T_base_board, point_m)
+    covariance = _bootstrap(good, method, answer, bootstrap, np.random.default_rng(seed))
+    return {
+        "T_flange_camera": answer.T_flange_camera,
+        "T_base_board": answer.T_base_board,
+        "sigma_mm": 1e3 * float(np.sqrt(np.trace(covariance[:3, :3]))),
+        "sigma_deg": float(np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))),
+        "covariance": covariance,
+        "formal_covariance": None if answer.fit is None else answer.fit.covariance[:6, :6],
+        "robot_noise_mm": None if answer.noise is None else 1e3 * answer.noise.robot_m,
+        "robot_noise_deg": None if answer.noise is None else float(np.degrees(answer.noise.robot_rad)),
+        "residual_mm": residual[0],
+        "residual_deg": residual[1],
+        "held_out_mm": errors[0],
+        "held_out_deg": errors[1],
+    }
 
 
 def _measured(
@@ -347,50 +397,3 @@ def place_board(T_base_flange: Array, T_camera_board: Array, T_flange_camera: Tr
     n = len(placed)
     sigma = float(np.sqrt(np.sum(residual_mm**2) / max(n - 1, 1) / n))
     return BoardPlacement(mean, residual_mm, residual_deg, sigma)
-
-
-def as_json(result: HandEyeResult, images: list[str]) -> dict[str, Any]:
-    """The result for hand_eye.json: 4×4 transforms in metres, errors in mm and degrees, views by name."""
-
-    def per_view(values: Array) -> dict[str, float]:
-        return {name: float(v) for name, v in zip(images, values, strict=True)}
-
-    away = {name: distance(T, result.methods[result.method]) for name, T in result.methods.items()}
-    correction = result.arm_correction
-    return {
-        "T_flange_camera": result.T_flange_camera.tolist(),
-        "T_base_board": result.T_base_board.tolist(),
-        "method": result.method,
-        "sigma": {
-            "mm": result.sigma_mm,
-            "deg": result.sigma_deg,
-            "covariance": result.covariance.tolist(),
-            "formal_covariance": None if result.formal_covariance is None else result.formal_covariance.tolist(),
-        },
-        "residuals": {
-            "mm": per_view(result.residual_mm),
-            "deg": per_view(result.residual_deg),
-            "held_out_mm": per_view(result.held_out_mm),
-            "held_out_deg": per_view(result.held_out_deg),
-        },
-        "methods": {
-            name: {"T_flange_camera": T.tolist(), "distance_mm": away[name][0], "distance_deg": away[name][1]}
-            for name, T in result.methods.items()
-        },
-        "spread": {"mm": result.spread_mm, "deg": result.spread_deg},
-        "noise": {
-            "robot_mm": result.robot_noise_mm,
-            "robot_deg": result.robot_noise_deg,
-            "corner_px": result.corner_sigma_px,
-        },
-        "motion": {
-            "rotation_spread_deg": result.rotation_spread_deg,
-            "second_axis_deg": result.second_axis_deg,
-            "condition": result.condition,
-        },
-        "excluded": {images[i]: reason for i, reason in result.excluded.items()},
-        "turned": [name for name, turned in zip(images, result.turned, strict=True) if turned],
-        "arm_correction": None if correction is None else correction.as_json(),
-        "arm_held_out_rms_mm": dict(result.arm_held_out_mm),
-        "T_flange_camera_uncorrected": result.T_flange_camera_uncorrected.tolist(),
-    }
