@@ -53,7 +53,7 @@ def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solut
         ComputeError: it does not converge, or something is not determined by the data.
     """
     steps = 0
-    sigmas = _first_guess(state, data, sigmas)
+    sigmas = first_guess(state, data, sigmas)
     chi2: dict[str, float] = {}
     redundancy: dict[str, float] = {}
     weights: dict[str, Array] = {}
@@ -73,11 +73,11 @@ def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solut
         if turn + 1 < rounds:
             sigmas = _estimated(sigmas, chi2, redundancy)
         else:
-            covariance = _clustered(weighted, normal, redundancy)
+            covariance = _honest(weighted, normal)
     return Solution(state, sigmas, weights, covariance, chi2, redundancy, steps)
 
 
-def _first_guess(state: State, data: Data, sigmas: Sigmas) -> Sigmas:
+def first_guess(state: State, data: Data, sigmas: Sigmas) -> Sigmas:
     """The tracks' sigma from the median of their residuals, so that robust weights mean something from the start."""
     squares = linearise(state, dataclasses.replace(data, sightings=None, robot=None, lens_covariance=None), sigmas)[
         "tracks"
@@ -187,23 +187,36 @@ def _estimated(sigmas: Sigmas, chi2: dict[str, float], redundancy: dict[str, flo
     )
 
 
-def _clustered(weighted: dict[str, Rows], normal: Normal, redundancy: dict[str, float]) -> Array:
-    """Covariance of the frame parameters that stays honest where the errors of one track are alike.
+def robust_rows(state: State, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
+    """Rows of every component with their robust weights."""
+    rows = linearise(state, data, sigmas)
+    weights = _weights(rows)
+    return {name: r.weighted(weights[name]) for name, r in rows.items()}
 
-    The sandwich H^-1 M H^-1: M sums the squared scores of whole tracks, and takes the other components at their word.
+
+def clustered_information(tracks: Rows, n: int) -> tuple[Array, Array]:
+    """H and M (n, n) of weighted tracks, points eliminated: the covariance H^-1 M H^-1 of the frame parameters.
+
+    It stays honest where the errors of one track are alike: M sums the squared scores of whole tracks. Source: the
+    sandwich of robust estimation (Huber, Robust Statistics, 6.3) with clusters.
     """
-    tracks = weighted["tracks"]
     point = tracks.point.indices[tracks.point.indptr[:-1]] // 3
     n_rows, n_points = len(tracks.residual), int(point.max()) + 1
     inner = Rows(tracks.residual, tracks.frame, tracks.point[:, : 3 * n_points].tocsr(), tracks.size)
-    information = normal_equations([inner]).schur
     spread = csr_matrix((tracks.residual, (point, np.arange(n_rows))), shape=(n_points, n_rows))
     scores = (spread @ tracks.frame).tocsr()
-    meat = (scores.T @ scores).toarray() * n_rows / max(redundancy["tracks"], 1.0)
+    free = max(n_rows - 3 * n_points - n, 1)
     _, weight, slope = _EXPECTED["tracks"]
-    rest = normal.schur - information
-    bread = _inverse(rest + information * slope / weight)
-    return bread @ (rest + meat) @ bread
+    return normal_equations([inner]).schur * slope / weight, (scores.T @ scores).toarray() * n_rows / free
+
+
+def _honest(weighted: dict[str, Rows], normal: Normal) -> Array:
+    """Covariance of the frame parameters; tracks by their clustered scores, the other components at their word."""
+    bread, meat = clustered_information(weighted["tracks"], len(normal.schur))
+    _, weight, slope = _EXPECTED["tracks"]
+    rest = normal.schur - bread * weight / slope
+    inverse = _inverse(rest + bread)
+    return inverse @ (rest + meat) @ inverse
 
 
 def _expectations(scale: float, dimensions: int) -> tuple[float, float, float]:

@@ -24,6 +24,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from service.compute.camera_model import CameraModel
+from service.compute.poses.pose_covariance import blocks, similarity_covariance
 from service.compute.poses.tracks import Tracks
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
@@ -106,6 +107,13 @@ class SfmModel:
     def points_world(self) -> Array:
         """(P, 3) triangulated points."""
         return self.tracks.points
+
+    def pose_covariance(self) -> Array:
+        """(N, 6, 6) of each pose after the positions were laid over the true ones by a similarity; the model's unit.
+
+        Increments (d, w) of exp(w) R, t + d in the model's axes. Takes a second or so.
+        """
+        return blocks(similarity_covariance(np.array(list(self.T_world_camera.values())), self.tracks, self.camera))
 
 
 def reconstruct(
