@@ -1,4 +1,4 @@
-"""The paper's cost x^T E x of outline points against projected spheres, algebraic or geometric, with derivatives."""
+"""What an outline says against a projected sphere: the cone's three numbers, or the paper's x^T E x of its points."""
 
 from __future__ import annotations
 
@@ -8,10 +8,37 @@ import numpy as np
 
 from service.core.geometry import Array
 
-Cost = Literal["sampson", "algebraic"]
+PointCost = Literal["sampson", "algebraic"]
+Cost = Literal["cone", "sampson", "algebraic"]
 
 
-def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: Cost) -> Array:
+def cone_residuals(
+    axes: Array, frames: Array, half_angles_rad: Array, centres_camera_m: Array, radius_m: float
+) -> tuple[Array, Array]:
+    """Residuals (O, 3) in radians of seen cones against spheres, and their derivative (O, 3, 3) by the centres.
+
+    Args:
+        axes: (O, 3) unit vectors to the centres as seen.
+        frames: (O, 3, 2) the first two columns of each cone's `frame()`.
+        half_angles_rad: (O,) as seen.
+        centres_camera_m: (O, 3) predicted centres in the camera frame.
+        radius_m: of the spheres.
+
+    A sphere at c is seen as the cone with the axis u = c / |c| and sin(a) = r / |c|: the residual is the tilt of u
+    along the two columns of the frame, and a minus the half angle seen. These three numbers are all that an outline
+    holds, and nearly linear in c.
+    """
+    distance = np.linalg.norm(centres_camera_m, axis=1)
+    u = centres_camera_m / distance[:, None]
+    half = np.arcsin(np.clip(radius_m / distance, 0.0, 0.999))
+    across = np.einsum("oik,oi->ok", frames, u - axes)
+    r = np.column_stack([across, half - half_angles_rad])
+    tilt = np.einsum("oik,oij->okj", frames, np.eye(3) - u[:, :, None] * u[:, None, :]) / distance[:, None, None]
+    shrink = -np.tan(half)[:, None] * u / distance[:, None]
+    return r, np.concatenate([tilt, shrink[:, None, :]], axis=1)
+
+
+def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: PointCost) -> Array:
     """Signed residuals (N,) of points (N, 3) normalised, z = 1, against spheres at (N, 3) in the camera frame.
 
     The outline of a sphere is x^T E x = 0 with E^-1 = P Q^-1 P^T. In the camera frame P = [I | 0] and
@@ -24,14 +51,14 @@ def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: Cos
 
 
 def residuals_and_derivative(
-    points: Array, centres_camera_m: Array, radius_m: float, cost: Cost
+    points: Array, centres_camera_m: Array, radius_m: float, cost: PointCost
 ) -> tuple[Array, Array]:
     """Residuals (N,) and their derivative (N, 3) with respect to the centres."""
     return _value_and_gradient(points, centres_camera_m, radius_m, cost, derivative=True)
 
 
 def _value_and_gradient(
-    points: Array, centres: Array, radius_m: float, cost: Cost, *, derivative: bool
+    points: Array, centres: Array, radius_m: float, cost: PointCost, *, derivative: bool
 ) -> tuple[Array, Array]:
     xx = np.einsum("nj,nj->n", points, points)
     cx = np.einsum("nj,nj->n", centres, points)
@@ -67,12 +94,3 @@ def skew(v: Array) -> Array:
     out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
     out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
     return out
-
-
-def left_jacobian(w: Array) -> Array:
-    """(3, 3) J with exp(w + d) = exp(J d) exp(w) to first order (Barfoot, State Estimation for Robotics, 7.1.5)."""
-    angle = float(np.linalg.norm(w))
-    W = skew(w)
-    if angle < 1e-6:
-        return np.eye(3) + 0.5 * W + W @ W / 6
-    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W

@@ -1,0 +1,321 @@
+"""The registration as a problem of least squares: outlines of posed images as rows, three an outline, linearised."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.cost import Cost, PointCost, cone_residuals, residuals_and_derivative, skew
+from service.compute.registration.identity import Assignment
+from service.core.errors import ComputeError
+from service.core.geometry import Array
+
+_CHUNK = 500  # outlines whose points are expanded at a time
+
+
+@dataclass(frozen=True, slots=True)
+class CommonErrors:
+    """Standard deviations, in px, of what all outlines of a capture have in common.
+
+    `shift_px`: in x and in y of the image; `growth_px`: of the radius; both are told apart from the registration by
+    views from different sides, hence solved for. `light_px`: displacement of all spheres in one direction of space,
+    at their mean distance: light from above that leaves the undersides dark. No view tells it from a displacement of
+    the scan, hence it is what remains of the predicted error however many images are taken.
+    """
+
+    shift_px: float = 0.02
+    growth_px: float = 0.02
+    light_px: float = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Outlines O of N images of G stations; what is known before the solution."""
+
+    members: list[tuple[int, int, int]]  # image, outline, marker
+    image: NDArray[np.int64]
+    marker: NDArray[np.int64]
+    group: NDArray[np.int64]  # position in `groups`
+    groups: list[int]
+    T_base_camera: Array  # (N, 4, 4)
+    centres: Array  # (M, 3)
+    radius_m: float
+    focal_px: float
+    axes: Array  # (O, 3)
+    frames: Array  # (O, 3, 2)
+    half_angles: Array  # (O,)
+    whiten: Array  # (O, 3, 3): whiten @ residual has unit covariance
+    points: list[Array] = field(repr=False)  # (L, 2) normalised; used by the costs of points only
+    point_sigma: Array = field(repr=False)  # (O,) of one of the L points as an independent measurement
+    common: Array = field(repr=False)  # (O, 3, K) displacement of a cone by each error of the image common to all
+    common_prior: Array = field(repr=False)  # (K, K) information
+    sphere_prior: Array | None = field(repr=False)  # (3 M, 3 M) information; None: centres taken as exact
+    light_unit_m: float  # displacement of a sphere that is seen as one px
+    with_scale: bool
+
+    @property
+    def n_images(self) -> int:
+        """N."""
+        return len(self.T_base_camera)
+
+    @property
+    def scale_column(self) -> int:
+        """Where ln scale is, if it is solved for."""
+        return 6 * len(self.groups)
+
+    @property
+    def sphere_column(self) -> int:
+        """Where the displacements of the spheres begin, if they are solved for."""
+        return self.scale_column + int(self.with_scale)
+
+    @property
+    def common_column(self) -> int:
+        """Where the common errors begin."""
+        return self.sphere_column + (0 if self.sphere_prior is None else 3 * len(self.centres))
+
+    @property
+    def size(self) -> int:
+        """n: number of common unknowns."""
+        return self.common_column + 3 + self.common.shape[2]
+
+    def prior(self) -> Array:
+        """(n, n) information on the common unknowns."""
+        out = np.zeros((self.size, self.size))
+        if self.sphere_prior is not None:
+            out[self.sphere_column : self.common_column, self.sphere_column : self.common_column] = self.sphere_prior
+        out[self.common_column :, self.common_column :] = self.common_prior
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """A solution: values of the unknowns."""
+
+    bases: Array  # (G, 4, 4) T_base_scan of each station
+    scale: float
+    spheres: Array  # (M, 3) displacements of the centres, scan frame
+    common: Array  # (3 + K,) px: displacement in space (scan frame), shift, growth, and of the intrinsics
+    poses: Array  # (N, 6) errors of the poses: position (m), rotation vector, base axes
+
+    def moved(self, problem: Problem, dx: Array, poses: Array) -> State:
+        """After a step of the common unknowns, with the pose errors that go with it."""
+        bases = self.bases.copy()
+        for k in range(len(bases)):
+            d = dx[6 * k : 6 * k + 6]
+            bases[k, :3, :3] = Rotation.from_rotvec(d[3:]).as_matrix() @ bases[k, :3, :3]
+            bases[k, :3, 3] += d[:3]
+        scale = self.scale * float(np.exp(dx[problem.scale_column])) if problem.with_scale else self.scale
+        spheres = self.spheres
+        if problem.sphere_prior is not None:
+            spheres = spheres + dx[problem.sphere_column : problem.common_column].reshape(-1, 3)
+        return State(bases, scale, spheres, self.common + dx[problem.common_column :], poses)
+
+    def prior_values(self, problem: Problem) -> Array:
+        """(n,) present values of the unknowns that have a prior, zero for the others."""
+        out = np.zeros(problem.size)
+        if problem.sphere_prior is not None:
+            out[problem.sphere_column : problem.common_column] = self.spheres.ravel()
+        out[problem.common_column :] = self.common
+        return out
+
+    def cameras(self, problem: Problem, *, refined: bool) -> Array:
+        """(N, 4, 4) T_base_camera, metric; `refined` by the errors found."""
+        T = problem.T_base_camera.copy()
+        T[:, :3, 3] *= self.scale
+        if refined:
+            T[:, :3, :3] = Rotation.from_rotvec(self.poses[:, 3:]).as_matrix() @ T[:, :3, :3]
+            T[:, :3, 3] += self.poses[:, :3]
+        return T
+
+
+@dataclass(frozen=True, slots=True)
+class Linearised:
+    """Rows of the outlines: r + J dx + A xi, xi the whole error of the image's pose (not a step of it)."""
+
+    J: Array  # (O, 3, n)
+    A: Array  # (O, 3, 6)
+    r: Array  # (O, 3)
+
+
+def assemble(
+    outlines: Sequence[Sequence[SphereOutline]],
+    assignments: Sequence[Assignment],
+    poses: Array,
+    groups: Sequence[int] | NDArray[np.int64],
+    centres_scan_m: Array,
+    radius_m: float,
+    camera: CameraModel,
+    *,
+    with_scale: bool,
+    sphere_covariance_m2: Array | None,
+    common_errors: CommonErrors,
+    intrinsics_covariance: Array | None,
+) -> Problem:
+    """The problem of `register`; its arguments.
+
+    Raises:
+        ComputeError: too few outlines or markers.
+    """
+    members = [(i, j, m) for i, a in enumerate(assignments) for j, m in sorted(a.markers.items())]
+    if len(members) < 3 or len({m for _, _, m in members}) < 3:
+        raise ComputeError(
+            f"{len(members)} outlines of {len({m for _, _, m in members})} markers do not determine a registration",
+            remedy="Use images in which at least four registration spheres are visible",
+        )
+    f = 0.5 * (camera.fx + camera.fy)
+    used = [outlines[i][j] for i, j, _ in members]
+    used_groups = [int(groups[i]) for i, _, _ in members]
+    first = int(groups[0])
+    order = sorted(set(used_groups), key=lambda g: (g != first, g))
+    axes = np.array([o.cone.axis for o in used])
+    frames = np.array([o.cone.frame()[:, :2] for o in used])
+    half = np.array([o.cone.half_angle_rad for o in used])
+    common = _common_displacements(axes, frames, camera)
+    e = common_errors
+    sigma = np.maximum([e.light_px, e.light_px, e.light_px, e.shift_px, e.shift_px, e.growth_px], 1e-6)
+    prior = np.diag(1 / sigma**2)
+    if intrinsics_covariance is not None:
+        k = len(intrinsics_covariance)
+        common = np.concatenate([common, _intrinsics_errors(axes, frames, half, camera)[:, :, :k]], axis=2)
+        information = np.zeros((6 + k, 6 + k))
+        information[:6, :6], information[6:, 6:] = prior, np.linalg.inv(intrinsics_covariance)
+        prior = information
+    return Problem(
+        members=members,
+        image=np.array([i for i, _, _ in members]),
+        marker=np.array([m for _, _, m in members]),
+        group=np.array([order.index(g) for g in used_groups]),
+        groups=order,
+        T_base_camera=np.array(poses, dtype=np.float64),
+        centres=np.asarray(centres_scan_m, dtype=np.float64),
+        radius_m=radius_m,
+        focal_px=f,
+        axes=axes,
+        frames=frames,
+        half_angles=half,
+        whiten=_whitening(np.array([o.cone_covariance for o in used])),
+        points=[o.points for o in used],
+        point_sigma=np.array([_point_sigma(o) for o in used]) / f,
+        common=common,
+        common_prior=prior,
+        sphere_prior=None if sphere_covariance_m2 is None else _block_inverse(sphere_covariance_m2),
+        light_unit_m=float(np.mean(radius_m / np.sin(half))) / f,
+        with_scale=with_scale,
+    )
+
+
+def _whitening(covariance: Array) -> Array:
+    return np.linalg.inv(np.linalg.cholesky(covariance)).astype(np.float64)
+
+
+def _point_sigma(o: SphereOutline) -> float:
+    # L points on a fitted conic carry the information of its n edge points, no more.
+    # Beyond it an outline errs as a whole; two of its parameters share each such error.
+    variance = max(o.sigma_px, 0.03) ** 2 / max(o.n_edges, 12) + o.systematic_px**2 / 2
+    return float(np.sqrt(variance * len(o.points)))
+
+
+def _block_inverse(covariances: Array) -> Array:
+    n = len(covariances)
+    out = np.zeros((3 * n, 3 * n))
+    for k, c in enumerate(covariances):
+        out[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.linalg.inv(c)
+    return out
+
+
+def _common_displacements(axes: Array, frames: Array, camera: CameraModel) -> Array:
+    """Displacement (O, 3, 3) of cones when all outlines shift by a pixel in x, in y, or grow by one."""
+    z = axes[:, 2]
+    out = np.zeros((len(axes), 3, 3))
+    for k, f in enumerate((camera.fx, camera.fy)):
+        out[:, :2, k] = frames[:, k, :] * (z / f)[:, None]
+    out[:, 2, 2] = z / (0.5 * (camera.fx + camera.fy))
+    return out
+
+
+def _intrinsics_errors(axes: Array, frames: Array, half: Array, camera: CameraModel) -> Array:
+    """Displacement (O, 3, 8) of cones by errors of fx, fy, cx, cy, k1, k2, p1, p2, the image being given."""
+    x, y, z = axes[:, 0] / axes[:, 2], axes[:, 1] / axes[:, 2], axes[:, 2]
+    r2, zero = x**2 + y**2, np.zeros(len(axes))
+    plane = -np.stack(
+        [
+            np.stack([x / camera.fx, zero]), np.stack([zero, y / camera.fy]),
+            np.stack([zero + 1 / camera.fx, zero]), np.stack([zero, zero + 1 / camera.fy]),
+            np.stack([x * r2, y * r2]), np.stack([x * r2**2, y * r2**2]),
+            np.stack([2 * x * y, r2 + 2 * y**2]), np.stack([r2 + 2 * x**2, 2 * x * y]),
+        ]
+    )  # fmt: skip
+    out = np.zeros((len(axes), 3, 8))
+    out[:, :2] = np.einsum("oik,cio->okc", frames[:, :2], plane) * z[:, None, None]
+    size = [-0.5 / camera.fx + zero, -0.5 / camera.fy + zero, zero, zero, -2 * r2, -3 * r2**2, zero, zero]
+    out[:, 2] = (np.stack(size) * half).T
+    return out
+
+
+def linearise(problem: Problem, state: State, cost: Cost) -> Linearised:
+    """Whitened rows of the outlines at a state."""
+    T = state.cameras(problem, refined=True)[problem.image]
+    origin = (problem.T_base_camera[problem.image, :3, 3]) * state.scale
+    centres = problem.centres + state.spheres + problem.light_unit_m * state.common[:3]
+    rotated = np.einsum("oij,oj->oi", state.bases[problem.group, :3, :3], centres[problem.marker])
+    place = rotated + state.bases[problem.group, :3, 3]
+    c = np.einsum("oji,oj->oi", T[:, :3, :3], place - T[:, :3, 3])
+    in_image = state.common[3:]
+    seen, slope = cone_residuals(problem.axes, problem.frames, problem.half_angles, c, problem.radius_m)
+    if cost == "cone":
+        seen = seen + problem.common @ in_image
+        r = np.einsum("oij,oj->oi", problem.whiten, seen)
+        by_centre, by_common = problem.whiten @ slope, problem.whiten @ problem.common
+    else:
+        equivalent = np.linalg.solve(slope, problem.common)  # a common error as a displacement of the centre
+        by_centre, r = _point_rows(problem, c + equivalent @ in_image, cost)
+        by_common = by_centre @ equivalent
+    S = by_centre @ T[:, :3, :3].transpose(0, 2, 1)  # by a displacement in base axes
+    J = np.zeros((len(c), 3, problem.size))
+    for k in range(len(problem.groups)):
+        here = problem.group == k
+        J[here, :, 6 * k : 6 * k + 3] = S[here]
+        J[here, :, 6 * k + 3 : 6 * k + 6] = -S[here] @ skew(rotated[here])
+    if problem.with_scale:
+        J[:, :, problem.scale_column] = -np.einsum("okj,oj->ok", S, origin)
+    turned = S @ state.bases[problem.group, :3, :3]
+    if problem.sphere_prior is not None:
+        for o, m in enumerate(problem.marker):
+            J[o, :, problem.sphere_column + 3 * m : problem.sphere_column + 3 * m + 3] = turned[o]
+    J[:, :, problem.common_column : problem.common_column + 3] = problem.light_unit_m * turned
+    J[:, :, problem.common_column + 3 :] = by_common
+    A = np.concatenate([-S, S @ skew(place - T[:, :3, 3])], axis=2)
+    # The present pose errors are in r already; the rows are those of their whole size.
+    return Linearised(J, A, r - np.einsum("okj,oj->ok", A, state.poses[problem.image]))
+
+
+def _point_rows(problem: Problem, centres: Array, cost: PointCost) -> tuple[Array, Array]:
+    """Three rows an outline with the normal equations of all its points: derivative (O, 3, 3) and residual (O, 3)."""
+    n = len(centres)
+    N, b = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    for start in range(0, n, _CHUNK):
+        part = range(start, min(n, start + _CHUNK))
+        counts = np.array([len(problem.points[o]) for o in part])
+        flat = np.concatenate([problem.points[o] for o in part])
+        flat = np.column_stack([flat, np.ones(len(flat))])
+        owner = np.repeat(np.arange(start, start + len(counts)), counts)
+        r, D = residuals_and_derivative(flat, centres[owner], problem.radius_m, cost)
+        first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+        N[part.start : part.stop] = np.add.reduceat(D[:, :, None] * D[:, None, :], first, axis=0)
+        b[part.start : part.stop] = np.add.reduceat(D * r[:, None], first, axis=0)
+    if cost == "sampson":
+        weight = 1 / problem.point_sigma**2
+    else:
+        # The paper's cost weights all points alike; only a common factor makes its rows of the order of one.
+        length = np.trace(N, axis1=1, axis2=2)
+        inside = np.einsum("oij,oij->o", problem.whiten, problem.whiten) / np.sum(centres**2, axis=1)
+        weight = np.full(n, float(np.median(inside) / np.median(length)))
+    L: Array = np.linalg.cholesky(N * weight[:, None, None]).astype(np.float64)
+    r = np.linalg.solve(L, (b * weight[:, None])[:, :, None])[:, :, 0]
+    return L.transpose(0, 2, 1), r.astype(np.float64)
