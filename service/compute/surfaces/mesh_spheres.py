@@ -83,10 +83,10 @@ def locate_spheres(
     """Locate every sphere of radius `radius_m` in a mesh or point cloud, best covered first.
 
     Cells of surface vote for a centre one radius away; each peak of votes is fitted by a robust known-radius fit and
-    accepted by its coverage, its residuals (also against the other spheres'), the radius of a free fit, and that the surface ends with the sphere
-    instead of going on smoothly, as a cylinder's or an ellipsoid's does. Caps of 30° half angle suffice where noise
-    lets them. Winding may be inverted as a whole or for single spheres; a dent is told from a sphere by the
-    majority's winding, in a cloud without normals not at all.
+    accepted by its coverage, its residuals (also against the other spheres'), the radius of a free fit, and that the
+    surface ends with the sphere instead of going on smoothly, as a cylinder's or an ellipsoid's does. Caps of 30°
+    half angle suffice where noise lets them. Winding may be inverted as a whole or for single spheres; a dent is
+    told from a sphere by the majority's winding, in a cloud without normals not at all.
 
     Args:
         vertices_m: (V, 3); vertices may be repeated, as in STL.

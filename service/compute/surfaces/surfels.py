@@ -93,6 +93,6 @@ def _from_sums(cells: Array, low: Array, cell: float, *, is_mesh: bool) -> Surfe
 
 
 def grid_keys(points: Array, low: Array, size: IntArray, cell: float) -> IntArray:
-    """Keys (N,) of the cubic cells of points (N, 3) in a grid from `low`, one cell of margin, of `size` cells (3,)."""
+    """Keys (N,) of the cells of points (N, 3), in a grid of `size` cells (3,) that begins one before `low`."""
     index = np.floor((points - low) / cell).astype(np.int64) + 1
     return (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]
