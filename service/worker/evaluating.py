@@ -1,0 +1,250 @@
+"""Job `evaluate`: the paper's errors on the control spheres, and the error budget, for every registration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+
+from service.compute.budget.closure import Alignment, compare_shapes, locate_in_images
+from service.compute.budget.error_budget import (
+    ErrorBudget,
+    MeasuredSpheres,
+    Observation,
+    contributions,
+    control_observation,
+    loop_observations,
+)
+from service.compute.camera_model import CameraModel
+from service.compute.images import read_image
+from service.compute.markers.archive import outline_from_record
+from service.compute.markers.records import SphereOutline
+from service.compute.overlay import draw_overlay
+from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE, Detection
+from service.compute.registration.evaluation import Evaluation
+from service.compute.registration.evaluation import evaluate as evaluate_controls
+from service.compute.registration.hypotheses import match, sightings
+from service.compute.registration.identity import Assignment
+from service.compute.surfaces.constellations import match_constellations
+from service.core.errors import ComputeError
+from service.core.geometry import Array, apply, inverse
+from service.core.model import ArtefactRef
+from service.worker.job import JobAnswer, JobContext
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """What scanner and CT say of the spheres, in the frame of the registered scan."""
+
+    scan: MeasuredSpheres
+    control: MeasuredSpheres
+    ct: MeasuredSpheres | None  # in its own frame, one row for each sphere of the scan, NaN where it has none
+
+
+@dataclass(frozen=True, slots=True)
+class _Registered:
+    """One registration and the images that it has a pose for."""
+
+    name: str
+    record: Mapping[str, Any]
+    camera: CameraModel
+    images: Sequence[Mapping[str, Any]]
+    outlines: Sequence[Sequence[SphereOutline]]
+    T_scan_camera: Array
+    markers: Sequence[Assignment]
+    controls: Sequence[Assignment]
+
+
+def evaluate(context: JobContext) -> JobAnswer:
+    """One row a registration: errors on the control spheres, which took no part in it, and its budget."""
+    arguments = context.arguments
+    measured = _measured(arguments)
+    radius_m = float(arguments["radius_m"])
+    table: list[dict[str, Any]] = []
+    budgets: dict[str, Any] = {}
+    pictures: dict[str, Callable[[], list[ArtefactRef]]] = {}
+    found: dict[str, Any] = {}
+    for name, record in arguments["registrations"].items():
+        registered = _registered(context, name, record, measured, radius_m, found)
+        answer = evaluate_controls(
+            registered.outlines,
+            registered.controls,
+            registered.T_scan_camera,
+            measured.control.centres_m,
+            radius_m,
+            registered.camera,
+        )
+        budget = _budget(registered, measured, radius_m)
+        budgets[name] = budget.as_json()
+        table.append(_row(registered, answer, budget))
+        pictures[name] = partial(_overlays, context, registered, measured, radius_m)
+    best = min(table, key=lambda row: row["mean_radial_error_mm"])
+    # The best source, and beside it the robot's own poses: the eye sees the difference.
+    refs = [ref for name in dict.fromkeys((best["poses"], "robot")) if name in pictures for ref in pictures[name]()]
+    measures = {f"{row['poses']}_mean_radial_error_mm": row["mean_radial_error_mm"] for row in table}
+    measures |= {f"{row['poses']}_mean_reprojection_error_px": row["mean_reprojection_error_px"] for row in table}
+    measures["best_mean_radial_error_mm"] = best["mean_radial_error_mm"]
+    measures["best_predicted_error_mm"] = best["predicted_error_mm"]
+    measures["control_normalised_chi2"] = best["control_normalised_chi2"]
+    measures["control_spheres"] = float(len(measured.control.centres_m))
+    refs.append(context.keep_json(table, kind="evaluation", name="evaluation.json"))
+    refs.append(context.keep_json(budgets, kind="error_budget", name="error_budget.json"))
+    return JobAnswer(measures, tuple(refs), {"table": table, "budgets": budgets})
+
+
+def _row(registered: _Registered, answer: Evaluation, budget: ErrorBudget) -> dict[str, Any]:
+    control = next(o for o in budget.observations if o.name == "control spheres")
+    registration = [c.sigma_m for c in budget.contributions if c.counted and c.name != "scan"]
+    return {
+        "poses": registered.name,
+        "source": registered.record["poses"],
+        "resolution": f"{registered.camera.width} × {registered.camera.height}",
+        "mean_radial_error_mm": answer.mean_radial_error_mm,
+        "mean_reprojection_error_px": answer.mean_reprojection_error_px,
+        "control_outlines": len(answer.errors),
+        "images": len(registered.images),
+        "predicted_error_mm": 1e3 * float(np.sqrt(np.sum(np.square(registration)))),
+        "control_error_mm": 1e3 * control.observed_m,
+        "control_normalised_chi2": control.normalised_chi2,
+    }
+
+
+def _measured(arguments: Mapping[str, Any]) -> _Measured:
+    """Scan, control scan and CT brought together by their spheres."""
+    scan = _spheres(arguments["scan"])
+    both = _spheres(arguments["control_scan"])
+    found = match_constellations(scan.centres_m, both.centres_m)
+    pairs = np.array(found.pairs)
+    here, there = pairs[:, 0], pairs[:, 1]
+    _, alignment = compare_shapes(
+        scan.centres_m[here], scan.covariance_m2[here], both.centres_m[there], both.covariance_m2[there]
+    )
+    extra = list(found.missing_b)
+    if not extra:
+        raise ComputeError("the control scan shows no sphere beside the registration spheres")
+    R = alignment.T_a_b[:3, :3]
+    control = MeasuredSpheres(
+        apply(alignment.T_a_b, both.centres_m[extra]),
+        R @ both.covariance_m2[extra] @ R.T + alignment.covariance_at_m2(both.centres_m[extra]),
+        both.surface_rms_m,
+    )
+    if arguments.get("ct") is None:
+        return _Measured(scan, control, None)
+    ct = _spheres(arguments["ct"])
+    shared = match_constellations(scan.centres_m, ct.centres_m).pairs
+    centres, covariance = np.full_like(scan.centres_m, np.nan), np.zeros((len(scan.centres_m), 3, 3))
+    for a, b in shared:
+        centres[a], covariance[a] = ct.centres_m[b], ct.covariance_m2[b]
+    return _Measured(scan, control, MeasuredSpheres(centres, covariance, ct.surface_rms_m))
+
+
+def _spheres(result: Mapping[str, Any]) -> MeasuredSpheres:
+    records = result["details"]["spheres"]
+    rms_m = [1e-3 * record["rms_mm"] for record in records]
+    return MeasuredSpheres(
+        np.array([record["centre_m"] for record in records]),
+        np.array([record["covariance_m2"] for record in records]),
+        float(np.sqrt(np.mean(np.square(rms_m)))),
+    )
+
+
+def _registered(
+    context: JobContext,
+    name: str,
+    record: Mapping[str, Any],
+    measured: _Measured,
+    radius_m: float,
+    found: dict[str, Any],
+) -> _Registered:
+    camera = CameraModel.from_record(record["camera"])
+    sha256 = record["outlines"]
+    if sha256 not in found:
+        found[sha256] = context.input_json(sha256)
+    cameras = record["T_scan_camera"]
+    images = [image for image in context.arguments["images"] if image["viewpoint"] in cameras]
+    if not images:
+        raise ComputeError(f"registration {name!r} has a pose for none of the control images")
+    outlines = [[outline_from_record(r, camera) for r in found[sha256][image["viewpoint"]]] for image in images]
+    T_scan_camera = np.array([cameras[image["viewpoint"]] for image in images])
+    n = len(measured.scan.centres_m)
+    centres = np.vstack([measured.scan.centres_m, measured.control.centres_m])
+    markers: list[Assignment] = []
+    controls: list[Assignment] = []
+    for mine, T in zip(outlines, T_scan_camera, strict=True):
+        placed = apply(inverse(T), centres)
+        pairs = match(sightings(mine, radius_m, camera), placed, radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
+        markers.append(Assignment({outline: m for outline, m, _ in pairs if m < n}, inverse(T)))
+        controls.append(Assignment({outline: m - n for outline, m, _ in pairs if m >= n}, inverse(T)))
+    return _Registered(name, record, camera, images, outlines, T_scan_camera, markers, controls)
+
+
+def _budget(registered: _Registered, measured: _Measured, radius_m: float) -> ErrorBudget:
+    """Contributions where the control spheres are: in the middle of the anatomy."""
+    record = registered.record
+    T_world_scan = np.array(record["T_world_scan"])
+    target = measured.control.centres_m.mean(axis=0)
+    components = {
+        name: Alignment(T_world_scan, np.array(covariance)[:6, :6])
+        for name, covariance in record["components"].items()
+    }
+    sigma_m = {
+        name: float(np.sqrt(np.trace(component.covariance_at_m2(target[None])[0])))
+        for name, component in components.items()
+    }
+    # Each sphere alone needs three images; control captures are few, so two must do where there are no more.
+    least = min(3, len(registered.images))
+    controls = locate_in_images(
+        registered.outlines,
+        registered.controls,
+        registered.T_scan_camera,
+        measured.control.centres_m,
+        radius_m,
+        least_images=least,
+    )
+    observations: list[Observation] = []
+    if controls:
+        placed = Alignment(T_world_scan, np.array(record["covariance"])[:6, :6])
+        observations.append(control_observation(placed, controls, measured.control))
+    places = locate_in_images(
+        registered.outlines,
+        registered.markers,
+        registered.T_scan_camera,
+        measured.scan.centres_m,
+        radius_m,
+        least_images=least,
+    )
+    observations += loop_observations(places, measured.scan, measured.ct)
+    return ErrorBudget(contributions(sigma_m, measured.scan, measured.ct), tuple(observations))
+
+
+def _overlays(
+    context: JobContext, registered: _Registered, measured: _Measured, radius_m: float
+) -> list[ArtefactRef]:
+    """Pictures of one image a station, with detected and predicted outlines drawn over it."""
+    first: dict[str, int] = {}
+    for i, image in enumerate(registered.images):
+        first.setdefault(image["station"], i)
+    refs: list[ArtefactRef] = []
+    for i in first.values():
+        markers, controls = registered.markers[i].markers, registered.controls[i].markers
+        detections = [
+            Detection(outline, markers.get(j), controls.get(j), None)
+            for j, outline in enumerate(registered.outlines[i])
+        ]
+        picture = draw_overlay(
+            read_image(context.input(registered.images[i]["sha256"])),
+            registered.camera,
+            detections,
+            T_scan_camera=registered.T_scan_camera[i],
+            registration_centres_m=measured.scan.centres_m,
+            control_centres_m=measured.control.centres_m,
+            radius_m=radius_m,
+        )
+        jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
+        name = f"{registered.name}_{registered.images[i]['viewpoint']}.jpg"
+        refs.append(context.keep_bytes(jpeg, kind="overlay", media_type="image/jpeg", name=name))
+    return refs
