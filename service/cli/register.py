@@ -12,7 +12,8 @@ import typer
 
 from drivers.mesh_file import MeshUnit, read_mesh_file
 from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
-from service.compute.pipeline import detect_all, register_images
+from service.compute.locating import LocatedOutlines, detect_all, locate_outlines, searched_whole
+from service.compute.pipeline import register_images
 from service.compute.poses.pose_files import read_camera_json, read_poses, read_spheres_json
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import ConfigurationError, DataError
@@ -39,6 +40,12 @@ def register_command(
         str, typer.Option("--control", help="Indices of the mesh's spheres that only serve the evaluation: 3,7,9.")
     ] = "",
     estimate_scale: Annotated[bool, typer.Option("--estimate-scale", help="The poses are not metric.")] = False,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="Processes that look at images; one a core by default.")
+    ] = None,
+    full_search: Annotated[
+        bool, typer.Option("--full-search", help="Search every image whole, not only where the poses say.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Register posed images with a scan by the spheres that both show, and say how well it fits."""
@@ -47,34 +54,51 @@ def register_command(
         model = read_camera_json(camera)
         known = read_poses(poses, [file.name for file in files])
         registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control)
+        T_world_camera = np.array([known[file.name] for file in files])
+        processes = min(len(files), workers or os.cpu_count() or 1)
         with progress_bar(quiet=json) as progress:
-            outlines = detect_all(
-                files,
-                model,
-                workers=min(len(files), os.cpu_count() or 1),
-                progress=lambda done, total: progress("spheres in images", done, total),
-            )
+
+            def show(done: int, total: int) -> None:
+                progress("spheres in images", done, total)
+
+            if full_search:
+                located = searched_whole(detect_all(files, model, workers=processes, progress=show))
+            else:
+                located = locate_outlines(
+                    files,
+                    model,
+                    T_world_camera,
+                    registration_m,
+                    radius_m,
+                    control_centres_m=control_m,
+                    metric=not estimate_scale,
+                    workers=processes,
+                    progress=show,
+                )
         result = register_images(
-            outlines,
-            np.array([known[file.name] for file in files]),
+            located.outlines,
+            T_world_camera,
             model,
             registration_m,
             radius_m,
             control_centres_m=control_m,
             estimate_scale=estimate_scale,
             names=[file.name for file in files],
+            assignments=located.assignments,
         )
         record = result.as_json(model)
         record["spheres_mm"] = {
             "registration": (registration_m * 1e3).tolist(),
             "control": (control_m * 1e3).tolist(),
         }
+        record["search"] = _search(located, [file.name for file in files])
         out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
         if json:
             print_json(record)
             return
         console.print(
-            f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms"
+            f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms, "
+            f"predicted error at their centre {record['predicted_error_mm']:.3f} mm"
         )
         if result.evaluation is not None:
             evaluation = result.evaluation
@@ -83,6 +107,21 @@ def register_command(
                 f"{evaluation.mean_reprojection_error_px:.2f} px mean reprojection error"
             )
         console.print(f"written: {out}")
+
+
+def _search(located: LocatedOutlines, names: list[str]) -> dict[str, object]:
+    """How many images were searched whole, in how many only predicted places, and what was not found there."""
+    return {
+        "images_searched": located.count("searched"),
+        "images_predicted": located.count("predicted"),
+        "anchors": [names[i] for i in located.anchors],
+        "spheres_expected": sum(image.expected for image in located.images),
+        "spheres_missing": [
+            {"image": name, "sphere": sphere, "reason": reason}
+            for name, image in zip(names, located.images, strict=True)
+            for sphere, reason in sorted(image.missing.items())
+        ],
+    }
 
 
 def _images(folder: Path) -> list[Path]:

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images import read_image
-from service.compute.markers.detect import detect_spheres
-from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.locating import detect_all, locate_outlines
+from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost
 from service.compute.registration.evaluation import Evaluation, evaluate
 from service.compute.registration.hypotheses import match, sightings
@@ -24,6 +18,8 @@ from service.compute.registration.identity import Assignment, identify
 from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
+
+__all__ = ["Detection", "ImageDetections", "PipelineResult", "detect_all", "locate_outlines", "register_images"]
 
 CONTROL_GATE = 0.5  # of the radius: a control sphere is where the registration says, or the registration is wrong
 CONTROL_SIZE_GATE = 0.15
@@ -59,6 +55,7 @@ class PipelineResult:
     markers: tuple[int, ...]  # registration spheres used
     assignments: tuple[Assignment, ...] = field(repr=False)
     control_assignments: tuple[Assignment, ...] = field(repr=False)
+    centre_scan_m: Array = field(repr=False)  # (3,) of the registration spheres: the scene's centre
 
     def as_json(self, camera: CameraModel) -> dict[str, object]:
         """Plain data of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
@@ -74,6 +71,7 @@ class PipelineResult:
             "mean_reprojection_error_px": None
             if self.evaluation is None
             else self.evaluation.mean_reprojection_error_px,
+            "predicted_error_mm": 1e3 * r.sigma_at_m(self.centre_scan_m),
             "n_images": r.n_images,
             "markers": [
                 {
@@ -118,59 +116,6 @@ def _detection_json(d: Detection) -> dict[str, object]:
     }
 
 
-def detect_file(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    """The outlines in one image file.
-
-    Raises:
-        DataError: the file is missing, truncated, no image, or not of the camera's size; `where` names it.
-    """
-    image = read_image(path)
-    try:
-        return detect_spheres(image, camera, options)
-    except DataError as error:
-        raise DataError(error.what, where=str(path), remedy=error.remedy) from error
-
-
-def detect_all(
-    image_paths: Sequence[Path],
-    camera: CameraModel,
-    options: DetectionOptions = DEFAULTS,
-    workers: int = 1,
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[tuple[SphereOutline, ...], ...]:
-    """The outlines in all images, in the order given.
-
-    Args:
-        image_paths: JPEG or PNG files of the camera's size.
-        camera: intrinsics.
-        options: of the detector.
-        workers: processes; 1 computes here.
-        progress: called with (done, all) after each image.
-
-    Raises:
-        DataError: an image cannot be used; the first one is named.
-    """
-    work = partial(detect_file, camera=camera, options=options)
-    out: list[tuple[SphereOutline, ...]] = []
-    if workers <= 1:
-        for path in image_paths:
-            out.append(work(path))
-            if progress is not None:
-                progress(len(out), len(image_paths))
-        return tuple(out)
-    context = multiprocessing.get_context("spawn")  # forking a process that runs threads may deadlock
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
-        for found in pool.map(work, image_paths):
-            out.append(found)
-            if progress is not None:
-                progress(len(out), len(image_paths))
-    return tuple(out)
-
-
-def _one_thread() -> None:
-    cv2.setNumThreads(1)
-
-
 def register_images(
     outlines: Sequence[Sequence[SphereOutline]],
     poses: Array,
@@ -183,11 +128,12 @@ def register_images(
     estimate_scale: bool = False,
     cost: Cost = "sampson",
     names: Sequence[str] = (),
+    assignments: Sequence[Assignment] | None = None,
 ) -> PipelineResult:
     """Identity, registration and evaluation of detected outlines.
 
     Args:
-        outlines: per image, from `detect_all`.
+        outlines: per image, from `locate_outlines` or `detect_all`.
         poses: (N, 4, 4) T_world_camera, or T_base_camera of each image's group.
         camera: intrinsics.
         registration_centres_m: (M, 3) in the scan frame.
@@ -197,6 +143,8 @@ def register_images(
         estimate_scale: the poses are not metric.
         cost: of the registration.
         names: of the images.
+        assignments: per image, which outlines are which registration spheres, where `locate_outlines` knows it;
+            None: found here.
 
     Raises:
         DataError: lengths do not agree.
@@ -209,10 +157,11 @@ def register_images(
     if not np.all(np.isfinite(poses)):
         raise DataError("a camera pose holds a number that is not finite")
     labels = list(names) or [f"image {i}" for i in range(n)]
-    assignments = identify(
-        outlines, registration_centres_m, camera, poses,
-        radius_m=radius_m, groups=stations, metric=not estimate_scale, names=labels,
-    )  # fmt: skip
+    if assignments is None:
+        assignments = identify(
+            outlines, registration_centres_m, camera, poses,
+            radius_m=radius_m, groups=stations, metric=not estimate_scale, names=labels,
+        )  # fmt: skip
     registration = register(
         outlines, assignments, poses, stations, registration_centres_m, radius_m, camera,
         estimate_scale=estimate_scale, cost=cost,
@@ -232,7 +181,8 @@ def register_images(
         for i, found in enumerate(outlines)
     )
     used = tuple(sorted({r.marker for r in registration.residuals if not r.excluded}))
-    return PipelineResult(registration, evaluation, images, used, assignments, control)
+    centre = np.asarray(registration_centres_m, dtype=np.float64).mean(axis=0)
+    return PipelineResult(registration, evaluation, images, used, tuple(assignments), control, centre)
 
 
 def _detection(outline: SphereOutline, index: int, record: OutlineResidual | None, control: Assignment) -> Detection:
