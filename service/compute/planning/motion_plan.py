@@ -1,0 +1,201 @@
+"""From wished camera poses to a motion: reachable, free of collisions, sharp, and in a short order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from service.compute.planning.collision import ArmBody, Obstacles, nearest_contacts, straight_path
+from service.compute.planning.inverse import nearest_posture
+from service.compute.planning.optics import DepthOfField, depths_m
+from service.core.geometry import Array, Transform, inverse, transform
+
+Order = Literal["as_listed", "shortest"]
+
+_NUDGES_DEG = tuple(sign * step for step in (2.5, 5.0, 7.5, 10.0, 12.5, 15.0) for sign in (1, -1))
+_PATH_STEP_RAD = np.radians(3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """All that a plan depends on, in the base frame of the station."""
+
+    body: ArmBody
+    obstacles: Obstacles
+    centre_m: Array  # (3,) of the scene
+    margin_m: float  # clearance that must stay
+    start_rad: Array  # (6,) where the arm stands
+    speed_rad_s: float
+    acceleration_rad_s2: float
+    sharp: DepthOfField | None = None
+    must_be_sharp_m: Array = field(default_factory=lambda: np.zeros((0, 3)), repr=False)  # (N, 3) points
+    pause_s: float = 0.0  # at each viewpoint
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedView:
+    """One viewpoint and what became of it."""
+
+    name: str
+    T_base_camera: Transform = field(repr=False)  # as it will be taken
+    outcome: Literal["feasible", "nudged", "refused"]
+    reason: str = ""  # of a nudge or a refusal
+    nudge_deg: float = 0.0  # about the vertical through the scene's centre
+    joints_rad: Array = field(default_factory=lambda: np.full(6, np.nan), repr=False)
+    travel_s: float = 0.0  # from the one before
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPlan:
+    """Views in the order in which they will be taken, then the refused ones."""
+
+    views: tuple[PlannedView, ...]
+    order: Order
+    total_s: float
+    listed_s: float  # the same views in the order of the list
+
+    @property
+    def feasible(self) -> tuple[PlannedView, ...]:
+        """Those that will be taken."""
+        return tuple(view for view in self.views if view.outcome != "refused")
+
+    @property
+    def refused(self) -> tuple[PlannedView, ...]:
+        """Those that will not."""
+        return tuple(view for view in self.views if view.outcome == "refused")
+
+
+def plan_motion(views: Sequence[tuple[str, Transform]], situation: Situation, order: Order) -> MotionPlan:
+    """Check, nudge and order camera poses (name, T_base_camera).
+
+    A pose out of reach, in collision or with the scene out of focus is turned about the vertical through the scene's
+    centre, by up to 15°, until it is none of that; failing this it is refused with the reason of the original pose.
+    A viewpoint to which the straight way in joint space is blocked is refused where it stands in the order.
+    """
+    placed = [_place(name, T, situation) for name, T in views]
+    able = [view for view in placed if view.outcome != "refused"]
+    refused = [view for view in placed if view.outcome == "refused"]
+    joints = np.array([view.joints_rad for view in able]).reshape(-1, 6)
+    times = travel_times_s(np.vstack([situation.start_rad, joints]), situation)
+    listed = list(range(len(able)))
+    sequence = shortest_order(times) if order == "shortest" and len(able) > 2 else listed
+    kept: list[PlannedView] = []
+    here, at = situation.start_rad, 0
+    total = 0.0
+    for i in sequence:
+        blocked = _blocked(here, able[i].joints_rad, situation)
+        if blocked:
+            refused.append(replace(able[i], outcome="refused", reason=f"on the way there {blocked}"))
+            continue
+        kept.append(replace(able[i], travel_s=float(times[at, i + 1])))
+        total += float(times[at, i + 1]) + situation.pause_s
+        here, at = able[i].joints_rad, i + 1
+    listed_s = float(sum(times[a, b] for a, b in zip([0, *(i + 1 for i in listed)], [i + 1 for i in listed])))  # noqa: B905 - the last has no successor
+    return MotionPlan((*kept, *refused), order, total, listed_s + situation.pause_s * len(able))
+
+
+def infeasible_reason(T_base_camera: Transform, joints_rad: Array | None, situation: Situation) -> str:
+    """Why a pose cannot be taken, or an empty text."""
+    if joints_rad is None:
+        return "the arm does not reach it"
+    contact = nearest_contacts(situation.body, situation.obstacles, joints_rad[None])[0]
+    if contact.clearance_m < situation.margin_m:
+        return str(contact)
+    if situation.sharp is not None and len(situation.must_be_sharp_m):
+        near, far = depths_m(T_base_camera, situation.must_be_sharp_m)
+        if near < situation.sharp.near_m or far > situation.sharp.far_m:
+            return (
+                f"the scene lies {near:.2f} to {far:.2f} m from the camera, "
+                f"sharp is {situation.sharp.near_m:.2f} to {situation.sharp.far_m:.2f} m"
+            )
+    return ""
+
+
+def travel_times_s(joints_rad: Array, situation: Situation) -> Array:
+    """(K, K) time between joint positions (K, 6), by the joint that turns furthest: ramp up, constant, ramp down."""
+    distance = np.abs(joints_rad[:, None] - joints_rad[None]).max(axis=2)
+    v, a = situation.speed_rad_s, situation.acceleration_rad_s2
+    return np.where(distance > v**2 / a, distance / v + v / a, 2 * np.sqrt(distance / a))
+
+
+def shortest_order(times_s: Array) -> list[int]:
+    """A short open path from node 0 through all others of (K + 1, K + 1), as indices 0 … K − 1 of the others.
+
+    The better of the listed order and the nearest neighbour's, improved by 2-opt until no reversal helps: never
+    longer than the listed order, the same at every call.
+    """
+    count = len(times_s) - 1
+    paths = [list(range(1, count + 1)), _nearest_neighbours(times_s)]
+    best = min((_two_opt(path, times_s) for path in paths), key=lambda path: _length(path, times_s))
+    return [node - 1 for node in best]
+
+
+def _nearest_neighbours(times_s: Array) -> list[int]:
+    left, path, here = set(range(1, len(times_s))), list[int](), 0
+    while left:
+        here = min(left, key=lambda node: (times_s[here, node], node))
+        left.remove(here)
+        path.append(here)
+    return path
+
+
+def _two_opt(path: list[int], times_s: Array) -> list[int]:
+    path = list(path)
+    improved = True
+    while improved:
+        improved = False
+        for i in range(len(path) - 1):
+            before = path[i - 1] if i else 0
+            for j in range(i + 1, len(path)):
+                old = times_s[before, path[i]]
+                new = times_s[before, path[j]]
+                if j + 1 < len(path):
+                    old += times_s[path[j], path[j + 1]]
+                    new += times_s[path[i], path[j + 1]]
+                if new < old - 1e-9:
+                    path[i : j + 1] = path[i : j + 1][::-1]
+                    improved = True
+    return path
+
+
+def _length(path: Sequence[int], times_s: Array) -> float:
+    return float(sum(times_s[a, b] for a, b in zip([0, *path], path)))  # noqa: B905 - the last has no successor
+
+
+def _place(name: str, T_base_camera: Transform, situation: Situation) -> PlannedView:
+    joints = _joints(T_base_camera, situation)
+    reason = infeasible_reason(T_base_camera, joints, situation)
+    if not reason and joints is not None:
+        return PlannedView(name, T_base_camera, "feasible", joints_rad=joints)
+    for nudge in _NUDGES_DEG:
+        turned = turned_about_scene(T_base_camera, situation.centre_m, float(np.radians(nudge)))
+        joints = _joints(turned, situation)
+        if joints is not None and not infeasible_reason(turned, joints, situation):
+            return PlannedView(name, turned, "nudged", reason, nudge, joints)
+    return PlannedView(name, T_base_camera, "refused", reason)
+
+
+def turned_about_scene(T_base_camera: Transform, centre_m: Array, angle_rad: float) -> Transform:
+    """The camera carried along its arc: about the vertical through the scene's centre."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return transform(R, centre_m - R @ centre_m) @ T_base_camera
+
+
+def _joints(T_base_camera: Transform, situation: Situation) -> Array | None:
+    """Joints (6,) in the posture in which the arm stands now: a change of posture on the way is no small motion."""
+    T_base_flange = T_base_camera @ inverse(situation.body.T_flange_camera)
+    return nearest_posture(situation.body.model, T_base_flange, situation.start_rad)
+
+
+def _blocked(here: Array, there: Array, situation: Situation) -> str:
+    # Both ends are known to be free, or are where the arm stands already.
+    way = straight_path(here, there, float(_PATH_STEP_RAD))[1:-1]
+    if not len(way):
+        return ""
+    contacts = nearest_contacts(situation.body, situation.obstacles, way)
+    worst = min(contacts, key=lambda contact: contact.clearance_m)
+    return str(worst) if worst.clearance_m < situation.margin_m else ""

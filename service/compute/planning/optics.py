@@ -1,0 +1,37 @@
+"""Depth of field: which distances a lens renders sharp."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.core.geometry import Array, Transform, apply, inverse
+
+
+@dataclass(frozen=True, slots=True)
+class DepthOfField:
+    """Distances along the optical axis within which a point is drawn no wider than the circle of confusion."""
+
+    near_m: float
+    far_m: float  # infinite beyond the hyperfocal distance
+
+
+def depth_of_field(
+    focal_length_m: float, aperture_f: float, focus_distance_m: float, circle_of_confusion_m: float
+) -> DepthOfField:
+    """Near and far limit for a thin lens focused at a distance from its entrance pupil.
+
+    With H = f² / (N c) + f: near = H s / (H + (s − f)), far = H s / (H − (s − f)).
+    Source: S. F. Ray, Applied Photographic Optics, 3rd ed. 2002, chapter 22.
+    """
+    f, s = focal_length_m, focus_distance_m
+    hyperfocal = f**2 / (aperture_f * circle_of_confusion_m) + f
+    far = hyperfocal * s / (hyperfocal - (s - f)) if hyperfocal > s - f else float("inf")
+    return DepthOfField(hyperfocal * s / (hyperfocal + (s - f)), far)
+
+
+def depths_m(T_base_camera: Transform, points_base_m: Array) -> tuple[float, float]:
+    """Least and greatest distance along the optical axis of points (N, 3)."""
+    depth = apply(inverse(T_base_camera), points_base_m)[:, 2]
+    return float(np.min(depth)), float(np.max(depth))
