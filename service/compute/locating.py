@@ -143,6 +143,7 @@ def locate_outlines(
     *,
     control_centres_m: Array | None = None,
     groups: Sequence[int] | NDArray[np.int64] | None = None,
+    scenes: Sequence[int] | NDArray[np.int64] | None = None,
     metric: bool = True,
     options: DetectionOptions = DEFAULTS,
     workers: int = 1,
@@ -163,6 +164,8 @@ def locate_outlines(
         radius_m: of all spheres.
         control_centres_m: (C, 3) spheres that only serve the evaluation, or None.
         groups: (N,) station of each image; None: all one.
+        scenes: (N,) images with one number show the same spheres, in other ones spheres that no list names may have
+            come or gone; None: all one.
         metric: the positions of the poses are in metres.
         options: of the detector.
         workers: processes; 1 computes here.
@@ -177,13 +180,16 @@ def locate_outlines(
         raise DataError(f"{n} images, but {len(poses)} poses and {len(stations)} stations")
     if not np.all(np.isfinite(poses)):
         raise DataError("a camera pose holds a number that is not finite")
+    shown = np.zeros(n, dtype=np.int64) if scenes is None else np.asarray(scenes, dtype=np.int64)
+    sets = [np.nonzero((stations == g) & (shown == s))[0] for g in np.unique(stations) for s in np.unique(shown)]
     controls = np.zeros((0, 3)) if control_centres_m is None else np.asarray(control_centres_m, dtype=np.float64)
     spheres = np.vstack([registration_centres_m, controls])
     n_registration = len(registration_centres_m)
     with _mapping(workers, n) as mapped:
         look = partial(_look, camera=camera, options=options)
         first = _provisional(
-            image_paths, camera, poses, stations, spheres, n_registration, radius_m,
+            image_paths, camera, poses, stations, [mine for mine in sets if len(mine)],
+            spheres, n_registration, radius_m,
             metric=metric, options=options, mapped=mapped,
         )  # fmt: skip
         if first is None:
@@ -247,6 +253,7 @@ def _provisional(
     camera: CameraModel,
     poses: Array,
     stations: NDArray[np.int64],
+    sets: Sequence[NDArray[np.int64]],
     spheres: Array,
     n_registration: int,
     radius_m: float,
@@ -255,17 +262,17 @@ def _provisional(
     options: DetectionOptions,
     mapped: _Map,
 ) -> _Provisional | None:
-    """The registration of a few images of each station; None when none is to be had that can be trusted."""
+    """The registration of a few images of each of the `sets`; None when none is to be had that can be trusted."""
     seen: dict[int, tuple[SphereOutline, ...]] = {}
     look = partial(_look_reduced, camera=camera, options=options)
-    members = [np.nonzero(stations == g)[0] for g in np.unique(stations)]
+    nothing: tuple[SphereOutline, ...] = ()
     for per_station in _ANCHORS if metric else _ANCHORS_WITHOUT_SCALE:
-        chosen = [i for mine in members for i in spread_views(poses, mine, per_station)]
+        chosen = [i for mine in sets for i in spread_views(poses, mine, per_station)]
         if len(chosen) > 0.5 * len(poses):
             return None  # nothing to be saved
         new = [i for i in chosen if i not in seen]
         seen |= dict(zip(new, mapped(look, [image_paths[i] for i in new]), strict=True))
-        outlines: list[tuple[SphereOutline, ...]] = [seen.get(i, ()) for i in range(len(poses))]
+        outlines = [seen.get(i, nothing) for i in range(len(poses))]
         try:
             assignments = identify(
                 outlines, spheres[:n_registration], camera, poses, radius_m=radius_m, groups=stations, metric=metric
@@ -278,7 +285,7 @@ def _provisional(
             continue  # more anchors may tell; if not, the search of all images says what is wrong
         used = {(r.image, r.outline) for r in solved.residuals if not r.excluded}
         agreeing = {i for i, _ in used}
-        if any(len(agreeing.intersection(mine.tolist())) < 2 for mine in members):
+        if any(len(agreeing.intersection(mine.tolist())) < 2 for mine in sets):
             continue
         T_scan_camera = solved.T_scan_camera
         off = [

@@ -25,7 +25,7 @@ class Params(Record):
     calibration: str  # step with the intrinsics
     hand_eye: str  # step with T_flange_camera
     scan: str
-    poses: tuple[Literal["robot", "colmap", "glomap"], ...] = ("robot", "colmap", "glomap")
+    poses: tuple[Literal["robot", "colmap", "glomap", "hybrid"], ...] = ("robot", "colmap", "glomap", "hybrid")
     structure_from_motion: StructureFromMotion = StructureFromMotion()
 
 
@@ -43,17 +43,18 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     hand_eye = hand_eye_of(context, params.hand_eye, (image["station"] for image in images))
     shared = {"images": images, "camera": camera, **hand_eye}
     mappers = {"colmap": "incremental", "glomap": "global"}
-    (detected,) = context.evidence.run_jobs(JobRequest("detect_spheres", shared))
-    markers = {
-        **shared,
-        "outlines": detected.artefacts[0].sha256,
+    spheres = {
         "spheres_m": result_of(context, params.scan)["spheres_m"],
         "radius_m": context.protocol.spheres.radius_mm / 1000,
     }
+    (detected,) = context.evidence.run_jobs(JobRequest("detect_spheres", {**shared, **spheres}))
+    markers = {**shared, **spheres, "outlines": detected.artefacts[0].sha256}
     by_poses: dict[str, JobResult] = {}
     if "robot" in params.poses:
         (by_poses["robot"],) = context.evidence.run_jobs(JobRequest("register", {**markers, "poses": "robot"}))
     wanted = [mappers[p] for p in params.poses if p in mappers]
+    if "hybrid" in params.poses and not wanted:
+        wanted = ["incremental"]
     reconstructed: tuple[JobResult, ...] = ()
     if wanted:
         # Registered robot poses share one frame over both stations: they tell which images see the same thing.
@@ -63,10 +64,20 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         reconstructed = context.evidence.run_jobs(request)
         models = {ref.original_name.removesuffix(".json"): ref for ref in reconstructed[0].artefacts}
         sources = [p for p in params.poses if p in mappers]
-        answers = context.evidence.run_jobs(
-            *(JobRequest("register", {**markers, "poses": p, "model": models[mappers[p]].sha256}) for p in sources)
-        )
-        by_poses |= dict(zip(sources, answers, strict=True))
+        requests = [
+            JobRequest("register", {**markers, "poses": p, "model": models[mappers[p]].sha256}) for p in sources
+        ]
+        if "hybrid" in params.poses:
+            # It starts from one reconstruction and adds the robot and the spheres.
+            begun = {"model": models[wanted[0]].sha256, "tracks": models[f"{wanted[0]}_tracks.npz"].sha256}
+            requests.append(JobRequest("hybrid", {**markers, **begun}))
+        answers = context.evidence.run_jobs(*requests)
+        by_poses |= dict(zip(sources, answers, strict=False))
+        if "hybrid" in params.poses:
+            adjusted = answers[-1]
+            reconstructed += (adjusted,)
+            model = {"poses": "hybrid", "model": adjusted.artefacts[0].sha256}
+            (by_poses["hybrid"],) = context.evidence.run_jobs(JobRequest("register", {**markers, **model}))
     measures = dict(detected.measures)
     for poses, answer in by_poses.items():
         measures |= {f"{poses}_{name}": value for name, value in answer.measures.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,7 +15,7 @@ from service.compute.images import read_image
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.records import SphereOutline
 from service.compute.overlay import draw_overlay
-from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE, Detection, detect_all, register_images
+from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE, Detection, locate_outlines, register_images
 from service.compute.registration.evaluation import evaluate as evaluate_controls
 from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment
@@ -29,20 +29,33 @@ from service.worker.robot_poses import robot_camera_poses
 
 
 def detect_spheres(context: JobContext) -> JobAnswer:
-    """Outlines of every sphere in every image, as one artefact that all registrations share."""
+    """Outlines of every sphere in every image, as one artefact that all registrations share.
+
+    The robot's poses tell where to look; where they are too far off, the images are searched whole.
+    """
     images = context.arguments["images"]
     files = [context.input(image["sha256"]) for image in images]
-    outlines = detect_all(
+    located = locate_outlines(
         files,
         context.camera(),
+        robot_camera_poses(context.arguments, images),
+        np.array(context.arguments["spheres_m"]),
+        float(context.arguments["radius_m"]),
+        groups=_numbered(image["station"] for image in images),
+        scenes=_numbered(image["step"] for image in images),
         workers=min(len(files), os.cpu_count() or 1),
         progress=lambda done, total: context.progress("spheres in images", done, total),
     )
-    records = [[outline_record(outline) for outline in found] for found in outlines]
+    records = [[outline_record(outline) for outline in found] for found in located.outlines]
     found = dict(zip((image["viewpoint"] for image in images), records, strict=True))
     total = sum(map(len, records))
     ref = context.keep_json(found, kind="outlines", name="outlines.json")
-    return JobAnswer({"outlines": float(total), "outlines_an_image": total / len(images)}, (ref,))
+    measures = {
+        "outlines": float(total),
+        "outlines_an_image": total / len(images),
+        "images_searched_whole": float(located.count("searched")),
+    }
+    return JobAnswer(measures, (ref,))
 
 
 def register(context: JobContext) -> JobAnswer:
@@ -54,9 +67,9 @@ def register(context: JobContext) -> JobAnswer:
     spheres = np.array(arguments["spheres_m"])
     radius_m = float(arguments["radius_m"])
     names = [image["viewpoint"] for image in images]
-    robot = source == "robot"
+    metric = source in ("robot", "hybrid")
     solved = register_images(
-        outlines, poses, camera, spheres, radius_m, groups=groups, estimate_scale=not robot, names=names
+        outlines, poses, camera, spheres, radius_m, groups=groups, estimate_scale=not metric, names=names
     )
     answer = solved.registration
     centre = spheres.mean(axis=0)
@@ -79,6 +92,12 @@ def register(context: JobContext) -> JobAnswer:
         },
         "excluded": [f"{names[r.image]}, sphere {r.marker}: {r.reason}" for r in answer.excluded],
     }
+    if source == "hybrid":
+        # The spheres are in these poses already: only their adjustment knows how well the scan is placed.
+        adjusted = context.input_json(arguments["model"])
+        measures["predicted_error_mm"] = adjusted["predicted_error_mm"]
+        result |= {key: adjusted[key] for key in ("T_world_scan", "T_world_station")}
+        result["covariance"] = adjusted["scan_covariance"]
     ref = context.keep_json({**result, **_residuals(answer, names)}, kind="registration", name=f"{source}.json")
     return JobAnswer(measures, (ref,), result)
 
@@ -141,6 +160,12 @@ def _poses(context: JobContext) -> tuple[Array, list[int], list[dict[str, Any]]]
     model = context.input_json(arguments["model"])["T_world_camera"]
     images = [image for image in images if image["viewpoint"] in model]
     return np.array([model[image["viewpoint"]] for image in images]), [0] * len(images), images
+
+
+def _numbered(names: Iterable[str]) -> list[int]:
+    """A number for each name, the same for the same."""
+    numbers: dict[str, int] = {}
+    return [numbers.setdefault(name, len(numbers)) for name in names]
 
 
 def _outlines(
