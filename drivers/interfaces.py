@@ -217,6 +217,11 @@ class CapturedImage:
     focal_length_mm: float
     trigger_monotonic_s: float
     arrival_monotonic_s: float
+    width: int = 0  # px; of these, 0 or "" where the file does not tell
+    height: int = 0
+    lens_serial: str = ""
+    body_serial: str = ""
+    focus_distance_m: float = 0.0
 
     @property
     def jpeg(self) -> CapturedFile:

@@ -199,6 +199,11 @@ class GphotoCamera:
             focal_length_mm=exif.focal_length_mm or 0.0,
             trigger_monotonic_s=trigger_s,
             arrival_monotonic_s=arrival_s,
+            width=exif.width,
+            height=exif.height,
+            lens_serial=exif.lens_serial,
+            body_serial=exif.body_serial,
+            focus_distance_m=exif.focus_distance_m or 0.0,
         )
         self._check_new(image)
         self._clock_offset_s = _clock_offset_s(exif.taken, trigger_s)

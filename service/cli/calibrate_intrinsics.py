@@ -55,6 +55,9 @@ def intrinsics_command(
         typer.Option("--marker-mm", help="Side of a ChArUco marker; without: ¾ of a square."),
     ] = None,
     dictionary: Annotated[str, typer.Option("--dictionary", help="Of the ChArUco markers.")] = "DICT_5X5_1000",
+    legacy: Annotated[
+        bool, typer.Option("--legacy", help="A ChArUco board as OpenCV printed it before version 4.6.")
+    ] = False,
     model: Annotated[
         LensModel,
         typer.Option("--model", help="Distortion: none, k1 k2, + p1 p2, + k3, rational k1 … k6."),

@@ -9,6 +9,7 @@ from service.core.model import Record
 from service.steps.capture import capture_viewpoints
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, result_of
+from service.steps.optics import departing_images, optics_departures
 from service.steps.viewpoints import ViewpointSet, plan_viewpoints
 
 
@@ -44,6 +45,9 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         ]
         nominal = context.devices.nominal_T_flange_camera()
         measures |= capture_viewpoints(context, plan, nominal, image_kind="board_image").measures()
+        departures = optics_departures(context)
+        if departures is not None:
+            measures["optics_departures"] = float(departing_images(departures))
     camera = None
     if "intrinsics" not in params.solve:
         if params.intrinsics_of is None:

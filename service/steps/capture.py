@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import tempfile
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +37,7 @@ _WORTH_ANOTHER_TRY = (
     StaleImageError,
     UnreadableFileError,
 )
+NONE_REFUSED: Mapping[str, str] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,7 @@ def capture_viewpoints(
     T_flange_camera: Transform,
     *,
     image_kind: str,
+    refused: Mapping[str, str] = NONE_REFUSED,
     on_captured: Callable[[], None] = lambda: None,
 ) -> CaptureTotals:
     """Capture every viewpoint that this attempt has not captured yet, in order.
@@ -73,6 +75,7 @@ def capture_viewpoints(
     Args:
         T_flange_camera: the best known mounting; decides only where the camera goes, not where it was.
         image_kind: artefact kind of the photographs (`image`, `board_image`, `control_image`).
+        refused: viewpoints that the plan has given up, with the reason; recorded as such, not tried.
         on_captured: called after each image that is in the record; must return at once.
 
     Raises DeviceError when a viewpoint fails for good, StepInterruptedError on pause.
@@ -87,6 +90,11 @@ def capture_viewpoints(
         context.checkpoint()
         context.progress("viewpoints", len(viewpoints) - len(todo), len(viewpoints))
         viewpoint = todo[0]
+        if viewpoint.name in refused:
+            refusal = UnreachablePoseError(f"the plan leaves it out: {refused[viewpoint.name]}")
+            context.evidence.record(_failed(context, viewpoint, refusal, skipped=True))
+            given_up.add(viewpoint.name)
+            continue
         try:
             _capture_with_retries(context, camera, viewpoint, T_flange_camera, wanted, image_kind)
         except UnreachablePoseError as error:
@@ -162,7 +170,7 @@ def _streams(robot: RobotArm) -> bool:
 
 
 def _go_to(context: StepContext, robot: RobotArm, viewpoint: Viewpoint, T_flange_camera: Transform) -> SettleReport:
-    near = robot.state().sample.joints_rad
+    near = robot.state().sample.joints_rad if viewpoint.joints_rad is None else viewpoint.joints_rad
     target = robot.solve_ik(flange_target(viewpoint.T_base_camera, T_flange_camera), near)
     motion = context.protocol.motion
     limits = MotionLimits(motion.speed_rad_s, motion.acceleration_rad_s2, context.protocol.settle.timeout_s)
@@ -342,6 +350,11 @@ def _camera_record(image: CapturedImage) -> dict[str, object]:
         "exif_time": image.exif_time,
         "lens": image.lens,
         "focal_length_mm": image.focal_length_mm,
+        "width": image.width,
+        "height": image.height,
+        "lens_serial": image.lens_serial,
+        "body_serial": image.body_serial,
+        "focus_distance_m": image.focus_distance_m,
     }
 
 

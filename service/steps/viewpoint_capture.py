@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import Literal
 
+from service.compute.planning.motion_plan import Order
 from service.core.model import Record
 from service.steps.capture import capture_viewpoints
 from service.steps.context import StepContext, StepKind, StepOutcome
 from service.steps.live import Live, LiveAnalysis
+from service.steps.optics import departing_images, optics_departures
+from service.steps.planning import plan_step
 from service.steps.viewpoints import ViewpointSet, denser_viewpoints, plan_viewpoints
 
 
@@ -16,6 +19,7 @@ class Params(Record):
 
     purpose: Literal["dataset", "control"]
     viewpoints: tuple[ViewpointSet, ...]
+    order: Order = "as_listed"
     live: Live | None = None
 
 
@@ -39,14 +43,21 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     if live is not None:
         wanted = live.suggested()
         plan += [viewpoint for viewpoint in extra if viewpoint.name in wanted]
+    nominal = context.devices.nominal_T_flange_camera()
+    there = {capture.viewpoint for capture in context.evidence.captures(context.step.id)}
+    planned = plan_step(context, [v for v in plan if v.name not in there], nominal, params.order)
     totals = capture_viewpoints(
         context,
-        plan,
-        context.devices.nominal_T_flange_camera(),
+        [*planned.viewpoints, *(v for v in plan if v.name in there)],
+        nominal,
         image_kind="image" if params.purpose == "dataset" else "control_image",
+        refused=planned.refused,
         on_captured=(lambda: None) if live is None else live.look,
     )
     measures = totals.measures()
+    departures = optics_departures(context)
+    if departures is not None:
+        measures["optics_departures"] = float(departing_images(departures))
     if live is not None:
         taken = {viewpoint.name for viewpoint in plan}
         measures |= live.summary(last.station, [(v, 0.0) for v in extra if v.name not in taken])

@@ -109,7 +109,7 @@ def _intrinsics(
         validation,
         uncertainty,
         calibration_warnings(solved, validation, uncertainty),
-        [names[usable.indices[k]] for k in solved.views.tolist()],
+        [names[usable.indices[k]] for k in map(int, solved.views)],
         {names[k]: excluded[k] for k in sorted(excluded)},
     )
     measures = {

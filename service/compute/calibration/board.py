@@ -20,6 +20,8 @@ _SEARCH_WIDTHS = (1200, 2400)  # px; the board is searched for at these sizes, t
 _CHARUCO_WIDTHS = (1600, 3200)  # its markers are smaller than squares
 _REACH = 0.4  # of the shortest distance between two corners: the window must not see the next corner's edges
 _MAX_HALF = 30  # px; beyond this a window gains nothing and lens distortion bends the edges in it
+_SMOOTHING = 0.15  # sigma of the smoothing, in half windows
+_MAX_SMOOTHING_PX = 1.5
 _MIN_CHARUCO_CORNERS = 8
 
 
@@ -36,6 +38,7 @@ class Board:
         pattern: what is printed.
         marker_m: side of a ChArUco board's markers; None: three quarters of a square.
         dictionary: of a ChArUco board's markers, one of OpenCV's names.
+        legacy: a ChArUco board as OpenCV printed it before 4.6 (differs where the squares in a column are even).
     """
 
     columns: int
@@ -44,6 +47,7 @@ class Board:
     pattern: Pattern = "checkerboard"
     marker_m: float | None = None
     dictionary: str = "DICT_5X5_1000"
+    legacy: bool = False
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not 0 < self.square_m < 10:
@@ -73,8 +77,8 @@ class Board:
     def _marker_m(self) -> float:
         return 0.75 * self.square_m if self.marker_m is None else self.marker_m
 
-    def charuco(self, *, legacy: bool = False) -> cv2.aruco.CharucoBoard:
-        """OpenCV's description of a ChArUco board; `legacy` as OpenCV printed it before 4.6.
+    def charuco(self) -> cv2.aruco.CharucoBoard:
+        """OpenCV's description of a ChArUco board.
 
         Raises:
             DataError: an unknown dictionary, or one with too few markers.
@@ -90,7 +94,7 @@ class Board:
             )
         size = (self.columns + 1, self.rows + 1)
         board = cv2.aruco.CharucoBoard(size, self.square_m, self._marker_m(), dictionary)
-        board.setLegacyPattern(legacy)
+        board.setLegacyPattern(self.legacy)
         return board
 
     def reach(self) -> float:
@@ -141,8 +145,8 @@ def find_board(image_grey: Grey, board: Board) -> BoardView:
     """
     _check(image_grey)
     if board.pattern == "checkerboard":
-        corners = detect_board(image_grey, board.columns, board.rows)
-        return BoardView(np.arange(len(corners)), corners)
+        corners, good = _find_checkerboard(image_grey, board.columns, board.rows)
+        return BoardView(np.flatnonzero(good), corners[good])
     return _find_charuco(image_grey, board) if board.pattern == "charuco" else _find_circles(image_grey, board)
 
 
@@ -158,11 +162,18 @@ def detect_board(image_grey: Grey, columns: int, rows: int) -> Array:
         ComputeError: the whole board is not visible.
     """
     _check(image_grey)
-    found = _search_checkerboard(image_grey, columns, rows)
-    corners = _refine(image_grey, found, _grid_spacing(found.reshape(rows, columns, 2)), _REACH)
-    if (columns + rows) % 2 and not _first_square_is_dark(image_grey, corners.reshape(rows, columns, 2)):
-        corners = corners[::-1].copy()
-    return corners
+    return _find_checkerboard(image_grey, columns, rows)[0]
+
+
+def _find_checkerboard(image: Grey, columns: int, rows: int) -> tuple[Array, NDArray[np.bool_]]:
+    """All corners, and which of them can be trusted."""
+    found = _search_checkerboard(image, columns, rows)
+    corners, good = _refine(image, found, _half_window(_grid_spacing(found.reshape(rows, columns, 2)), _REACH))
+    if np.count_nonzero(good) < 0.8 * len(good):
+        raise ComputeError("corners of the board drifted while they were refined", remedy="take a sharper image")
+    if (columns + rows) % 2 and not _first_square_is_dark(image, corners.reshape(rows, columns, 2)):
+        return corners[::-1].copy(), good[::-1].copy()
+    return corners, good
 
 
 def _check(image: Grey) -> None:
@@ -208,20 +219,33 @@ def _grid_spacing(grid: Array) -> float:
     )
 
 
-def _refine(image: Grey, found: Array, spacing_px: float, reach: float) -> Array:
-    """Corners at full size, by the point whose directions to all pixels are normal to their gradients.
+def _refine(image: Grey, found: Array, half: int) -> tuple[Array, NDArray[np.bool_]]:
+    """Corners (N, 2) at full size, and which of them stayed near and have their whole window in the image.
 
-    Four squares meet point-symmetrically, so neither gamma nor blur moves this point.
-    Source: Förstner and Gülch 1987, as OpenCV's cornerSubPix has it.
+    A corner is the point whose directions to all pixels of the window are normal to their gradients.
+    Four squares meet point-symmetrically, so neither gamma nor blur moves this point. Smoothing first halves its
+    error: differences of neighbouring pixels amplify noise, and a sharp lens is sampled too coarsely for them.
+    Source: Förstner and Gülch 1987, as OpenCV's cornerSubPix has it; the smoothing from bench/corner_accuracy.py.
     """
-    half = int(np.clip(reach * spacing_px, 2, _MAX_HALF))
+    sigma = float(np.clip(_SMOOTHING * half, 0.5, _MAX_SMOOTHING_PX))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
-    start = found.astype(np.float32).reshape(-1, 1, 2)
-    refined = cv2.cornerSubPix(image, start.copy(), (half, half), (-1, -1), criteria)
-    corners = np.asarray(refined, dtype=np.float64).reshape(-1, 2)
-    if np.abs(corners - found).max() > 0.5 * spacing_px:
-        raise ComputeError("corners of the board drifted while they were refined", remedy="take a sharper image")
-    return corners
+    margin = 2 * half + 6  # the window may move by its own half
+    corners = np.empty_like(found)
+    for k, (x, y) in enumerate(found.round().astype(int)):
+        left, top = max(x - margin, 0), max(y - margin, 0)
+        patch = image[top : y + margin + 1, left : x + margin + 1].astype(np.float32)
+        patch = cv2.GaussianBlur(patch, (0, 0), sigma)
+        start = (found[k] - [left, top]).astype(np.float32).reshape(1, 1, 2)
+        refined = cv2.cornerSubPix(patch, start, (half, half), (-1, -1), criteria)
+        corners[k] = np.asarray(refined, dtype=np.float64).reshape(2) + np.array([left, top])
+    border = np.array(image.shape[::-1]) - 1 - half
+    whole = ((corners >= half) & (corners <= border)).all(axis=1)
+    near = np.linalg.norm(corners - found, axis=1) <= half
+    return corners, whole & near
+
+
+def _half_window(spacing_px: float, reach: float) -> int:
+    return int(np.clip(reach * spacing_px, 2, _MAX_HALF))
 
 
 def _first_square_is_dark(image: Grey, grid: Array) -> bool:
@@ -239,18 +263,17 @@ def _find_charuco(image: Grey, board: Board) -> BoardView:
     """Identify corners by their markers on a reduced copy, then refine them at full size."""
     for target in _CHARUCO_WIDTHS:
         small, scale = _reduced(image, target)
-        for legacy in (False, True):
-            found, identifiers, _, _ = cv2.aruco.CharucoDetector(board.charuco(legacy=legacy)).detectBoard(small)
-            # Annotated as always there; None when no marker is seen.
-            if identifiers is not None and len(identifiers) >= _MIN_CHARUCO_CORNERS:  # pyright: ignore[reportUnnecessaryComparison]
-                indices = np.asarray(identifiers, dtype=np.int64).ravel()
-                corners = (np.asarray(found, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
-                return _charuco_view(image, board, indices, corners)
+        found, identifiers, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(small)
+        # Annotated as always there; None when no marker is seen.
+        if identifiers is not None and len(identifiers) >= _MIN_CHARUCO_CORNERS:  # pyright: ignore[reportUnnecessaryComparison]
+            indices = np.asarray(identifiers, dtype=np.int64).ravel()
+            corners = (np.asarray(found, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
+            return _charuco_view(image, board, indices, corners)
         if small is image:
             break
     raise ComputeError(
         f"fewer than {_MIN_CHARUCO_CORNERS} corners of the ChArUco board in the image",
-        remedy="check columns and rows (inner corners), the dictionary, sharpness and light",
+        remedy="check columns and rows (inner corners), dictionary, sharpness; a board older than OpenCV 4.6: legacy",
     )
 
 
@@ -263,8 +286,8 @@ def _charuco_view(image: Grey, board: Board, indices: NDArray[np.int64], corners
     part = np.asarray(grid, dtype=np.float64)[row.min() : row.max() + 1, column.min() : column.max() + 1]
     if min(part.shape[:2]) < 2:
         raise ComputeError("only one row of the ChArUco board is seen", remedy="more of the board must be visible")
-    refined = _refine(image, corners, _grid_spacing(part), board.reach())
-    return BoardView(indices, refined)
+    refined, good = _refine(image, corners, _half_window(_grid_spacing(part), board.reach()))
+    return BoardView(indices[good], refined[good])
 
 
 def _scatter(corners: Array) -> float:
@@ -273,18 +296,24 @@ def _scatter(corners: Array) -> float:
 
 
 def _find_circles(image: Grey, board: Board) -> BoardView:
-    """Find an asymmetric grid of dark circles on a reduced copy, then the centroid of each at full size."""
-    flags = cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
+    """Find an asymmetric grid of dark circles on a reduced copy, then the centroid of each at full size.
+
+    The centroid of a tilted circle's image is not the image of its centre: by 0.1 px at 45° and 20 px across.
+    """
     for target in _SEARCH_WIDTHS:
         small, scale = _reduced(image, target)
         settings = cv2.SimpleBlobDetector.Params()
         settings.minArea, settings.maxArea = 20, small.size / (4 * board.columns * board.rows)
         settings.minDistBetweenBlobs = 4
         detector = cv2.SimpleBlobDetector.create(settings)
-        found, centres = cv2.findCirclesGrid(small, (board.columns, board.rows), flags=flags, blobDetector=detector)
-        if found:
-            start = (np.asarray(centres, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
-            return BoardView(np.arange(len(start)), _centroids(image, start))
+        for more in (cv2.CALIB_CB_CLUSTERING, 0):
+            flags = cv2.CALIB_CB_ASYMMETRIC_GRID | more
+            found, centres = cv2.findCirclesGrid(
+                small, (board.columns, board.rows), flags=flags, blobDetector=detector
+            )
+            if found:
+                start = (np.asarray(centres, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
+                return BoardView(np.arange(len(start)), _centroids(image, start))
         if small is image:
             break
     raise ComputeError(

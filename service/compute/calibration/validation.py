@@ -108,6 +108,8 @@ def calibration_warnings(
             found.append(
                 f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): fewer terms do"
             )
+    if result.board.pattern == "circles":
+        found.append("the middle of a tilted circle's image is not its centre: a checkerboard is more accurate")
     if validation is None:
         found.append("too few views for cross-validation")
     elif validation.five_fold_rms_px > _HELD_OUT_FACTOR * result.rms_px:

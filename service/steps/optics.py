@@ -1,0 +1,56 @@
+"""Images held against those of the calibration: focus, zoom, aperture, lens and body must not have changed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from service.compute.calibration.optics import Optics, OpticsDeparture, compare_optics
+from service.core.model import ViewpointCaptured
+from service.steps.context import StepContext
+
+_STATED = (
+    "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "lens", "lens_serial",
+    "body_serial",
+)  # fmt: skip
+_NAMED = 6  # in the line for the operator
+
+
+def optics_departures(context: StepContext) -> tuple[OpticsDeparture, ...] | None:
+    """How the images of this step depart from those that the intrinsics were calibrated from, by viewpoint.
+
+    The calibration is the last one before this step that has images; a calibration is held against itself. None if
+    there is none: nothing can be said then. What departs is noted in the record and told to the operator.
+    """
+    mine = context.evidence.captures(context.step.id)
+    reference = _calibration_images(context)
+    if not mine or not reference:
+        return None
+    departures = compare_optics([_optics(c) for c in reference], [_optics(c) for c in mine]).departures
+    if departures:
+        lines = [str(departure) for departure in departures]
+        context.note("images depart from the calibration", departures=lines)
+        more = f" and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
+        context.tell(f"the lens is not as it was calibrated: {'; '.join(lines[:_NAMED])}{more}")
+    return departures
+
+
+def departing_images(departures: Sequence[OpticsDeparture]) -> int:
+    """How many images depart."""
+    return len({departure.image for departure in departures})
+
+
+def _calibration_images(context: StepContext) -> tuple[ViewpointCaptured, ...]:
+    ids = [step.id for step in context.protocol.steps]
+    until = ids.index(context.step.id) + 1
+    for step in reversed(context.protocol.steps[:until]):
+        params = step.params.model_dump()
+        if step.kind == "calibration" and "intrinsics" in params["solve"]:
+            images = context.evidence.captures(params["images_of"] or step.id)
+            if images:
+                return images
+    return ()
+
+
+def _optics(capture: ViewpointCaptured) -> Optics:
+    record = capture.camera
+    return Optics(image=capture.viewpoint, **{name: record[name] for name in _STATED if record.get(name)})
