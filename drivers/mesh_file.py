@@ -80,7 +80,7 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
             "the file changed while it was read", where=str(path), remedy="Wait until the export has finished"
         )
     _validate(path, vertices, faces)
-    found, evidence = _unit(path, vertices[np.unique(faces)], unit)
+    found, evidence = credible_unit(path, vertices[np.unique(faces)], unit)
     vertices = vertices * METRES_PER_UNIT[found]
     first, index = merge_equal(vertices)
     merged, faces = vertices[first], index[faces]
@@ -218,8 +218,12 @@ def _validate(path: Path, vertices: Array, faces: IntArray) -> None:
         )
 
 
-def _unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str]:
-    """The unit to believe and why."""
+def credible_unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str]:
+    """The unit to believe and why, from vertices (V, 3) in the file's unit.
+
+    Raises:
+        UnreadableFileError: no unit is credible, or the configured one contradicts the size.
+    """
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     low, high = SCENE_DIAGONAL_M if unit == "auto" else OBJECT_DIAGONAL_M
     span = f"{'a scene' if unit == 'auto' else 'what is scanned'} is {low:g} to {high:g} m across"

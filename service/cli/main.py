@@ -19,10 +19,14 @@ _COMMANDS = {
     "worker": "service.cli.worker:worker_command",
     "doctor": "service.cli.doctor:doctor_command",
     "calibrate": "service.cli.calibrate:calibrate_app",
+    "sfm": "service.cli.sfm:sfm_command",
     "register": "service.cli.register:register_command",
+    "spheres": "service.cli.spheres:spheres_command",
+    "layout": "service.cli.layout:layout_command",
     "simulate": "service.cli.simulate:simulate_command",
     "audit": "service.cli.audit:audit_app",
     "protocol": "service.cli.protocol:protocol_app",
+    "plan": "service.cli.plan:plan_app",
 }
 _SETTINGS: dict[str, dict[str, Any]] = {
     "simulate": {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}

@@ -49,7 +49,9 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         "expected": params.spheres,
     }
     if params.compare_with is not None:
-        arguments["reference_m"] = result_of(context, params.compare_with)["spheres_m"]
+        reference = result_of(context, params.compare_with)
+        arguments["reference_m"] = reference["spheres_m"]
+        arguments["reference_covariances_m2"] = [s["covariance_m2"] for s in reference["details"]["spheres"]]
     (answer,) = context.evidence.run_jobs(JobRequest("locate_spheres", arguments))
     result = Result.model_validate(answer.result)
     return StepOutcome({**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"))

@@ -7,10 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from service.compute.registration.layout import SUBSET as LAYOUT_SUBSET
+from service.compute.registration.layout import check_layout
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.isosurface import surface
-from service.compute.surfaces.mesh_spheres import MeshSphere
+from service.compute.surfaces.loop_closure import LoopClosure, close_loop
 from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres
+from service.compute.surfaces.sphere_records import sphere_record
 from service.core.geometry import Array
 from service.worker.job import JobAnswer, JobContext
 
@@ -37,30 +40,53 @@ def locate_spheres(context: JobContext) -> JobAnswer:
 
 def _search(context: JobContext, vertices_m: Array, faces: Any) -> JobAnswer:
     arguments = context.arguments
-    spheres = find_spheres(vertices_m, faces, float(arguments["radius_m"]), int(arguments["expected"]))
+    radius_m = float(arguments["radius_m"])
+    spheres = find_spheres(vertices_m, faces, radius_m, int(arguments["expected"]))
+    centres = np.array([s.centre_m for s in spheres])
+    covariances = np.array([s.covariance for s in spheres])
+    layout = check_layout(centres, covariances, radius_m=radius_m) if len(spheres) >= LAYOUT_SUBSET else None
     measures = {
         "spheres_found": float(len(spheres)),
         "radius_residual_max_mm": 1e3 * max(abs(s.radius_residual_m) for s in spheres),
         "sphere_rms_max_mm": 1e3 * max(s.rms_m for s in spheres),
         "sphere_sigma_max_mm": 1e3 * max(float(np.sqrt(np.trace(s.covariance))) for s in spheres),
     }
-    centres = np.array([s.centre_m for s in spheres])
-    details: dict[str, Any] = {"spheres": [_record(s) for s in spheres]}
+    details: dict[str, Any] = {"spheres": [sphere_record(s) for s in spheres]}
+    if layout is not None:
+        measures["layout_margin_mm"] = 1e3 * layout.margin_m
+        details["layout_problems"] = list(layout.problems)
     if arguments.get("reference_m") is not None:
-        match = match_constellations(np.array(arguments["reference_m"]), centres)
+        reference = np.array(arguments["reference_m"])
+        match = match_constellations(reference, centres)
         measures["spheres_compared"] = float(len(match.pairs))
         measures["sphere_change_rms_mm"] = 1e3 * match.rms_m
         measures["sphere_change_max_mm"] = 1e3 * float(match.residuals_m.max())
         details["T_reference_mesh"] = match.T_a_b.tolist()
+        if arguments.get("reference_covariances_m2") is not None:
+            closure = close_loop(
+                reference, np.array(arguments["reference_covariances_m2"]), centres, covariances, match
+            )
+            measures["spheres_moved"] = float(len(closure.moved))
+            measures["loop_closure_chi2"] = closure.chi2_per_dof
+            details["loop_closure"] = _closure_record(closure)
     return JobAnswer(measures, (), {"spheres_m": centres.tolist(), "details": details})
 
 
-def _record(sphere: MeshSphere) -> dict[str, Any]:
+def _closure_record(closure: LoopClosure) -> dict[str, Any]:
     return {
-        "centre_m": sphere.centre_m.tolist(),
-        "covariance_m2": sphere.covariance.tolist(),
-        "rms_mm": 1e3 * sphere.rms_m,
-        "radius_residual_mm": 1e3 * sphere.radius_residual_m,
-        "coverage": sphere.coverage,
-        "vertices": sphere.n,
+        "T_reference_mesh": closure.T_a_b.tolist(),
+        "chi2_per_dof": closure.chi2_per_dof,
+        "rms_mm": 1e3 * closure.rms_m,
+        "sigma_rms_mm": 1e3 * closure.sigma_rms_m,
+        "spheres": [
+            {
+                "reference": s.pair[0],
+                "sphere": s.pair[1],
+                "difference_mm": (1e3 * s.difference_m).tolist(),
+                "sigma_mm": 1e3 * s.sigma_m,
+                "z": s.z,
+                "moved": s.moved,
+            }
+            for s in closure.spheres
+        ],
     }

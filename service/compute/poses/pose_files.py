@@ -294,11 +294,13 @@ def write_camera_json(path: Path, camera: CameraModel) -> None:
 def read_spheres_json(path: Path) -> SphereFile:
     """Spheres from {"radius_mm": 15, "registration_mm": [[x,y,z],…], "control_mm": [[x,y,z],…]}.
 
+    `details`, what the `spheres` command knows of each besides, is passed over.
+
     Raises:
         DataError: a key is missing or unknown, no registration sphere, or malformed numbers.
     """
     document = _object(path)
-    _check_keys(document, {"radius_mm", "registration_mm"}, {"control_mm"}, path)
+    _check_keys(document, {"radius_mm", "registration_mm"}, {"control_mm", "details"}, path)
     radius = document["radius_mm"]
     if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0 < radius < math.inf:
         raise DataError(f"radius_mm is {radius!r}, not a positive number", where=str(path))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +123,9 @@ def locate_spheres(
 
 def _checked(vertices_m: Array, faces: NDArray[np.integer], normals: Array | None) -> tuple[Array, IntArray]:
     vertices = np.ascontiguousarray(vertices_m, dtype=np.float64)
-    triangles = np.asarray(faces)
+    triangles = cast(
+        "IntArray", np.asarray(faces)
+    )  # of whatever integers: a copy of 20 million faces has half a gigabyte
     if triangles.size == 0:
         triangles = np.empty((0, 3), dtype=np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from service.compute.surfaces.surfels import Surfels, grid_keys
+from service.compute.surfaces.surfels import Surfels, grid_keys, summed
 from service.core.geometry import Array
 
 IntArray = NDArray[np.int64]
@@ -44,8 +44,8 @@ def vote_peaks(patches: Surfels, radius: float) -> Array:
     low = votes.min(axis=0)
     size = np.floor((votes.max(axis=0) - low) / cell).astype(np.int64) + 3
     cells, group = np.unique(grid_keys(votes, low, size, cell), return_inverse=True)
-    mass = np.bincount(group, weight, len(cells))
-    moment = np.stack([np.bincount(group, votes[:, k] * weight, len(cells)) for k in range(3)], axis=1)
+    sums = summed(group, [weight, *(votes.T * weight)], len(cells))
+    mass, moment = sums[:, 0], sums[:, 1:]
     total, centre = mass.copy(), moment.copy()
     steps = (-1, 0, 1)
     for offset in (int((i * size[1] + j) * size[2] + k) for i in steps for j in steps for k in steps):
@@ -78,6 +78,7 @@ def rough_centre(patches: Surfels, tree: cKDTree, start: Array, radius: float, m
         return None
     points, normals, area = patches.position[hood], patches.normal[hood], patches.area[hood]
     centre, band = start, 0.3 * radius
+    unit, residual, weights = np.zeros_like(points), np.zeros(len(points)), np.zeros(len(points))
     for _ in range(15):
         ray = points - centre
         distance = np.linalg.norm(ray, axis=1)

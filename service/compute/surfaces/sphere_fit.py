@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.surfaces.surfels import summed
 from service.core.geometry import Array
 
 IntArray = NDArray[np.int64]
@@ -163,14 +164,15 @@ def _patches(u: Array, r: Array, w: Array) -> Patches:
         if n <= _MOST_PATCHES:
             break
         cell *= 1.15
-    total = np.bincount(group, w, n)
+    sums = summed(group, [w, w * r, w * w, *(w * u.T)], n)
+    total = sums[:, 0]
     kept = total > 0.02 * float(np.median(total))
-    direction = np.stack([np.bincount(group, w * u[:, k], n) for k in range(3)], axis=1)[kept]
+    direction = sums[kept, 3:]
     return Patches(
         unit=direction / np.linalg.norm(direction, axis=1, keepdims=True),
-        residual=(np.bincount(group, w * r, n) / total)[kept],
+        residual=(sums[:, 1] / total)[kept],
         weight=total[kept],
-        white=(np.bincount(group, w * w, n) / total**2)[kept],
+        white=(sums[:, 2] / total**2)[kept],
     )
 
 

@@ -65,14 +65,14 @@ def estimate_noise(spheres: Sequence[Patches]) -> NoiseModel:
         parts = [_spectrum(p, K, length) for p, K in zip(usable, contrasts, strict=True)]
         for ratio in RATIOS:
             cost = 0.0
-            scales: list[float] = []
+            tried: list[float] = []
             for values, y in parts:
                 variance = 1 + ratio * values
                 scale = max(float(np.mean(y * y / variance)), floor)
-                scales.append(scale)
+                tried.append(scale)
                 cost += float(np.sum(np.log(variance))) + len(y) * float(np.log(scale))
             if best is None or cost < best[0] - 1e-9:
-                best = (cost, length, ratio, np.array(scales))
+                best = (cost, length, ratio, np.array(tried))
     assert best is not None
     _, length, ratio, scales = best
     dof = np.array([len(p.residual) - 4.0 for p in usable])

@@ -63,10 +63,10 @@ def surfels(vertices: Array, faces: IntArray, normals: Array | None, cell: float
         columns = [np.ones(len(point)), weight, *(weight * p for p in (x, y, z)), *vector.T]
         columns += [weight * p for p in (x * x, y * y, z * z, x * y, x * z, y * z)]
         keys.append(key)
-        sums.append(np.stack([np.bincount(group, column, len(key)) for column in columns], axis=1))
+        sums.append(summed(group, columns, len(key)))
     merged, group = np.unique(np.concatenate(keys), return_inverse=True)
     stacked = np.concatenate(sums)
-    cells = np.stack([np.bincount(group, stacked[:, k], len(merged)) for k in range(14)], axis=1)
+    cells = summed(group, list(stacked.T), len(merged))
     return _from_sums(cells[cells[:, 1] > 0], low, cell, is_mesh=len(faces) > 0)
 
 
@@ -90,6 +90,11 @@ def _from_sums(cells: Array, low: Array, cell: float, *, is_mesh: bool) -> Surfe
     area = np.minimum(weight, 2 * usual) if is_mesh else usual
     kept = by_spread | by_vector | by_few
     return Surfels(mean[kept] + low, normal[kept], area[kept], vector[kept])
+
+
+def summed(group: IntArray, columns: list[Array], n: int) -> Array:
+    """Sums (n, len(columns)) of the columns (N,) over the rows of each group (N,)."""
+    return np.stack([np.bincount(group, column, n).astype(np.float64) for column in columns], axis=1)
 
 
 def grid_keys(points: Array, low: Array, size: IntArray, cell: float) -> IntArray:

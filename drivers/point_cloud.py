@@ -1,0 +1,121 @@
+"""Reads point clouds (PLY without faces, or text: x y z, with normals or colours) in metres."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import trimesh
+
+from drivers.errors import UnreadableFileError
+from drivers.interfaces import Array
+from drivers.mesh_file import METRES_PER_UNIT, MeshUnit, credible_unit
+
+TEXT_SUFFIXES = (".xyz", ".asc", ".pts", ".txt", ".csv")
+
+
+@dataclass(frozen=True, slots=True)
+class PointCloud:
+    """Points without faces.
+
+    Attributes:
+        points_m: (N, 3).
+        normals: (N, 3) unit, or None when the file has none.
+        unit: of the file.
+        unit_evidence: why that unit is believed.
+    """
+
+    points_m: Array
+    normals: Array | None
+    unit: str
+    unit_evidence: str
+
+
+def is_point_cloud(path: Path) -> bool:
+    """Whether a file holds points and no faces, by its name or its PLY header."""
+    if path.suffix.lower() in TEXT_SUFFIXES:
+        return True
+    if path.suffix.lower() != ".ply":
+        return False
+    with path.open("rb") as stream:
+        for line in stream:
+            words = line.split()
+            if words[:2] == [b"element", b"face"]:
+                return int(words[2]) == 0
+            if words[:2] == [b"element", b"tristrips"]:
+                return False  # a mesh, of a kind that is not read
+            if words[:1] == [b"end_header"]:
+                return True
+    return False
+
+
+def read_point_cloud(path: Path, unit: MeshUnit = "auto") -> PointCloud:
+    """Read a point cloud.
+
+    Text has one point a line, x y z, and after it a normal of length 1 if there is one; other columns are ignored.
+
+    Raises:
+        UnreadableFileError: not such a file, coordinates that are not finite, or a unit that is not credible.
+    """
+    try:
+        points, normals = _text(path) if path.suffix.lower() in TEXT_SUFFIXES else _ply(path)
+    except (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, EOFError, struct.error) as error:
+        raise UnreadableFileError(
+            f"this is not a point cloud that can be parsed ({error})",
+            where=str(path),
+            remedy="Export points as PLY, or as text with x y z in each line",
+        ) from error
+    if len(points) < 3 or not np.isfinite(points).all():
+        raise UnreadableFileError(
+            "the file has no points, or some that are not finite", where=str(path), remedy="Export the scan again"
+        )
+    found, evidence = credible_unit(path, points, unit)
+    return PointCloud(points * METRES_PER_UNIT[found], normals, found, evidence)
+
+
+def _text(path: Path) -> tuple[Array, Array | None]:
+    with path.open(encoding="utf-8-sig") as stream:
+        first = stream.readline()
+    separator = "," if "," in first else ";" if ";" in first else None
+    # A header line, or the number of points alone (.pts).
+    words = first.replace(",", " ").replace(";", " ").split()
+    skipped = 0 if len(words) >= 3 and _is_number(words[0]) else 1
+    table = np.loadtxt(
+        path, delimiter=separator, skiprows=skipped, ndmin=2, comments=("#", "//"), encoding="utf-8-sig"
+    )
+    if table.shape[1] < 3:
+        raise ValueError(f"{table.shape[1]} columns")
+    return np.ascontiguousarray(table[:, :3]), _unit_normals(table[:, -3:] if table.shape[1] >= 6 else None)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _ply(path: Path) -> tuple[Array, Array | None]:
+    with path.open("rb") as stream:
+        loaded = cast("Any", trimesh.load(stream, file_type="ply", process=False))
+    points = np.array(loaded.vertices, dtype=np.float64)
+    raw = loaded.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    names = () if raw is None else raw.dtype.names if hasattr(raw, "dtype") else tuple(raw)
+    if raw is None or not {"nx", "ny", "nz"} <= set(names or ()):
+        return points, None
+    columns = [np.asarray(raw[name], dtype=np.float64).ravel() for name in ("nx", "ny", "nz")]
+    return points, _unit_normals(np.stack(columns, axis=1))
+
+
+def _unit_normals(columns: Array | None) -> Array | None:
+    """Columns that are unit normals; others (colours, intensities) are not."""
+    if columns is None:
+        return None
+    length = np.linalg.norm(columns, axis=1)
+    if not np.isfinite(length).all() or np.mean(np.abs(length - 1.0) < 0.05) < 0.99:
+        return None
+    return columns / np.maximum(length, 1e-300)[:, None]

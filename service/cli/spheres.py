@@ -1,0 +1,98 @@
+"""`orthocapture spheres`: find the spheres in a scan, a CT mesh or a point cloud, and write spheres.json."""
+
+from __future__ import annotations
+
+import json as json_module
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.table import Table
+
+from drivers.mesh_file import MeshUnit, read_mesh_file
+from drivers.point_cloud import is_point_cloud, read_point_cloud
+from service.cli.common import JsonOption, console, print_json, reporting_errors
+from service.compute.surfaces.mesh_spheres import MeshSphere, locate_spheres
+from service.compute.surfaces.sphere_records import spheres_document
+from service.core.errors import DataError
+from service.core.geometry import Array
+
+SeedsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--seeds", help="A point at or near each sphere, mm in the mesh's frame: x,y,z;x,y,z or a JSON file of them."
+    ),
+]
+
+
+def spheres_command(
+    mesh: Annotated[Path, typer.Option("--mesh", help="OBJ, PLY or STL; a PLY or text file of points.")],
+    radius_mm: Annotated[float, typer.Option("--radius-mm", help="Radius of the spheres.")],
+    out: Annotated[Path, typer.Option("--out", help="The spheres.json to write.")],
+    expect: Annotated[int | None, typer.Option("--expect", help="How many there must be.")] = None,
+    seeds: SeedsOption = None,
+    mesh_unit: Annotated[MeshUnit, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
+    json: JsonOption = False,
+) -> None:
+    """Find every sphere of a radius in a mesh or point cloud, with its covariance and what it was measured on."""
+    with reporting_errors(json):
+        found = spheres_of(mesh, radius_mm / 1e3, mesh_unit, expect, seeds)
+        document = spheres_document(found, radius_mm / 1e3)
+        out.write_text(json_module.dumps(document, indent=1), encoding="utf-8")
+        if json:
+            print_json(document)
+            return
+        table = Table("", "x mm", "y mm", "z mm", "sigma mm", "rms mm", "radius mm", "coverage")
+        for number, sphere in enumerate(found):
+            table.add_row(
+                str(number),
+                *(f"{value * 1e3:.3f}" for value in sphere.centre_m),
+                f"{1e3 * float(np.sqrt(np.trace(sphere.covariance))):.4f}",
+                f"{1e3 * sphere.rms_m:.3f}",
+                f"{1e3 * sphere.radius_residual_m:+.3f} ± {1e3 * sphere.radius_sigma_m:.3f}",
+                f"{sphere.coverage:.2f}",
+            )
+        console.print(table)
+        console.print(f"written: {out}")
+
+
+def spheres_of(
+    mesh: Path, radius_m: float, unit: MeshUnit, expected: int | None, seeds: str | None
+) -> tuple[MeshSphere, ...]:
+    """Spheres of a mesh or point cloud file, metres; in the order of the seeds if given."""
+    seeds_m = read_seeds(seeds)
+    if expected is not None and seeds_m is not None and len(seeds_m) != expected:
+        raise DataError(f"{len(seeds_m)} seeds are given and {expected} spheres expected", remedy="give one for each")
+    normals: Array | None = None
+    faces: NDArray[np.integer] = np.empty((0, 3), dtype=np.int64)
+    if mesh.is_file() and is_point_cloud(mesh):
+        cloud = read_point_cloud(mesh, unit)
+        vertices, normals = cloud.points_m, cloud.normals
+    else:
+        scan = read_mesh_file(mesh, unit)
+        vertices, faces = scan.mesh.vertices_m, scan.mesh.faces
+    return locate_spheres(vertices, faces, radius_m, expected, normals=normals, seeds_m=seeds_m)
+
+
+def read_seeds(text: str | None) -> Array | None:
+    """Seeds (K, 3) in metres from "x,y,z;x,y,z" in millimetres, or a JSON file: a list of [x, y, z], or an object
+    with such a list under registration_mm, as spheres.json has it."""
+    if text is None:
+        return None
+    path = Path(text)
+    try:
+        if path.is_file():
+            document: object = json_module.loads(path.read_text(encoding="utf-8"))
+            if isinstance(document, dict):
+                document = cast("dict[str, Any]", document)["registration_mm"]
+            seeds = np.array(document, dtype=np.float64)
+        else:
+            rows = [row.split(",") for row in text.split(";") if row.strip()]
+            seeds = np.array([[float(word) for word in row] for row in rows])
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise DataError(f"the seeds cannot be read ({error})", where=text, remedy="give x,y,z;x,y,z in mm") from error
+    if seeds.ndim != 2 or seeds.shape[1] != 3 or len(seeds) == 0:
+        raise DataError("the seeds are not points x,y,z", where=text, remedy="give x,y,z;x,y,z in mm, or a JSON file")
+    return seeds / 1e3

@@ -1,0 +1,167 @@
+"""Did spheres move between two measurements: differences against their uncertainties, sphere by sphere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from service.compute.surfaces.constellations import ConstellationMatch
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, apply, transform
+
+SYSTEMATIC_SIGMA_M = 2.0e-5  # of each coordinate: what two instruments differ by beyond their noise (scale, warmth)
+MOVED_PROBABILITY = 1.0e-3  # of calling any sphere moved when none did
+_LEAST = 4  # spheres that must stay to refer the others to
+
+
+@dataclass(frozen=True, slots=True)
+class SphereDifference:
+    """One sphere in both measurements, the frames brought together by the spheres that did not move.
+
+    Attributes:
+        pair: (index in a, index in b).
+        difference_m: (3,) position in b minus position in a, in frame a.
+        sigma_m: standard deviation of the difference's length along its direction, the registration's included.
+        z: Mahalanobis length of the difference.
+        probability: of such a z when the sphere did not move.
+        moved: whether it is called moved.
+    """
+
+    pair: tuple[int, int]
+    difference_m: Array
+    sigma_m: float
+    z: float
+    probability: float
+    moved: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosure:
+    """Two measurements of one scene, compared.
+
+    Attributes:
+        T_a_b: rigid, weighted by the covariances, by the spheres that did not move.
+        spheres: in the order of the match's pairs.
+        chi2_per_dof: of the spheres that did not move; near 1 when the stated uncertainties are true.
+        rms_m: of the differences of the spheres that did not move.
+        sigma_rms_m: what that rms should be by the stated uncertainties.
+    """
+
+    T_a_b: Transform
+    spheres: tuple[SphereDifference, ...]
+    chi2_per_dof: float
+    rms_m: float
+    sigma_rms_m: float
+
+    @property
+    def moved(self) -> tuple[SphereDifference, ...]:
+        """The spheres that moved, the most significant first."""
+        return tuple(sorted((s for s in self.spheres if s.moved), key=lambda s: -s.z))
+
+
+def close_loop(
+    a: Array,
+    covariances_a: Array,
+    b: Array,
+    covariances_b: Array,
+    match: ConstellationMatch,
+    systematic_sigma_m: float = SYSTEMATIC_SIGMA_M,
+) -> LoopClosure:
+    """Compare the matched spheres of two measurements and name those that moved.
+
+    Each sphere is predicted from the others; the one that departs most from its prediction is set aside if chance
+    does not explain it, and the rest is judged again.
+
+    Args:
+        a: (M, 3) centres, metres.
+        covariances_a: (M, 3, 3), m².
+        b: (N, 3) centres in another frame.
+        covariances_b: (N, 3, 3).
+        match: which is which.
+        systematic_sigma_m: added to every coordinate of a difference.
+
+    Raises:
+        ComputeError: fewer than four spheres in common.
+    """
+    if len(match.pairs) < _LEAST:
+        raise ComputeError(f"{len(match.pairs)} spheres in common do not close a loop", remedy="scan all spheres")
+    rows, columns = (np.array(side) for side in zip(*match.pairs, strict=True))
+    pa, pb = a[rows], b[columns]
+    R = match.T_a_b[:3, :3]
+    C = covariances_a[rows] + R @ covariances_b[columns] @ R.T + systematic_sigma_m**2 * np.eye(3)
+    staying = np.ones(len(pa), dtype=np.bool_)
+    limit = MOVED_PROBABILITY / len(pa)
+    while staying.sum() > _LEAST:
+        z2 = np.array([_against_others(pa, pb, C, staying, int(i), match.T_a_b)[1] for i in np.flatnonzero(staying)])
+        worst = int(z2.argmax())
+        if chi2.sf(float(z2[worst]), 3) >= limit:
+            break
+        staying[np.flatnonzero(staying)[worst]] = False
+    T, _ = _weighted(pa[staying], pb[staying], C[staying], match.T_a_b)
+    spheres: list[SphereDifference] = []
+    for i, pair in enumerate(match.pairs):
+        difference, z2, sigma = _against_others(pa, pb, C, staying, i, T)
+        spheres.append(
+            SphereDifference(
+                pair, difference, sigma, float(np.sqrt(z2)), float(chi2.sf(z2, 3)), moved=not bool(staying[i])
+            )
+        )
+    d = apply(T, pb[staying]) - pa[staying]
+    dof = 3 * int(staying.sum()) - 6
+    statistic = float(np.einsum("ni,nij,nj->", d, np.linalg.inv(C[staying]), d))
+    expected = float(np.trace(C[staying], axis1=1, axis2=2).sum()) * dof / (3 * staying.sum())
+    return LoopClosure(
+        T_a_b=T,
+        spheres=tuple(spheres),
+        chi2_per_dof=statistic / dof,
+        rms_m=float(np.sqrt(np.mean(np.sum(d**2, axis=1)))),
+        sigma_rms_m=float(np.sqrt(expected / staying.sum())),
+    )
+
+
+def _against_others(
+    a: Array, b: Array, C: Array, staying: NDArray[np.bool_], i: int, start: Transform
+) -> tuple[Array, float, float]:
+    """Difference (3,) of sphere i from where the others put it, its squared Mahalanobis length, and its sigma."""
+    others = staying.copy()
+    others[i] = False
+    T, covariance = _weighted(a[others], b[others], C[others], start)
+    predicted = apply(T, b[i])
+    J = _jacobian(predicted[None])[0]
+    S = C[i] + J @ covariance @ J.T
+    d = predicted - a[i]
+    length = float(np.linalg.norm(d))
+    along = d / length if length > 0 else np.array([1.0, 0.0, 0.0])
+    return d, float(d @ np.linalg.solve(S, d)), float(np.sqrt(along @ S @ along))
+
+
+def _jacobian(points: Array) -> Array:
+    """d(exp(w) p + t) / d(t, w): (N, 3, 6)."""
+    J = np.zeros((len(points), 3, 6))
+    J[:, :, :3] = np.eye(3)
+    x, y, z = points.T
+    J[:, 0, 4], J[:, 0, 5] = z, -y
+    J[:, 1, 3], J[:, 1, 5] = -z, x
+    J[:, 2, 3], J[:, 2, 4] = y, -x
+    return J
+
+
+def _weighted(a: Array, b: Array, C: Array, start: Transform) -> tuple[Transform, Array]:
+    """Rigid T_a_b by generalised least squares, and its covariance (6, 6) of (t, w) at a's origin, outer frame."""
+    T = start.copy()
+    W = np.linalg.inv(C)
+    normal = np.eye(6)
+    for _ in range(8):
+        points = apply(T, b)
+        J = _jacobian(points)
+        JW = np.einsum("nki,nkl->nil", J, W)
+        normal = np.einsum("nil,nlj->ij", JW, J)
+        step = np.linalg.solve(normal, np.einsum("nil,nl->i", JW, a - points))
+        T[:] = transform(Rotation.from_rotvec(step[3:]), step[:3]) @ T
+        if float(np.abs(step).max()) < 1e-12:
+            break
+    return T, np.asarray(np.linalg.inv(normal), dtype=np.float64)

@@ -1,0 +1,34 @@
+"""Located spheres as plain data, in the files and results of this project."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from service.compute.surfaces.mesh_spheres import MeshSphere
+
+
+def sphere_record(sphere: MeshSphere) -> dict[str, Any]:
+    """One sphere: lengths in the unit that each key names, the covariance in m²."""
+    return {
+        "centre_m": sphere.centre_m.tolist(),
+        "covariance_m2": sphere.covariance.tolist(),
+        "sigma_mm": 1e3 * float(np.sqrt(np.trace(sphere.covariance))),
+        "rms_mm": 1e3 * sphere.rms_m,
+        "radius_residual_mm": 1e3 * sphere.radius_residual_m,
+        "radius_sigma_mm": 1e3 * sphere.radius_sigma_m,
+        "coverage": sphere.coverage,
+        "n_points": sphere.n,
+    }
+
+
+def spheres_document(spheres: tuple[MeshSphere, ...], radius_m: float) -> dict[str, Any]:
+    """The content of spheres.json: centres as `read_spheres_json` reads them, and under `details`, in the same order,
+    what each is worth."""
+    return {
+        "radius_mm": radius_m * 1e3,
+        "registration_mm": [(sphere.centre_m * 1e3).tolist() for sphere in spheres],
+        "control_mm": [],
+        "details": [sphere_record(sphere) for sphere in spheres],
+    }
