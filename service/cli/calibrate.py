@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typer
 
+from service.cli.calibrate_hand_eye import hand_eye_command
 from service.cli.calibrate_intrinsics import intrinsics_command
 
 calibrate_app = typer.Typer(
@@ -12,3 +13,4 @@ calibrate_app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 calibrate_app.command("intrinsics")(intrinsics_command)
+calibrate_app.command("hand-eye")(hand_eye_command)

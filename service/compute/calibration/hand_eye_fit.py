@@ -8,8 +8,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
+from scipy.special import chdtri
 
 from service.compute.calibration.arm_correction import (
     HARMONICS,
@@ -48,10 +47,12 @@ from service.core.geometry import Array, Transform
 Method = Literal["weighted", "reprojection", "park", "daniilidis", "tsai", "horaud", "andreff"]
 ArmTerms = Literal["none", "geometry", "geometry+gears"]
 
-_TAIL = 1e-4  # one good image in ten thousand is taken for an outlier
-_LIMIT = float(chi2.isf(_TAIL, 6))
+# An arm's systematic error puts views three times the others' scatter off, and they must stay: it is their due. A
+# wrong pose, a moved board or a bad detection is farther away than this.
+_GROSS = 5.0
+_LIMIT = float(chdtri(6, 1e-4))  # where the arm's own error is part of the model
 _MEDIAN_NORM = 1.538  # median length of three standard normal numbers
-_CHI2_MEDIAN = float(chi2.median(6))
+_CHI2_MEDIAN = float(chdtri(6, 0.5))
 _MAX_EXCLUDED = 1 / 3
 _ARM_FLOOR_M = 3e-6  # no arm repeats better
 _MIN_ARM_VIEWS = 9
@@ -145,11 +146,9 @@ def find_outliers(data: Measured, rng: np.random.Generator) -> dict[int, str]:
     fit = Fit(X, B, np.zeros(0), np.zeros((12, 12)))
     keep = np.zeros(len(e), dtype=bool)
     square = np.zeros(len(e))
-    # The variances of few views are themselves uncertain: Fisher's distribution, not chi-squared.
-    limit = 6 * float(f_distribution.isf(_TAIL, 6, 3 * len(e) - 6))
     for round_ in range(_ROUNDS):
         square = mahalanobis(views, noise, fit, keep if round_ else None)
-        now = square < limit
+        now = square < 6 * _GROSS**2
         if now.sum() < max(MIN_VIEWS, (1 - _MAX_EXCLUDED) * len(e)):
             raise ComputeError(
                 f"{np.count_nonzero(~now)} of {len(e)} board images disagree with the robot's poses",
