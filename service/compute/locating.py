@@ -30,7 +30,7 @@ from service.core.geometry import Array, apply, inverse
 
 _ANCHORS = (2, 4)  # images of a station that are searched first; more when these do not agree
 _ANCHORS_WITHOUT_SCALE = (3, 6)
-_ANCHOR_WIDTH_PX = 1000  # at least, of the reduced image on which an anchor is searched
+ANCHOR_WIDTH_PX = 1000  # at least, of the reduced image on which an anchor is searched
 _MOST_FAILED = 0.4  # of the images whose prediction may fail before the prediction itself is doubted
 _SAME_SPHERE = 0.15  # in radii: one unlisted sphere seen from two sides
 _GATE, _SIZE_GATE = 0.5, 0.12  # of an outline of a whole search, against its prediction
@@ -244,7 +244,7 @@ def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> _Found
 
 
 def _look_reduced(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    image, smaller = read_reduced(path, camera, _ANCHOR_WIDTH_PX)
+    image, smaller = read_reduced(path, camera, ANCHOR_WIDTH_PX)
     return detect_spheres(image, smaller, options)
 
 

@@ -26,7 +26,8 @@ _PLACE_GATE, _SIZE_GATE = 0.05, 0.04  # of a whole outline against the image's o
 _ROUGH_GATE = 0.12
 _LEAST_PART = 0.45  # of an outline that must be inside the image and not behind another sphere
 _REGION_RADIUS_PX = 24.0  # of a sphere in the reduced region on which a search runs
-_REGION_RAYS = 96
+_REGION_RAYS = 64
+_APPROACHED = 5  # spheres on which an image's pose is first found; all, where these do not agree
 _POSE_SPHERES = 3  # three numbers each: with three, a pose is determined and contradicted by something
 
 
@@ -110,8 +111,7 @@ def _attempt(
     pose = expected.T_camera_scan
     shown = visible_cones(pose, centres, radius_m, camera)
     if expected.margin > NEAR:
-        roughs = {m: rough for m, cone in shown.items() if (rough := _approach(image, camera, cone, expected.margin))}
-        pose = _agreed_pose(roughs, centres, radius_m, pose, _ROUGH_GATE)
+        pose = _approached_pose(image, camera, expected, shown)
         shown = visible_cones(pose, centres, radius_m, camera)
     outlines: dict[int, SphereOutline] = {}
     missing: dict[int, str] = {}
@@ -123,7 +123,9 @@ def _attempt(
             missing[m] = "another colour than the markers'"
         else:
             outlines[m] = outline
-    pose = _agreed_pose({m: o.cone for m, o in outlines.items()}, centres, radius_m, pose, _PLACE_GATE)
+    cones = {m: o.cone for m, o in outlines.items()}
+    agreed = _agreed_pose(cones, expected, pose, _PLACE_GATE, 0.5 * len(cones))
+    pose = pose if agreed is None else agreed
     for m, outline in list(outlines.items()):
         place, size = deviation(outline.cone, cone_of_sphere(apply(pose, centres[m]), radius_m))
         part = max(outline.coverage, 0.2)
@@ -204,7 +206,7 @@ def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin:
         rays = cone.rays(where.azimuth_rad[points.slot], cone.half_angle_rad + points.offset_px * per_pixel)
         bounds = (0.9 * cone.half_angle_rad, 1.1 * cone.half_angle_rad)
         fit = ransac_cone(
-            rays, points.strength, points.slot, bounds, 0.8 * float(np.median(per_pixel)), rng, trials=200
+            rays, points.strength, points.slot, bounds, 0.8 * float(np.median(per_pixel)), rng, trials=120
         )
         if fit is None:
             return None
@@ -212,16 +214,54 @@ def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin:
     return cone
 
 
-def _agreed_pose(cones: dict[int, Cone], centres_m: Array, radius_m: float, T: Transform, gate: float) -> Transform:
-    """T_camera_scan on which most cones agree; `T` itself where too few do."""
+def _approached_pose(
+    image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, shown: dict[int, Cone]
+) -> Transform:
+    """The image's pose from circles near the predicted ones: of a few spheres, of all where those do not agree."""
+    order = _spread(shown)
+    roughs: dict[int, Cone] = {}
+    for part, agreeing in ((order[:_APPROACHED], 4), (order[_APPROACHED:], 3)):
+        for m in part:
+            rough = _approach(image, camera, shown[m], expected.margin)
+            if rough is not None:
+                roughs[m] = rough
+        least = max(agreeing, 0.5 * len(roughs))
+        pose = _agreed_pose(roughs, expected, expected.T_camera_scan, _ROUGH_GATE, least)
+        if pose is not None:
+            return pose
+    return expected.T_camera_scan
+
+
+def _spread(cones: dict[int, Cone]) -> list[int]:
+    """The spheres, each as far as can be from those before it."""
+    if not cones:
+        return []
+    names = list(cones)
+    axes = np.array([cone.axis for cone in cones.values()])
+    order = [int(np.argmax(np.linalg.norm(axes - axes.mean(axis=0), axis=1)))]
+    gap = np.full(len(names), np.inf)
+    while len(order) < len(names):
+        gap = np.minimum(gap, np.linalg.norm(axes - axes[order[-1]], axis=1))
+        gap[order] = -1.0
+        order.append(int(np.argmax(gap)))
+    return [names[k] for k in order]
+
+
+def _agreed_pose(
+    cones: dict[int, Cone], expected: Prediction, start: Transform, gate: float, least: float
+) -> Transform | None:
+    """T_camera_scan on which `least` cones, and three, agree; None where they do not."""
     if len(cones) < _POSE_SPHERES:
-        return T
+        return None
     index = list(cones)
     axes = np.array([c.axis for c in cones.values()])
     half = np.array([c.half_angle_rad for c in cones.values()])
-    new = fit_pose(axes, half, centres_m[index], radius_m, T)
-    agree = sum(deviation(c, cone_of_sphere(apply(new, centres_m[m]), radius_m))[0] < gate for m, c in cones.items())
-    return new if agree >= max(_POSE_SPHERES, 0.5 * len(cones)) else T
+    pose = fit_pose(axes, half, expected.centres_m[index], expected.radius_m, start)
+    agreeing = sum(
+        deviation(c, cone_of_sphere(apply(pose, expected.centres_m[m]), expected.radius_m))[0] < gate
+        for m, c in cones.items()
+    )
+    return pose if agreeing >= max(_POSE_SPHERES, least) else None
 
 
 def fit_pose(
