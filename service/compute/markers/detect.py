@@ -10,25 +10,12 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.candidates import Candidate, colour_gradient, edges, find_candidates
-from service.compute.markers.cones import Cone, angles_to, distance_gradient, fit_cone, ransac_cone
-from service.compute.markers.edges import (
-    colour_values,
-    coloured_edge_profiles,
-    envelope_edges,
-    luma_values,
-    profiles,
-    sample,
-    sub_pixel_edges,
-)
-from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
+from service.compute.markers.cones import Cone, ransac_cone
+from service.compute.markers.edges import envelope_edges, profiles, sample
+from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.markers.refine import refine_outline
 from service.core.errors import DataError
 from service.core.geometry import Array
-
-POOR_LUMA_PX = 0.3  # sigma of an edge point above which the outline is also tried in colour
-MOST_SHIFT_PX = 0.5  # between colours that shift the luma edge more than this, the edge is not used
-# Measured on rendered scenes with exact truth: what stays of an outline's error when its noise has averaged out.
-NOISE_CORRELATION = 2.0  # neighbouring profiles share pixels: edge points over independent ones
-LUMA_SYSTEMATIC_PX, COLOUR_SYSTEMATIC_PX = 0.06, 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,148 +213,6 @@ def _consistent(roughs: list[RoughSphere]) -> list[RoughSphere]:
 def _chromaticity(colours: list[tuple[float, float, float]]) -> Array:
     pixels = np.array(colours, dtype=np.float32).reshape(1, -1, 3) / 255
     return cv2.cvtColor(pixels, cv2.COLOR_BGR2LAB)[0, :, 1:].astype(np.float64)
-
-
-def refine_outline(
-    image_bgr: NDArray[np.uint8],
-    camera: CameraModel,
-    rough: Cone,
-    options: DetectionOptions = DEFAULTS,
-    *,
-    score: float = 1.0,
-) -> SphereOutline | None:
-    """The outline near `rough` at full resolution, touching only its region; None when there is none to be trusted.
-
-    `rough` may come from the coarse search or from a prediction; it must be right to about a tenth of the radius.
-    """
-    rng = np.random.default_rng(options.seed)
-    cone = rough
-    radius_px = cone.half_angle_rad * camera.fx
-    reach = max(4.0, 0.1 * radius_px)
-    where = profiles(cone, camera, 128, np.arange(-reach, reach + 0.1, max(0.5, reach / 20)))
-    points = envelope_edges(sample(image_bgr, where.pixels), where)
-    if len(points.slot) < 16:
-        return None
-    per_pixel = where.per_pixel_rad[points.slot]
-    rays = cone.rays(where.azimuth_rad[points.slot], cone.half_angle_rad + points.offset_px * per_pixel)
-    tolerance = max(1.0, 0.012 * radius_px) * float(np.median(per_pixel))
-    bounds = (0.8 * cone.half_angle_rad, 1.25 * cone.half_angle_rad)
-    fit = ransac_cone(rays, points.strength, points.slot, bounds, tolerance, rng)
-    if fit is None:
-        return None
-    cone = fit[0]
-    first = _measure(image_bgr, camera, cone, 2.4, options, by_colour=False)
-    if first is None or first.sigma_px > POOR_LUMA_PX:
-        first = _measure(image_bgr, camera, cone, 2.4, options, by_colour=True) or first
-    if first is None:
-        return None
-    best = _measure(image_bgr, camera, first.cone, 1.6, options, by_colour=False)
-    if best is None or best.sigma_px > POOR_LUMA_PX:
-        other = _measure(image_bgr, camera, first.cone, 1.6, options, by_colour=True)
-        if other is not None and (best is None or other.sigma_px < 0.7 * best.sigma_px):
-            best = other
-    if (
-        best is None
-        or best.coverage < options.min_coverage
-        or best.rms_px > options.max_rms_px
-        or best.contrast < options.min_contrast
-        or best.cone.axis[2] < 0.3
-    ):
-        return None
-    middle = camera.project(best.cone.axis[None])[0]
-    colour = _median_colour(image_bgr, middle, 0.5 * best.cone.half_angle_rad * camera.fx)
-    evidence = Evidence(
-        best.coverage, best.rms_px, best.sigma_px, best.n_edges, best.systematic_px, best.contrast, colour, score,
-        best.covariance,
-    )  # fmt: skip
-    return outline_from_cone(best.cone, camera, options.n_points, evidence)
-
-
-@dataclass(frozen=True, slots=True)
-class _Measured:
-    """A cone by sub-pixel edges."""
-
-    cone: Cone
-    coverage: float
-    sigma_px: float
-    rms_px: float
-    n_edges: int
-    contrast: float
-    systematic_px: float
-    covariance: Array
-
-
-def _measure(
-    image: NDArray[np.uint8],
-    camera: CameraModel,
-    cone: Cone,
-    reach_px: float,
-    options: DetectionOptions,
-    *,
-    by_colour: bool,
-) -> _Measured | None:
-    radius_px = cone.half_angle_rad * camera.fx
-    n_rays = int(np.clip(2 * np.pi * radius_px, 120, 480))
-    window = reach_px + float(np.clip(0.06 * radius_px, 3.0, 6.0))
-    where = profiles(cone, camera, n_rays, np.arange(-window, window + 0.01, 0.5))
-    values, colours = luma_values(image, where, srgb=options.srgb)
-    if by_colour:
-        values = colour_values(colours, where)
-    found = sub_pixel_edges(values, where, radius_px, reach_px)
-    offset, ok = found.offset_px, found.ok
-    if options.srgb and not by_colour:
-        model = coloured_edge_profiles(colours, where, found.blur_px)
-        shift = sub_pixel_edges(model, where, radius_px, reach_px, (found.blur_px,)).offset_px
-        ok = ok & (np.abs(shift) < MOST_SHIFT_PX)
-        offset = offset - np.clip(shift, -MOST_SHIFT_PX, MOST_SHIFT_PX)
-    result = _robust_cone(cone, where.azimuth_rad, offset, found.sigma_px, ok, where.per_pixel_rad)
-    if result is None:
-        return None
-    fitted, used, coverage, sigma_px, rms_px = result
-    contrast = float(np.median(np.abs(found.step[used])))
-    systematic = COLOUR_SYSTEMATIC_PX if by_colour else LUMA_SYSTEMATIC_PX
-    spread = (sigma_px / camera.fx) ** 2 * NOISE_CORRELATION
-    J = distance_gradient(where.azimuth_rad[used])
-    noise = np.asarray(np.linalg.inv(J.T @ J), dtype=np.float64) * spread
-    covariance = noise + np.eye(3) * (systematic / camera.fx) ** 2
-    return _Measured(fitted, coverage, sigma_px, rms_px, int(used.sum()), contrast, systematic, covariance)
-
-
-def _robust_cone(
-    cone: Cone, azimuth: Array, offset_px: Array, sigma_px: Array, ok: NDArray[np.bool_], per_pixel: Array
-) -> tuple[Cone, NDArray[np.bool_], float, float, float] | None:
-    """Cone by Tukey's weights on the geometric distances; points used, coverage, robust sigma and rms (px)."""
-    if ok.sum() < 24:
-        return None
-    rays = cone.rays(azimuth, cone.half_angle_rad + offset_px * per_pixel)
-    fitted = cone
-    # An edge is never known better than a few hundredths of a pixel, whatever its profile says.
-    base = 1.0 / (sigma_px**2 + 0.05**2)
-    weights = np.where(ok, base, 0.0)
-    scale = 1.0
-    residual = np.zeros(len(rays))
-    for _ in range(8):
-        fitted = fit_cone(rays[weights > 0], weights[weights > 0], fitted, 2)
-        residual = angles_to(fitted, rays) / per_pixel
-        scale = max(0.04, 1.4826 * float(np.median(np.abs(residual[ok]))))
-        u = residual / (4.0 * scale)
-        weights = np.where(ok & (np.abs(u) < 1), base * (1 - u**2) ** 2, 0.0)
-        if (weights > 0).sum() < 24:
-            return None
-    used = ok & (np.abs(residual) < 3.5 * scale)
-    if used.sum() < 24:
-        return None
-    coverage = float((ok & (np.abs(residual) < max(0.5, 3.5 * scale))).mean())
-    return fitted, used, coverage, scale, float(np.sqrt(np.mean(residual[used] ** 2)))
-
-
-def _median_colour(image: NDArray[np.uint8], middle: Array, reach: float) -> tuple[float, float, float]:
-    h, w = image.shape[:2]
-    x0, x1 = (int(np.clip(middle[0] + s * reach, 0, w - 1)) for s in (-1, 1))
-    y0, y1 = (int(np.clip(middle[1] + s * reach, 0, h - 1)) for s in (-1, 1))
-    step = max(1, (x1 - x0) // 32)
-    b, g, r = np.median(image[y0 : y1 + 1 : step, x0 : x1 + 1 : step].reshape(-1, 3), axis=0)
-    return float(b), float(g), float(r)
 
 
 def _distinct(a: SphereOutline, b: SphereOutline) -> bool:
