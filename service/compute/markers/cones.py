@@ -33,9 +33,10 @@ class Cone:
 
     def frame(self) -> Array:
         """(3, 3) columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""
-        e1 = np.array([1.0, 0.0, 0.0]) - self.axis[0] * self.axis
-        e1 /= float(np.linalg.norm(e1))
-        return np.column_stack([e1, np.cross(self.axis, e1), self.axis]).astype(np.float64)
+        x, y, z = (float(v) for v in self.axis)
+        n = math.sqrt((1 - x * x) ** 2 + (x * y) ** 2 + (x * z) ** 2)
+        a, b, c = (1 - x * x) / n, -x * y / n, -x * z / n
+        return np.array([[a, y * c - z * b, x], [b, z * a - x * c, y], [c, x * b - y * a, z]])
 
     def rays(self, azimuth_rad: Array, angle_rad: Array) -> Array:
         """Unit rays (..., 3) at `angle_rad` from the axis and `azimuth_rad` about it (broadcast)."""
@@ -170,8 +171,9 @@ def ransac_cone(
     if not np.any(good):
         return None
     axis, half = axis[good], half[good]
-    cosine = np.clip(rays @ axis.T, -1.0, 1.0)
-    agree = np.abs(np.arccos(cosine) - half) < tolerance_rad  # (N, K)
+    # |angle - half| < tolerance, by cosines: they fall as the angle grows.
+    cosine = rays @ axis.T
+    agree = (cosine > np.cos(half + tolerance_rad)) & (cosine < np.cos(np.maximum(half - tolerance_rad, 0)))  # (N, K)
     votes = np.where(agree, strengths[:, None], 0.0)
     starts = np.searchsorted(sorted_slots, np.unique(sorted_slots))
     total = np.maximum.reduceat(votes, starts, axis=0).sum(axis=0) / max(n_slots, 1)

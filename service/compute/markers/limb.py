@@ -130,7 +130,7 @@ def fit_limb(
         p = p + delta
         p[:, _OFFSET] = np.clip(p[:, _OFFSET], -reach_px, reach_px)
         p[:, [0, 1, 2, 5, 6, 7]] = np.clip(p[:, [0, 1, 2, 5, 6, 7]], 1e-4, 1.5)
-        if it >= 1 and good.sum() > 16:
+        if 1 <= it < iterations - 1 and good.sum() > 16:
             limb, limb_sigma = _around(p[:, 3], good, 0.02)
             slope, slope_sigma = _around(p[:, 4], good, 0.1)
     variance = np.linalg.inv(own)[:, _OFFSET, _OFFSET]

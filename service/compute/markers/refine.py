@@ -19,6 +19,7 @@ SYSTEMATIC_PX = 0.025
 MOST_SIGMA_PX = 0.5  # of an edge point; where there is no outline, places within the search's reach scatter more
 TEXTURE_FACTOR = 3.0  # sigma of an edge point over the one its own profile tells
 _BLOCKS = 16  # of an outline, for the noise that neighbouring edge points share
+_TRIALS = 150  # of RANSAC: the rough outline is near
 _FIRST_PROFILES, _PROFILES = 64, 128
 _START_BLUR_PX, _START_CHROMA_BLUR_PX = 0.7, 1.2
 
@@ -76,7 +77,7 @@ def _by_envelope(
     rays = rough.rays(where.azimuth_rad[points.slot], rough.half_angle_rad + points.offset_px * per_pixel)
     tolerance = max(1.0, 0.012 * radius_px) * float(np.median(per_pixel))
     bounds = (0.8 * rough.half_angle_rad, 1.25 * rough.half_angle_rad)
-    fit = ransac_cone(rays, points.strength, points.slot, bounds, tolerance, rng)
+    fit = ransac_cone(rays, points.strength, points.slot, bounds, tolerance, rng, _TRIALS)
     return None if fit is None else fit[0]
 
 
@@ -153,11 +154,11 @@ def _robust_cone(
     weights = np.where(ok, base, 0.0)
     residual, scale = offset, 1.0
     step = np.zeros(3)
-    for _ in range(10):
+    for _ in range(6):
         w = J * weights[:, None]
         normal = w.T @ J
-        if np.linalg.cond(normal) > 1e8:
-            return None
+        if float(np.linalg.det(normal)) < 1e-9 * float(np.trace(normal)) ** 3:
+            return None  # an arc too short to tell
         step = np.linalg.solve(normal, w.T @ offset)
         residual = offset - J @ step
         scale = max(0.03, 1.4826 * float(np.median(np.abs(residual[ok]))))
