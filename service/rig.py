@@ -34,6 +34,31 @@ class PayloadSection(Record):
     centre_of_gravity_m: Vector3
 
 
+class CollisionSection(Record):
+    """What the planner keeps clear of; the sizes suit a UR10e with a full-frame camera over a board on a table."""
+
+    arm: str | None = None  # kinematics, such as UR10e; None: as the controller names itself
+    table_below_scene_m: float = 0.07  # the table's top below the scene's centre
+    specimen_size_m: Vector3 = (
+        0.34,
+        0.46,
+        0.17,
+    )  # along the approach, across it, up; with spheres
+    camera_from_m: Vector3 = (0.0, 0.0, -0.09)  # axis of a capsule around body and lens, in the camera's frame
+    camera_to_m: Vector3 = (0.0, 0.0, 0.05)
+    camera_radius_m: Annotated[float, Field(gt=0, lt=0.3)] = 0.06
+    margin_m: Annotated[float, Field(ge=0, lt=0.2)] = 0.01  # clearance that must stay
+
+
+class OpticsSection(Record):
+    """The lens, for the depth of field."""
+
+    focal_length_mm: Annotated[float, Field(gt=0)]
+    aperture_f: Annotated[float, Field(gt=0)]
+    focus_distance_m: Annotated[float, Field(gt=0)]
+    blur_um: Annotated[float, Field(gt=0)] = 45.0  # circle of confusion on the sensor, 12 px of 3.76 µm
+
+
 class RigSection(Record):
     """The rig file."""
 
@@ -44,6 +69,8 @@ class RigSection(Record):
     stations: dict[str, StationSection] = Field(default_factory=dict)
     T_flange_camera_nominal: tuple[tuple[float, float, float, float], ...] | None = None
     payload: PayloadSection | None = None
+    collision: CollisionSection = CollisionSection()
+    optics: OpticsSection | None = None  # None: depth of field is not judged
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,7 +24,7 @@ from drivers.interfaces import (
 )
 from drivers.plugin import DriverConfig, DriverSpec
 from service.core.errors import ConfigurationError
-from service.rig import Rig
+from service.rig import CollisionSection, OpticsSection, Rig
 from service.steps.context import StationLayout
 
 GROUP = "orthocapture.drivers"
@@ -108,20 +108,15 @@ class Station:
 
     def layout(self, station: str) -> StationLayout:
         """Where things are at a station of the rig file."""
-        section = self.rig.section.stations.get(station)
-        if section is None:
-            known = ", ".join(self.rig.section.stations) or "none"
-            raise ConfigurationError(
-                f"the rig has no station {station!r}", where=str(self.rig.path), remedy=f"Stations: {known}"
-            )
-        azimuth = math.radians(section.approach_azimuth_deg)
-        return StationLayout(
-            station, section.robot, section.scene_centre_m, (math.cos(azimuth), math.sin(azimuth), 0.0)
-        )
+        return layout_of(self.rig, station)
 
     def nominal_T_flange_camera(self) -> Transform:
         """The camera mount's drawing."""
         return self.rig.nominal_T_flange_camera()
+
+    def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
+        """What the rig file says of the arm's surroundings and of the lens."""
+        return self.rig.section.collision, self.rig.section.optics
 
     def reopen(self, device: Device) -> None:
         """Close and open again, after a link dropped."""
@@ -182,3 +177,15 @@ class Station:
             raise ConfigurationError(
                 f"device {name!r} is configured wrongly: {problems}", where=str(self.rig.path)
             ) from error
+
+
+def layout_of(rig: Rig, station: str) -> StationLayout:
+    """Where things are at a station of a rig file. Raises ConfigurationError if it has no such station."""
+    section = rig.section.stations.get(station)
+    if section is None:
+        known = ", ".join(rig.section.stations) or "none"
+        raise ConfigurationError(
+            f"the rig has no station {station!r}", where=str(rig.path), remedy=f"Stations: {known}"
+        )
+    azimuth = math.radians(section.approach_azimuth_deg)
+    return StationLayout(station, section.robot, section.scene_centre_m, (math.cos(azimuth), math.sin(azimuth), 0.0))

@@ -163,6 +163,7 @@ class _Rig:
             "stations": {name: self._station(i, name) for i, name in enumerate(STATIONS)},
             "T_flange_camera_nominal": nominal_hand_eye().tolist(),
             "payload": {"mass_kg": 1.6, "centre_of_gravity_m": [0.0, 0.0, 0.08]},
+            "collision": {"arm": ARM_MODEL.name},
         }
 
     def _station(self, index: int, name: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,6 +68,7 @@ class TerminalOperator:
     display: Display
     hands: SimulatedHands
     descriptor: int = 0  # of the terminal
+    preview: Callable[[str], str] = lambda _step: ""  # what a step is going to do, where that can be told
     _asked: AskOperator | None = None
     _typed: bytes = b""
 
@@ -102,6 +104,9 @@ class TerminalOperator:
         self.display.clear()
         step = self.protocol.step(question.step)
         lines = [question.text, *(f"  ☐ {item}" for item in question.checklist)]
+        plan = self.preview(question.step) if question.for_ == "confirm" else ""
+        if plan:
+            lines.append(f"\nThe plan: {plan}")
         lines.append(f"\nType one of: {', '.join(question.options)} (with a reason where one is needed).")
         if "confirm" in question.options and question.checklist:
             lines.append("By `confirm` you say that every item of the list is done.")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,15 +29,18 @@ from service.cli.common import (
 from service.cli.hands import SimulatedHands
 from service.cli.operators import AutomaticOperator, Display, TerminalOperator
 from service.core.actions import VERBS, record_to_sign, refuse
+from service.core.errors import ConfigurationError
 from service.core.fold import fold
 from service.core.model import ActionRefused, OperatorAction
-from service.core.protocol import load_protocol
+from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState
 from service.rig import Rig, load_rig
 from service.runner import Runner
 from service.runs import recorded_rig, recorded_run, require_simulated, start_run
-from service.station import Station
+from service.station import Station, layout_of
 from service.steps import params_models
+from service.steps.live import describe_view
+from service.steps.preview import preview_plans
 from service.store.store import Store
 
 RigOption = Annotated[Path, typer.Option("--rig", help="The rig file: devices and stations of this site.")]
@@ -148,6 +152,9 @@ def status_command(
         phase = "skipped" if now.skipped else now.phase.replace("_", " ")
         table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), gates)
     console.print(table)
+    live = [job for job in state.step.jobs.values() if job.kind == "live_view" and job.status != "enqueued"]
+    for job in live[-3:]:
+        console.print(escape(describe_view(job)))
     for deviation in state.deviations:
         if not deviation.is_note:
             console.print(f"deviation: {escape(deviation.text)}")
@@ -166,10 +173,24 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
                 "attempt": s.attempt,
                 "captured": sorted(s.captured),
                 "measures": dict(s.measures),
+                "live": [
+                    {"viewpoint": job.result["viewpoint"], **job.measures}
+                    for job in s.jobs.values()
+                    if job.kind == "live_view" and job.status == "finished"
+                ],
             }
             for name, s in state.steps.items()
         },
+        "next_best_views": next_best_views(state),
     }
+
+
+def next_best_views(state: RunState) -> list[dict[str, Any]]:
+    """Of the newest summary of the images; none before the first one."""
+    jobs = [job for step in state.steps.values() for job in step.jobs.values()]
+    done = [job for job in jobs if job.kind == "live_summary" and job.status == "finished"]
+    newest = max(done, key=lambda job: job.enqueued_seq, default=None)
+    return [] if newest is None else list(newest.result["next_best_views"])
 
 
 def drive(store: Store, run_id: str, rig: Rig, *, data: Path, auto_confirm: bool, worker: bool) -> RunState:
@@ -179,8 +200,11 @@ def drive(store: Store, run_id: str, rig: Rig, *, data: Path, auto_confirm: bool
     hands = SimulatedHands(rig.section.hands if rig.section.simulated else None)
     if auto_confirm:
         require_simulated(rig)
-    kind = AutomaticOperator if auto_confirm else TerminalOperator
-    operator = kind(root.operator, protocol, display, hands)
+    operator = (
+        AutomaticOperator(root.operator, protocol, display, hands)
+        if auto_confirm
+        else TerminalOperator(root.operator, protocol, display, hands, preview=partial(_preview, protocol, rig))
+    )
     station = Station(rig)
     # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -191,6 +215,15 @@ def drive(store: Store, run_id: str, rig: Rig, *, data: Path, auto_confirm: bool
         display.clear()
         station.close()
         signal.signal(signal.SIGTERM, before)
+
+
+def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
+    """What a capture step is going to do, for the person who is asked to release it."""
+    try:
+        plans = preview_plans(protocol, protocol.step(step), rig, partial(layout_of, rig))
+    except ConfigurationError as error:
+        return str(error)
+    return "; ".join(plan.text for plan in plans)
 
 
 @contextmanager

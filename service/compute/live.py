@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import cone_of_sphere
-from service.compute.markers.detect import detect_spheres, refine_outline
+from service.compute.markers.detect import detect_spheres
 from service.compute.markers.edges import profiles, sample
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.markers.refine import refine_outline
 from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment, identify
 from service.compute.registration.solve import RegistrationResult, register

@@ -14,6 +14,7 @@ from service.core.model import ArtefactRef, Payload, Record, StepNote, Viewpoint
 from service.core.protocol import Protocol as LabProtocol
 from service.core.protocol import Step
 from service.core.run_state import JobState
+from service.rig import CollisionSection, OpticsSection
 from service.store.records import NewArtefact
 
 P = TypeVar("P", bound=Record)
@@ -62,6 +63,10 @@ class Devices(Protocol):
 
     def nominal_T_flange_camera(self) -> Transform:
         """The camera mount's drawing."""
+        ...
+
+    def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
+        """What the arm must keep clear of, and the lens where it is described."""
         ...
 
     def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:

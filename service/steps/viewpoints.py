@@ -60,6 +60,7 @@ class Viewpoint:
     name: str
     station: str
     T_base_camera: Transform
+    joints_rad: Array | None = None  # (6,) as planned; None: nearest to where the arm stands
 
 
 _UP = np.array([0.0, 0.0, 1.0])

@@ -37,6 +37,7 @@ from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, from_rotation_vector, to_rotation_vector, transform
 from service.core.model import OperatorAction
 from service.core.run_state import RunState
+from service.rig import CollisionSection, OpticsSection
 from service.steps.context import StationLayout
 
 TRAVEL_S = 0.02
@@ -258,6 +259,9 @@ class BenchRig:
 
     def nominal_T_flange_camera(self) -> Transform:
         return transform(np.eye(3), np.array([0.0, 0.0, 0.1]))
+
+    def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
+        return CollisionSection(), None
 
     def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
         self._on_open = on_open

@@ -22,13 +22,13 @@ def depth_of_field(
 ) -> DepthOfField:
     """Near and far limit for a thin lens focused at a distance from its entrance pupil.
 
-    With H = f² / (N c) + f: near = H s / (H + (s − f)), far = H s / (H − (s − f)).
+    With H = f² / (N c) + f: near = s (H − f) / (H + s − 2 f), far = s (H − f) / (H − s).
     Source: S. F. Ray, Applied Photographic Optics, 3rd ed. 2002, chapter 22.
     """
     f, s = focal_length_m, focus_distance_m
     hyperfocal = f**2 / (aperture_f * circle_of_confusion_m) + f
-    far = hyperfocal * s / (hyperfocal - (s - f)) if hyperfocal > s - f else float("inf")
-    return DepthOfField(hyperfocal * s / (hyperfocal + (s - f)), far)
+    far = s * (hyperfocal - f) / (hyperfocal - s) if hyperfocal > s else float("inf")
+    return DepthOfField(s * (hyperfocal - f) / (hyperfocal + s - 2 * f), far)
 
 
 def depths_m(T_base_camera: Transform, points_base_m: Array) -> tuple[float, float]:
