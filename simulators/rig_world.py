@@ -11,8 +11,11 @@ from typing import Any, cast
 
 import numpy as np
 
-from simulators.geometry import Array
+from simulators.geometry import Array, look_at
 from simulators.world import STATIONS, Scene
+
+# Where the technician holds the camera for an overview: nearly above the scene, so that no sphere hides another.
+HELD_CAMERA = look_at(np.array([0.06, -0.17, 0.78]), np.array([0.0, 0.0, 0.05]), np.array([0.0, 1.0, 0.0]))
 
 Act = Callable[[Mapping[str, Any]], dict[str, Any]]
 
@@ -30,6 +33,7 @@ class World:
     board_placements: int = 0
     board_placed: bool = False
     pedal_presses: int = 0
+    camera_held: bool = False  # in the technician's hands, instead of on the arm
     station: str = STATIONS[0]
     _joints: dict[str, Array] = field(default_factory=dict[str, Array])
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -49,8 +53,9 @@ class World:
         with self._lock:
             q = self._joints.get(self.camera_arm, self.start_joints_rad)
             board = self.scene.board_placement(self.board_placements) if self.board_placed else None
+            camera = HELD_CAMERA if self.camera_held else self.scene.true_camera(q, self.station)
             return {
-                "T_world_camera": self.scene.true_camera(q, self.station).tolist(),
+                "T_world_camera": camera.tolist(),
                 "intrinsics": self.scene.camera_intrinsics(self.image_width).to_json(),
                 "scene": {
                     "seed": self.scene.seed,
@@ -82,6 +87,8 @@ class World:
                     self.control_spheres = action == "place_control_spheres"
                 case "spray":
                     self.spray = True
+                case "hold_camera" | "mount_camera":
+                    self.camera_held = action == "hold_camera"
                 case "press_pedal":
                     self.pedal_presses += 1
                 case _:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
@@ -15,7 +15,7 @@ from service.cli.spheres import spheres_of
 from service.compute.images import read_image
 from service.compute.markers.detect import detect_spheres
 from service.compute.poses.pose_files import read_camera_json, read_spheres_json
-from service.compute.registration.layout import LayoutReport, check_layout
+from service.compute.registration.layout import LayoutReport, check_layout, layout_record
 from service.compute.registration.photo_layout import merge_places, places_from_outlines
 from service.core.geometry import Array
 
@@ -68,28 +68,6 @@ def _centres(
     seen = [places_from_outlines(detect_spheres(read_image(path), model), radius_m) for path in photos]
     centres, covariances, _ = merge_places(seen)
     return centres, covariances, radius_m
-
-
-def layout_record(report: LayoutReport) -> dict[str, Any]:
-    """The report as plain data, lengths in mm."""
-    return {
-        "passed": report.passed,
-        "problems": list(report.problems),
-        "margin_mm": 1e3 * report.margin_m,
-        "margin_sigma_mm": 1e3 * report.margin_sigma_m,
-        "margin_by_count_mm": {str(k): 1e3 * v for k, v in report.margin_by_count_m.items() if np.isfinite(v)},
-        "worst": [
-            {"spheres": list(c.spheres), "taken_for": list(c.taken_for), "misfit_mm": 1e3 * c.misfit_m}
-            for c in report.worst
-        ],
-        "depth_mm": 1e3 * report.depth_m,
-        "extent_mm": 1e3 * report.extent_m,
-        "largest_gap_deg": float(np.rad2deg(report.largest_gap_rad)),
-        "moves": [
-            {"sphere": m.sphere, "by_mm": (1e3 * m.by_m).tolist(), "margin_mm": 1e3 * m.margin_m}
-            for m in report.moves
-        ],
-    }
 
 
 def _show(report: LayoutReport, centres: Array) -> None:

@@ -19,8 +19,9 @@ from service.store.records import Job, NewArtefact
 from service.store.store import Store
 from service.worker.calibrate import calibrate
 from service.worker.job import Handler, JobContext
+from service.worker.layout import layout
 from service.worker.live import coverage_points, live_summary, live_view
-from service.worker.poses import structure_from_motion
+from service.worker.poses import hybrid, structure_from_motion
 from service.worker.registering import detect_spheres, evaluate, register
 from service.worker.surfaces import ct_surface, locate_spheres
 
@@ -33,7 +34,9 @@ HANDLERS: Mapping[str, Handler] = {
         calibrate,
         ct_surface,
         locate_spheres,
+        layout,
         structure_from_motion,
+        hybrid,
         detect_spheres,
         register,
         evaluate,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,6 +176,28 @@ def check_layout(
         problems=tuple(problems),
         moves=_moves(centres, radius_m, required_margin_m) if margin < required_margin_m else (),
     )
+
+
+def layout_record(report: LayoutReport) -> dict[str, Any]:
+    """The report as plain data, lengths in mm."""
+    return {
+        "passed": report.passed,
+        "problems": list(report.problems),
+        "margin_mm": 1e3 * report.margin_m,
+        "margin_sigma_mm": 1e3 * report.margin_sigma_m,
+        "margin_by_count_mm": {str(k): 1e3 * v for k, v in report.margin_by_count_m.items() if np.isfinite(v)},
+        "worst": [
+            {"spheres": list(c.spheres), "taken_for": list(c.taken_for), "misfit_mm": 1e3 * c.misfit_m}
+            for c in report.worst
+        ],
+        "depth_mm": 1e3 * report.depth_m,
+        "extent_mm": 1e3 * report.extent_m,
+        "largest_gap_deg": float(np.rad2deg(report.largest_gap_rad)),
+        "moves": [
+            {"sphere": m.sphere, "by_mm": (1e3 * m.by_m).tolist(), "margin_mm": 1e3 * m.margin_m}
+            for m in report.moves
+        ],
+    }
 
 
 def visible_counts(centres_m: Array, radius_m: float, cameras_m: Array) -> IntArray:
