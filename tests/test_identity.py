@@ -87,7 +87,7 @@ def test_four_of_ten_among_three_false_without_poses() -> None:
             continue
         assert not wrong(a.markers, truth)
         named += len(a.markers) == 4
-    assert named >= 0.95 * len(cases), refused
+    assert named >= 0.99 * len(cases), refused
 
 
 def test_an_image_with_two_spheres_is_named_through_the_poses() -> None:
@@ -127,6 +127,15 @@ def test_symmetric_layout_is_called_ambiguous() -> None:
     outlines = [exact_outlines(made, i, ring)[0] for i in range(4)]
     with pytest.raises(ComputeError, match="ambiguous"):
         identify(outlines, ring, made.camera, made.T_world_camera, radius_m=RADIUS_M)
+
+
+def test_one_image_that_can_be_read_in_two_ways_names_them() -> None:
+    angle = np.arange(6) * np.pi / 3
+    ring: Array = np.stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), np.full(6, 0.05)], axis=1)
+    made = scene(1, seed=1)
+    outlines = exact_outlines(made, 0, ring)[0]
+    with pytest.raises(ComputeError, match=r"ambiguous: \{0=\d, .*\} and \{0=\d"):
+        identify([outlines], ring, made.camera, radius_m=RADIUS_M)
 
 
 def test_too_few_says_how_many_where() -> None:

@@ -88,7 +88,7 @@ def apply_each(cameras: Array, truth: Array, point: Array) -> Array:
     """Distances (N,) between the places of a point in each camera as found and in truth."""
     return np.array(
         [
-            np.linalg.norm(apply(inverse(a), point) - apply(inverse(b), point))
+            float(np.linalg.norm(apply(inverse(a), point) - apply(inverse(b), point)))
             for a, b in zip(cameras, truth, strict=True)
         ]
     )
@@ -117,7 +117,8 @@ def test_what_no_view_can_tell_remains() -> None:
         [f[0] for f in found], assignments, made.T_world_camera, [0] * n, REGISTRATION_M, RADIUS_M, made.camera,
         common_errors=CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=0.1),
     )  # fmt: skip
-    distance = float(np.mean([np.linalg.norm(made.centres_camera(i, TARGET[None])) for i in range(n)]))
+    seen = np.concatenate([made.centres_camera(i, REGISTRATION_M) for i in range(n)])
+    distance = float(np.mean(np.linalg.norm(seen, axis=1)))
     expected = np.sqrt(3) * 0.1 / made.camera.fx * distance
     assert result.sigma_components_m(TARGET)["common"] == pytest.approx(expected, rel=0.1)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,6 +11,9 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import residuals
 from service.compute.registration.identity import Assignment
+from service.compute.registration.normal import compress, inverse_symmetric, marginalise, pose_errors, solve_symmetric
+from service.compute.registration.prediction import Foreign, Prediction, foreign_rows, predict
+from service.compute.registration.result import RegistrationResult, Solution
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse
 
@@ -24,6 +27,12 @@ class ControlError:
     sphere: int
     radial_error_mm: float
     reprojection_error_px: float
+    sigma_mm: float | None = (
+        None  # predicted rms of the radial error; None where nothing was stated to predict it from
+    )
+    normalised: float | None = (
+        None  # the outline's three numbers against their prediction, in standard deviations, rms
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +42,12 @@ class Evaluation:
     mean_radial_error_mm: float
     mean_reprojection_error_px: float
     errors: tuple[ControlError, ...]
+
+    @property
+    def normalised_rms(self) -> float | None:
+        """Rms of the normalised errors: near 1 if the stated covariances are right; None where there are none."""
+        values = [e.normalised for e in self.errors if e.normalised is not None]
+        return float(np.sqrt(np.mean(np.square(values)))) if values else None
 
     def per_sphere(self) -> dict[int, tuple[float, float, int]]:
         """Sphere → mean radial error (mm), mean reprojection error (px), number of images."""
@@ -59,6 +74,9 @@ def evaluate(
     centres_scan_m: Array,
     radius_m: float,
     camera: CameraModel,
+    *,
+    registration: RegistrationResult | None = None,
+    centre_covariance_m2: Array | None = None,
 ) -> Evaluation:
     """Errors of spheres that took no part in the registration.
 
@@ -69,27 +87,109 @@ def evaluate(
         centres_scan_m: (C, 3) control spheres.
         radius_m: of the control spheres.
         camera: intrinsics.
+        registration: what predicts the errors; its covariance gives `sigma_mm` and `normalised`. The cameras must be
+            its `T_scan_camera` or its `T_scan_camera_refined`.
+        centre_covariance_m2: (C, 3, 3) of the control spheres' centres; None takes them as exact.
+
+    Both errors are the paper's: radial, the mean distance between the rays of the outline's points and the hull of
+    the sphere; reprojection, the mean distance of the points from the projected outline (geometric, to first order).
 
     Raises:
         ComputeError: no control sphere was seen.
     """
-    errors: list[ControlError] = []
-    for i, assignment in enumerate(assignments):
-        for j, s in sorted(assignment.markers.items()):
-            centre = apply(inverse(T_scan_camera[i]), centres_scan_m[s])
-            points = outlines[i][j].points
-            radial = radial_errors_m(points, centre, radius_m)
-            lifted = np.column_stack([points, np.ones(len(points))])
-            distance = np.abs(residuals(lifted, np.broadcast_to(centre, lifted.shape), radius_m, "sampson"))
-            errors.append(
-                ControlError(
-                    i, j, s, float(radial.mean()) * 1e3, float(distance.mean()) * 0.5 * (camera.fx + camera.fy)
-                )
-            )
-    if not errors:
+    members = [(i, j, s) for i, a in enumerate(assignments) for j, s in sorted(a.markers.items())]
+    if not members:
         raise ComputeError(
             "no control sphere was found in any image", remedy="Capture control images before the spheres are removed"
         )
+    stated = None
+    if registration is not None:
+        refined = bool(np.allclose(T_scan_camera, registration.T_scan_camera_refined, atol=1e-12, equal_nan=True))
+        rows = foreign_rows(registration.solution, outlines, members, centres_scan_m)
+        spread = None if centre_covariance_m2 is None else centre_covariance_m2[[s for _, _, s in members]]
+        stated = predict(registration.solution, rows, refined=refined, centre_covariance_m2=spread)
+    errors: list[ControlError] = []
+    for k, (i, j, s) in enumerate(members):
+        centre = apply(inverse(T_scan_camera[i]), centres_scan_m[s])
+        errors.append(
+            _error(i, j, s, outlines[i][j].points, centre, radius_m, camera, None if stated is None else stated[k])
+        )
+    return _summary(errors)
+
+
+def leave_one_out(registration: RegistrationResult, *, refined: bool = False) -> Evaluation:
+    """Errors of every registration sphere as predicted by the others: evaluation where there are no control spheres.
+
+    Args:
+        registration: with its solution, from which each sphere's outlines are taken out (one linear step; the
+            weights of the outlines and the sizes of all errors stay).
+        refined: predict with the errors found of the camera poses (from the other spheres) taken off.
+
+    A sphere without which a station would see fewer than three is left out of the result.
+
+    Raises:
+        ComputeError: no sphere can be spared.
+    """
+    full = registration.solution
+    problem = full.problem
+    errors: list[ControlError] = []
+    for m in sorted(set(problem.marker.tolist())):
+        out = problem.marker == m
+        weights = np.where(out, 0.0, full.weights)
+        if any(len(set(problem.marker[(weights > 0) & (problem.group == k)].tolist())) < 3
+               for k in range(len(problem.groups))):  # fmt: skip
+            continue
+        rest = _without(full, weights)
+        mine = np.nonzero(out & (full.weights > 0))[0]
+        lines = full.linearised
+        r = lines.r[mine] + lines.J[mine] @ rest.step
+        rows = Foreign(problem.image[mine], lines.J[mine], lines.A[mine], r, problem.whiten[mine])
+        stated = predict(rest.solution, rows, refined=refined)
+        T = rest.solution.state.cameras(problem, refined=refined)
+        for o, prediction in zip(mine, stated, strict=True):
+            i, j, _ = problem.members[o]
+            base = rest.solution.state.bases[problem.group[o]]
+            centre = apply(inverse(T[i]) @ base, problem.centres[m])
+            errors.append(_error(i, j, m, problem.points[o], centre, problem.radius_m, problem.camera, prediction))
+    if not errors:
+        raise ComputeError("no sphere can be left out: each is needed", remedy="Use more registration spheres")
+    return _summary(errors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    solution: Solution
+    step: Array  # (n,) of the common unknowns
+
+
+def _without(full: Solution, weights: Array) -> _Rest:
+    problem, lines, prior = full.problem, full.linearised, full.problem.prior()
+    blocks = compress(lines.J, lines.A, lines.r, problem.image, problem.n_images, weights)
+    marginal = marginalise(blocks, full.pose_root, full.outline_factor)
+    H = marginal.H + prior
+    dx = -solve_symmetric(H, marginal.g + prior @ full.state.prior_values(problem))
+    state = full.state.moved(problem, dx, pose_errors(blocks, marginal, dx, full.outline_factor))
+    solution = replace(
+        full, state=state, weights=weights, blocks=blocks, marginal=marginal, covariance=inverse_symmetric(H)
+    )
+    return _Rest(solution, dx)
+
+
+def _error(
+    image: int, outline: int, sphere: int, points: Array, centre: Array, radius_m: float, camera: CameraModel,
+    stated: Prediction | None,
+) -> ControlError:  # fmt: skip
+    radial = radial_errors_m(points, centre, radius_m)
+    lifted = np.column_stack([points, np.ones(len(points))])
+    distance = np.abs(residuals(lifted, np.broadcast_to(centre, lifted.shape), radius_m, "sampson"))
+    return ControlError(
+        image, outline, sphere, float(radial.mean()) * 1e3, float(distance.mean()) * 0.5 * (camera.fx + camera.fy),
+        None if stated is None else 1e3 * stated.sigma_rad * float(np.linalg.norm(centre)),
+        None if stated is None else stated.normalised,
+    )  # fmt: skip
+
+
+def _summary(errors: list[ControlError]) -> Evaluation:
     return Evaluation(
         float(np.mean([e.radial_error_mm for e in errors])),
         float(np.mean([e.reprojection_error_px for e in errors])),

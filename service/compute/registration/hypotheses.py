@@ -6,16 +6,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
+from service.compute.registration.cost import cone_residuals, skew
 from service.core.geometry import Array, Transform, apply, transform
 
 _MOST_DETECTIONS = 18  # of one image, the best ones: triples grow with the cube
-_MOST_REFINED = 60
+_MOST_REFINED = 150
+_CHUNK = 4000  # triples refined at a time
+_FLOOR_RAD = 1.2e-4  # what the sphere list and the lens add to an outline's own error: 0.1 mm at a metre and less
+_TRIPLE_CHI2 = 30.0  # 3 degrees of freedom
+_OUTLINE_CHI2 = 30.0  # 3 degrees of freedom
+_EVIDENCE = (
+    14.0  # log of how much rarer a stranger is where a sphere is expected, than a sphere; kept on the low side
+)
+_MARGIN = 9.0  # log of the odds at which a reading counts as the only one
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +35,8 @@ class Sightings:
     half_angles: Array  # (D,)
     positions_m: Array  # (D, 3) in the camera frame, good across the ray, weak along it
     depth_sigma_m: Array  # (D,)
+    frames: Array  # (D, 3, 2) first columns of the cones' frames
+    sigma_rad: Array  # (D, 3) of tilt, tilt and half angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +46,7 @@ class Hypothesis:
     markers: dict[int, int]  # detection → marker
     T_camera_scan: Transform
     rms_px: float
+    score: float = 0.0  # log odds against chance
 
     @property
     def count(self) -> int:
@@ -45,13 +57,19 @@ class Hypothesis:
 def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: CameraModel) -> Sightings:
     """Geometry of the outlines of one image."""
     if not outlines:
-        return Sightings(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
+        return Sightings(
+            np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 2)), np.zeros((0, 3))
+        )
     axes = np.array([o.cone.axis for o in outlines])
     half = np.array([o.cone.half_angle_rad for o in outlines])
     distance = radius_m / np.sin(half)
     # Half a pixel of the radius covers the systematic error of an outline, more where only a part is seen.
     sigma = 0.5 / camera.fx / np.array([max(o.coverage, 0.2) for o in outlines])
-    return Sightings(axes, half, axes * distance[:, None], distance * sigma / half)
+    own = np.array([np.diag(o.cone_covariance) for o in outlines])
+    return Sightings(
+        axes, half, axes * distance[:, None], distance * sigma / half,
+        np.array([o.cone.frame()[:, :2] for o in outlines]), np.sqrt(own + _FLOOR_RAD**2),
+    )  # fmt: skip
 
 
 def match(
@@ -82,8 +100,9 @@ def image_hypotheses(
     """Readings of an image that explain at least four detections, the best first; distinct ones only.
 
     Triples of detections are paired with all ordered triples of markers whose mutual distances the known radius
-    allows (size gives depth to about a hundredth), each gives a pose, and a fourth and every further detection must
-    agree; survivors are solved by PnP on the directions of the sphere centres and verified again, strictly.
+    allows (size gives depth to about a hundredth). Each gives a pose, solved from the nine numbers of its three
+    outlines; those that fit must find a fourth and every further detection where they predict it. Survivors are
+    solved from all their outlines and judged by their residuals in standard deviations.
     """
     seen = sightings(outlines, radius_m, camera)
     D = min(len(seen.axes), _MOST_DETECTIONS)
@@ -92,7 +111,7 @@ def image_hypotheses(
     model, image = _triples(seen, D, centres_scan_m)
     if len(model) == 0:
         return []
-    R, t = _kabsch(centres_scan_m[model], seen.positions_m[image])
+    R, t = _fitting(seen, model, image, centres_scan_m, radius_m)
     counts, error = _support(seen, R, t, centres_scan_m, radius_m)
     order = np.lexsort((error, -counts))
     results: dict[frozenset[tuple[int, int]], Hypothesis] = {}
@@ -100,21 +119,34 @@ def image_hypotheses(
     for h in order[:4000]:
         if counts[h] < 4 or len(tried) >= _MOST_REFINED:
             break
-        pairs = match(seen, centres_scan_m @ R[h].T + t[h], radius_m, 0.8, 0.12)
+        pairs = match(seen, centres_scan_m @ R[h].T + t[h], radius_m, *_LOOSE)
         key = frozenset((d, m) for d, m, _ in pairs)
         if len(pairs) < 4 or key in tried:
             continue
         tried.add(key)
-        refined = _refine(seen, {d: m for d, m, _ in pairs}, centres_scan_m, radius_m, camera)
+        refined = _refine(seen, {d: m for d, m, _ in pairs}, R[h], t[h], centres_scan_m, radius_m, camera.fx)
         if refined is not None:
             results.setdefault(frozenset(refined.markers.items()), refined)
-    found = sorted(results.values(), key=lambda r: (-r.count, r.rms_px))
+    found = sorted(results.values(), key=lambda r: -r.score)
     # A reading contained in a better one adds nothing.
     kept: list[Hypothesis] = []
     for r in found:
         if not any(set(r.markers.items()) <= set(k.markers.items()) for k in kept):
             kept.append(r)
     return kept
+
+
+def rivals(readings: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Of readings, best first: those that contradict the best and are not much less likely."""
+    if not readings:
+        return []
+    best = readings[0]
+    return [r for r in readings[1:] if best.score - r.score < _MARGIN and _contradict(best, r)]
+
+
+def _contradict(a: Hypothesis, b: Hypothesis) -> bool:
+    shared = a.markers.keys() & b.markers.keys()
+    return any(a.markers[d] != b.markers[d] for d in shared) or not shared
 
 
 def _triples(seen: Sightings, D: int, centres: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -148,6 +180,53 @@ def _kabsch(model: Array, image: Array) -> tuple[Array, Array]:
     return R, ci - np.einsum("kij,kj->ki", R, cm)
 
 
+_LOOSE = (0.4, 0.06)  # of a triple's pose: marker radii, and part of the size
+
+
+def _fitting(
+    seen: Sightings, model: NDArray[np.int64], image: NDArray[np.int64], centres: Array, radius_m: float
+) -> tuple[Array, Array]:
+    """Poses (K, 3, 3), (K, 3) of the triples whose nine numbers fit one."""
+    rotations: list[Array] = []
+    places: list[Array] = []
+    for start in range(0, len(model), _CHUNK):
+        points, pick = centres[model[start : start + _CHUNK]], image[start : start + _CHUNK]
+        start_R, start_t = _kabsch(points, seen.positions_m[pick])
+        R, t, chi2 = _pose_steps(seen, pick, points, start_R, start_t, radius_m, 3)
+        good = chi2 < _TRIPLE_CHI2
+        rotations.append(R[good])
+        places.append(t[good])
+    return np.concatenate(rotations), np.concatenate(places)
+
+
+def _pose_steps(
+    seen: Sightings, pick: NDArray[np.int64], points: Array, rotation: Array, t: Array, radius_m: float, steps: int
+) -> tuple[Array, Array, Array]:
+    """Gauss–Newton on the cones of detections `pick` (K, k) of spheres at (K, k, 3): poses and chi² (K,)."""
+    K, k = pick.shape
+    flat = pick.ravel()
+    chi2 = np.zeros(K)
+    for step in range(steps + 1):
+        turned = np.einsum("kij,knj->kni", rotation, points)
+        c = (turned + t[:, None]).reshape(-1, 3)
+        # A wild pose is not worth a derivative; it will not fit.
+        c[:, 2] = np.maximum(c[:, 2], 2 * radius_m)
+        r, slope = cone_residuals(seen.axes[flat], seen.frames[flat], seen.half_angles[flat], c, radius_m)
+        r = r / seen.sigma_rad[flat]
+        chi2 = np.sum(r.reshape(K, -1) ** 2, axis=1)
+        if step == steps:
+            break
+        slope = slope / seen.sigma_rad[flat][:, :, None]
+        J = np.concatenate([slope, -slope @ skew(turned.reshape(-1, 3))], axis=2).reshape(K, 3 * k, 6)
+        JJ = J.transpose(0, 2, 1) @ J
+        H = JJ + 1e-9 * np.trace(JJ, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+        dx = -np.linalg.solve(H, np.einsum("kni,kn->ki", J, r.reshape(K, -1))[:, :, None])[:, :, 0]
+        dx[:, 3:] = np.clip(dx[:, 3:], -0.3, 0.3)
+        rotation = Rotation.from_rotvec(dx[:, 3:]).as_matrix() @ rotation
+        t = t + dx[:, :3]
+    return rotation, t, chi2
+
+
 def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: float) -> tuple[NDArray[np.int64], Array]:
     """Detections explained (K,) by each pose, loosely, and their mean angle in radii."""
     counts = np.zeros(len(R), dtype=np.int64)
@@ -160,7 +239,7 @@ def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: floa
         half = np.arcsin(radius_m / distance)
         angle = np.arccos(np.clip(cosine, -1, 1)) / half[:, None, :]
         ratio = seen.half_angles[None, :, None] / half[:, None, :]
-        angle[(angle > 0.8) | (np.abs(ratio - 1) > 0.12)] = np.inf
+        angle[(angle > _LOOSE[0]) | (np.abs(ratio - 1) > _LOOSE[1])] = np.inf
         nearest = angle.min(axis=2)
         ok = np.isfinite(nearest)
         counts[part] = ok.sum(axis=1)
@@ -169,42 +248,45 @@ def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: floa
 
 
 def _refine(
-    seen: Sightings, markers: dict[int, int], centres: Array, radius_m: float, camera: CameraModel
+    seen: Sightings,
+    markers: dict[int, int],
+    rotation: Array,
+    t: Array,
+    centres: Array,
+    radius_m: float,
+    focal_px: float,
 ) -> Hypothesis | None:
-    f = camera.fx
-    for _ in range(4):
-        if len(markers) < 4:
+    """The reading solved from all its outlines; those that do not fit are dropped, those that do are added."""
+    for _ in range(6):
+        pick, chosen = np.array(list(markers)), np.array(list(markers.values()))
+        new_R, new_t, _ = _pose_steps(seen, pick[None], centres[chosen][None], rotation[None], t[None], radius_m, 5)
+        T = transform(new_R[0], new_t[0])
+        c = apply(T, centres)
+        if np.any(c[chosen][:, 2] < 2 * radius_m):
             return None
-        T = _pnp(seen.axes[list(markers)], centres[list(markers.values())])
-        if T is None:
-            return None
-        pairs = match(seen, apply(T, centres), radius_m, 0.08, 0.08)
-        # The worst of a set with one intruder spoils all: drop it and try again with the rest.
-        if len(pairs) < len(markers):
-            c = apply(T, centres[list(markers.values())])
-            c /= np.linalg.norm(c, axis=1, keepdims=True)
-            angle = np.arccos(np.clip(np.sum(c * seen.axes[list(markers)], axis=1), -1, 1))
-            worst = list(markers)[int(np.argmax(angle))]
-            kept = {d: m for d, m, _ in pairs}
-            markers = kept if len(kept) >= 4 else {d: m for d, m in markers.items() if d != worst}
+        r, _ = cone_residuals(seen.axes[pick], seen.frames[pick], seen.half_angles[pick], c[chosen], radius_m)
+        own = np.sum((r / seen.sigma_rad[pick]) ** 2, axis=1)
+        if own.max() > _OUTLINE_CHI2:
+            if len(markers) < 5:
+                return None
+            worst = int(pick[int(np.argmax(own))])
+            markers = {d: m for d, m in markers.items() if d != worst}
             continue
-        new = {d: m for d, m, _ in pairs}
-        if new == markers:
-            angles = np.array([a for _, _, a in pairs])
-            return Hypothesis(markers, T, float(np.sqrt(np.mean(angles**2))) * f)
-        markers = new
+        near = {d: m for d, m, _ in match(seen, c, radius_m, 0.1, 0.03)}
+        more = {d: m for d, m in near.items() if d not in markers and m not in markers.values()}
+        fresh = np.array(list(more), dtype=np.int64)
+        if len(fresh):
+            at = c[np.array(list(more.values()))]
+            s, _ = cone_residuals(seen.axes[fresh], seen.frames[fresh], seen.half_angles[fresh], at, radius_m)
+            fits = np.sum((s / seen.sigma_rad[fresh]) ** 2, axis=1) < _OUTLINE_CHI2
+            more = {int(d): more[int(d)] for d in fresh[fits]}
+        if not more:
+            chi2 = float(own.sum())
+            # Six of the numbers went into the pose: what is left must look like noise.
+            free = 3 * len(markers) - 6
+            if chi2 > free + 4.5 * np.sqrt(2 * free) + 6:
+                return None
+            rms = float(np.sqrt(np.mean(np.sum(r[:, :2] ** 2, axis=1))))
+            return Hypothesis(markers, T, rms * focal_px, _EVIDENCE * len(markers) - chi2 / 2)
+        markers, rotation, t = {**markers, **more}, new_R[0], new_t[0]
     return None
-
-
-def _pnp(axes: Array, points: Array) -> Transform | None:
-    """T_camera_scan from directions (N, 3) to points (N, 3), N ≥ 4: SQPnP, then Levenberg–Marquardt."""
-    if np.any(axes[:, 2] < 0.2):
-        return None
-    pixels = np.ascontiguousarray(axes[:, :2] / axes[:, 2:])
-    eye = np.eye(3)
-    ok, rvec, tvec = cv2.solvePnP(points, pixels, eye, None, flags=cv2.SOLVEPNP_SQPNP)
-    if not ok:
-        return None
-    rvec, tvec = cv2.solvePnPRefineLM(points, pixels, eye, None, rvec, tvec)
-    T = transform(cv2.Rodrigues(rvec)[0].astype(np.float64), np.asarray(tvec, dtype=np.float64).reshape(3))
-    return T if np.all(np.isfinite(T)) and np.all(apply(T, points)[:, 2] > 0) else None

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.hypotheses import Hypothesis, Sightings, image_hypotheses, match, sightings
+from service.compute.registration.hypotheses import Hypothesis, Sightings, image_hypotheses, match, rivals, sightings
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse, rotation_angle_rad, transform
 
@@ -74,7 +74,7 @@ def identify(
     readings = [image_hypotheses(o, centres, radius_m, camera) for o in outlines]
     _require_any(readings, outlines, names, len(centres))
     if poses is None:
-        return tuple(_alone(r) for r in readings)
+        return _each_alone(readings, names)
     stations = np.zeros(len(outlines), dtype=np.int64) if groups is None else np.asarray(groups)
     out: list[Assignment] = [Assignment()] * len(outlines)
     for g in sorted(set(stations.tolist())):
@@ -109,15 +109,27 @@ def _require_any(
     )
 
 
-def _alone(readings: list[Hypothesis]) -> Assignment:
-    """The reading of an image without poses, unless another is as good."""
-    if not readings or (len(readings) > 1 and not _better(readings[0], readings[1])):
-        return Assignment()
-    return Assignment(dict(readings[0].markers), readings[0].T_camera_scan)
+def _each_alone(readings: Sequence[list[Hypothesis]], names: Sequence[str]) -> tuple[Assignment, ...]:
+    """The readings of images without poses; an image that can be read in two ways is left unread beside others."""
+    unclear = [k for k, r in enumerate(readings) if rivals(r)]
+    if unclear and len(unclear) == sum(bool(r) for r in readings):
+        k = unclear[0]
+        raise ComputeError(
+            f"the arrangement of spheres is ambiguous: {_named(readings[k][0].markers)} and "
+            + " and ".join(_named(r.markers) for r in rivals(readings[k])[:3])
+            + " explain the outlines alike",
+            where=names[k],
+            remedy="Show more of the spheres in one image, or place them less symmetrically",
+        )
+    return tuple(
+        Assignment(dict(r[0].markers), r[0].T_camera_scan) if r and k not in unclear else Assignment()
+        for k, r in enumerate(readings)
+    )
 
 
-def _better(a: Hypothesis, b: Hypothesis) -> bool:
-    return a.count > b.count or a.rms_px < 0.35 * b.rms_px
+def _named(markers: dict[int, int]) -> str:
+    """A reading in words: outline = sphere, counted from 0."""
+    return "{" + ", ".join(f"{d}={m}" for d, m in sorted(markers.items())) + "}"
 
 
 def _solve_group(
@@ -160,7 +172,7 @@ def _solve_group(
         if _differ(best, other) and other.total >= 0.9 * best.total and other.cost < 3 * best.cost + 0.02:
             raise ComputeError(
                 f"the arrangement of spheres is ambiguous: two readings explain {best.total} and {other.total} "
-                "of the detections",
+                f"of the detections, in one image {' and '.join(map(_named, _first_difference(best, other)))}",
                 where=where,
                 remedy="Place the spheres less symmetrically, or show more of them in an image",
             )
@@ -197,9 +209,16 @@ def _differ(a: _Reading, b: _Reading) -> bool:
     return False
 
 
+def _first_difference(a: _Reading, b: _Reading) -> tuple[dict[int, int], dict[int, int]]:
+    """The markers of the first image that two readings read differently."""
+    return next(
+        (x, y) for x, y in zip(a.markers, b.markers, strict=True) if any(d in y and y[d] != m for d, m in x.items())
+    )
+
+
 def _metric_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[tuple[Transform, float]]:
     ranked = sorted(
-        ((h.count, -h.rms_px, k, n) for k, r in enumerate(readings) for n, h in enumerate(r[:_HYPOTHESES_PER_IMAGE])),
+        ((h.score, -h.rms_px, k, n) for k, r in enumerate(readings) for n, h in enumerate(r[:_HYPOTHESES_PER_IMAGE])),
         reverse=True,
     )
     return [(poses[k] @ readings[k][n].T_camera_scan, 1.0) for _, _, k, n in ranked[:_MOST_TRIED]]
@@ -208,7 +227,7 @@ def _metric_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[t
 def _similarity_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[tuple[Transform, float]]:
     """From pairs of images: their rotations must agree, their distance gives the scale."""
     ranked = sorted(
-        ((h.count, -h.rms_px, k, n) for k, r in enumerate(readings) for n, h in enumerate(r[:_HYPOTHESES_PER_IMAGE])),
+        ((h.score, -h.rms_px, k, n) for k, r in enumerate(readings) for n, h in enumerate(r[:_HYPOTHESES_PER_IMAGE])),
         reverse=True,
     )[:60]
     spread = float(np.max(np.linalg.norm(poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0), axis=1)))

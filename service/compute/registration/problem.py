@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +43,11 @@ class Problem:
     marker: NDArray[np.int64]
     group: NDArray[np.int64]  # position in `groups`
     groups: list[int]
+    station: NDArray[np.int64]  # (N,) position in `groups`, -1 for a group without outlines
     T_base_camera: Array  # (N, 4, 4)
     centres: Array  # (M, 3)
     radius_m: float
+    camera: CameraModel
     focal_px: float
     axes: Array  # (O, 3)
     frames: Array  # (O, 3, 2)
@@ -168,45 +170,74 @@ def assemble(
             f"{len(members)} outlines of {len({m for _, _, m in members})} markers do not determine a registration",
             remedy="Use images in which at least four registration spheres are visible",
         )
-    f = 0.5 * (camera.fx + camera.fy)
-    used = [outlines[i][j] for i, j, _ in members]
     used_groups = [int(groups[i]) for i, _, _ in members]
     first = int(groups[0])
     order = sorted(set(used_groups), key=lambda g: (g != first, g))
+    e = common_errors
+    sigma = np.maximum([e.light_px, e.light_px, e.light_px, e.shift_px, e.shift_px, e.growth_px], 1e-6)
+    prior = np.diag(1 / sigma**2)
+    n_intrinsics = 0
+    if intrinsics_covariance is not None:
+        n_intrinsics = len(intrinsics_covariance)
+        information = np.zeros((6 + n_intrinsics, 6 + n_intrinsics))
+        information[:6, :6], information[6:, 6:] = prior, np.linalg.inv(intrinsics_covariance)
+        prior = information
+    f = 0.5 * (camera.fx + camera.fy)
+    half = [outlines[i][j].cone.half_angle_rad for i, j, _ in members]
+    empty = Problem(
+        members=[],
+        image=np.zeros(0, dtype=np.int64),
+        marker=np.zeros(0, dtype=np.int64),
+        group=np.zeros(0, dtype=np.int64),
+        groups=order,
+        station=np.array([order.index(int(g)) if int(g) in order else -1 for g in groups]),
+        T_base_camera=np.array(poses, dtype=np.float64),
+        centres=np.asarray(centres_scan_m, dtype=np.float64),
+        radius_m=radius_m,
+        camera=camera,
+        focal_px=f,
+        axes=np.zeros((0, 3)),
+        frames=np.zeros((0, 3, 2)),
+        half_angles=np.zeros(0),
+        whiten=np.zeros((0, 3, 3)),
+        points=[],
+        point_sigma=np.zeros(0),
+        common=np.zeros((0, 3, 3 + n_intrinsics)),
+        common_prior=prior,
+        sphere_prior=None if sphere_covariance_m2 is None else _block_inverse(sphere_covariance_m2),
+        light_unit_m=float(np.mean(radius_m / np.sin(half))) / f,
+        with_scale=with_scale,
+    )
+    return with_outlines(empty, outlines, members)
+
+
+def with_outlines(
+    problem: Problem, outlines: Sequence[Sequence[SphereOutline]], members: list[tuple[int, int, int]]
+) -> Problem:
+    """The problem with these outlines (image, outline, marker) in place of its own."""
+    used = [outlines[i][j] for i, j, _ in members]
+    camera, image = problem.camera, np.array([i for i, _, _ in members], dtype=np.int64)
     axes = np.array([o.cone.axis for o in used])
     frames = np.array([o.cone.frame()[:, :2] for o in used])
     half = np.array([o.cone.half_angle_rad for o in used])
     common = _common_displacements(axes, frames, camera)
-    e = common_errors
-    sigma = np.maximum([e.light_px, e.light_px, e.light_px, e.shift_px, e.shift_px, e.growth_px], 1e-6)
-    prior = np.diag(1 / sigma**2)
-    if intrinsics_covariance is not None:
-        k = len(intrinsics_covariance)
-        common = np.concatenate([common, _intrinsics_errors(axes, frames, half, camera)[:, :, :k]], axis=2)
-        information = np.zeros((6 + k, 6 + k))
-        information[:6, :6], information[6:, 6:] = prior, np.linalg.inv(intrinsics_covariance)
-        prior = information
-    return Problem(
+    n_intrinsics = problem.common.shape[2] - 3
+    if n_intrinsics:
+        more = _intrinsics_errors(axes, frames, half, camera)[:, :, :n_intrinsics]
+        common = np.concatenate([common, more], axis=2)
+    return replace(
+        problem,
         members=members,
-        image=np.array([i for i, _, _ in members]),
-        marker=np.array([m for _, _, m in members]),
-        group=np.array([order.index(g) for g in used_groups]),
-        groups=order,
-        T_base_camera=np.array(poses, dtype=np.float64),
-        centres=np.asarray(centres_scan_m, dtype=np.float64),
-        radius_m=radius_m,
-        focal_px=f,
+        image=image,
+        marker=np.array([m for _, _, m in members], dtype=np.int64),
+        group=problem.station[image],
         axes=axes,
         frames=frames,
         half_angles=half,
         whiten=_whitening(np.array([o.cone_covariance for o in used])),
         points=[o.points for o in used],
-        point_sigma=np.array([_point_sigma(o) for o in used]) / f,
+        point_sigma=np.array([_point_sigma(o) for o in used]) / problem.focal_px,
         common=common,
-        common_prior=prior,
-        sphere_prior=None if sphere_covariance_m2 is None else _block_inverse(sphere_covariance_m2),
-        light_unit_m=float(np.mean(radius_m / np.sin(half))) / f,
-        with_scale=with_scale,
     )
 
 
