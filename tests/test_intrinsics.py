@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from service.compute.calibration.adjustment import LensModel
 from service.compute.calibration.board import Board, BoardView, board_points, detect_board, half_turn
-from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_board
+from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_board, locate_view
+from service.compute.calibration.uncertainty import projection_uncertainty
+from service.compute.calibration.validation import calibration_warnings, cross_validate
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
+from service.core.geometry import Array, Transform, align_points, apply, inverse, look_at, transform
 from tests.support.textured_scene import TEXEL_M, Slab, camera_of_width, render
 
 COLUMNS, ROWS, SQUARE_M = 16, 23, 0.015
@@ -163,3 +168,129 @@ def test_views_that_determine_nothing_are_refused() -> None:
         calibrate_intrinsics(few[:2], BOARD, SIZE)
     with pytest.raises(DataError, match="view 1"):
         calibrate_intrinsics([few[0], BoardView(few[1].indices, few[1].corners[:-1])], BOARD, SIZE)
+
+
+def _random_views(count: int, seed: int, *, noise_px: float = 0.04, shared_px: float = 0.0) -> list[BoardView]:
+    """Noisy corners; with `shared_px` the corners of one image are warped together, each image in its own way."""
+    rng = np.random.default_rng(seed)
+    points = BOARD.points()
+    views: list[BoardView] = []
+    while len(views) < count:
+        angles = [rng.uniform(0, 360), rng.uniform(5, 40), rng.uniform(0, 360)]
+        R = Rotation.from_euler("zxz", angles, degrees=True).as_matrix()
+        place = np.array([rng.uniform(-0.06, 0.06), rng.uniform(-0.04, 0.04), rng.uniform(0.7, 1.0)])
+        pixels = CAMERA.project(apply(transform(R, place - R @ points.mean(axis=0)), points))
+        inside = ((pixels > 5) & (pixels < np.array(SIZE) - 6)).all(axis=1)
+        if np.count_nonzero(inside) < 150:
+            continue
+        pixels += rng.normal(0, noise_px, pixels.shape)
+        x, y = ((pixels - pixels.mean(axis=0)) / pixels.std(axis=0)).T
+        pixels += np.stack([x * x, y * y, x * y, x**3, y**3], axis=1) @ rng.normal(0, shared_px, (5, 2))
+        views.append(BoardView(np.flatnonzero(inside), pixels[inside]))
+    return views
+
+
+@pytest.mark.parametrize("shared_px", [0.0, 0.02])
+def test_stated_covariance_is_honest_also_when_the_corners_of_an_image_err_together(shared_px: float) -> None:
+    squares: list[float] = []
+    for seed in range(12):
+        result = calibrate_intrinsics(_random_views(16, seed, shared_px=shared_px), BOARD, SIZE)
+        error = np.array([getattr(result.camera, name) - getattr(CAMERA, name) for name in result.parameters])
+        squares.append(float(error @ np.linalg.solve(result.covariance, error)) / len(error))
+        assert result.inflation >= 1
+        assert (result.inflation > 5) == (shared_px > 0)
+    assert 0.4 < np.mean(squares) < 2.0
+
+
+def test_leaving_a_view_out_is_what_a_new_adjustment_without_it_gives() -> None:
+    views = _random_views(9, 3, shared_px=0.02)
+    result = calibrate_intrinsics(views, BOARD, SIZE)
+    validation = cross_validate(result)
+    for k in (0, 4):
+        without = calibrate_intrinsics([view for i, view in enumerate(views) if i != k], BOARD, SIZE)
+        change = np.array([getattr(without.camera, n) - getattr(result.camera, n) for n in result.parameters])
+        sigma = np.sqrt(np.diag(result.covariance))
+        np.testing.assert_allclose(result.leave_one_out[k] / sigma, change / sigma, atol=0.15)
+        assert locate_view(views[k], BOARD, without.camera)[1] == pytest.approx(
+            validation.leave_one_out_view_px[k], rel=0.02
+        )
+    assert validation.five_fold_rms_px > result.rms_px
+    assert validation.five_fold_rms_px == pytest.approx(validation.leave_one_out_rms_px, rel=0.1)
+
+
+def test_projection_uncertainty_is_the_spread_of_projections_over_calibrations() -> None:
+    """Each calibration's camera is moved to see the boards where they are, as whoever finds its pose will do."""
+    projected: list[Array] = []
+    once = calibrate_intrinsics(_random_views(12, 0), BOARD, SIZE)
+    stated = projection_uncertainty(once, 0.8, columns=6, rows=4)
+    inflation = once.inflation  # a dozen images tell it roughly; here it is known to be one
+    rng = np.random.default_rng(5)
+    clean = _random_views(12, 0, noise_px=0.0)
+    truth = calibrate_intrinsics(clean, BOARD, SIZE)
+    rays = np.column_stack([CAMERA.normalise(stated.pixels.reshape(-1, 2)), np.ones(24)]) * 0.8
+    points = BOARD.points()
+    for _ in range(30):
+        noisy = [BoardView(v.indices, v.corners + rng.normal(0, 0.04, v.corners.shape)) for v in clean]
+        result = calibrate_intrinsics(noisy, BOARD, SIZE)
+        seen = [
+            np.concatenate([apply(T, points[v.indices]) for T, v in zip(r.T_camera_board, clean, strict=True)])
+            for r in (truth, result)
+        ]
+        motion, _ = align_points(seen[1], seen[0])
+        projected.append(result.camera.project(apply(motion, rays)))
+    spread = np.array(projected)
+    observed = [np.sqrt(np.linalg.eigvalsh(np.cov(spread[:, k].T))[-1]) for k in range(24)]
+    ratio = np.array(observed) / stated.sigma_px.ravel() * np.sqrt(inflation)
+    assert 0.75 < np.median(ratio) < 1.3
+    assert 0.5 < ratio.min() < ratio.max() < 1.8
+    # px to mm at that distance: f pixels a radian
+    assert stated.centre_mm == pytest.approx(stated.centre_px * 800 / CAMERA.fx, rel=0.02)
+    with pytest.raises(DataError, match="not in front"):
+        projection_uncertainty(truth, -1.0)
+
+
+@pytest.mark.parametrize("model", ["pinhole", "radial2", "opencv5", "rational"])
+def test_other_lens_models(model: LensModel) -> None:
+    lens = {
+        "pinhole": {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0},
+        "radial2": {"p1": 0.0, "p2": 0.0},
+        "opencv5": {"k1": -0.2, "k3": 0.3},
+        "rational": {"k1": 0.3, "k4": 0.35, "k5": 0.05},
+    }[model]
+    camera = dataclasses.replace(CAMERA, **lens)
+    points = BOARD.points()
+    views: list[BoardView] = []
+    for view in _random_views(14, 8, noise_px=0.0):
+        T, _ = locate_view(view, BOARD, CAMERA)
+        pixels = camera.project(apply(T, points[view.indices]))
+        views.append(
+            BoardView(view.indices, pixels + np.random.default_rng(len(views)).normal(0, 0.02, pixels.shape))
+        )
+    result = calibrate_intrinsics(views, BOARD, SIZE, model=model)
+    assert result.rms_px < 0.035
+    assert len(result.parameters) == {"pinhole": 4, "radial2": 6, "opencv5": 9, "rational": 12}[model]
+    for name in result.parameters[:4]:
+        assert abs(getattr(result.camera, name) - getattr(camera, name)) < 5 * result.sigma[name]
+    rays = np.column_stack([camera.normalise(np.array([[200.0, 150.0], [700.0, 500.0]])), np.ones(2)])
+    np.testing.assert_allclose(result.camera.project(rays), camera.project(rays), atol=0.3)
+
+
+def test_a_view_that_suffered_from_a_worse_one_comes_back() -> None:
+    views = _random_views(12, 2)
+    rng = np.random.default_rng(0)
+    for k, size_px in ((3, 40.0), (7, 6.0)):
+        views[k] = BoardView(views[k].indices, views[k].corners + rng.normal(0, size_px, views[k].corners.shape))
+    few = views[5]
+    views[5] = BoardView(few.indices[:4], few.corners[:4])
+    result = calibrate_intrinsics(views, BOARD, SIZE)
+    assert [e.index for e in result.excluded] == [3, 5, 7]
+    assert "4 corners" in result.excluded[1].reason
+    assert "px, median" in result.excluded[0].reason
+
+
+def test_warnings_name_what_is_weak() -> None:
+    result = calibrate_intrinsics(_random_views(8, 1, shared_px=0.05), BOARD, SIZE, model="rational")
+    words = " ".join(calibration_warnings(result, cross_validate(result), projection_uncertainty(result, 0.8)))
+    assert "8 views" in words
+    assert "is not determined" in words
+    assert "images disagree" in words

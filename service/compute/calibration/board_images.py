@@ -16,6 +16,9 @@ from service.compute.calibration.board import Board, BoardView, find_board
 from service.compute.images import read_grey
 from service.core.errors import ComputeError, DataError
 
+_MANY_FILES = 16
+_MANY_BYTES = 30e6
+
 
 @dataclass(frozen=True, slots=True)
 class BoardImage:
@@ -55,7 +58,7 @@ def find_boards(
     Args:
         files: images.
         board: what to look for.
-        workers: processes.
+        workers: processes, at most.
         progress: called with images done and in all.
 
     Raises:
@@ -65,7 +68,7 @@ def find_boards(
         board.charuco()
     work = partial(_find, board=board)
     found: list[BoardImage] = []
-    if workers <= 1 or len(files) <= 1:
+    if workers <= 1 or not _worth_processes(files):
         for file in files:
             found.append(work(file))
             if progress:
@@ -106,6 +109,11 @@ def usable_views(found: Sequence[BoardImage]) -> UsableViews:
             indices.append(index)
             views.append(image.view)
     return UsableViews(size, tuple(indices), tuple(views), excluded)
+
+
+def _worth_processes(files: Sequence[Path]) -> bool:
+    """Whether there is more to do than to start processes."""
+    return len(files) >= _MANY_FILES or sum(file.stat().st_size for file in files if file.is_file()) > _MANY_BYTES
 
 
 def _find(file: Path, board: Board) -> BoardImage:

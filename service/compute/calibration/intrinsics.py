@@ -41,7 +41,8 @@ _MIN_CORNERS = 8
 _MIN_TILT_SPREAD_DEG = 10.0
 _OUTLIER = 3.0  # times the median error of all views
 _OUTLIER_FLOOR_PX = 0.02
-_MIN_VIEWS_TO_JACKKNIFE = 6
+_MIN_VIEWS_TO_COMPARE = 6
+_MIN_EIGENVALUE = 1e-14  # of the normal matrix scaled to a diagonal of ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +68,11 @@ class IntrinsicsResult:
         parameters: (P) names, in the order of the covariance.
         covariance: (P, P), px and 1. From the corners' noise, as large as their residuals show it, times `inflation`.
         inflation: how many times larger the variance is than from independent corners, 1 at least: the corners of one
-            image err together (light, flatness of the board, the model of the lens), and the jackknife over images
-            shows by how much.
+            image err together (light, flatness of the board, the model of the lens), and how much the images
+            disagree shows by how much.
         sigma: standard deviation of each parameter, the roots of the covariance's diagonal.
         sigma_independent: the same from corner noise alone, as most programs state it.
-        sigma_jackknife: the same from the spread of solutions without one image each; NaN of fewer than 6 views.
+        sigma_by_image: the same from the disagreement of the images alone; NaN of fewer than 6 views.
         leave_one_out: (N, P) change of the parameters when one view is left out (one Newton step).
         sigma_corner_px: standard deviation of one coordinate of a corner, from the residuals.
         T_camera_board: (N, 4, 4); board frame: x along the columns, y along the rows, z away from the camera.
@@ -95,7 +96,7 @@ class IntrinsicsResult:
     inflation: float
     sigma: dict[str, float]
     sigma_independent: dict[str, float]
-    sigma_jackknife: dict[str, float]
+    sigma_by_image: dict[str, float]
     leave_one_out: Array
     sigma_corner_px: float
     T_camera_board: Array
@@ -143,10 +144,9 @@ def calibrate_intrinsics(
     corners_used = sum(len(view.indices) for view in seen)
     freedom = 2 * corners_used - count - 6 * len(used)
     variance = sum(float(view.weighted @ view.weighted) for view in solution.views) / max(freedom, 1)
-    normal = np.sum([view.normal for view in solution.views], axis=0)
-    independent = np.linalg.inv(normal) * variance
-    left_out = leave_one_out(solution)
-    inflation, jackknife = _inflation(independent, left_out)
+    root = _inverse_root(np.sum([view.normal for view in solution.views], axis=0))
+    independent = root @ root.T * variance
+    inflation, by_image = _inflation(solution, root, variance)
     covariance = independent * inflation
     poses = solution.T_camera_board()
     counts = _coverage_map([view.corners for view in seen], size)
@@ -164,8 +164,8 @@ def calibrate_intrinsics(
         inflation=inflation,
         sigma=_sigma(names, covariance),
         sigma_independent=_sigma(names, independent),
-        sigma_jackknife=_sigma(names, jackknife),
-        leave_one_out=left_out,
+        sigma_by_image=_sigma(names, by_image),
+        leave_one_out=leave_one_out(solution),
         sigma_corner_px=float(np.sqrt(variance)),
         T_camera_board=poses,
         coverage=np.count_nonzero(counts) / counts.size,
@@ -275,19 +275,41 @@ def _check_view(view: BoardView, count: int, index: int) -> None:
         raise DataError(f"a corner's index is outside of the board's {count}", where=f"view {index}")
 
 
-def _inflation(independent: Array, left_out: Array) -> tuple[float, Array]:
-    """How much larger the jackknife's covariance is, averaged over all directions, and that covariance (P, P).
+def _inverse_root(normal: Array) -> Array:
+    """R (P, P) with R Rᵀ = the inverse of the normal matrix: in its coordinates the normal matrix is the identity.
 
-    The form of the covariance is taken from the corners, its size from the images: a dozen images do not determine
-    a matrix of 8 × 8. Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 11.
+    Raises:
+        ComputeError: the views do not determine the parameters.
     """
-    n, count = left_out.shape
-    if n < _MIN_VIEWS_TO_JACKKNIFE or not np.isfinite(left_out).all():
-        return 1.0, np.full_like(independent, np.nan)
-    offset = left_out - left_out.mean(axis=0)
-    jackknife = (n - 1) / n * offset.T @ offset
-    ratio = float(np.trace(np.linalg.solve(independent, jackknife))) / count
-    return max(1.0, ratio), jackknife
+    scale = np.sqrt(np.diag(normal))
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    if values[0] < _MIN_EIGENVALUE:
+        raise ComputeError(
+            "the views do not determine all terms of the distortion",
+            remedy="take a model with fewer terms, or show the board in the corners of the image",
+        )
+    return vectors / np.sqrt(values) / scale[:, None]
+
+
+def _inflation(solution: Adjustment, root: Array, variance: float) -> tuple[float, Array]:
+    """How much larger the covariance is by images than by corners, over all directions; and by images (P, P).
+
+    Each image's gradient is one draw of what its corners err by together. It is corrected for what the solution has
+    already fitted to it, without which few images look too good. The form of the covariance is still taken from the
+    corners and only its size from the images: a dozen images do not determine a matrix of 8 × 8.
+    Source: Bell and McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage samples",
+    Survey Methodology 28, 2002 (CR2).
+    """
+    count = len(root)
+    if len(solution.views) < _MIN_VIEWS_TO_COMPARE:
+        return 1.0, np.full_like(root, np.nan)
+    total = np.zeros((count, count))
+    for view in solution.views:
+        share, turn = np.linalg.eigh(root.T @ view.normal @ root)
+        free = np.clip(1 - share, 1e-6, None)
+        corrected = turn @ ((turn.T @ root.T @ view.gradient) / np.sqrt(free))
+        total += np.outer(corrected, corrected)
+    return max(1.0, float(np.trace(total)) / count / variance), root @ total @ root.T
 
 
 def _sigma(names: Sequence[str], covariance: Array) -> dict[str, float]:

@@ -43,7 +43,7 @@ def intrinsics_record(
         "excluded": [{"image": image, "reason": reason} for image, reason in excluded.items()],
         "sigma": dict(result.sigma),
         "sigma_independent": dict(result.sigma_independent),
-        "sigma_jackknife": {name: _number(value) for name, value in result.sigma_jackknife.items()},
+        "sigma_by_image": {name: _number(value) for name, value in result.sigma_by_image.items()},
         "sigma_corner_px": result.sigma_corner_px,
         "inflation": result.inflation,
         "covariance": {"parameters": list(result.parameters), "matrix": result.covariance.tolist()},
