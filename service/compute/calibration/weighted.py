@@ -28,7 +28,8 @@ from service.core.geometry import Array, Transform
 FLOOR_M = 2e-7
 _ITERATIONS = 8
 _SELECTION_ROUNDS = 80
-_SINGULAR = 1e-13  # least eigenvalue of the scaled normal matrix
+_UNDETERMINED = "the views do not determine the hand-eye transform"
+_SINGULAR = 3e-7  # least pivot of the scaled normal matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,15 +150,22 @@ def _minimum(gram: Array, prior: Array) -> tuple[Array, Array, float]:
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 1 / np.sqrt(np.diag(H))  # metres, radians and tolerances: to the same size
         scaled = H * scale[:, None] * scale
-    if not np.isfinite(scaled).all() or float(np.linalg.eigvalsh(scaled)[0]) < _SINGULAR:
-        raise ComputeError(
-            "the views do not determine the hand-eye transform", remedy="take views with more rotation"
-        )
-    L = np.linalg.cholesky(scaled)
+    L = _factor(scaled)
     half = np.asarray(solve_triangular(L, np.diag(scale), lower=True, check_finite=False), dtype=np.float64)
     covariance = half.T @ half
     log_determinant = float(np.sum(np.log(np.diag(L))) - np.sum(np.log(scale)))
     return -covariance @ gram[:-1, -1], covariance, log_determinant
+
+
+def _factor(scaled: Array) -> Array:
+    """Cholesky factor of a normal matrix with unit diagonal. Raises ComputeError when it is singular."""
+    try:
+        L = np.asarray(np.linalg.cholesky(scaled), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        raise ComputeError(_UNDETERMINED, remedy="take views with more rotation") from error
+    if not np.diag(L).min() > _SINGULAR:
+        raise ComputeError(_UNDETERMINED, remedy="take views with more rotation")
+    return L
 
 
 def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations: int = _ITERATIONS) -> Fit:

@@ -1,0 +1,170 @@
+"""Board images and data set viewpoints of simulated scenes as geometry only: joints, poses, noisy corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from service.compute.calibration.board import Board
+from service.compute.calibration.reprojection import BoardCorners
+from service.compute.camera_model import CameraModel
+from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
+from service.steps.context import StationLayout
+from service.steps.viewpoints import ViewpointSet, flange_target, plan_viewpoints
+from simulators.arm import ARM_MODEL
+from simulators.ur_controller.kinematics import inverse as joints_for
+from simulators.world import SCENE_CENTRE_M, Scene, nominal_hand_eye
+
+PROTOCOLS = Path(__file__).parents[2] / "protocols"
+BOARD = Board(23, 16, 0.015)
+_NEAR = np.array([1.57, -1.5, 1.9, -2.0, -1.57, 0.0])
+T_FLANGE_CAMERA = transform(Rotation.from_rotvec([0.02, -0.03, 1.55]), np.array([0.012, -0.055, 0.093]))
+T_BASE_BOARD = transform(Rotation.from_euler("xyz", [176, 3, 40], degrees=True), np.array([0.7, -0.1, 0.05]))
+CAMERA = CameraModel(4752, 3168, 6650.0, 6652.0, 2380.0, 1580.0, -0.05, 0.03, 2e-4, -3e-4)
+_VIEW_M = 0.65  # where the scene's centre is, in front of the camera
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """One viewpoint: its station and the joints of the arm."""
+
+    station: str
+    q: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What a hand-eye calibration is given, N views."""
+
+    T_base_flange: Array
+    T_camera_board: Array
+    corners: BoardCorners
+    joints_rad: Array
+
+
+def plan(scene: Scene, protocol: str, *steps: str) -> list[Shot]:
+    """The viewpoints of these steps that the arm reaches, as a protocol plans them."""
+    text = yaml.safe_load((PROTOCOLS / f"{protocol}.yaml").read_text(encoding="utf-8"))
+    by_id = {step["id"]: step for step in text["steps"]}
+    shots: list[Shot] = []
+    for step in steps:
+        for record in by_id[step]["params"]["viewpoints"]:
+            wanted = ViewpointSet.model_validate(record)
+            layout = _layout(scene, wanted.station)
+            for viewpoint in plan_viewpoints(wanted, layout):
+                q = joints_for(ARM_MODEL, flange_target(viewpoint.T_base_camera, nominal_hand_eye()), _NEAR)
+                if q is not None:
+                    shots.append(Shot(wanted.station, q))
+    return shots
+
+
+def _layout(scene: Scene, station: str) -> StationLayout:
+    centre = apply(inverse(scene.T_world_base[station]), SCENE_CENTRE_M)
+    towards = -centre[:2] / np.linalg.norm(centre[:2])
+    x, y, z = (float(v) for v in centre)
+    return StationLayout(station, "robot", (x, y, z), (float(towards[0]), float(towards[1]), 0.0))
+
+
+def board_session(scene: Scene, shots: Sequence[Shot], *, sigma_px: float = 0.05, width: int = 4752) -> Session:
+    """The board as the images show it: all views that hold the whole board, corners with white noise."""
+    lens = scene.camera_intrinsics(width).to_json()
+    camera = CameraModel.from_record({key: lens[key] for key in _CAMERA})
+    rng = np.random.default_rng([scene.seed, 7])
+    T_world_board = scene.board_placement(0)
+    flanges: list[Array] = []
+    boards: list[Array] = []
+    corners: list[Array] = []
+    joints: list[Array] = []
+    for shot in shots:
+        T_camera_board = inverse(scene.true_camera(shot.q, shot.station)) @ T_world_board
+        pixels = camera.project(apply(T_camera_board, BOARD.points()))
+        if not ((pixels > 0) & (pixels < [camera.width, camera.height])).all():
+            continue
+        pixels = pixels + rng.normal(0, sigma_px, pixels.shape)
+        flanges.append(scene.nominal_flange(shot.q))
+        boards.append(locate(BOARD.points(), pixels, camera, T_camera_board))
+        corners.append(pixels)
+        joints.append(shot.q)
+    return Session(
+        np.array(flanges), np.array(boards), BoardCorners(BOARD.points(), np.array(corners), camera), np.array(joints)
+    )
+
+
+def noisy_session(count: int, mm: float, deg: float, seed: int, *, sigma_px: float = 0.05) -> Session:
+    """Views from all sides by an arm whose poses have independent noise (for each axis); joints are left zero."""
+    rng = np.random.default_rng([seed, count])
+    points = BOARD.points()
+    centre = points.mean(axis=0)
+    hands: list[Array] = []
+    boards: list[Array] = []
+    corners: list[Array] = []
+    while len(hands) < count:
+        tilt, azimuth = np.deg2rad(rng.uniform(5, 40)), rng.uniform(0, 2 * np.pi)
+        out = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])
+        target, up = centre + rng.uniform(-0.02, 0.02, 3), np.array([rng.normal(0, 0.3), -1.0, 0.0])
+        roll = transform(Rotation.from_euler("z", 180.0 * rng.integers(2), degrees=True), np.zeros(3))
+        T_board_camera = look_at(centre + 0.75 * out, target, up) @ roll
+        T_camera_board = inverse(T_board_camera)
+        pixels = CAMERA.project(apply(T_camera_board, points))
+        if not ((pixels > 0) & (pixels < [CAMERA.width, CAMERA.height])).all():
+            continue
+        pixels = pixels + rng.normal(0, sigma_px, pixels.shape)
+        wobble = transform(Rotation.from_rotvec(np.deg2rad(rng.normal(0, deg, 3))), rng.normal(0, mm, 3) * 1e-3)
+        hands.append(T_BASE_BOARD @ T_board_camera @ inverse(T_FLANGE_CAMERA) @ wobble)
+        boards.append(locate(points, pixels, CAMERA, T_camera_board))
+        corners.append(pixels)
+    return Session(
+        np.array(hands), np.array(boards), BoardCorners(points, np.array(corners), CAMERA), np.zeros((count, 6))
+    )
+
+
+@dataclass(frozen=True)
+class OddScene(Scene):
+    """A scene whose arm errs in ways that no term of the correction describes exactly.
+
+    Beside its other errors: gear waves between the whole numbers of periods, of two frequencies a joint, and links
+    that sag under their weight.
+    """
+
+    def true_flange(self, q: Array, station: str) -> Array:
+        """T_world_flange where the flange really is."""
+        rng = np.random.default_rng([self.seed, 0x0DD])
+        waves = rng.uniform(1.5, 7.5, (2, 6)), rng.uniform(0, 2 * np.pi, (2, 6))
+        more = np.radians(0.006) * np.sin(waves[0] * q + waves[1]).sum(axis=0)
+        sag = np.zeros(6)
+        sag[1] = np.radians(0.02) * np.cos(q[1])
+        sag[2] = np.radians(0.01) * np.cos(q[1] + q[2])
+        return super().true_flange(q + more + sag, station)
+
+
+_CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+def locate(points: Array, pixels: Array, camera: CameraModel, near: Array) -> Array:
+    """T_camera_board of the least reprojection error, from a start nearby."""
+    rvec, tvec = cv2.solvePnPRefineLM(
+        points, pixels, camera.matrix, camera.distortion, cv2.Rodrigues(near[:3, :3])[0], near[:3, 3].copy()
+    )
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rvec)[0], np.asarray(tvec).ravel()
+    return T
+
+
+def scene_error_mm(scene: Scene, shots: Sequence[Shot], T_base_camera: Array) -> float:
+    """RMS error of where the cameras put the scene's centre, each station's base aligned as a registration does."""
+    about = np.array([[0, 0, _VIEW_M], [0.1, 0, _VIEW_M], [0, 0.1, _VIEW_M], [0, 0, _VIEW_M - 0.1], [0, 0, 0.0]])
+    squares: list[Any] = []
+    for station in sorted({shot.station for shot in shots}):
+        mine = [i for i, shot in enumerate(shots) if shot.station == station]
+        true = np.array([apply(scene.true_camera(shots[i].q, station), about) for i in mine])
+        found = np.array([apply(T_base_camera[i], about) for i in mine])
+        T, _ = align_points(true.reshape(-1, 3), found.reshape(-1, 3))
+        squares += list(np.sum((apply(T, found[:, 0]) - true[:, 0]) ** 2, axis=1))
+    return 1e3 * float(np.sqrt(np.mean(squares)))
