@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.adjustment import LensModel
-from service.compute.calibration.board import Board, BoardView, board_points, detect_board, half_turn
-from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_board, locate_view
+from service.compute.calibration.board import Board, BoardView, board_points, find_board, half_turn
+from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_view
 from service.compute.calibration.uncertainty import projection_uncertainty
 from service.compute.calibration.validation import calibration_warnings, cross_validate
 from service.compute.camera_model import CameraModel
@@ -85,7 +85,7 @@ def test_corners_are_found_to_a_twentieth_of_a_pixel(
     board: tuple[Slab, Array], picture: tuple[NDArray[np.uint8], Transform]
 ) -> None:
     image, pose = picture
-    found = detect_board(image, COLUMNS, ROWS)
+    found = find_board(image, BOARD).corners
     truth = CAMERA.project(apply(inverse(pose), board[1].reshape(-1, 3)))
     distance = np.linalg.norm(found[:, None] - truth[None], axis=2)
     assert len(set(distance.argmin(axis=1))) == COLUMNS * ROWS
@@ -94,8 +94,8 @@ def test_corners_are_found_to_a_twentieth_of_a_pixel(
 
 def test_numbering_follows_the_board_when_the_picture_is_turned(picture: tuple[NDArray[np.uint8], Transform]) -> None:
     image, _ = picture
-    upright = detect_board(image, COLUMNS, ROWS)
-    turned = detect_board(np.ascontiguousarray(image[::-1, ::-1]), COLUMNS, ROWS)
+    upright = find_board(image, BOARD).corners
+    turned = find_board(np.ascontiguousarray(image[::-1, ::-1]), BOARD).corners
     back = np.array([image.shape[1] - 1, image.shape[0] - 1]) - turned
     assert np.linalg.norm(back - upright, axis=1).max() < 0.1
     assert half_turn(COLUMNS, ROWS, SQUARE_M) is None
@@ -113,8 +113,8 @@ def test_large_image_is_searched_small_and_measured_at_full_size(
 ) -> None:
     image, _ = picture
     large = cv2.resize(image, None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
-    found = detect_board(np.asarray(large, dtype=np.uint8), COLUMNS, ROWS)
-    reference = (detect_board(image, COLUMNS, ROWS) + 0.5) * 3 - 0.5
+    found = find_board(np.asarray(large, dtype=np.uint8), BOARD).corners
+    reference = (find_board(image, BOARD).corners + 0.5) * 3 - 0.5
     assert np.sqrt(np.mean(np.sum((found - reference) ** 2, axis=1))) < 0.2
 
 
@@ -122,9 +122,9 @@ def test_hidden_board_is_an_error(picture: tuple[NDArray[np.uint8], Transform]) 
     image = picture[0].copy()
     image[:, :400] = 90
     with pytest.raises(ComputeError, match="no board of 16 × 23"):
-        detect_board(image, COLUMNS, ROWS)
+        find_board(image, BOARD)
     with pytest.raises(DataError, match="grey"):
-        detect_board(np.zeros((10, 10, 3), dtype=np.uint8), COLUMNS, ROWS)
+        find_board(np.zeros((10, 10, 3), dtype=np.uint8), BOARD)
 
 
 def test_camera_is_recovered_within_its_sigma() -> None:
@@ -149,10 +149,10 @@ def test_camera_is_recovered_within_its_sigma() -> None:
     assert np.linalg.norm(origin - centre) == pytest.approx(expected, abs=3e-4)
 
 
-def test_locate_board_agrees_with_the_corners() -> None:
+def test_locating_a_view_agrees_with_the_corners() -> None:
     pose = _poses(3, 35)[2]
     corners = _corners(CAMERA, pose, 0.03, np.random.default_rng(0))
-    T, rms = locate_board(corners, SQUARE_M, COLUMNS, ROWS, CAMERA)
+    T, rms = locate_view(_views([corners])[0], BOARD, CAMERA)
     assert rms < 0.06
     again = CAMERA.project(apply(T, board_points(COLUMNS, ROWS, SQUARE_M)))
     assert np.sqrt(np.mean(np.sum((again - corners) ** 2, axis=1))) == pytest.approx(rms)

@@ -150,23 +150,12 @@ def find_board(image_grey: Grey, board: Board) -> BoardView:
     return _find_charuco(image_grey, board) if board.pattern == "charuco" else _find_circles(image_grey, board)
 
 
-def detect_board(image_grey: Grey, columns: int, rows: int) -> Array:
-    """Inner corners (columns · rows, 2) of a checkerboard in pixels, row after row.
-
-    The board is searched for on a reduced copy and its corners are refined at full size. A board with one even
-    and one odd corner count is always numbered from the same physical corner: the square between the first
-    corners of the first two rows is dark.
-
-    Raises:
-        DataError: not a grey 8-bit image.
-        ComputeError: the whole board is not visible.
-    """
-    _check(image_grey)
-    return _find_checkerboard(image_grey, columns, rows)[0]
-
-
 def _find_checkerboard(image: Grey, columns: int, rows: int) -> tuple[Array, NDArray[np.bool_]]:
-    """All corners, and which of them can be trusted."""
+    """All corners of a checkerboard, and which of them can be trusted.
+
+    A board with one even and one odd corner count is always numbered from the same physical corner: the square
+    between the first corners of the first two rows is dark.
+    """
     found = _search_checkerboard(image, columns, rows)
     corners, good = _refine(image, found, _half_window(_grid_spacing(found.reshape(rows, columns, 2)), _REACH))
     if np.count_nonzero(good) < 0.8 * len(good):

@@ -19,21 +19,10 @@ from service.compute.calibration.adjustment import (
     start,
     start_pose,
 )
-from service.compute.calibration.board import Board, BoardView, board_points, detect_board, half_turn
+from service.compute.calibration.board import Board, BoardView
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
-
-__all__ = [
-    "ExcludedView",
-    "IntrinsicsResult",
-    "board_points",
-    "calibrate_intrinsics",
-    "detect_board",
-    "half_turn",
-    "locate_board",
-    "locate_view",
-]
 
 COVERAGE_GRID = (12, 8)
 _MIN_VIEWS = 3
@@ -175,17 +164,6 @@ def calibrate_intrinsics(
         excluded=tuple(ExcludedView(index, reasons[index]) for index in sorted(reasons)),
         adjustment=solution,
     )
-
-
-def locate_board(
-    corners: Array, square_m: float, columns: int, rows: int, camera: CameraModel
-) -> tuple[Transform, float]:
-    """T_camera_board of one whole checkerboard and a calibrated camera, and its RMS reprojection error in px.
-
-    Raises:
-        ComputeError: no pose explains the corners.
-    """
-    return locate_view(BoardView(np.arange(columns * rows), corners), Board(columns, rows, square_m), camera)
 
 
 def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Transform, float]:
