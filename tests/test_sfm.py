@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.sfm import SfmModel, SfmOptions, choose_pairs, reconstruct
+from service.compute.poses.pairs import choose_pairs
+from service.compute.poses.sfm import SfmModel, SfmOptions, reconstruct
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Transform, align_points, apply
+from service.core.geometry import Transform, align_points, apply, inverse
 from tests.support.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
 OPTIONS = SfmOptions(max_features=1500, neighbours=4)
@@ -46,6 +47,20 @@ def _rms_m(model: SfmModel, views: dict[str, tuple[Path, Transform]]) -> float:
     return float(np.sqrt(np.mean(np.sum((truth - apply(T, scale * found)) ** 2, axis=1))))
 
 
+def _unit_m(model: SfmModel, views: dict[str, tuple[Path, Transform]]) -> float:
+    truth = np.array([views[name][1][:3, 3] for name in model.T_world_camera])
+    return align_points(truth, np.array([T[:3, 3] for T in model.T_world_camera.values()]), with_scale=True)[1]
+
+
+def _tracks_reproject(model: SfmModel) -> None:
+    """Image and point of every observation belong together, in our pixels."""
+    poses, tracks = list(model.T_world_camera.values()), model.tracks
+    for i, T in enumerate(poses):
+        mine = tracks.image == i
+        pixels = model.camera.project(apply(inverse(T), tracks.points[tracks.point[mine]]))
+        assert np.median(np.linalg.norm(pixels - tracks.pixels[mine], axis=1)) < 0.4
+
+
 def test_both_mappers_share_features_and_find_the_poses(
     camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -71,6 +86,11 @@ def test_both_mappers_share_features_and_find_the_poses(
         assert model.n_registered == len(views)
         assert model.mean_reprojection_error_px < 0.4
         assert len(model.points_world) > 300
+        _tracks_reproject(model)
+        spread = np.sqrt(np.trace(model.pose_covariance()[:, :3, :3].sum(axis=0)) / len(views)) * _unit_m(
+            model, views
+        )
+        assert 0.3 < _rms_m(model, views) / spread < 3
         # 0.25 mm is a quarter of a pixel at the scene
         assert _rms_m(model, views) < 2.5e-4
     assert set(first.seconds) == {"extract", "match", "map"}
@@ -115,7 +135,7 @@ def test_pairs_are_neighbours_and_connected() -> None:
     poses = ring_of_poses(24)
     names = [f"v{k:02d}" for k in range(24)]
     prior = dict(zip(names, poses, strict=True))
-    pairs = choose_pairs(names, prior, SfmOptions(neighbours=6))
+    pairs = choose_pairs(names, prior, 6, 60.0)
     assert 24 * 6 / 2 <= len(pairs) < 24 * 6
     reach = {0}
     for _ in range(24):
@@ -123,8 +143,19 @@ def test_pairs_are_neighbours_and_connected() -> None:
     assert reach == set(range(24))
     # an image without a pose is matched with all others, and no prior means all pairs
     del prior["v07"]
-    assert sum(7 in pair for pair in choose_pairs(names, prior, SfmOptions(neighbours=6))) == 23
-    assert len(choose_pairs(names, None, SfmOptions())) == 24 * 23 / 2
+    assert sum(7 in pair for pair in choose_pairs(names, prior, 6, 60.0)) == 23
+    assert len(choose_pairs(names, None, 8, 60.0)) == 24 * 23 / 2
+
+
+def test_across_stations_every_pair_is_kept() -> None:
+    """Poses of two base frames say nothing about pairs between them."""
+    poses = ring_of_poses(12)
+    names = [f"v{k:02d}" for k in range(12)]
+    prior = {name: poses[k % 6] for k, name in enumerate(names)}
+    stations = {name: "one" if k < 6 else "two" for k, name in enumerate(names)}
+    pairs = choose_pairs(names, prior, 2, 60.0, stations=stations)
+    assert sum((i < 6) != (j < 6) for i, j in pairs) == 36
+    assert sum((i < 6) == (j < 6) for i, j in pairs) < 30
 
 
 def test_two_far_stations_are_bridged() -> None:
@@ -132,5 +163,5 @@ def test_two_far_stations_are_bridged() -> None:
     poses = ring_of_poses(24, tilt_deg=45)
     names = [f"v{k:02d}" for k in range(24)]
     prior = {names[k]: poses[k] for k in (1, 3, 5, 13, 15, 17)}
-    pairs = choose_pairs(sorted(prior), prior, SfmOptions(neighbours=2, max_angle_deg=30))
+    pairs = choose_pairs(sorted(prior), prior, 2, 30.0)
     assert any(i < 3 <= j for i, j in pairs)

@@ -1,11 +1,19 @@
-"""Job `structure_from_motion`: camera poses from the images alone, one model over both stations."""
+"""Jobs on camera poses: structure from motion, and hybrid poses of it with the robot and the spheres."""
 
 from __future__ import annotations
 
+import io
+import json
+from typing import Any
+
 import numpy as np
 
-from service.compute.poses.sfm import SfmOptions, reconstruct
+from service.compute.markers.archive import outline_from_record
+from service.compute.poses.hybrid import HybridPoses, hybrid_poses
+from service.compute.poses.sfm import SfmModel, SfmOptions, reconstruct
+from service.compute.poses.tracks import Tracks
 from service.worker.job import JobAnswer, JobContext
+from service.worker.robot_poses import robot_camera_poses
 
 
 def structure_from_motion(context: JobContext) -> JobAnswer:
@@ -32,6 +40,9 @@ def structure_from_motion(context: JobContext) -> JobAnswer:
         data = {
             "mapper": mapper,
             "T_world_camera": {name: T.tolist() for name, T in model.T_world_camera.items()},
+            "pose_covariance": {
+                name: C.tolist() for name, C in zip(model.T_world_camera, model.pose_covariance(), strict=True)
+            },
             "mean_reprojection_error_px": model.mean_reprojection_error_px,
             "mean_track_length": model.mean_track_length,
             "missing": list(model.missing),
@@ -40,4 +51,83 @@ def structure_from_motion(context: JobContext) -> JobAnswer:
             "seconds": model.seconds,
         }
         artefacts.append(context.keep_json(data, kind="sfm_model", name=f"{mapper}.json"))
+        artefacts.append(
+            context.keep_bytes(
+                _packed(model), kind="sfm_tracks", media_type="application/octet-stream", name=f"{mapper}_tracks.npz"
+            )
+        )
     return JobAnswer(measures, tuple(artefacts))
+
+
+def hybrid(context: JobContext) -> JobAnswer:
+    """Adjust the tracks of a model, the robot's poses and the registration spheres together."""
+    arguments = context.arguments
+    camera = context.camera()
+    model = context.input_json(arguments["model"])["T_world_camera"]
+    images = [image for image in arguments["images"] if image["viewpoint"] in model]
+    names = [image["viewpoint"] for image in images]
+    found = context.input_json(arguments["outlines"])
+    stations = sorted({image["station"] for image in images})
+    context.progress("hybrid poses", 0, 1)
+    answer = hybrid_poses(
+        np.array([model[name] for name in names]),
+        _unpacked(context.input(arguments["tracks"]).read_bytes(), names),
+        [[outline_from_record(record, camera) for record in found[name]] for name in names],
+        camera,
+        np.array(arguments["spheres_m"]),
+        float(arguments["radius_m"]),
+        T_base_camera=robot_camera_poses(arguments, images),
+        groups=[stations.index(image["station"]) for image in images],
+        names=names,
+    )
+    measures = {
+        "track_sigma_px": answer.sigma_track_px,
+        "robot_sigma_mm": 1e3 * (answer.sigma_robot_m or 0.0),
+        "robot_sigma_deg": float(np.degrees(answer.sigma_robot_rad or 0.0)),
+    }
+    ref = context.keep_json(_record(answer, names, stations), kind="hybrid_poses", name="hybrid_poses.json")
+    return JobAnswer(measures, (ref,))
+
+
+def _record(answer: HybridPoses, names: list[str], stations: list[str]) -> dict[str, Any]:
+    return {
+        "T_world_camera": {name: T.tolist() for name, T in zip(names, answer.T_world_camera, strict=True)},
+        "pose_covariance": {name: C.tolist() for name, C in zip(names, answer.scan_pose_covariance, strict=True)},
+        "pose_covariance_frame": "scan",
+        "T_world_scan": answer.T_world_scan.tolist(),
+        "T_world_station": {stations[g]: T.tolist() for g, T in answer.T_world_group.items()},
+        "scan_covariance": answer.scan_covariance.tolist(),
+        "predicted_error_mm": 1e3 * answer.sigma_at_m(answer.centre_scan_m),
+        "sigma_track_px": answer.sigma_track_px,
+        "sphere_factor": answer.sphere_factor,
+        "sigma_robot_m": answer.sigma_robot_m,
+        "sigma_robot_rad": answer.sigma_robot_rad,
+        "chi2": answer.chi2,
+    }
+
+
+def _packed(model: SfmModel) -> bytes:
+    """The tracks as a compressed NumPy archive, images by name."""
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        names=np.array(json.dumps(list(model.T_world_camera))),
+        image=model.tracks.image.astype(np.int32),
+        point=model.tracks.point.astype(np.int32),
+        pixels=model.tracks.pixels.astype(np.float32),
+        points=model.tracks.points,
+    )
+    return buffer.getvalue()
+
+
+def _unpacked(data: bytes, names: list[str]) -> Tracks:
+    """The tracks again, images numbered as in `names`."""
+    with np.load(io.BytesIO(data)) as archive:
+        order = json.loads(str(archive["names"]))
+        number = np.array([names.index(name) for name in order], dtype=np.int64)
+        return Tracks(
+            number[archive["image"].astype(np.int64)],
+            archive["point"].astype(np.int64),
+            archive["pixels"].astype(np.float64),
+            archive["points"],
+        )

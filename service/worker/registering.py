@@ -96,8 +96,10 @@ def register(context: JobContext) -> JobAnswer:
         # The spheres are in these poses already: only their adjustment knows how well the scan is placed.
         adjusted = context.input_json(arguments["model"])
         measures["predicted_error_mm"] = adjusted["predicted_error_mm"]
+        T_scan_world = inverse(np.array(adjusted["T_world_scan"]))
         result |= {key: adjusted[key] for key in ("T_world_scan", "T_world_station")}
         result["covariance"] = adjusted["scan_covariance"]
+        result["T_scan_camera"] = {name: (T_scan_world @ T).tolist() for name, T in zip(names, poses, strict=True)}
     ref = context.keep_json({**result, **_residuals(answer, names)}, kind="registration", name=f"{source}.json")
     return JobAnswer(measures, (ref,), result)
 

@@ -18,6 +18,7 @@ _CAUCHY = {"tracks": 2.4, "spheres": 3.0, "robot_position": 3.0, "robot_rotation
 _SETTLED = 0.2  # change of the cost, which is a chi square of all residuals, at which an adjustment has converged
 _NEARLY = 5.0  # the same while the variances are still being estimated
 _MOST_STEPS = 40
+_LEAST = Sigmas(track_px=0.02, sphere=0.3, robot_m=1e-5, robot_rad=1e-5)  # no measurement is better than this
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,9 @@ def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solut
         covariance = _inverse(normal.schur)
         redundancy = _redundancy(weighted, normal, covariance)
         chi2 = {
-            name: float(np.sum(r.squares)) / max(redundancy[name], 1e-3) / (_EXPECTED[name][0] if name in _EXPECTED else 1)
+            name: float(np.sum(r.squares))
+            / max(redundancy[name], 1e-3)
+            / (_EXPECTED[name][0] if name in _EXPECTED else 1)
             for name, r in weighted.items()
         }
         if turn + 1 < rounds:
@@ -83,7 +86,8 @@ def first_guess(state: State, data: Data, sigmas: Sigmas) -> Sigmas:
         "tracks"
     ].squares
     return dataclasses.replace(
-        sigmas, track_px=max(0.02, sigmas.track_px * math.sqrt(float(np.median(squares)) / (2 * math.log(2))))
+        sigmas,
+        track_px=max(_LEAST.track_px, sigmas.track_px * math.sqrt(float(np.median(squares)) / (2 * math.log(2)))),
     )
 
 
@@ -95,10 +99,10 @@ def _descend(state: State, data: Data, sigmas: Sigmas, settled: float) -> tuple[
         weights = _weights(rows)
         normal = normal_equations([r.weighted(weights[name]) for name, r in rows.items()], damping)
         candidate = moved(state, data, *normal.step(damping))
-        after = linearise(candidate, data, sigmas)
-        new = _cost(after)
-        if not math.isfinite(new):
-            raise ComputeError("the bundle adjustment diverged", remedy="check the camera, the poses and the spheres")
+        with np.errstate(all="ignore"):  # a step that leads nowhere is not taken
+            after = linearise(candidate, data, sigmas)
+            new = _cost(after)
+        new = new if math.isfinite(new) else math.inf
         if new <= cost:
             enough = cost - new <= settled
             state, rows, cost, damping = candidate, after, new, max(damping / 10, 1e-9)
@@ -109,7 +113,9 @@ def _descend(state: State, data: Data, sigmas: Sigmas, settled: float) -> tuple[
         else:
             damping *= 30
             if damping > 1e6:
-                return state, rows, step
+                raise ComputeError(
+                    "the bundle adjustment does not converge", remedy="check the camera, the poses and the spheres"
+                )
     return state, rows, _MOST_STEPS
 
 
@@ -180,10 +186,10 @@ def _estimated(sigmas: Sigmas, chi2: dict[str, float], redundancy: dict[str, flo
 
     return dataclasses.replace(
         sigmas,
-        track_px=sigmas.track_px * factor("tracks"),
-        sphere=max(0.3, sigmas.sphere * factor("spheres")),
-        robot_m=max(1e-6, sigmas.robot_m * factor("robot_position")),
-        robot_rad=max(1e-6, sigmas.robot_rad * factor("robot_rotation")),
+        track_px=max(_LEAST.track_px, sigmas.track_px * factor("tracks")),
+        sphere=max(_LEAST.sphere, sigmas.sphere * factor("spheres")),
+        robot_m=max(_LEAST.robot_m, sigmas.robot_m * factor("robot_position")),
+        robot_rad=max(_LEAST.robot_rad, sigmas.robot_rad * factor("robot_rotation")),
     )
 
 

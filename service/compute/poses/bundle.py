@@ -7,7 +7,8 @@ A pose's increment (d, w) is exp(w) R, t + d in the axes of the outer frame.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from service.core.geometry import Array
 
 Index = NDArray[np.int64]
 LENS = ("fx", "fy", "cx", "cy")
+COMMON = ("shift_x", "shift_y", "growth", "light_x", "light_y", "light_z")
 _CHUNK = 2000  # points eliminated at a time
 
 
@@ -32,6 +34,7 @@ class State:
     points: Array  # (P + M, 3) in the frame
     bases: Array  # (G, 4, 4) T_frame_base
     camera: CameraModel
+    common: Array = field(default_factory=lambda: np.zeros(len(COMMON)))  # px, errors that all outlines share
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,9 @@ class Data:
     tracks: Tracks
     sightings: SphereSightings | None = None
     centres: Array | None = None  # (M, 3) spheres in the frame
-    centre_sigma_m: float = 2e-5
+    centre_whitening: Array | None = None  # (M, 3, 3) W with W C W^T = I for the covariance C of a centre
+    common_sigma_px: Array | None = None  # (6,) of COMMON
+    light_unit_m: float = 0.0  # displacement of the spheres in space for a pixel of light
     radius_m: float = 0.0
     robot: Array | None = None  # (N, 4, 4) T_base_camera; NaN where there is none
     group: Index | None = None  # (N,) position in the bases
@@ -93,16 +98,25 @@ class Rows:
 
 
 def width(state: State, data: Data) -> int:
-    """Number of frame parameters: six a camera, six a base, and the lens."""
-    return 6 * len(state.cameras) + 6 * len(state.bases) + (len(LENS) if data.lens_covariance is not None else 0)
+    """Number of frame parameters: six a camera, six a base, what the outlines share, and the lens."""
+    return _lens_column(state, data) + (len(LENS) if data.lens_covariance is not None else 0)
+
+
+def _common_column(state: State) -> int:
+    return 6 * (len(state.cameras) + len(state.bases))
+
+
+def _lens_column(state: State, data: Data) -> int:
+    return _common_column(state) + (len(COMMON) if data.sightings is not None else 0)
 
 
 def linearise(state: State, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
-    """Rows of every component that the data have: tracks, spheres, centres, robot_position, robot_rotation, lens."""
+    """Rows of every component that the data have: tracks, spheres, centres, common, robot_position …, lens."""
     out = {"tracks": _track_rows(state, data, sigmas)}
     if data.sightings is not None:
         out["spheres"] = _sphere_rows(state, data, sigmas)
         out["centres"] = _centre_rows(state, data)
+        out["common"] = _common_rows(state, data)
     if data.robot is not None and data.group is not None:
         out["robot_position"], out["robot_rotation"] = _robot_rows(state, data, sigmas)
     if data.lens_covariance is not None:
@@ -166,13 +180,15 @@ def moved(state: State, data: Data, frame: Array, points: Array) -> State:
     n, g = len(state.cameras), len(state.bases)
     camera = state.camera
     if data.lens_covariance is not None:
-        values = {name: getattr(camera, name) + float(d) for name, d in zip(LENS, frame[6 * (n + g) :], strict=True)}
+        change = frame[_lens_column(state, data) :]
+        values = {name: getattr(camera, name) + float(d) for name, d in zip(LENS, change, strict=True)}
         camera = dataclasses.replace(camera, **values)
     return State(
         _turned(state.cameras, frame[: 6 * n].reshape(-1, 6)),
         state.points + points,
         _turned(state.bases, frame[6 * n : 6 * (n + g)].reshape(-1, 6)),
         camera,
+        state.common if data.sightings is None else state.common + frame[6 * (n + g) :][: len(COMMON)],
     )
 
 
@@ -187,10 +203,10 @@ def _turned(poses: Array, steps: Array) -> Array:
 # --- rows of each component -----------------------------------------------------------------------------
 
 
-def _seen(state: State, image: Index, point: Index) -> tuple[Array, Array, Array]:
+def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
     """Points in their cameras (O, 3), and the derivatives (O, 3, 6) by the pose and (O, 3, 3) by the point."""
-    R, t = state.cameras[image, :3, :3], state.cameras[image, :3, 3]
-    v = state.points[point] - t
+    R, t = cameras[:, :3, :3], cameras[:, :3, 3]
+    v = points - t
     Rt = np.swapaxes(R, 1, 2)
     d_pose = np.concatenate([-Rt, Rt @ _skew(v)], axis=2)
     return np.einsum("oij,oj->oi", Rt, v), d_pose, Rt
@@ -198,7 +214,7 @@ def _seen(state: State, image: Index, point: Index) -> tuple[Array, Array, Array
 
 def _track_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
     tracks = data.tracks
-    c, d_pose, d_point = _seen(state, tracks.image, tracks.point)
+    c, d_pose, d_point = _seen(state.cameras[tracks.image], state.points[tracks.point])
     camera = state.camera
     f = np.array([camera.fx, camera.fy]) / sigmas.track_px
     measured = camera.normalise(tracks.pixels)
@@ -209,7 +225,7 @@ def _track_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
     d_image *= f[:, None]
     lens = None
     if data.lens_covariance is not None:
-        lens = -_lens_derivative(camera, tracks.pixels, measured) * f[:, None]
+        lens = (_lens_column(state, data), -_lens_derivative(camera, tracks.pixels, measured) * f[:, None])
     return _rows(state, data, tracks.image, tracks.point, residual, d_image @ d_pose, d_image @ d_point, lens)
 
 
@@ -217,7 +233,8 @@ def _sphere_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
     s = data.sightings
     assert s is not None
     point = s.marker + len(data.tracks.points)
-    c, d_pose, d_point = _seen(state, s.image, point)
+    light = data.light_unit_m * state.common[3:]
+    c, d_pose, d_point = _seen(state.cameras[s.image], state.points[point] + light)
     distance = np.linalg.norm(c, axis=1)
     u = c / distance[:, None]
     e = s.frames[:, :, :2]
@@ -234,18 +251,25 @@ def _sphere_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
         lift[:, :2] = _lens_derivative(state.camera, pixels, plane) * axes[:, 2, None, None]
         lens = np.zeros((len(c), 3, len(LENS)))
         lens[:, :2] = -np.swapaxes(e, 1, 2) @ lift
-    residual = np.concatenate(
-        [np.einsum("sik,si->sk", e, u - axes), (np.arcsin(sine) - s.half_angles)[:, None]], axis=1
-    )
+    focal = 0.5 * (state.camera.fx + state.camera.fy)
+    shift = np.zeros((len(c), 3, len(COMMON)))  # what the detector adds to a cone
+    shift[:, :2, :2] = np.swapaxes(e[:, :2], 1, 2) * (axes[:, 2] / focal)[:, None, None]
+    shift[:, 2, 2] = axes[:, 2] ** 2 / focal
+    seen = np.concatenate([np.einsum("sik,si->sk", e, u - axes), (np.arcsin(sine) - s.half_angles)[:, None]], axis=1)
+    residual = seen + shift @ state.common
     d = np.zeros((len(c), 3, 3))
     tangent = (np.eye(3) - u[:, :, None] * u[:, None, :]) / distance[:, None, None]
     d[:, :2] = np.swapaxes(e, 1, 2) @ tangent
     d[:, 2] = -(sine / (distance * np.sqrt(1 - sine**2)))[:, None] * u
     whitening = s.whitening / sigmas.sphere
     d = whitening @ d
-    lens = None if lens is None else whitening @ lens
+    more = whitening @ shift
+    more[:, :, 3:] = data.light_unit_m * (d @ d_point)
+    if lens is not None:
+        more = np.concatenate([more, whitening @ lens], axis=2)
     residual = np.einsum("sij,sj->si", whitening, residual)
-    return _rows(state, data, s.image, point, residual, d @ d_pose, d @ d_point, lens)
+    first = _common_column(state)
+    return _rows(state, data, s.image, point, residual, d @ d_pose, d @ d_point, (first, more))
 
 
 def _lens_derivative(camera: CameraModel, pixels: Array, plane: Array) -> Array:
@@ -265,15 +289,16 @@ def _rows(
     residual: Array,
     d_pose: Array,
     d_point: Array,
-    lens: Array | None,
+    more: tuple[int, Array] | None,
 ) -> Rows:
+    """`more`: derivatives by further frame parameters, from a column on."""
     n_obs, k = residual.shape
     row = np.arange(n_obs * k).reshape(n_obs, k, 1)
     columns, values = [np.broadcast_to(6 * image[:, None, None] + np.arange(6), d_pose.shape)], [d_pose]
-    if lens is not None:
-        first = width(state, data) - len(LENS)
-        columns.append(np.broadcast_to(first + np.arange(len(LENS)), lens.shape))
-        values.append(lens)
+    if more is not None:
+        first, further = more
+        columns.append(np.broadcast_to(first + np.arange(further.shape[2]), further.shape))
+        values.append(further)
     frame = np.concatenate(values, axis=2)
     return Rows(
         residual.ravel(),
@@ -283,28 +308,35 @@ def _rows(
     )
 
 
-def _sparse(row: Array, column: Array, values: Array, shape: tuple[int, int]) -> csr_matrix:
-    row, column = np.broadcast_to(row, values.shape), np.broadcast_to(column, values.shape)
-    return coo_matrix((values.ravel(), (row.ravel(), column.ravel())), shape=shape).tocsr()
+def _sparse(row: NDArray[Any], column: NDArray[Any], values: NDArray[Any], shape: tuple[int, int]) -> csr_matrix:
+    rows, columns = np.broadcast_to(row, values.shape), np.broadcast_to(column, values.shape)
+    return coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape).tocsr()
 
 
 def _centre_rows(state: State, data: Data) -> Rows:
+    """The spheres' places in the scan."""
     assert data.centres is not None
+    assert data.centre_whitening is not None
     m, first = len(data.centres), len(data.tracks.points)
-    residual = ((state.points[first:] - data.centres) / data.centre_sigma_m).ravel()
-    index = np.arange(3 * m)
-    return Rows(
-        residual,
-        csr_matrix((3 * m, width(state, data))),
-        coo_matrix(
-            (np.full(3 * m, 1 / data.centre_sigma_m), (index, 3 * first + index)), shape=(3 * m, state.points.size)
-        ).tocsr(),
-        3,
-    )
+    residual = np.einsum("mij,mj->mi", data.centre_whitening, state.points[first:] - data.centres).ravel()
+    row = np.arange(3 * m).reshape(m, 3, 1)
+    column = 3 * (first + np.arange(m))[:, None, None] + np.arange(3)
+    point = _sparse(row, column, data.centre_whitening, (3 * m, state.points.size))
+    return Rows(residual, csr_matrix((3 * m, width(state, data))), point, 3)
+
+
+def _common_rows(state: State, data: Data) -> Rows:
+    """How large errors are that all outlines share."""
+    assert data.common_sigma_px is not None
+    count = len(COMMON)
+    row, column = np.arange(count)[:, None], _common_column(state) + np.arange(count)[:, None]
+    frame = _sparse(row, column, 1 / data.common_sigma_px[:, None], (count, width(state, data)))
+    return Rows(state.common / data.common_sigma_px, frame, csr_matrix((count, state.points.size)), 1)
 
 
 def _robot_rows(state: State, data: Data, sigmas: Sigmas) -> tuple[Rows, Rows]:
-    assert data.robot is not None and data.group is not None
+    assert data.robot is not None
+    assert data.group is not None
     image = np.nonzero(np.isfinite(data.robot).all(axis=(1, 2)))[0]
     base = data.group[image]
     B, M, T = state.bases[base], data.robot[image], state.cameras[image]
@@ -336,8 +368,9 @@ def _robot_rows(state: State, data: Data, sigmas: Sigmas) -> tuple[Rows, Rows]:
 
 def _lens_rows(state: State, data: Data) -> Rows:
     """The calibration as an observation of the lens."""
-    assert data.calibrated is not None and data.lens_covariance is not None
-    whitening = np.linalg.inv(np.linalg.cholesky(data.lens_covariance))
+    assert data.calibrated is not None
+    assert data.lens_covariance is not None
+    whitening = whitening_of(data.lens_covariance)
     change = np.array([getattr(state.camera, name) - getattr(data.calibrated, name) for name in LENS])
     n, count = width(state, data), len(LENS)
     row, column = np.arange(count)[:, None], n - count + np.arange(count)[None, :]
@@ -347,6 +380,11 @@ def _lens_rows(state: State, data: Data) -> Rows:
         csr_matrix((count, state.points.size)),
         count,
     )
+
+
+def whitening_of(covariance: Array) -> Array:
+    """(..., k, k) W with W C W^T = I for covariances C."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64)
 
 
 def _skew(v: Array) -> Array:

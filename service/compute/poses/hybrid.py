@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.poses.adjustment import Solution, solve
-from service.compute.poses.bundle import Data, Sigmas, SphereSightings, State
+from service.compute.poses.bundle import Data, Sigmas, SphereSightings, State, whitening_of
 from service.compute.poses.tracks import Tracks
 from service.compute.registration.identity import identify
-from service.compute.registration.solve import RegistrationResult, register
+from service.compute.registration.solve import COMMON, CommonErrors, RegistrationResult, register
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, transform
 
@@ -30,15 +30,18 @@ class HybridOptions:
     """Settings of the adjustment.
 
     Attributes:
-        sphere_sigma_m: standard deviation of a sphere's position in the scan, for each coordinate.
+        sphere_sigma_m: standard deviation of a sphere's position in the scan, for each coordinate, where no
+            covariance of it is given.
+        common_errors: sizes of what all outlines have in common; solved for.
         most_observations: of tracks that take part; more gain next to nothing and cost time and memory.
         robot_sigma_m: of the robot's positions, to begin with; estimated from the data.
         robot_sigma_rad: of its orientations, likewise.
         track_sigma_px: of the tracks, likewise.
     """
 
-    sphere_sigma_m: float = 2e-5
-    most_observations: int = 80_000
+    sphere_sigma_m: float = 5e-6
+    common_errors: CommonErrors = COMMON
+    most_observations: int = 200_000
     robot_sigma_m: float = 1e-3
     robot_sigma_rad: float = 2e-3
     track_sigma_px: float = 0.4
@@ -64,6 +67,7 @@ class HybridPoses:
         sigma_robot_m, sigma_robot_rad: of the robot's poses for each axis, systematic errors included; None without.
         chi2: reduced chi square of each component: tracks, spheres, centres, robot_position, robot_rotation, lens.
         registration: of the scan to the poses of structure from motion, where the adjustment began.
+        centre_scan_m: (3,) the middle of the spheres.
     """
 
     T_scan_camera: Array
@@ -79,6 +83,7 @@ class HybridPoses:
     sigma_robot_rad: float | None
     chi2: dict[str, float]
     registration: RegistrationResult = field(repr=False)
+    centre_scan_m: Array
 
     @property
     def scan_pose_covariance(self) -> Array:
@@ -144,6 +149,7 @@ def hybrid_poses(
     T_base_camera: Array | None = None,
     groups: Sequence[int] | NDArray[np.int64] | None = None,
     lens_covariance: Array | None = None,
+    sphere_covariance_m2: Array | None = None,
     names: Sequence[str] = (),
     options: HybridOptions | None = None,
 ) -> HybridPoses:
@@ -161,6 +167,7 @@ def hybrid_poses(
         groups: (N,) station of each image; None: all one.
         lens_covariance: (4, 4) of fx, fy, cx, cy as calibrated, to refine them with the calibration as a prior; None
             holds the camera.
+        sphere_covariance_m2: (M, 3, 3) of the centres; None: options.sphere_sigma_m.
         names: of the images, for messages.
         options: settings.
 
@@ -177,8 +184,17 @@ def hybrid_poses(
     assignments = identify(
         outlines, centres_scan_m, camera, poses, radius_m=radius_m, groups=one, metric=False, names=names
     )
+    # Only to begin with and to find wrong outlines: the adjustment itself knows the errors of the poses.
     start = register(
-        outlines, assignments, poses, one, centres_scan_m, radius_m, camera, estimate_scale=True
+        outlines,
+        assignments,
+        poses,
+        one,
+        centres_scan_m,
+        radius_m,
+        camera,
+        estimate_scale=True,
+        pose_covariance="exact",
     )
     used = tracks.thinned(settings.most_observations)
     sightings = _sightings(outlines, start)
@@ -189,11 +205,18 @@ def hybrid_poses(
         bases=bases,
         camera=camera,
     )
+    common = settings.common_errors
+    spheres = sphere_covariance_m2
+    if spheres is None:
+        spheres = np.broadcast_to(settings.sphere_sigma_m**2 * np.eye(3), (len(centres_scan_m), 3, 3))
+    distance_m = float(np.mean(radius_m / np.sin(sightings.half_angles)))
     data = Data(
         tracks=used,
         sightings=sightings,
         centres=centres_scan_m,
-        centre_sigma_m=settings.sphere_sigma_m,
+        centre_whitening=whitening_of(spheres),
+        common_sigma_px=np.repeat([common.shift_px, common.growth_px, common.light_px], [2, 1, 3]),
+        light_unit_m=distance_m / (0.5 * (camera.fx + camera.fy)),
         radius_m=radius_m,
         robot=T_base_camera if order else None,
         group=group,
@@ -222,6 +245,7 @@ def _answer(solution: Solution, order: list[int], n_points: int, start: Registra
         sigma_robot_rad=solution.sigmas.robot_rad if order else None,
         chi2=solution.chi2,
         registration=start,
+        centre_scan_m=state.points[n_points:].mean(axis=0),
     )
 
 
@@ -229,7 +253,7 @@ def _sightings(outlines: Sequence[Sequence[SphereOutline]], start: RegistrationR
     """The outlines that the registration used; a marker that it never used keeps its place in the scan."""
     used = [r for r in start.residuals if not r.excluded]
     found = [outlines[r.image][r.outline] for r in used]
-    whitening = np.array([np.linalg.inv(np.linalg.cholesky(o.cone_covariance)) for o in found])
+    whitening = whitening_of(np.array([o.cone_covariance for o in found]))
     return SphereSightings(
         image=np.array([r.image for r in used]),
         marker=np.array([r.marker for r in used]),

@@ -1,0 +1,95 @@
+"""Which pairs of images are worth matching."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from service.core.geometry import Array, Transform
+
+
+def choose_pairs(
+    names: Sequence[str],
+    prior: Mapping[str, Transform] | None,
+    neighbours: int,
+    max_angle_deg: float,
+    *,
+    stations: Mapping[str, str] | None = None,
+) -> list[tuple[int, int]]:
+    """Index pairs worth matching: nearest viewing directions around the scene, in one connected graph.
+
+    The scene centre is the point nearest to all optical axes. Images without a prior pose are paired with all.
+
+    Args:
+        names: of the images.
+        prior: T_world_camera of images; None pairs all with all.
+        neighbours: how many images each one is paired with, at least.
+        max_angle_deg: between viewing directions, beyond which images are not paired.
+        stations: frame of each image's prior pose where there are several: all pairs across them are kept, since
+            nothing is known of them.
+    """
+    if stations is not None and len({stations.get(name) for name in names}) > 1:
+        return _by_station(names, prior, neighbours, max_angle_deg, stations)
+    n = len(names)
+    known = [k for k, name in enumerate(names) if prior is not None and name in prior]
+    every = {(i, j) for i in range(n) for j in range(i + 1, n)}
+    if prior is None or len(known) < 3:
+        return sorted(every)
+    poses = np.stack([prior[names[k]] for k in known])
+    axes, centres = poses[:, :3, 2], poses[:, :3, 3]
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    scene = np.linalg.lstsq(projectors.sum(axis=0), np.einsum("nij,nj->i", projectors, centres), rcond=None)[0]
+    rays = centres - scene
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    angle = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
+    np.fill_diagonal(angle, np.inf)
+    chosen = {pair for pair in every if pair[0] not in known or pair[1] not in known}
+    for row in range(len(known)):
+        for column in np.argsort(angle[row])[:neighbours]:
+            if angle[row, column] <= max_angle_deg:
+                chosen.add(_ordered(known[row], known[int(column)]))
+    return sorted(chosen | _bridges(chosen, known, angle, n))
+
+
+def _by_station(
+    names: Sequence[str],
+    prior: Mapping[str, Transform] | None,
+    neighbours: int,
+    max_angle_deg: float,
+    stations: Mapping[str, str],
+) -> list[tuple[int, int]]:
+    n = len(names)
+    own = [stations.get(name) for name in names]
+    chosen = {(i, j) for i in range(n) for j in range(i + 1, n) if own[i] != own[j]}
+    for station in set(own):
+        mine = [k for k in range(n) if own[k] == station]
+        inner = choose_pairs([names[k] for k in mine], prior, neighbours, max_angle_deg)
+        chosen |= {(mine[i], mine[j]) for i, j in inner}
+    return sorted(chosen)
+
+
+def _ordered(i: int, j: int) -> tuple[int, int]:
+    return (i, j) if i < j else (j, i)
+
+
+def _bridges(chosen: set[tuple[int, int]], known: list[int], angle: Array, n: int) -> set[tuple[int, int]]:
+    """The nearest pairs between parts of the graph that are not connected: several for each, one may not match."""
+    added: set[tuple[int, int]] = set()
+    while True:
+        edges = np.array(sorted(chosen | added)).reshape(-1, 2)
+        graph = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+        count, label = cast("tuple[int, Any]", connected_components(graph, directed=False))
+        if count == 1:
+            return added
+        inside = label[known] == label[known[0]]
+        rows, columns = np.flatnonzero(inside), np.flatnonzero(~inside)
+        if len(columns) == 0:
+            return added
+        block = angle[np.ix_(rows, columns)]
+        for flat in np.argsort(block, axis=None)[:6]:
+            r, c = divmod(int(flat), len(columns))
+            added.add(_ordered(known[int(rows[r])], known[int(columns[c])]))
