@@ -72,6 +72,16 @@ def _smoothing(t: Array, wide: Array, blur_px: float) -> tuple[Array, Array]:
     return weight.astype(np.float32), slope.astype(np.float32)
 
 
+def _interpolation(t: Array, wide: Array) -> NDArray[np.float32]:
+    """(J, J') what Lanczos interpolation of the pixels does to a profile on the average over the pixels' places.
+
+    The kernel is stretched to the mean of the directions: across the pixels' diagonal it is narrower.
+    """
+    d = 1.1 * (t[:, None] - wide)
+    weight = np.where(np.abs(d) < 4, np.sinc(d) * np.sinc(d / 4), 0.0)
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True), dtype=np.float32)
+
+
 def fit_limb(
     coded_bgr: NDArray[np.float32],
     where: Profiles,
@@ -97,7 +107,7 @@ def fit_limb(
     """
     t = where.offsets_px
     step = float(t[1] - t[0])
-    margin = int(np.ceil(2.5 * max(chroma_blur_px, 1.2) / step))
+    margin = int(np.ceil(3.6 / step)) if step < 0.8 else 3
     wide = t[0] - margin * step + step * np.arange(len(t) + 2 * margin)
     data = np.asarray(coded_bgr @ (TO_YCC.T / 255), dtype=np.float32)  # (K, J, 3)
     K, J = data.shape[:2]
@@ -269,15 +279,15 @@ def _evaluate(
     to_ycc = TO_YCC.T.astype(np.float32)
     columns = columns @ to_ycc  # (K, P, J', 3)
     smooth, d_smooth = _smoothing(t, wide, float(common[1]))
+    sharp = _interpolation(t, wide)
     first = (wider - len(t)) // 2
-    cut = slice(first, first + len(t))
     jacobian = np.empty((K, _N, len(t), 3), dtype=np.float32)
-    jacobian[:, :-1, :, 0] = columns[:, :, cut, 0]
+    jacobian[:, :-1, :, 0] = columns[..., 0] @ sharp.T
     jacobian[:, :-1, :, 1:] = smooth @ columns[..., 1:]
     ycc = value @ to_ycc
     jacobian[:, -1, :, 0] = 0
     jacobian[:, -1, :, 1:] = d_smooth @ ycc[..., 1:]
     model = np.empty((K, len(t), 3), dtype=np.float32)
-    model[..., 0] = ycc[:, cut, 0]
+    model[..., 0] = ycc[..., 0] @ sharp.T
     model[..., 1:] = smooth @ ycc[..., 1:]
-    return model, jacobian, S[:, cut]
+    return model, jacobian, S[:, first : first + len(t)]

@@ -20,7 +20,7 @@ MOST_SIGMA_PX = 0.5  # of an edge point; where there is no outline, places withi
 TEXTURE_FACTOR = 3.0  # sigma of an edge point over the one its own profile tells
 _BLOCKS = 16  # of an outline, for the noise that neighbouring edge points share
 _TRIALS = 150  # of RANSAC: the rough outline is near
-_FIRST_PROFILES, _PROFILES = 64, 128
+_FIRST_PROFILES, _PROFILES = 48, 128
 _START_BLUR_PX, _START_CHROMA_BLUR_PX = 0.7, 1.2
 
 
