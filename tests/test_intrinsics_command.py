@@ -199,7 +199,7 @@ def test_images_of_a_later_step_are_held_against_the_calibration(tmp_path: Path)
     departures = optics_departures(context(1, moved))
     assert departures is not None
     assert departing_images(departures) == 2
-    assert "v1: focal_length_mm 52, calibrated at 50" in told[0]
+    assert "focal_length_mm 52, calibrated at 50: v1, v2" in told[0]
     assert len(moved.notes) == 1
     within = optics_departures(context(0, moved))
     assert within is not None

@@ -19,7 +19,7 @@ from service.compute.calibration.board import Board, Pattern
 from service.compute.calibration.board_images import UsableViews, find_boards, usable_views
 from service.compute.calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
 from service.compute.calibration.intrinsics_record import intrinsics_record
-from service.compute.calibration.optics import Optics, compare_optics
+from service.compute.calibration.optics import Optics, compare_optics, summary
 from service.compute.calibration.plots import calibration_plots
 from service.compute.calibration.uncertainty import ProjectionUncertainty, board_distance_m, projection_uncertainty
 from service.compute.calibration.validation import (
@@ -31,7 +31,6 @@ from service.compute.calibration.validation import (
 from service.core.errors import ComputeError, DataError
 
 _IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
-_DEPARTURES_SHOWN = 8
 
 
 def intrinsics_command(
@@ -146,7 +145,7 @@ def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[d
     calibrated = [optics_of(file) for file in calibration]
     within = compare_optics(calibrated, calibrated)
     record: dict[str, Any] = {"calibration_departures": [str(departure) for departure in within.departures]}
-    warnings = _departure_warnings("changed during the calibration", record["calibration_departures"])
+    warnings = [f"the lens changed during the calibration: {line}" for line in summary(within.departures)]
     if capture_folder is not None:
         comparison = compare_optics(calibrated, [optics_of(file) for file in image_files(capture_folder)])
         record |= {
@@ -155,17 +154,11 @@ def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[d
             "compared": list(comparison.compared),
             "not_stated": list(comparison.unknown),
         }
-        warnings += _departure_warnings("is not as it was calibrated", record["capture_departures"])
+        warnings += [f"the lens is not as it was calibrated: {line}" for line in summary(comparison.departures)]
         # Width and height are always there; without focal length and aperture nothing is known of the lens.
         if not {"focal_length_mm", "aperture_f"} & set(comparison.compared):
             warnings.append("the images state neither focal length nor aperture: a change would not be seen")
     return record, warnings
-
-
-def _departure_warnings(what: str, departures: Sequence[str]) -> list[str]:
-    shown = [f"the lens {what}: {departure}" for departure in departures[:_DEPARTURES_SHOWN]]
-    more = len(departures) - len(shown)
-    return [*shown, f"the lens {what}: {more} more departures"] if more else shown
 
 
 def optics_of(file: Path) -> Optics:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from service.compute.calibration.optics import Optics, OpticsDeparture, compare_optics
+from service.compute.calibration.optics import Optics, OpticsDeparture, compare_optics, summary
 from service.core.model import ViewpointCaptured
 from service.steps.context import StepContext
 
@@ -12,7 +12,6 @@ _STATED = (
     "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "lens", "lens_serial",
     "body_serial",
 )  # fmt: skip
-_NAMED = 6  # in the line for the operator
 
 
 def optics_departures(context: StepContext) -> tuple[OpticsDeparture, ...] | None:
@@ -27,10 +26,8 @@ def optics_departures(context: StepContext) -> tuple[OpticsDeparture, ...] | Non
         return None
     departures = compare_optics([_optics(c) for c in reference], [_optics(c) for c in mine]).departures
     if departures:
-        lines = [str(departure) for departure in departures]
-        context.note("images depart from the calibration", departures=lines)
-        more = f" and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
-        context.tell(f"the lens is not as it was calibrated: {'; '.join(lines[:_NAMED])}{more}")
+        context.note("images depart from the calibration", departures=[str(departure) for departure in departures])
+        context.tell(f"the lens is not as it was calibrated: {'; '.join(summary(departures))}")
     return departures
 
 

@@ -157,7 +157,7 @@ def calibrate_intrinsics(
         leave_one_out=leave_one_out(solution),
         sigma_corner_px=float(np.sqrt(variance)),
         T_camera_board=poses,
-        coverage=np.count_nonzero(counts) / counts.size,
+        coverage=float(np.count_nonzero(counts)) / counts.size,
         coverage_map=counts,
         tilt_deg=np.degrees(np.arccos(np.clip(np.abs(poses[:, 2, 2]), 0, 1))),
         tilt_spread_deg=_largest_angle_deg(poses[:, :3, 2]),

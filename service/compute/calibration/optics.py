@@ -14,6 +14,7 @@ _FIELDS = (
     "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "lens", "lens_serial",
     "body", "body_serial",
 )  # fmt: skip
+_NAMED = 5  # images in a line of the summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,18 @@ class OpticsComparison:
     def images(self) -> tuple[str, ...]:
         """Names of the images that depart, each once, in order."""
         return tuple(dict.fromkeys(departure.image for departure in self.departures))
+
+
+def summary(departures: Sequence[OpticsDeparture]) -> tuple[str, ...]:
+    """One line for each kind of departure, with the images that share it."""
+    alike: dict[tuple[str, str, str], list[str]] = {}
+    for departure in departures:
+        alike.setdefault((departure.field, departure.found, departure.calibrated), []).append(departure.image)
+    return tuple(
+        f"{field} {found}, calibrated at {calibrated}: {', '.join(images[:_NAMED])}"
+        + (f" and {len(images) - _NAMED} more" if len(images) > _NAMED else "")
+        for (field, found, calibrated), images in alike.items()
+    )
 
 
 def compare_optics(calibration: Sequence[Optics], capture: Sequence[Optics]) -> OpticsComparison:
