@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import fast_simplification
@@ -16,7 +16,12 @@ _FRUSTUM_M = 0.05
 
 
 def scene_figure(
-    vertices_m: Array, faces: Any, spheres_m: Array, cameras: Mapping[str, Array], stations: Mapping[str, str]
+    vertices_m: Array,
+    faces: Any,
+    spheres_m: Array,
+    cameras: Mapping[str, Array],
+    stations: Mapping[str, str],
+    predicted_error_mm: Callable[[Array], Array] | None = None,
 ) -> str:
     """HTML (a div with its script) of the scene in the scan frame.
 
@@ -26,6 +31,7 @@ def scene_figure(
         spheres_m: (M, 3) registration spheres.
         cameras: T_scan_camera (4, 4) by viewpoint.
         stations: station of each viewpoint.
+        predicted_error_mm: predicted target registration error (N,) of points (N, 3) of the scan; colours the mesh.
     """
     share = 1.0 - min(1.0, _FACES_SHOWN / max(len(faces), 1))
     points, triangles = vertices_m, faces.astype(np.int64)
@@ -34,7 +40,7 @@ def scene_figure(
     figure = go.Figure()
     figure.add_mesh3d(
         x=points[:, 0], y=points[:, 1], z=points[:, 2], i=triangles[:, 0], j=triangles[:, 1], k=triangles[:, 2],
-        color="#c9a58f", lighting={"ambient": 0.5, "diffuse": 0.8}, name="scan", hoverinfo="skip",
+        lighting={"ambient": 0.5, "diffuse": 0.8}, name="scan", **_colouring(points, predicted_error_mm),
     )  # fmt: skip
     figure.add_scatter3d(
         x=spheres_m[:, 0], y=spheres_m[:, 1], z=spheres_m[:, 2], mode="markers+text", name="registration spheres",
@@ -67,6 +73,17 @@ def scene_figure(
         legend={"orientation": "h"},
     )
     return str(figure.to_html(full_html=False, include_plotlyjs=True))
+
+
+def _colouring(points: Array, predicted_error_mm: Callable[[Array], Array] | None) -> dict[str, Any]:
+    if predicted_error_mm is None:
+        return {"color": "#c9a58f", "hoverinfo": "skip"}
+    return {
+        "intensity": predicted_error_mm(points),
+        "colorscale": "Viridis",
+        "colorbar": {"title": "predicted error (mm)", "len": 0.6},
+        "hovertemplate": "%{intensity:.4f} mm<extra></extra>",
+    }
 
 
 def _frusta(cameras: Sequence[Array]) -> Array:

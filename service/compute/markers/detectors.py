@@ -1,0 +1,27 @@
+"""The detectors that can be chosen by name; a new one is a function and a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.detect import detect_spheres
+from service.compute.markers.paper_chain import detect_by_masks
+from service.compute.markers.records import DetectionOptions, SphereOutline
+
+
+class Detector(Protocol):
+    """Finds the outlines of all spheres in an image (H, W, 3) of the camera's size."""
+
+    def __call__(
+        self, image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = ...
+    ) -> tuple[SphereOutline, ...]:
+        """The outlines, the most certain first."""
+        ...
+
+
+DETECTORS: Mapping[str, Detector] = {"classical": detect_spheres, "paper": detect_by_masks}

@@ -1,0 +1,244 @@
+"""The paper's detector: boxes, masks of the colour channels, an ellipse by false pixels, Canny points, RANSAC."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.candidates import find_candidates
+from service.compute.markers.cones import Cone, angles_to, ransac_cone
+from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
+from service.core.geometry import Array
+
+Box = tuple[float, float, float, float]  # left, top, right, bottom, pixels
+
+_MARGIN = 0.35  # of a circle's radius, around its box
+_MASK_SIDE = 96  # pixels to which a box is reduced for its mask and the ellipse
+_MAX_LOSS = 0.3  # false pixels of the best ellipse over the mask's area
+_LEAST_STEP = 10.0  # grey values between sphere and surroundings, for a channel to be used
+_ENVELOPE = 0.08  # of the semi-axis, to both sides of the ellipse
+_SLOTS = 96  # in which the outline's coverage is counted
+_MOST_BOXES = 24
+_LEAST_BOX_PX = 8
+# Canny's points lie on pixels; these share errors along the outline: about so many are independent.
+_INDEPENDENT = 20
+_LEAST_SIGMA_PX = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class EllipseEstimate:
+    """An ellipse in pixels of the image; `loss` is its false positives and negatives over the mask's area."""
+
+    x: float
+    y: float
+    a: float
+    b: float
+    theta_rad: float
+    loss: float
+
+
+def detect_by_masks(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    options: DetectionOptions = DEFAULTS,
+    boxes: Sequence[Box] | None = None,
+) -> tuple[SphereOutline, ...]:
+    """The outlines in an image (H, W, 3) by the paper's chain (supplement, "Ellipse Detection"); the best first.
+
+    Grounding DINO's boxes and SAM 2's masks are replaced where they are not given: boxes by a vote for circles, masks
+    by GrabCut on each channel, started from the middle. Kept for comparison with the default: its
+    edge points lie on whole pixels of one grey image.
+
+    Args:
+        image_bgr: at the camera's size.
+        camera: points are undistorted before the conic is fitted.
+        options: radii, coverage and number of points are used.
+        boxes: of another detector; None: found here.
+    """
+    found: list[SphereOutline] = []
+    for box in find_boxes(image_bgr, options) if boxes is None else boxes:
+        if min(box[2] - box[0], box[3] - box[1]) < _LEAST_BOX_PX:
+            continue
+        mask = sphere_mask(image_bgr, box)
+        if mask is None:
+            continue
+        estimate = fit_ellipse(mask, box)
+        if estimate.loss > _MAX_LOSS:
+            continue
+        outline = _outline(image_bgr, camera, estimate, options)
+        if outline is not None and all(_apart(outline, other) for other in found):
+            found.append(outline)
+    return tuple(sorted(found, key=lambda outline: -outline.score))
+
+
+def find_boxes(image_bgr: NDArray[np.uint8], options: DetectionOptions = DEFAULTS) -> list[Box]:
+    """Boxes around what may be a sphere, the most certain first."""
+    scale = min(1.0, options.coarse_width_px / image_bgr.shape[1])
+    small = image_bgr
+    if scale < 1:
+        size = (round(image_bgr.shape[1] * scale), round(image_bgr.shape[0] * scale))
+        small = np.asarray(cv2.resize(image_bgr, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    width = small.shape[1]
+    circles = find_candidates(
+        small, options.min_radius * width, options.max_radius * width, options.min_vote, _MOST_BOXES
+    )
+    out: list[Box] = []
+    for circle in circles:
+        x, y, half = circle.x / scale, circle.y / scale, (1 + _MARGIN) * circle.radius / scale
+        out.append((x - half, y - half, x + half, y + half))
+    return out
+
+
+def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | None:
+    """(side, side) the box reduced, true where the sphere in its middle is; None when nothing is there.
+
+    A mask for each channel, joined, opened and closed; the component that holds the middle is kept. The middle is
+    assumed to be sphere and the box's corners not to be; GrabCut decides the rest.
+    """
+    patch = cv2.resize(_cut(image_bgr, box), (_MASK_SIDE, _MASK_SIDE), interpolation=cv2.INTER_AREA)
+    rows, columns = np.mgrid[0:_MASK_SIDE, 0:_MASK_SIDE] - (_MASK_SIDE - 1) / 2
+    distance = np.hypot(rows, columns) / (_MASK_SIDE / 2 / (1 + _MARGIN))  # in radii of the circle in the box
+    joined = np.zeros((_MASK_SIDE, _MASK_SIDE), dtype=np.uint8)
+    for channel in range(3):
+        values = patch[:, :, channel]
+        step = float(np.median(values[distance < 0.8])) - float(np.median(values[distance > 1.15]))
+        if abs(step) < _LEAST_STEP:
+            continue  # a channel in which sphere and surroundings look alike has nothing to add to the others
+        labels = np.full((_MASK_SIDE, _MASK_SIDE), cv2.GC_PR_BGD, dtype=np.uint8)
+        labels[distance < 1.0] = cv2.GC_PR_FGD
+        labels[distance < 0.5] = cv2.GC_FGD
+        labels[distance > 1.25] = cv2.GC_BGD
+        background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
+        colours = np.ascontiguousarray(np.repeat(values[:, :, None], 3, axis=2))
+        cv2.setRNGSeed(0)
+        cv2.grabCut(colours, labels, (0, 0, 0, 0), background, foreground, 3, cv2.GC_INIT_WITH_MASK)
+        joined |= ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.uint8)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+    joined = np.asarray(cv2.morphologyEx(cv2.morphologyEx(joined, cv2.MORPH_OPEN, kernel), cv2.MORPH_CLOSE, kernel))
+    _, parts = cv2.connectedComponents(joined.astype(np.uint8))
+    part = int(parts[_MASK_SIDE // 2, _MASK_SIDE // 2])
+    return np.asarray(parts == part, dtype=np.bool_) if part else None
+
+
+def _cut(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
+    """The box out of the image; what lies beyond the image repeats its border."""
+    height, width = image_bgr.shape[:2]
+    rows = np.clip(np.arange(round(box[1]), round(box[3])), 0, height - 1)
+    columns = np.clip(np.arange(round(box[0]), round(box[2])), 0, width - 1)
+    return np.ascontiguousarray(image_bgr[np.ix_(rows, columns)])
+
+
+def fit_ellipse(mask: NDArray[np.bool_], box: Box) -> EllipseEstimate:
+    """The ellipse with the fewest false positives and negatives against a mask, from several starts."""
+    side = len(mask)
+    rows, columns = np.mgrid[0:side, 0:side].astype(np.float64)
+    inside = mask.astype(np.float64)
+
+    def loss(p: Array) -> float:
+        dx, dy = columns - p[0], rows - p[1]
+        c, s = np.cos(p[4]), np.sin(p[4])
+        a, b = max(float(p[2]), 2.0), max(float(p[3]), 2.0)
+        # Half a pixel of softness gives the simplex something to follow.
+        r = np.hypot((c * dx + s * dy) / a, (c * dy - s * dx) / b)
+        e = np.clip(0.5 + (1 - r) * 0.5 * (a + b), 0.0, 1.0)
+        return float(np.abs(e - inside).sum() / inside.sum())
+
+    y, x = (float(v) for v in np.argwhere(mask).mean(axis=0))
+    radius = float(np.sqrt(inside.sum() / np.pi))
+    half = side / 2 / (1 + _MARGIN)
+    starts = [
+        (x, y, radius, radius, 0.1),
+        (side / 2, side / 2, half, half, 0.1),
+        (x, y, 1.15 * radius, 0.9 * radius, 0.8),
+    ]
+    fits = [minimize(loss, np.array(s), method="Nelder-Mead", options={"maxfev": 260, "xatol": 0.02}) for s in starts]
+    best = min(fits, key=lambda fit: float(fit.fun))
+    p = np.asarray(best.x, dtype=np.float64)
+    sx, sy = (box[2] - box[0]) / side, (box[3] - box[1]) / side
+    return EllipseEstimate(
+        box[0] + (p[0] + 0.5) * sx - 0.5, box[1] + (p[1] + 0.5) * sy - 0.5, abs(p[2]) * sx, abs(p[3]) * sy, p[4],
+        float(best.fun),
+    )  # fmt: skip
+
+
+def _outline(
+    image_bgr: NDArray[np.uint8], camera: CameraModel, estimate: EllipseEstimate, options: DetectionOptions
+) -> SphereOutline | None:
+    """Canny points in the envelope of the ellipse, undistorted, through RANSAC, as an outline."""
+    radius = 0.5 * (estimate.a + estimate.b)
+    reach = max(3.0, _ENVELOPE * radius)
+    half = max(estimate.a, estimate.b) + reach + 4
+    left, top = max(0, int(estimate.x - half)), max(0, int(estimate.y - half))
+    patch = image_bgr[top : int(estimate.y + half) + 1, left : int(estimate.x + half) + 1]
+    if min(patch.shape[:2]) < 8:
+        return None
+    grey = cv2.GaussianBlur(cv2.cvtColor(patch, cv2.COLOR_BGR2GRAY), (5, 5), 1.0)
+    # Thresholds from this region: relative to the whole image's maximum, one highlight decides over all spheres.
+    steep = float(np.percentile(np.abs(cv2.Laplacian(grey, cv2.CV_32F)), 90))
+    edge = cv2.Canny(np.asarray(grey, dtype=np.uint8), 4.0 * steep, 10.0 * steep)
+    pixels = np.argwhere(edge > 0)[:, ::-1].astype(np.float64) + np.array([left, top])
+    dx, dy = pixels[:, 0] - estimate.x, pixels[:, 1] - estimate.y
+    c, s = np.cos(estimate.theta_rad), np.sin(estimate.theta_rad)
+    r = np.hypot((c * dx + s * dy) / estimate.a, (c * dy - s * dx) / estimate.b)
+    near = np.abs(r - 1) * radius < reach
+    pixels = pixels[near]
+    if len(pixels) < 16:
+        return None
+    rays = np.column_stack([camera.normalise(pixels), np.ones(len(pixels))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    slots = ((np.arctan2(dy, dx)[near] / (2 * np.pi) % 1.0) * _SLOTS).astype(np.int64)
+    per_pixel = 1.0 / camera.fx
+    half_angle = np.arctan(radius * per_pixel)
+    fit = ransac_cone(
+        rays, np.ones(len(rays)), slots, (0.8 * half_angle, 1.25 * half_angle), 1.5 * per_pixel,
+        np.random.default_rng(options.seed),
+    )  # fmt: skip
+    if fit is None:
+        return None
+    cone, inlier = fit
+    coverage = len(np.unique(slots[inlier])) / _SLOTS
+    if coverage < options.min_coverage:
+        return None
+    return outline_from_cone(
+        cone, camera, options.n_points, _evidence(image_bgr, camera, cone, rays[inlier], estimate, coverage)
+    )
+
+
+def _evidence(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    cone: Cone,
+    rays: Array,
+    estimate: EllipseEstimate,
+    coverage: float,
+) -> Evidence:
+    off_px = angles_to(cone, rays) * camera.fx
+    sigma_px = max(_LEAST_SIGMA_PX, 1.4826 * float(np.median(np.abs(off_px))))
+    variance = (sigma_px / camera.fx) ** 2 / (_INDEPENDENT * coverage)
+    u, v = round(estimate.x), round(estimate.y)
+    reach = max(2, round(0.4 * estimate.b))
+    colour = np.median(image_bgr[max(0, v - reach) : v + reach, max(0, u - reach) : u + reach].reshape(-1, 3), axis=0)
+    b, g, r = (float(value) for value in colour)
+    return Evidence(
+        coverage=coverage,
+        rms_px=float(np.sqrt(np.mean(off_px**2))),
+        sigma_px=sigma_px,
+        n_edges=len(rays),
+        systematic_px=_LEAST_SIGMA_PX,
+        contrast=0.0,  # not measured by this chain
+        colour_bgr=(b, g, r),
+        score=coverage * (1 - estimate.loss),
+        # Two directions share the points' noise by halves, the radius has all of it.
+        cone_covariance=np.diag([2 * variance, 2 * variance, variance]),
+    )
+
+
+def _apart(a: SphereOutline, b: SphereOutline) -> bool:
+    distance = np.arccos(np.clip(a.cone.axis @ b.cone.axis, -1, 1))
+    return bool(distance > 0.5 * max(a.cone.half_angle_rad, b.cone.half_angle_rad))
