@@ -58,9 +58,9 @@ class LiveAnalysis:
         if params is None:
             return None
         try:
-            spheres = result_of(context, params.spheres_of)["spheres_m"]
-            camera = result_of(context, params.calibration)["camera"]
-            T_flange_camera = result_of(context, params.hand_eye)["T_flange_camera"]
+            spheres = _result(context, params.spheres_of, "spheres_m")
+            camera = _result(context, params.calibration, "camera")
+            T_flange_camera = _result(context, params.hand_eye, "T_flange_camera")
             mesh = artefact_of(context, params.spheres_of, "ct_mesh").sha256
         except ConfigurationError as error:
             context.note("no_live_numbers", why=str(error))
@@ -220,6 +220,13 @@ def describe_view(job: JobState) -> str:
     if job.result.get("reason"):
         parts.append(str(job.result["reason"]))
     return f"{job.result['viewpoint']}: {', '.join(parts)}"
+
+
+def _result(context: StepContext, step: str, name: str) -> Any:
+    found = result_of(context, step).get(name)
+    if found is None:
+        raise ConfigurationError(f"step {step!r} gives no {name}", where=f"step {context.step.id}, live")
+    return found
 
 
 def _fails(gate: Gate, measures: Mapping[str, float]) -> bool:

@@ -11,7 +11,15 @@ import numpy as np
 from service.compute.calibration.kinematics import ArmModel, arm_model
 from service.compute.planning.collision import Capsule, Obstacles, universal_robot_body
 from service.compute.planning.inverse import nearest_posture
-from service.compute.planning.motion_plan import MotionPlan, Order, PlannedView, Situation, plan_motion
+from service.compute.planning.motion_plan import (
+    MotionPlan,
+    Order,
+    PlannedView,
+    Situation,
+    infeasible_reason,
+    plan_motion,
+    travel_times_s,
+)
 from service.compute.planning.optics import depth_of_field
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
@@ -47,7 +55,7 @@ def plan_step(
         model = known_arm(collision.arm or robot.report().identity.model)
         if model is None:
             why = "the arm's kinematics are not known: reach is asked of its controller at each viewpoint, no more"
-            plans.append(StepPlan(tuple(mine), {}, f"{station}: {why}", {"station": station, "unchecked": why}))
+            plans.append(StepPlan(tuple(mine), {}, f"{station}: {why}", {}))
             continue
         start = robot.state().sample.joints_rad
         layout = context.devices.layout(station)
@@ -60,10 +68,12 @@ def plan_step(
         tuple(v for plan in plans for v in plan.viewpoints),
         {name: reason for plan in plans for name, reason in plan.refused.items()},
         "; ".join(plan.text for plan in plans),
-        {"stations": [dict(plan.record) for plan in plans]},
+        {"stations": [dict(plan.record) for plan in plans if plan.record]},
     )
-    context.note(PLAN, text=whole.text, **whole.record)
-    context.tell(whole.text)
+    if whole.record["stations"]:
+        context.note(PLAN, text=whole.text, **whole.record)
+    if whole.text:
+        context.tell(whole.text)
     return whole
 
 
@@ -87,6 +97,31 @@ def plan_station(
         for v in answer.views
     )
     return StepPlan(planned, {v.name: v.reason for v in answer.refused}, _text(answer), _record(answer, layout.name))
+
+
+def feasible_extra(
+    context: StepContext, viewpoints: Sequence[Viewpoint], T_flange_camera: Transform
+) -> list[tuple[Viewpoint, float]]:
+    """Those of further viewpoints of one station that the arm can take, with the time to get there from where it is.
+
+    All of them, with no time, for an arm without known kinematics.
+    """
+    if not viewpoints:
+        return []
+    collision, optics = context.devices.surroundings()
+    robot = context.devices.robot(viewpoints[0].station)
+    model = known_arm(collision.arm or robot.report().identity.model)
+    if model is None:
+        return [(v, 0.0) for v in viewpoints]
+    layout, motion = context.devices.layout(viewpoints[0].station), context.protocol.motion
+    start = robot.state().sample.joints_rad
+    situation = situation_of(T_flange_camera, layout, model, collision, optics, motion, start)
+    out: list[tuple[Viewpoint, float]] = []
+    for viewpoint in viewpoints:
+        joints = nearest_posture(model, viewpoint.T_base_camera @ inverse(T_flange_camera), start)
+        if joints is not None and not infeasible_reason(viewpoint.T_base_camera, joints, situation):
+            out.append((viewpoint, float(travel_times_s(np.array([start, joints]), situation)[0, 1])))
+    return out
 
 
 def situation_of(

@@ -10,7 +10,7 @@ from service.steps.capture import capture_viewpoints
 from service.steps.context import StepContext, StepKind, StepOutcome
 from service.steps.live import Live, LiveAnalysis
 from service.steps.optics import departing_images, optics_departures
-from service.steps.planning import plan_step
+from service.steps.planning import feasible_extra, plan_step
 from service.steps.viewpoints import ViewpointSet, denser_viewpoints, plan_viewpoints
 
 
@@ -43,6 +43,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     if live is not None:
         wanted = live.suggested()
         plan += [viewpoint for viewpoint in extra if viewpoint.name in wanted]
+    context.devices.camera()  # no plan for an arm whose camera does not answer
     nominal = context.devices.nominal_T_flange_camera()
     there = {capture.viewpoint for capture in context.evidence.captures(context.step.id)}
     planned = plan_step(context, [v for v in plan if v.name not in there], nominal, params.order)
@@ -60,7 +61,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         measures["optics_departures"] = float(departing_images(departures))
     if live is not None:
         taken = {viewpoint.name for viewpoint in plan}
-        measures |= live.summary(last.station, [(v, 0.0) for v in extra if v.name not in taken])
+        candidates = feasible_extra(context, [v for v in extra if v.name not in taken], nominal)
+        measures |= live.summary(last.station, candidates)
     result = Result(purpose=params.purpose, captured=totals.captured)
     return StepOutcome(measures=measures, result=result.model_dump())
 

@@ -29,7 +29,6 @@ from service.compute.planning.coverage import (
     CoverageSurface,
     coverage_surface,
     covered_fraction,
-    dome_surface,
     seen,
 )
 from service.compute.planning.information import (
@@ -73,16 +72,13 @@ class _Station:
 
 
 def coverage_points(context: JobContext) -> JobAnswer:
-    """Points of the specimen that the images should see: of the CT's surface, or of a dome where there is none."""
+    """Points of the specimen that the images should see, on the CT's surface."""
     arguments = context.arguments
     spheres, radius_m = np.array(arguments["spheres_m"]), float(arguments["radius_m"])
-    if arguments["mesh"] is None:
-        surface = dome_surface(spheres, radius_m)
-    else:
-        with np.load(context.input(arguments["mesh"]), allow_pickle=False) as mesh:
-            surface = coverage_surface(
-                mesh["vertices_m"], mesh["faces"], spheres, radius_m, CoverageLimits(**arguments["limits"])
-            )
+    with np.load(context.input(arguments["mesh"]), allow_pickle=False) as mesh:
+        surface = coverage_surface(
+            mesh["vertices_m"], mesh["faces"], spheres, radius_m, CoverageLimits(**arguments["limits"])
+        )
     buffer = io.BytesIO()
     np.savez(
         buffer,

@@ -19,7 +19,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, apply, inverse, look_at
+from service.core.geometry import Array, Transform, apply, inverse
 
 _CELL_M = 0.0025  # of the occluder
 _LIFT_M = 0.002  # above the simplified surface, so that it does not hide its own points
@@ -113,24 +113,6 @@ def coverage_surface(
     return CoverageSurface(points[chosen], normals[chosen], vertices, simple)
 
 
-def dome_surface(spheres_m: Array, radius_m: float, *, n_points: int = 800) -> CoverageSurface:
-    """Stand-in where there is no CT: a flat dome between the spheres, with nothing that hides it."""
-    centre = spheres_m.mean(axis=0)
-    axes = np.linalg.svd(spheres_m - centre)[2]
-    k = np.arange(n_points) + 0.5
-    angle, r = np.pi * (1 + np.sqrt(5)) * k, np.sqrt(k / n_points)
-    extent = 0.7 * np.abs((spheres_m - centre) @ axes.T).max(axis=0)[:2]
-    height = max(2 * radius_m, 0.03)
-    local = np.column_stack([extent[0] * r * np.cos(angle), extent[1] * r * np.sin(angle), height * (1 - r**2)])
-    slope = np.column_stack(
-        [2 * height * local[:, 0] / extent[0] ** 2, 2 * height * local[:, 1] / extent[1] ** 2, np.ones(n_points)]
-    )
-    if np.linalg.det(axes) < 0:
-        axes[2] *= -1
-    normals = slope / np.linalg.norm(slope, axis=1, keepdims=True)
-    return CoverageSurface(centre + local @ axes, normals @ axes, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-
-
 def seen(
     surface: CoverageSurface,
     eye_m: Array,
@@ -190,7 +172,7 @@ def _between(points: Array, spheres_m: Array, radius_m: float, up: Array) -> NDA
 def _on_board(points: Array, normals: Array, up: Array, centre: Array) -> NDArray[np.bool_]:
     """Points of the plane on which the specimen lies, if one stands out among the heights of level surface."""
     height = (points - centre) @ up
-    level = np.abs(normals @ up) > 0.97
+    level = normals @ up > 0.97  # its top: the underside is as large
     if level.sum() < 50:
         return np.zeros(len(points), dtype=bool)
     edges = np.arange(height[level].min(), height[level].max() + 2 * _BOARD_M, _BOARD_M / 2)
@@ -212,12 +194,6 @@ def _dome(centre: Array, up: Array, distance_m: float) -> list[Array]:
             sideways = np.cos(azimuth) * axes[0] + np.sin(azimuth) * axes[1]
             eyes.append(centre + distance_m * (np.cos(tilt) * up + np.sin(tilt) * sideways))
     return eyes
-
-
-def dome_cameras(centre: Array, up: Array, distance_m: float) -> list[Transform]:
-    """Cameras (4, 4) on the dome that look at the centre."""
-    axes = _plane_axes(up)
-    return [look_at(eye, centre, axes[0]) for eye in _dome(centre, up, distance_m)]
 
 
 def _simplified(vertices_m: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:

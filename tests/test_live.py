@@ -1,0 +1,321 @@
+"""What an image brings while the capture runs: spheres, predicted error, coverage, which views to take next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from service.compute.live import LiveView, find_spheres, paired, register_station, sharpness
+from service.compute.planning.coverage import (
+    CoverageLimits,
+    CoverageSurface,
+    coverage_surface,
+    covered_fraction,
+    seen,
+)
+from service.compute.planning.information import (
+    ViewInformation,
+    pose_covariance,
+    pose_scatter,
+    predicted_information,
+    target_error,
+    view_information,
+)
+from service.compute.planning.next_best_view import Candidate, Present, next_best_views
+from service.core.errors import ComputeError
+from service.core.geometry import Array, apply, inverse, transform
+from service.core.model import StepNote
+from service.store.store import Store
+from service.worker.job import JobContext
+from service.worker.live import coverage_points, live_summary, live_view
+from tests.support.bench_rig import answer
+from tests.support.bench_run import PROTOCOL, Bench, begin_run
+from tests.support.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, Scene, exact_outlines, render, scene
+
+SPHERES_M = np.vstack([REGISTRATION_M, CONTROL_M])
+CENTRE_M = SPHERES_M.mean(axis=0)
+NO_SCATTER = np.zeros((6, 6))
+
+
+def informations(made: Scene, *, pose_noise_m: float = 0.0, seed: int = 0) -> list[ViewInformation]:
+    """Views with outlines of 0.1 px and camera poses that err by this much in 3D."""
+    rng = np.random.default_rng(seed)
+    centre = apply(made.T_world_scan, CENTRE_M)
+    out: list[ViewInformation] = []
+    for i, T in enumerate(made.T_world_camera):
+        outlines, which = exact_outlines(made, i, SPHERES_M, 0.1, seed=seed)
+        shift = transform(np.eye(3), rng.normal(0, pose_noise_m / np.sqrt(3), 3))
+        markers = dict(enumerate(which))
+        out.append(
+            view_information(
+                shift @ T, made.T_world_scan, outlines, markers, SPHERES_M, RADIUS_M, centre, 10 * pose_noise_m + 1e-4
+            )
+        )
+    return out
+
+
+# --- predicted error -----------------------------------------------------------------------------------------
+
+
+def test_the_predicted_covariance_is_that_of_many_repetitions() -> None:
+    made = scene(4, seed=3)
+    sigma_m = 0.5e-3
+    P = np.diag([sigma_m**2 / 3] * 3 + [0.0] * 3)
+    answers: list[Array] = []
+    for seed in range(150):
+        views = informations(made, pose_noise_m=sigma_m, seed=seed)
+        normal = sum((v.information for v in views), np.zeros((6, 6)))
+        answers.append(np.linalg.solve(normal, sum((v.information @ v.offset for v in views), np.zeros(6))))
+    predicted = pose_covariance([v.information for v in informations(made)], P)
+    spread = np.cov(np.array(answers).T)
+    assert np.sqrt(np.trace(spread[:3, :3]) / np.trace(predicted[:3, :3])) == pytest.approx(1.0, abs=0.15)
+    assert np.sqrt(np.trace(spread[3:, 3:]) / np.trace(predicted[3:, 3:])) == pytest.approx(1.0, abs=0.2)
+
+
+def test_the_scatter_of_the_views_shows_how_much_the_arm_errs() -> None:
+    views = informations(scene(40, seed=5), pose_noise_m=2e-3)
+    P = pose_scatter(views, 1e-4, 1e-4)
+    assert np.sqrt(np.trace(P[:3, :3])) == pytest.approx(2e-3, rel=0.25)
+
+
+def test_more_views_predict_less_error_and_one_sphere_none_at_all() -> None:
+    made = scene(8, seed=1)
+    views = informations(made)
+    centre = apply(made.T_world_scan, CENTRE_M)
+    errors = [target_error(views[:n], centre, sigma_m=1e-3, sigma_rad=1e-3).at_m(centre[None])[0] for n in (1, 3, 8)]
+    assert errors[0] > errors[1] > errors[2] > 0
+    one = predicted_information(made.T_world_camera[0], centre[None], RADIUS_M, centre, np.eye(3) * 1e-8)
+    with pytest.raises(ComputeError, match="do not determine"):
+        pose_covariance([one], NO_SCATTER)
+
+
+# --- next best view -------------------------------------------------------------------------------------------
+
+
+def choice(made: Scene, taken: int) -> tuple[Present, list[Candidate]]:
+    centre = apply(made.T_world_scan, CENTRE_M)
+    views = informations(made)
+    P = np.diag([1e-7] * 3 + [1e-8] * 3)
+    targets = apply(made.T_world_scan, SPHERES_M) - centre
+    present = Present(tuple(v.information for v in views[:taken]), P, targets, np.zeros(4, dtype=np.int64))
+    rng = np.random.default_rng(0)
+    rest = [Candidate(f"x{i}", v.information, rng.random(4) > 0.5, float(i)) for i, v in enumerate(views[taken:])]
+    return present, rest
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_next_best_view_helps_at_least_as_much_as_any_other(seed: int) -> None:
+    present, candidates = choice(scene(12, seed=seed), 2)
+    (first, *_) = next_best_views(present, candidates, limit_m=0.0, min_coverage=0.0)
+    errors = [present.error_m(c.information) for c in candidates]
+    assert first.predicted_error_m <= 1.01 * min(errors)
+    assert first.predicted_error_m < np.mean(errors) < present.error_m()
+
+
+def test_views_are_suggested_until_error_and_coverage_are_within_their_limits() -> None:
+    present, candidates = choice(scene(12, seed=2), 2)
+    few = next_best_views(present, candidates, limit_m=0.8 * present.error_m(), min_coverage=0.0, at_most=10)
+    assert few[-1].predicted_error_m <= 0.8 * present.error_m()
+    assert all(view.predicted_error_m > 0.8 * present.error_m() for view in few[:-1])
+    assert next_best_views(present, candidates, limit_m=1.0, min_coverage=0.0) == ()
+    covered = next_best_views(present, candidates, limit_m=1.0, min_coverage=1.0, at_most=10)
+    assert covered[-1].coverage == 1.0
+
+
+# --- coverage --------------------------------------------------------------------------------------------------
+
+
+def hill() -> tuple[Array, Any]:
+    """A hemisphere on a board, in the midst of the spheres."""
+    board = trimesh.creation.box(
+        (0.7, 0.5, 0.02), transform=trimesh.transformations.translation_matrix((0, 0, -0.01))
+    )
+    board = board.subdivide_to_size(0.02)
+    ball = trimesh.creation.icosphere(4, 0.06)
+    whole = trimesh.util.concatenate([board, ball])
+    return np.asarray(whole.vertices, dtype=np.float64), np.asarray(whole.faces, dtype=np.int32)
+
+
+def test_coverage_counts_what_two_views_have_seen_of_what_can_be_seen() -> None:
+    limits = CoverageLimits()
+    surface = coverage_surface(*hill(), REGISTRATION_M, RADIUS_M, limits, n_points=600)
+    assert np.all(surface.points_m[:, 2] > 0), "the board's underside and what is inside cannot be seen"
+    on_hill = np.linalg.norm(surface.points_m, axis=1) < 0.062
+    assert on_hill.mean() > 0.9, "the board does not count"
+    top = seen(surface, np.array([0.0, 0.0, 0.6]), limits)
+    side = seen(surface, np.array([0.45, 0.0, 0.4]), limits)
+    slope = surface.normals @ np.array([1.0, 0.0, 0.0])
+    assert np.all(side[slope > 0.7])
+    assert not np.any(side[slope < -0.7])
+    assert covered_fraction([top, side], 2) == pytest.approx(np.mean(top & side))
+    assert covered_fraction([top], 2) == 0.0
+    assert not seen(surface, np.array([0.0, 0.0, 1.2]), limits).any(), "too far away"
+
+
+def test_what_stands_in_between_hides_the_surface() -> None:
+    ring = np.array([[0.0, 0.0, 0.06]]) + 0.05 * np.stack(
+        [np.cos(np.arange(40)), np.sin(np.arange(40)), np.zeros(40)], 1
+    )
+    up = np.tile([0.0, 0.0, 1.0], (40, 1))
+    dome = CoverageSurface(ring, up, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    plate = trimesh.creation.box((0.8, 0.8, 0.001), transform=trimesh.transformations.translation_matrix((0, 0, 0.3)))
+    hidden = CoverageSurface(ring, up, np.asarray(plate.vertices), np.asarray(plate.faces))
+    above = np.array([0.0, 0.0, 0.65])
+    assert seen(dome, above, CoverageLimits()).mean() > 0.9
+    assert not seen(hidden, above, CoverageLimits()).any()
+
+
+# --- images ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pictures() -> tuple[Scene, list[Any]]:
+    made = scene(3, width=1200, seed=11)
+    return made, [render(made.camera, made.centres_camera(i, SPHERES_M), seed=i) for i in range(3)]
+
+
+def test_prediction_finds_what_a_search_of_the_whole_image_finds(pictures: tuple[Scene, list[Any]]) -> None:
+    made, images = pictures
+    T_camera_scan = inverse(made.T_world_camera[0]) @ made.T_world_scan
+    whole = find_spheres(images[0], made.camera, SPHERES_M, RADIUS_M, None)
+    near = find_spheres(
+        images[0], made.camera, SPHERES_M, RADIUS_M, transform(np.eye(3), np.full(3, 5e-4)) @ T_camera_scan
+    )
+    assert len(near) >= len(whole) >= 6
+    by_marker = {m: whole[o] for o, m in paired(whole, T_camera_scan, SPHERES_M, RADIUS_M, made.camera).items()}
+    for o, m in paired(near, T_camera_scan, SPHERES_M, RADIUS_M, made.camera).items():
+        if m in by_marker:
+            assert np.allclose(near[o].centre_px, by_marker[m].centre_px, atol=0.2)
+    lost = find_spheres(
+        images[0], made.camera, SPHERES_M, RADIUS_M, transform(np.eye(3), [0.1, 0, 0]) @ T_camera_scan
+    )
+    assert len(lost) == len(whole), "a prediction that is wrong is noticed, and the whole image searched"
+    quality = sharpness(images[0], near, made.camera)
+    blurred = sharpness(cv2.GaussianBlur(images[0], (0, 0), 2.5), near, made.camera)
+    assert blurred.edge_px > 1.5 * quality.edge_px
+
+
+def test_images_register_one_after_the_other(pictures: tuple[Scene, list[Any]]) -> None:
+    made, images = pictures
+    known, views = None, list[LiveView]()
+    for i, image in enumerate(images):
+        predicted = None if known is None else inverse(made.T_world_camera[i]) @ known
+        outlines = find_spheres(image, made.camera, SPHERES_M, RADIUS_M, predicted)
+        views.append(LiveView(f"v{i}", made.T_world_camera[i], outlines))
+        known = register_station(views, SPHERES_M, RADIUS_M, made.camera, known).T_base_scan
+        error = np.linalg.norm(apply(known, CENTRE_M) - apply(made.T_world_scan, CENTRE_M))
+        assert error < 0.15e-3
+
+
+# --- jobs ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    with Store.open(tmp_path / "data") as opened:
+        yield opened
+
+
+def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
+    store: Store, tmp_path: Path, pictures: tuple[Scene, list[Any]]
+) -> None:
+    made, images = pictures
+    np.savez(tmp_path / "mesh.npz", vertices_m=hill()[0], faces=hill()[1])
+    mesh = store.put_file(tmp_path / "mesh.npz", kind="ct_mesh", media_type="application/x-npz", original_name="m")
+    shared: dict[str, Any] = {
+        "camera": asdict(made.camera),
+        "T_flange_camera": np.eye(4).tolist(),
+        "spheres_m": SPHERES_M.tolist(),
+        "radius_m": RADIUS_M,
+        "arm_sigma_m": 1e-3,
+        "arm_sigma_rad": 1e-3,
+        "limits": asdict(CoverageLimits()),
+    }
+
+    def job(**arguments: Any) -> JobContext:
+        return JobContext({**shared, **arguments}, store, tmp_path, lambda _what, _done, _total: None)
+
+    surface = coverage_points(job(mesh=mesh.sha256)).artefacts[0].sha256
+    earlier: list[str] = []
+    errors: list[float] = []
+    for i, image in enumerate(images):
+        ok, jpeg = cv2.imencode(".jpg", image)
+        assert ok
+        photograph = store.put_bytes(jpeg.tobytes(), kind="image", media_type="image/jpeg", original_name=f"{i}.jpg")
+        taken = {
+            "viewpoint": f"v{i}",
+            "station": "station_1",
+            "sha256": photograph.sha256,
+            "T_base_flange": made.T_world_camera[i].tolist(),
+        }
+        done = live_view(job(image=taken, surface=surface if i else None, earlier=earlier))
+        assert done.measures["spheres_seen"] >= 6
+        assert done.measures["spheres_seen"] <= done.measures["outlines"]
+        earlier = [*earlier, done.artefacts[0].sha256]
+        errors.append(done.measures["predicted_target_error_mm"])
+    assert errors[2] < errors[0]
+    extra = scene(6, width=1200, seed=11).T_world_camera[3:]
+    candidates = [
+        {
+            "name": f"x{i}",
+            "T_base_camera": (made.T_world_scan @ inverse(made.T_world_scan) @ T).tolist(),
+            "travel_s": 1.0,
+        }
+        for i, T in enumerate(extra)
+    ]
+    summary = live_summary(
+        job(
+            views=earlier, surface=surface, station="station_1", limit_m=1e-5, min_coverage=1.0, candidates=candidates
+        )
+    )
+    assert summary.measures["predicted_target_error_mm"] == pytest.approx(errors[2], rel=1e-6)
+    assert 0 < summary.measures["outline_limited_error_mm"] < summary.measures["predicted_target_error_mm"]
+    assert 0 < summary.measures["specimen_coverage"] <= 1
+    suggested = summary.result["next_best_views"]
+    assert len(suggested) == 3
+    assert suggested[0]["predicted_error_mm"] < errors[2]
+    assert summary.result["reasons"] == {}
+
+
+# --- runs ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
+    with Store.open(tmp_path / "runs") as opened:
+        yield lambda text: begin_run(opened, text, tmp_path)
+
+
+def test_a_capture_goes_on_without_numbers_where_what_they_need_was_skipped(begin: Callable[[str], Bench]) -> None:
+    live = "      live: {calibration: fixation, hand_eye: fixation, spheres_of: fixation}\n"
+    bench = begin(PROTOCOL.replace("      purpose: dataset\n", f"      purpose: dataset\n{live}"))
+    assert bench.run().status == "completed"
+    assert [note.note for note in bench.payloads(StepNote) if note.step == "capture"] == ["no_live_numbers"]
+
+
+def test_an_operator_is_told_what_is_missing_and_what_would_help(begin: Callable[[str], Bench]) -> None:
+    gate = "      - {measure: predicted_target_error_mm, max: 0.3, unit: mm}\n    recovery: {retries: 2, wait_s: 0}"
+    bench = begin(PROTOCOL.replace("    recovery: {retries: 2, wait_s: 0}", gate))
+    advice = "Confirm to take 1 more views (vt25+40)"
+
+    def told(question: Any, _state: Any) -> Any:
+        assert "predicted_target_error_mm was not measured, allowed ≤ 0.3" in question.text
+        assert advice in question.text
+        return answer(question, "abort", reason="seen enough")
+
+    def suggest(moves: int) -> None:
+        if moves == 4:
+            data = {"advice": advice, "viewpoints": [{"viewpoint": "vt25+40"}]}
+            note = StepNote(step="capture", attempt=1, note="suggested_viewpoints", data=data)
+            bench.store.record(bench.run_id, [note], actor="runner")
+
+    bench.rig.arm.on_move = suggest
+    bench.script("capture", "recovery", told)
+    assert bench.run().status == "aborted"
