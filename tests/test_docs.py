@@ -149,6 +149,9 @@ RUN_ELSEWHERE = {
     "orthocapture calibrate intrinsics --images DIR --board 16x23 --square-mm 15 --out camera.json": (
         "tests/test_intrinsics_command.py::test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads"
     ),
+    "orthocapture sfm --images DIR --camera camera.json --out MODEL_DIR": (
+        "tests/test_sfm_command.py::test_robot_poses_of_two_frames_are_noticed_and_not_believed"
+    ),
     "make demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make test": "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
     "orthocapture simulate rig --scene 7 --dir rig": (
