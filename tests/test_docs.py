@@ -152,6 +152,10 @@ RUN_ELSEWHERE = {
     "orthocapture sfm --images DIR --camera camera.json --out MODEL_DIR": (
         "tests/test_sfm_command.py::test_robot_poses_of_two_frames_are_noticed_and_not_believed"
     ),
+    "orthocapture calibrate hand-eye --images DIR --robot-poses poses.csv --joints joints.csv --camera camera.json "
+    "--board 16x23 --square-mm 15 --out hand_eye.json": (
+        "tests/test_hand_eye_arm.py::test_the_command_calibrates_photographs"
+    ),
     "make demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make test": "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
     "orthocapture simulate rig --scene 7 --dir rig": (

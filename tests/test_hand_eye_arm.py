@@ -296,29 +296,35 @@ def test_suggested_poses_keep_what_they_promise() -> None:
 
 
 def test_the_command_calibrates_photographs(tmp_path: Path) -> None:
-    session = noisy_session(7, 0.02, 0.002, 8)
-    camera = session.corners.camera.scaled(900, 600)
-    names = [f"v{i}.png" for i in range(7)]
+    scene = Scene.generate(4)
+    session = board_session(scene, plan(scene, "demo", "camera_calibration"), width=900)
+    camera, count = session.corners.camera, len(session.T_base_flange)
+    names = [f"v{i:02d}.png" for i in range(count)]
     (tmp_path / "images").mkdir()
     look = checkerboard(BOARD.columns, BOARD.rows, BOARD.square_m)
     for i, name in enumerate(names):
         picture = photograph(look, camera, session.T_camera_board[i], np.random.default_rng(i), samples=2)
         cv2.imwrite(str(tmp_path / "images" / name), picture)
     write_poses_csv(tmp_path / "poses.csv", dict(zip(names, session.T_base_flange, strict=True)))
+    rows = [",".join([name, *map(repr, q.tolist())]) for name, q in zip(names, session.joints_rad, strict=True)]
+    (tmp_path / "joints.csv").write_text("image,q1,q2,q3,q4,q5,q6\n" + "\n".join(rows))
     (tmp_path / "camera.json").write_text(json.dumps(camera.record()))
     answer = CliRunner().invoke(
         calibrate_app,
         ["hand-eye", "--images", str(tmp_path / "images"), "--robot-poses", str(tmp_path / "poses.csv"),
-         "--camera", str(tmp_path / "camera.json"), "--board", "23x16", "--square-mm", "15",
-         "--out", str(tmp_path / "hand_eye.json"), "--preview", str(tmp_path / "plan.png"), "--suggest", "2"],
+         "--joints", str(tmp_path / "joints.csv"), "--camera", str(tmp_path / "camera.json"), "--board", "23x16",
+         "--square-mm", "15", "--out", str(tmp_path / "hand_eye.json"), "--preview", str(tmp_path / "plan.png"),
+         "--suggest", "2"],
     )  # fmt: skip
     assert answer.exit_code == 0, answer.output
     record = json.loads((tmp_path / "hand_eye.json").read_text())
-    assert _error_mm(np.array(record["T_flange_camera"])) < 0.3
+    assert np.linalg.norm((np.array(record["T_flange_camera"]) - scene.T_flange_camera)[:3, 3]) < 2e-3
     assert np.array(record["T_base_board"]).shape == (4, 4)
     assert set(record["residuals"]["held_out_mm"]) == set(names)
     assert np.array(record["sigma"]["covariance"]).shape == (6, 6)
     assert {"weighted", "park", "reprojection"} <= set(record["methods"])
+    assert record["suggestions_reachable"]
     assert len(record["suggested_poses"]) == 2
     assert (tmp_path / "plan.png").is_file()
-    assert "held-out images" in answer.output
+    assert record["arm_correction"]["arm"] == "UR10e"
+    assert "with the arm's own error estimated" in answer.output
