@@ -45,9 +45,19 @@ def test_a_canon(tmp_path: Path) -> None:
     path = photograph(
         tmp_path / "IMG_0001.JPG",
         image={271: "Canon", 272: "Canon EOS R5", 274: 6},
-        photo={33437: 5.6, 33434: 1 / 125, 34855: 400, 37386: 85.0, 36867: "2025:01:02 03:04:05", 42036: "RF85mm"},
+        photo={
+            33437: 5.6,
+            33434: 1 / 125,
+            34855: 400,
+            37386: 85.0,
+            36867: "2025:01:02 03:04:05",
+            42036: "RF85mm",
+            42037: "L-77",
+            37382: 0.75,
+        },
     )
     record = read_exif(path)
+    assert (record.lens_serial, record.focus_distance_m) == ("L-77", pytest.approx(0.75))
     assert (record.make, record.model, record.lens) == ("Canon", "Canon EOS R5", "RF85mm")
     assert (record.aperture_f, record.iso, record.focal_length_mm) == (pytest.approx(5.6), 400, 85.0)
     assert record.exposure_s == pytest.approx(1 / 125)

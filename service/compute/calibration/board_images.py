@@ -16,7 +16,7 @@ from service.compute.calibration.board import Board, BoardView, find_board
 from service.compute.images import read_grey
 from service.core.errors import ComputeError, DataError
 
-_MANY_FILES = 16
+_MANY_FILES = 24
 _MANY_BYTES = 30e6
 
 

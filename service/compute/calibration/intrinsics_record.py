@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.calibration.intrinsics import IntrinsicsResult
+from service.compute.calibration.intrinsics import COVERAGE_GRID, IntrinsicsResult
 from service.compute.calibration.uncertainty import ProjectionUncertainty
-from service.compute.calibration.validation import CrossValidation
+from service.compute.calibration.validation import CrossValidation, residual_field
 from service.core.geometry import Array
 
 
@@ -28,6 +28,7 @@ def intrinsics_record(
         excluded: reason by image name, images without the board included.
     """
     board = result.board
+    residuals, counts = residual_field(result, *COVERAGE_GRID)
     return {
         "model": result.model,
         "board": {
@@ -48,6 +49,7 @@ def intrinsics_record(
         "inflation": result.inflation,
         "covariance": {"parameters": list(result.parameters), "matrix": result.covariance.tolist()},
         "coverage": {"share": result.coverage, "corners": result.coverage_map.tolist()},
+        "residuals": {"corners": counts.tolist(), "mean_px": np.round(residuals, 5).tolist()},
         "tilt": {"largest_deg": float(result.tilt_deg.max()), "spread_deg": result.tilt_spread_deg},
         "cross_validation": None
         if validation is None

@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 
 from service.compute.calibration.intrinsics import IntrinsicsResult
 from service.compute.calibration.uncertainty import ProjectionUncertainty
+from service.compute.calibration.validation import residual_field
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 _WIDTH = 1080
 _MARGIN = 56
+_ENOUGH = 5  # corners in a cell for an arrow
 _BLACK, _GREY, _BLUE, _RED = (20, 20, 20), (190, 190, 190), (180, 90, 20), (40, 40, 210)
 
 Canvas = NDArray[np.uint8]
@@ -49,21 +51,16 @@ def _coverage(result: IntrinsicsResult) -> Canvas:
 
 def _residuals(result: IntrinsicsResult) -> Canvas:
     """Mean residual of each of 24 × 16 cells, which shows what the model does not hold, and each view's error."""
-    corners = np.concatenate([view.corners for view in result.corners])
-    residual = np.concatenate([view.residual.reshape(-1, 2) for view in result.adjustment.views])
+    field, counts = residual_field(result)
+    mean, enough = field.reshape(-1, 2), np.flatnonzero(counts >= _ENOUGH)
+    cells = np.array(counts.shape[::-1])
     size = np.array([result.camera.width, result.camera.height])
-    cells = np.array([24, 16])
-    cell = np.clip((corners + 0.5) / size * cells, 0, cells - 1).astype(int)
-    flat = cell[:, 1] * cells[0] + cell[:, 0]
-    count = np.bincount(flat, minlength=int(cells.prod()))
-    mean = np.stack([np.bincount(flat, residual[:, k], int(cells.prod())) for k in (0, 1)], axis=1)
-    mean /= np.maximum(count, 1)[:, None]
-    largest = float(np.linalg.norm(mean[count >= 5], axis=1).max(initial=1e-6))
+    largest = float(np.linalg.norm(mean[enough], axis=1).max(initial=1e-6))
     length = 0.8 * float((size / cells).min())
     canvas, scale = _frame(
         result, f"{result.rms_px:.3f} px rms; arrows: mean residual of a cell, longest {largest:.3f} px"
     )
-    for k in np.flatnonzero(count >= 5):
+    for k in enough:
         middle = (np.array([k % cells[0], k // cells[0]]) + 0.5) / cells * size
         tip = middle + mean[k] / largest * length
         cv2.arrowedLine(canvas, _at(middle, scale), _at(tip, scale), _BLUE, 1, cv2.LINE_AA, tipLength=0.3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.compute.calibration.adjustment import adjust, fit_pose, rms
 from service.compute.calibration.intrinsics import IntrinsicsResult
@@ -82,6 +83,23 @@ def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidatio
 
 def _pooled(per_view_px: Array, counts: Array) -> float:
     return float(np.sqrt(np.sum(per_view_px**2 * counts) / np.sum(counts)))
+
+
+def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) -> tuple[Array, NDArray[np.int64]]:
+    """Mean residual (rows, columns, 2) of the corners in each cell of the image, px, and how many (rows, columns).
+
+    Noise averages out; what remains is what the lens model does not hold.
+    """
+    corners = np.concatenate([view.corners for view in result.corners])
+    residual = np.concatenate([view.residual.reshape(-1, 2) for view in result.adjustment.views])
+    cells = np.array([columns, rows])
+    size = np.array([result.camera.width, result.camera.height])
+    cell = np.clip((corners + 0.5) / size * cells, 0, cells - 1).astype(int)
+    flat = cell[:, 1] * columns + cell[:, 0]
+    count = np.bincount(flat, minlength=columns * rows)
+    total = np.stack([np.bincount(flat, residual[:, k], columns * rows) for k in (0, 1)], axis=1)
+    mean = total / np.maximum(count, 1)[:, None]
+    return mean.reshape(rows, columns, 2), count.reshape(rows, columns).astype(np.int64)
 
 
 def calibration_warnings(

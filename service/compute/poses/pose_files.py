@@ -27,7 +27,7 @@ _MORE_DISTORTION = ("k3", "k4", "k5", "k6")
 _CALIBRATION_KEYS = (
     "model", "board", "n_views", "images", "rms_px", "per_view_rms_px", "excluded", "sigma", "sigma_independent",
     "sigma_by_image", "sigma_corner_px", "inflation", "covariance", "coverage", "tilt", "cross_validation",
-    "uncertainty", "warnings", "optics",
+    "residuals", "uncertainty", "warnings", "optics",
 )  # fmt: skip
 
 
