@@ -22,6 +22,9 @@ PARAMETER_COUNT: dict[LensModel, int] = {"pinhole": 4, "radial2": 6, "opencv4": 
 
 _HUBER = 3.0  # standard deviations of one coordinate beyond which a corner counts less
 _MAX_ITERATIONS = 40
+# px over the terms' own unit: k3 … k6 are drawn to 0 ± 3 by as much as one corner of 0.03 px. Where the images
+# determine them this is nothing; where they do not, numerator and denominator would cancel without limit.
+_PRIOR = 0.03 / 3
 _START_VIEWS = 20  # that OpenCV's solver starts from; the others join in the adjustment
 
 
@@ -102,6 +105,13 @@ def project_with_jacobian(points: Array, pose: Array, camera: CameraModel) -> tu
     pixels, jacobian = cv2.projectPoints(points, pose[:3], pose[3:], camera.matrix, terms)
     J = np.asarray(jacobian, dtype=np.float64)
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2), J[:, :6], J[:, 6:18]
+
+
+def prior_precision(count: int) -> Array:
+    """(count,) diagonal of the normal matrix that the weak prior on k3 … k6 adds; nothing for the other terms."""
+    precision = np.zeros(count)
+    precision[8:] = _PRIOR**2
+    return precision
 
 
 def start(
@@ -193,10 +203,12 @@ def adjust(
     """
     theta = parameters_of(camera, parameters)
     damping = 1e-4
+    prior = prior_precision(parameters)
     state, cost, scale = _linearise(views, points, theta, poses, size)
+    cost += float(prior @ theta**2)
     for _ in range(iterations):
-        normal = np.sum([view.normal for view in state], axis=0)
-        gradient = np.sum([view.gradient for view in state], axis=0)
+        normal = np.sum([view.normal for view in state], axis=0) + np.diag(prior)
+        gradient = np.sum([view.gradient for view in state], axis=0) + prior * theta
         shape = np.sqrt(np.diag(normal))
         if not np.isfinite(shape).all() or shape.min() <= 0:
             raise ComputeError("the views do not determine the camera", remedy="take views with more tilt")
@@ -204,6 +216,7 @@ def adjust(
         step = -np.linalg.solve(scaled, gradient / shape) / shape
         moved = np.stack([p + _pose_step(view, step) for p, view in zip(poses, state, strict=True)])
         trial, trial_cost, trial_scale = _linearise(views, points, theta + step, moved, size, scale)
+        trial_cost += float(prior @ (theta + step) ** 2)
         if not np.isfinite(trial_cost) or trial_cost > cost * (1 + 1e-12):
             damping *= 10
             if damping > 1e6:
@@ -216,6 +229,7 @@ def adjust(
             break
         if trial_scale < 0.7 * scale:  # far from the solution the corners' own scale is not yet known
             state, cost, scale = _linearise(views, points, theta, poses, size)
+            cost += float(prior @ theta**2)
     state, _, scale = _linearise(views, points, theta, poses, size)
     if not np.isfinite(theta).all() or theta[:2].min() <= 0:
         raise ComputeError("the calibration did not converge", remedy="check the board's size and the views")

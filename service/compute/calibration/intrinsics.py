@@ -16,6 +16,7 @@ from service.compute.calibration.adjustment import (
     adjust,
     fit_pose,
     pose_matrix,
+    prior_precision,
     start,
     start_pose,
 )
@@ -103,6 +104,7 @@ def calibrate_intrinsics(
     """Calibrate a camera from views of a flat board.
 
     Source: Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000, with OpenCV's distortion.
+    k3 … k6 have a weak prior (`prior_precision`), which shows where the images leave them open.
 
     Views whose error stands out (more than three times the median) are left out, the worst first, and named; one that
     fits the final camera after all comes back. Corners that stand out within a view count less (Huber).
@@ -133,7 +135,7 @@ def calibrate_intrinsics(
     corners_used = sum(len(view.indices) for view in seen)
     freedom = 2 * corners_used - count - 6 * len(used)
     variance = sum(float(view.weighted @ view.weighted) for view in solution.views) / max(freedom, 1)
-    root = _inverse_root(np.sum([view.normal for view in solution.views], axis=0))
+    root = _inverse_root(np.sum([view.normal for view in solution.views], axis=0) + np.diag(prior_precision(count)))
     independent = root @ root.T * variance
     inflation, by_image = _inflation(solution, root, variance)
     covariance = independent * inflation
@@ -183,12 +185,14 @@ def leave_one_out(solution: Adjustment) -> Array:
     Without view i the gradient at the solution is minus this view's share, g_i, and the normal matrix lacks its
     share, S_i: d = (S - S_i)^-1 g_i. NaN where the other views do not determine the camera.
     """
-    normal = np.sum([view.normal for view in solution.views], axis=0)
+    normal = np.sum([view.normal for view in solution.views], axis=0) + np.diag(
+        prior_precision(len(solution.parameters))
+    )
     scale = np.sqrt(np.diag(normal))
     changes = np.full((len(solution.views), len(scale)), np.nan)
     for k, view in enumerate(solution.views):
         rest = (normal - view.normal) / np.outer(scale, scale)
-        if np.linalg.eigvalsh(rest)[0] > 1e-12:
+        if np.linalg.eigvalsh(rest)[0] > _MIN_EIGENVALUE:
             changes[k] = np.linalg.solve(rest, view.gradient / scale) / scale
     return changes
 
