@@ -226,9 +226,10 @@ def main() -> None:
     parser.add_argument("--outlines", type=Path, help="folder that keeps detected outlines between runs")
     parser.add_argument("--out", type=Path, default=RESULT)
     options = parser.parse_args()
-    cases = [monte_carlo(case, options.seeds) for case in CASES]
-    for row in cases:
-        print(row, flush=True)
+    cases: list[dict[str, Any]] = []
+    for case in CASES:
+        cases.append(monte_carlo(case, options.seeds))
+        print(cases[-1], flush=True)
     scenes: list[dict[str, Any]] = []
     for seed in options.scenes:
         capture = read_capture(seed, render_scene(seed, 1920, 20, cache=CACHE, workers=options.workers))

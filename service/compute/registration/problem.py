@@ -30,8 +30,8 @@ class CommonErrors:
     """
 
     shift_px: float = 0.02
-    growth_px: float = 0.02
-    light_px: float = 0.05
+    growth_px: float = 0.03
+    light_px: float = 0.025
 
 
 @dataclass(frozen=True, slots=True)
