@@ -78,17 +78,20 @@ Effort = Literal["quick", "normal", "quality"]
 def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothing", threads: int = 2) -> SfmOptions:
     """Settings for images of this camera.
 
-    Camera positions are off by about 0.3 mm (quick), 0.03 (normal) and 0.015 (quality) on 20 images 1920 px wide of a
-    scene 0.65 m away (bench/sfm.py); the errors are noise, so more features are what makes them smaller.
+    Camera positions were off by 0.017–0.028 mm (normal) and 0.013 mm (quality) on 20 rendered images 1920 px wide of
+    a scene 0.65 m away (bench/sfm.py); the errors are noise, so more features are what makes them smaller.
     """
+    longer = max(camera.width, camera.height)
     if effort == "quick":
         return SfmOptions(max_image_size=1280, max_features=2500, neighbours=8, refine=refine, threads=threads)
     if effort == "normal":
-        return SfmOptions(max_image_size=2400, max_features=4000, neighbours=8, refine=refine, threads=threads)
+        return SfmOptions(
+            max_image_size=min(longer, 2400), max_features=4000, neighbours=8, refine=refine, threads=threads
+        )
     # Small images are doubled first; large ones have the pixels themselves.
-    small = max(camera.width, camera.height) <= 2400
+    small = longer <= 2400
     return SfmOptions(
-        max_image_size=4000,
+        max_image_size=min(longer, 4000),
         max_features=8000,
         first_octave=-1 if small else 0,
         neighbours=10,
