@@ -10,12 +10,12 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drivers.mesh_file import MeshUnit, read_mesh_file
+from drivers.mesh_file import MeshUnit
 from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
+from service.cli.spheres import SeedsOption, spheres_of
 from service.compute.locating import LocatedOutlines, detect_all, locate_outlines, searched_whole
 from service.compute.pipeline import register_images
 from service.compute.poses.pose_files import read_camera_json, read_poses, read_spheres_json
-from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array
 
@@ -39,6 +39,7 @@ def register_command(
     control: Annotated[
         str, typer.Option("--control", help="Indices of the mesh's spheres that only serve the evaluation: 3,7,9.")
     ] = "",
+    seeds: SeedsOption = None,
     estimate_scale: Annotated[bool, typer.Option("--estimate-scale", help="The poses are not metric.")] = False,
     workers: Annotated[
         int | None, typer.Option("--workers", min=1, help="Processes that look at images; one a core by default.")
@@ -53,7 +54,7 @@ def register_command(
         files = _images(images)
         model = read_camera_json(camera)
         known = read_poses(poses, [file.name for file in files])
-        registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control)
+        registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control, seeds)
         T_world_camera = np.array([known[file.name] for file in files])
         processes = min(len(files), workers or os.cpu_count() or 1)
         with progress_bar(quiet=json) as progress:
@@ -134,7 +135,12 @@ def _images(folder: Path) -> list[Path]:
 
 
 def _spheres(
-    mesh: Path | None, spheres: Path | None, radius_mm: float | None, mesh_unit: MeshUnit, control: str
+    mesh: Path | None,
+    spheres: Path | None,
+    radius_mm: float | None,
+    mesh_unit: MeshUnit,
+    control: str,
+    seeds: str | None,
 ) -> tuple[Array, Array, float]:
     """Registration and control centres (M, 3), (C, 3) and the radius, metres."""
     if (mesh is None) == (spheres is None):
@@ -145,8 +151,7 @@ def _spheres(
     if radius_mm is None:
         raise typer.BadParameter("--mesh needs --radius-mm")
     assert mesh is not None
-    scan = read_mesh_file(mesh, mesh_unit)
-    found = locate_spheres(scan.mesh.vertices_m, scan.mesh.faces, radius_mm / 1e3)
+    found = spheres_of(mesh, radius_mm / 1e3, mesh_unit, None, seeds)
     centres = np.array([sphere.centre_m for sphere in found])
     try:
         chosen = sorted({int(word) for word in control.split(",") if word.strip()})

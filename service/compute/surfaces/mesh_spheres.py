@@ -23,7 +23,7 @@ _MOST_SAMPLES = 5000  # of one sphere: beyond, neighbours repeat each other's no
 _NEAR_MISSES = 6
 _MIXED = 0.2  # |orientation| below which the normals say nothing
 _MAX_RADIUS_SIGMA = 0.15  # in radii; a radius that is known less is no evidence of a sphere
-_ROUGHER = 2.5  # times the rms of the best covered spheres: noise of one mesh is not so different between spheres
+_ROUGHER = 2.0  # times the rms of the best covered spheres: noise of one mesh is not so different between spheres
 _SEED_REACH = 1.6  # a seed is a rough centre or a point on the surface: the centre is within so many radii
 
 
@@ -62,7 +62,7 @@ class SphereLimits:
     max_rms: float = 0.025
     max_radius_residual: float = 0.04
     max_flank: float = 0.3
-    max_form: float = 0.012
+    max_form: float = 0.01
 
 
 @dataclass(frozen=True, slots=True)

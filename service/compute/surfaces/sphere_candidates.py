@@ -21,6 +21,7 @@ _BAND = 0.05  # of the coarse fit, in radii; surfels have little noise left
 _FLANK = 0.12  # in radii beyond that: where another shape goes on smoothly
 _FLANK_COSINE = 0.88
 _ROUGH_RMS = 0.013  # of the coarse fit, in radii
+_WELL_COVERED = 0.3  # then it is fitted whatever its rms: the operator wants to know why it is refused
 _MOST_FLANK = 0.6  # of its area over that of the inliers
 
 
@@ -105,10 +106,6 @@ def rough_centre(patches: Surfels, tree: cKDTree, start: Array, radius: float, m
     beyond = (np.abs(residual) >= band) & (np.abs(residual) < band + _FLANK * radius)
     beyond &= np.abs(np.sum(unit * normals, axis=1)) > _FLANK_COSINE
     rms = float(np.sqrt(np.sum(weights * residual**2) / np.sum(weights)))
-    if (
-        coverage < 0.6 * min_coverage
-        or rms > _ROUGH_RMS * radius
-        or np.sum(area[beyond]) > _MOST_FLANK * np.sum(area[inlier])
-    ):
-        return None
-    return centre
+    ends = float(np.sum(area[beyond])) <= _MOST_FLANK * float(np.sum(area[inlier]))
+    round_enough = rms <= _ROUGH_RMS * radius or coverage >= _WELL_COVERED
+    return centre if coverage >= 0.6 * min_coverage and ends and round_enough else None

@@ -46,7 +46,7 @@ class Patches:
 
     Attributes:
         unit: (P, 3) directions from the centre.
-        residual: (P,) distance from the surface, m, outward positive.
+        residual: (P,) distance from the surface, m, outward positive, free of what Tukey's weights hide of it.
         weight: (P,) sums of the samples' weights.
         white: (P,) variance of the average when the samples' variance is 1 and they are independent.
     """
@@ -121,7 +121,8 @@ def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> Sp
     inlier = weights > 0
     u, r, w = unit[inlier], residual[inlier], weights[inlier]
     beyond = (np.abs(residual) >= band) & (np.abs(residual) < band + _FLANK * radius) & (cosine > _FLANK_COSINE)
-    patches = _patches(u, r, w)
+    gain = _tukey_gain(residual, band, area)
+    patches = _patches(u, gain * r, w)
     outward = np.sum(samples.outward[inlier] * u, axis=1)
     stated = np.linalg.norm(samples.outward[inlier], axis=1)
     orientation = float(np.sum(w * outward) / max(np.sum(w * stated), 1e-300)) if np.any(stated > 0) else 0.0
@@ -129,7 +130,7 @@ def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> Sp
         centre=centre,
         band=band,
         rms=float(np.sqrt(np.sum(w * r * r) / np.sum(w))),
-        radius_residual=_free_radius(u, r, w),
+        radius_residual=gain * _free_radius(u, r, w),
         coverage=coverage(u),
         orientation=orientation,
         flank=float(np.sum(area[beyond]) / np.sum(area[inlier])),
@@ -137,6 +138,16 @@ def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> Sp
         n=int(np.count_nonzero(inlier)),
         patches=patches,
     )
+
+
+def _tukey_gain(residual: Array, band: float, area: Array) -> float:
+    """How much weighted means of residuals understate them: a shift of the surface moves the mean by the sum of the
+    influence function's slopes, not of the weights."""
+    inside = (np.abs(residual) < band) & (area > 0)
+    x2 = (residual[inside] / band) ** 2
+    weights = float(np.sum(area[inside] * (1 - x2) ** 2))
+    slopes = float(np.sum(area[inside] * (1 - x2) * (1 - 5 * x2)))
+    return float(np.clip(weights / max(slopes, 1e-300), 1.0, 1.8))
 
 
 def _free_radius(u: Array, r: Array, w: Array) -> float:

@@ -20,7 +20,7 @@ _FLOOR = 5e-5  # sigma of a perfect mesh, in radii: that of coordinates in singl
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Noise of a surface: V = s² (diag(white) + ratio · mean(white) · G), G the Matérn 3/2 correlation of a length.
+    """Noise of a surface: V = s² (diag(white) + ratio · mean(white) · G), G the Matérn 5/2 correlation of a length.
 
     Attributes:
         length: of the correlation, in radii.
@@ -91,8 +91,8 @@ def _own_variance(p: Patches) -> float:
 
 
 def _correlation(unit: Array, length: float) -> Array:
-    d = np.linalg.norm(unit[:, None] - unit[None], axis=2) * (np.sqrt(3.0) / length)
-    return (1 + d) * np.exp(-d)
+    d = np.linalg.norm(unit[:, None] - unit[None], axis=2) * (np.sqrt(5.0) / length)
+    return (1 + d + d * d / 3) * np.exp(-d)
 
 
 def _spectrum(p: Patches, K: Array, length: float) -> tuple[Array, Array]:
