@@ -137,6 +137,7 @@ RUN_HERE: dict[str, Check] = {
     '--operator "A. Name"': asks_and_is_aborted,
     "orthocapture resume latest --data runs": asks_and_is_aborted,
     "orthocapture status latest --data runs": succeeds,
+    "orthocapture plan next latest --data runs": succeeds,
     "orthocapture act pause --run latest --data runs": succeeds,
     "orthocapture worker --data runs": serves_until_terminated,
     "orthocapture register --images DIR --camera camera.json --poses poses.csv --mesh scan.ply --radius-mm 15 "
@@ -156,6 +157,13 @@ RUN_ELSEWHERE = {
     "--board 16x23 --square-mm 15 --out hand_eye.json": (
         "tests/test_hand_eye_arm.py::test_the_command_calibrates_photographs"
     ),
+    "orthocapture plan show protocols/exvivo_spine.yaml --rig rig.yaml": (
+        "tests/test_planning.py::test_the_command_plans_from_files_alone"
+    ),
+    "orthocapture spheres --mesh scan.ply --radius-mm 15 --out spheres.json": (
+        "tests/test_mesh_spheres_hard.py::test_command_reads_clouds_and_writes_spheres"
+    ),
+    "orthocapture layout --spheres spheres.json": "tests/test_layout.py::test_command",
     "make demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make test": "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
     "orthocapture simulate rig --scene 7 --dir rig": (
