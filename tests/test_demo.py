@@ -93,6 +93,22 @@ def test_report_stands_alone(demo: dict[str, Any]) -> None:
     assert 'src="http' not in html
 
 
+def test_every_image_was_looked_at_while_the_specimen_was_there(demo: dict[str, Any]) -> None:
+    answer = orthocapture("status", demo["run"], "--data", demo["data_dir"], "--json")
+    steps = json.loads(answer.stdout)["steps"]
+    looked_at: list[float] = []
+    for name in ("viewpoint_capture_1", "control_capture_1", "viewpoint_capture_2", "control_capture_2"):
+        assert {view["viewpoint"] for view in steps[name]["live"]} == set(steps[name]["captured"])
+        assert all(view["spheres_seen"] >= 4 for view in steps[name]["live"])
+        looked_at += [view["predicted_target_error_mm"] for view in steps[name]["live"]]
+    last = steps["control_capture_2"]["measures"]
+    assert 0 < last["predicted_target_error_mm"] <= max(looked_at)
+    assert 0.6 <= last["specimen_coverage"] <= 1
+    events = json.loads(orthocapture("audit", "show", demo["run"], "--data", demo["data_dir"], "--json").stdout)
+    plans = [e for e in events["events"] if "note=motion_plan" in e["summary"]]
+    assert len(plans) == 4, "recorded before the first motion of each capture"
+
+
 def test_truth_never_enters_the_run(demo: dict[str, Any]) -> None:
     database = Path(demo["database"]).read_bytes()
     assert b"truth" not in database

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -27,11 +29,14 @@ from service.compute.planning.motion_plan import (
 from service.compute.planning.optics import depth_of_field
 from service.core.geometry import Array, Transform, inverse, look_at, transform
 from service.core.protocol import Motion, load_protocol
-from service.rig import CollisionSection
+from service.rig import CollisionSection, load_rig
+from service.station import layout_of
 from service.steps import calibration, params_models, viewpoint_capture
 from service.steps.context import StationLayout
 from service.steps.planning import situation_of, usual_posture
+from service.steps.preview import preview_plans
 from service.steps.viewpoints import denser_viewpoints, plan_viewpoints
+from tests.support.rig import orthocapture
 
 PROTOCOL = Path(__file__).parents[1] / "protocols" / "exvivo_spine.yaml"
 ARM = arm_model("UR10e")
@@ -212,3 +217,35 @@ def test_extra_viewpoints_keep_their_names_and_their_distance_from_planned_ones(
     planned_eyes = np.array([v.T_base_camera[:3, 3] for v in plan_viewpoints(one, LAYOUT)])
     for view in extra:
         assert np.linalg.norm(planned_eyes - view.T_base_camera[:3, 3], axis=1).min() > 0.03
+
+
+# --- command -----------------------------------------------------------------------------------------------------
+
+RIG = """\
+name: OR 3
+devices: {robot: {driver: ur, host: 192.0.2.1}}
+stations:
+  station_1: {robot: robot, scene_centre_m: [0.0, 0.75, 0.13], approach_azimuth_deg: -90}
+  station_2: {robot: robot, scene_centre_m: [0.0, 0.75, 0.13], approach_azimuth_deg: -90}
+T_flange_camera_nominal: [[1, 0, 0, 0], [0, 1, 0, -0.055], [0, 0, 1, 0.095], [0, 0, 0, 1]]
+"""
+
+
+def test_the_command_plans_from_files_alone(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(RIG + "collision: {arm: UR10e}\n")
+    words = ("plan", "show", str(PROTOCOL), "--rig", str(tmp_path / "rig.yaml"), "--step", "control_capture_1")
+    done = orthocapture(*words, "--json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    (plan,) = json.loads(done.stdout)["control_capture_1"]
+    assert [view["outcome"] for view in plan["views"]] == ["feasible"] * 8
+    assert plan["estimated_s"] > 0
+    (tmp_path / "rig.yaml").write_text(RIG)
+    assert "nothing to plan" in orthocapture(*words).stderr
+
+
+def test_a_person_sees_the_plan_before_confirming(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(RIG + "collision: {arm: UR10e}\n")
+    rig, protocol = load_rig(tmp_path / "rig.yaml"), load_protocol(PROTOCOL, params_models()).protocol
+    (plan,) = preview_plans(protocol, protocol.step("control_capture_2"), rig, partial(layout_of, rig))
+    assert plan.text.startswith("8 of 8 viewpoints, about ")
+    assert preview_plans(protocol, protocol.step("fixation"), rig, partial(layout_of, rig)) == ()
