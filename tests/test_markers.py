@@ -17,6 +17,7 @@ from service.compute.markers.detect import detect_spheres, refine_outline
 from service.compute.markers.records import DetectionOptions, SphereOutline
 from service.core.errors import DataError
 from service.core.geometry import Array
+from tests.support.sphere_conditions import Look, render_look
 from tests.support.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, camera, render, scene
 
 directions = st.tuples(st.floats(-0.35, 0.35), st.floats(-0.25, 0.25), st.floats(0.4, 1.5))
@@ -67,7 +68,7 @@ def test_ransac_finds_the_cone_among_outliers(where: tuple[float, float, float],
     )
     assert result is not None
     cone, inlier = result
-    assert inlier[visible].mean() > 0.95
+    assert inlier[visible].mean() > 0.9  # of a third of an outline, a cone within the tolerance may miss the ends
     final = fit_cone(rays[visible], np.ones(int(visible.sum())), start)
     assert float(np.linalg.norm(final.axis - truth.axis)) < 1e-9
     # A short arc passes an error within the tolerance on to the radius several times over.
@@ -186,3 +187,37 @@ def test_an_outline_survives_its_record() -> None:
 def test_wrong_size_is_refused() -> None:
     with pytest.raises(DataError, match="768×512"):
         detect_spheres(np.zeros((512, 768, 3), np.uint8), camera(1024))
+
+
+CONDITIONS = [
+    Look("green", "wood", (((0.95, 0.1, -0.25), 0.8),), blur_px=0.6),
+    Look("blue", "green cloth", (((0.8, -0.2, -0.5), 0.45), ((-0.7, -0.4, -0.6), 0.4)), subsampled=False),
+    Look("green", "blood", srgb=False),
+]
+
+
+@pytest.mark.parametrize("look", CONDITIONS, ids=lambda look: f"{look.colour} on {look.ground}")
+def test_outlines_are_right_and_know_how_right_under_any_light(look: Look) -> None:
+    cam = camera(800)
+    centres = np.array([[-0.11, -0.06, 0.55], [0.08, 0.06, 0.6], [0.1, -0.06, 0.65]])
+    found = detect_spheres(render_look(cam, centres, look, seed=2), cam, DetectionOptions(srgb=look.srgb))
+    axes, radii, ids = errors_px(found, centres, cam.fx)
+    assert sorted(ids) == [0, 1, 2]
+    assert max(axes) < 0.2
+    assert max(map(abs, radii)) < 0.2
+    chi2: list[float] = []
+    for o, k in zip(found, ids, strict=True):
+        truth = cone_of_sphere(centres[k], RADIUS_M)
+        e = np.append(
+            o.cone.frame()[:, :2].T @ (truth.axis - o.cone.axis), truth.half_angle_rad - o.cone.half_angle_rad
+        )
+        chi2.append(float(e @ np.linalg.solve(o.cone_covariance, e)) / 3)
+    assert 0.02 < float(np.mean(chi2)) < 4
+
+
+def test_a_stain_on_a_sphere_is_no_sphere_and_green_cloth_has_none() -> None:
+    cam = camera(800)
+    assert detect_spheres(render_look(cam, np.zeros((0, 3)), Look("green", "green cloth"), seed=1), cam) == ()
+    centres = np.array([[-0.08, -0.03, 0.55], [0.08, 0.03, 0.6]])
+    found = detect_spheres(render_look(cam, centres, Look("white", "wood", stains=3), seed=3), cam)
+    assert sorted(errors_px(found, centres, cam.fx)[2]) == [0, 1]

@@ -78,7 +78,8 @@ def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: Detec
     kept: list[RoughSphere] = []
     for candidate in candidates:
         middle = np.append(coarse_camera.normalise(np.array([[candidate.x, candidate.y]]))[0], 1.0)
-        if any(_within(middle, k.cone) for k in kept if k.score > 0.6):
+        angle = float(np.arctan(candidate.radius / coarse_camera.fx))
+        if any(_within(middle, k.cone) and angle < 1.4 * k.cone.half_angle_rad for k in kept if k.score > 0.6):
             continue  # a highlight or a shadow on a sphere that is already known
         rough = _examine(coarse, edge_map, coarse_camera, candidate, options, rng)
         if rough is not None:
@@ -129,7 +130,8 @@ def _examine(
         or coverage < 0.8 * options.min_coverage
     ):
         return None
-    return RoughSphere(cone, coverage, interior, loss, colour)
+    rough = RoughSphere(cone, coverage, interior, loss, colour)
+    return rough if rough.score >= options.min_score else None
 
 
 def _interior(
@@ -185,7 +187,16 @@ def _within(direction: Array, cone: Cone) -> bool:
     return float(direction @ cone.axis) > float(np.linalg.norm(direction)) * float(np.cos(0.8 * cone.half_angle_rad))
 
 
+def _on(inner: Cone, outer: Cone) -> bool:
+    """Whether a disc lies on a clearly larger one."""
+    small = inner.half_angle_rad < 0.65 * outer.half_angle_rad
+    return small and _within(inner.axis, outer)
+
+
 def _without_overlaps(roughs: list[RoughSphere]) -> list[RoughSphere]:
+    # Stains and highlights are discs too, but on a sphere.
+    whole = [r for r in roughs if r.coverage > 0.6 and r.mask_loss < 0.4]
+    roughs = [r for r in roughs if not any(_on(r.cone, w.cone) for w in whole)]
     kept: list[RoughSphere] = []
     for rough in roughs:
         for other in kept:

@@ -181,7 +181,7 @@ def _gauss_newton(
     seen = cross.transpose(0, 2, 1) @ solved
     reduced = (full[:, _OWN:, _OWN:] - seen[:, :, 1:])[good].sum(axis=0)
     pull = (g[:, _OWN:] - seen[:, :, 0])[good].sum(axis=0)
-    change = np.clip(np.linalg.solve(reduced + 1e-6 * np.eye(2), pull), -0.3, 0.3)
+    change = np.clip(np.linalg.solve(reduced + 1e-6 * np.eye(2), pull), -0.3, 0.6)
     return solved[:, :, 0] - solved[:, :, 1:] @ change, change, own
 
 

@@ -25,7 +25,8 @@ class DetectionOptions:
     min_vote: float = 0.2  # part of a circle's edge that must vote for its centre
     min_coverage: float = 0.38  # part of the outline that must be seen
     max_rms_px: float = 1.0  # of the edge points of one outline, after rejection
-    max_interior_edges: float = 0.07  # edge pixels inside a sphere over its area
+    max_interior_edges: float = 0.11  # edge pixels inside a sphere over its area
+    min_score: float = 0.2  # of a disc on the coarse copy
     min_contrast: float = 0.01  # median step across the outline over full scale, linear light
     max_leak: float = 0.2  # part of the outline across which the sphere's colour goes on without an edge
     n_points: int = 200  # L, points sampled equidistantly on an outline

@@ -15,7 +15,8 @@ from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence
 from service.core.geometry import Array
 
 # Measured on rendered scenes with exact truth: what stays of an outline's error when its noise has averaged out.
-SYSTEMATIC_PX = 0.025
+# It comes from what the limb's fall and the blur can be taken for each other, so it grows with the blur.
+SYSTEMATIC_PER_BLUR = 0.05
 MOST_SIGMA_PX = 0.5  # of an edge point; where there is no outline, places within the search's reach scatter more
 TEXTURE_FACTOR = 3.0  # sigma of an edge point over the one its own profile tells
 _BLOCKS = 16  # of an outline, for the noise that neighbouring edge points share
@@ -40,9 +41,17 @@ def refine_outline(
     if cone is None:
         return None
     blurs = (_START_BLUR_PX, _START_CHROMA_BLUR_PX)
-    first = _measure(image_bgr, camera, cone, _FIRST_PROFILES, 1.0, 2.5, 4, blurs, options)
-    if first is None:
-        return None
+    first = None
+    for _ in range(3):
+        first = _measure(image_bgr, camera, cone, _FIRST_PROFILES, 1.0, 2.5, 4, blurs, options)
+        if first is None:
+            return None
+        cone = first.cone
+        if first.limb.blur_px < 1.3 * max(1.0, blurs[0]):
+            break
+        # Out of focus: the profiles were too short for it.
+        blurs = (first.limb.blur_px, first.limb.chroma_blur_px)
+    assert first is not None
     blurs = (first.limb.blur_px, first.limb.chroma_blur_px)
     best = _measure(image_bgr, camera, first.cone, _PROFILES, 0.5, 1.6, 3, blurs, options)
     if (
@@ -56,7 +65,7 @@ def refine_outline(
     middle = camera.project(best.cone.axis[None])[0]
     colour = _median_colour(image_bgr, middle, 0.5 * best.cone.half_angle_rad * camera.fx)
     evidence = Evidence(
-        best.coverage, best.rms_px, best.sigma_px, best.n_edges, SYSTEMATIC_PX, best.contrast, colour, score,
+        best.coverage, best.rms_px, best.sigma_px, best.n_edges, best.systematic_px, best.contrast, colour, score,
         best.covariance,
     )  # fmt: skip
     return outline_from_cone(best.cone, camera, options.n_points, evidence)
@@ -92,6 +101,7 @@ class _Measured:
     rms_px: float
     n_edges: int
     contrast: float
+    systematic_px: float
     covariance: Array
 
 
@@ -123,6 +133,7 @@ def _measure(
         return None
     fitted, used, residual, weights, scale, coverage = fit
     covariance = _covariance(where.azimuth_rad, residual, weights, used, scale)
+    systematic = SYSTEMATIC_PER_BLUR * limb.blur_px
     angle = float(np.median(where.per_pixel_rad))
     return _Measured(
         cone=fitted,
@@ -132,7 +143,8 @@ def _measure(
         rms_px=float(np.sqrt(np.mean(residual[used] ** 2))),
         n_edges=int(used.sum()),
         contrast=float(np.median(limb.contrast[used])),
-        covariance=(covariance + np.eye(3) * SYSTEMATIC_PX**2) * angle**2,
+        systematic_px=systematic,
+        covariance=(covariance + np.eye(3) * systematic**2) * angle**2,
     )
 
 
