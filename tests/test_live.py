@@ -72,7 +72,8 @@ def test_the_predicted_covariance_is_that_of_many_repetitions() -> None:
     for seed in range(150):
         views = informations(made, pose_noise_m=sigma_m, seed=seed)
         normal = sum((v.information for v in views), np.zeros((6, 6)))
-        answers.append(np.linalg.solve(normal, sum((v.information @ v.offset for v in views), np.zeros(6))))
+        right = sum((v.information @ v.offset for v in views), np.zeros(6))
+        answers.append(np.asarray(np.linalg.solve(normal, right), dtype=np.float64))
     predicted = pose_covariance([v.information for v in informations(made)], P)
     spread = np.cov(np.array(answers).T)
     assert np.sqrt(np.trace(spread[:3, :3]) / np.trace(predicted[:3, :3])) == pytest.approx(1.0, abs=0.15)
@@ -140,6 +141,7 @@ def hill() -> tuple[Array, Any]:
     board = board.subdivide_to_size(0.02)
     ball = trimesh.creation.icosphere(4, 0.06)
     whole = trimesh.util.concatenate([board, ball])
+    assert isinstance(whole, trimesh.Trimesh)
     return np.asarray(whole.vertices, dtype=np.float64), np.asarray(whole.faces, dtype=np.int32)
 
 
@@ -194,7 +196,7 @@ def test_prediction_finds_what_a_search_of_the_whole_image_finds(pictures: tuple
         if m in by_marker:
             assert np.allclose(near[o].centre_px, by_marker[m].centre_px, atol=0.2)
     lost = find_spheres(
-        images[0], made.camera, SPHERES_M, RADIUS_M, transform(np.eye(3), [0.1, 0, 0]) @ T_camera_scan
+        images[0], made.camera, SPHERES_M, RADIUS_M, transform(np.eye(3), np.array([0.1, 0.0, 0.0])) @ T_camera_scan
     )
     assert len(lost) == len(whole), "a prediction that is wrong is noticed, and the whole image searched"
     quality = sharpness(images[0], near, made.camera)

@@ -111,7 +111,9 @@ def test_every_posture_reaches_the_pose_and_the_given_one_is_among_them(q: Array
 def test_the_nearest_posture_turns_no_joint_by_a_needless_revolution() -> None:
     q = np.array([4.5, -1.7, 1.4, -1.4, -1.5, -6.0])
     T = forward(ARM, q[None])[0]
-    assert np.allclose(nearest_posture(ARM, T, q + 0.1), q, atol=1e-6)
+    found = nearest_posture(ARM, T, q + 0.1)
+    assert found is not None
+    assert np.allclose(found, q, atol=1e-6)
 
 
 # --- feasibility ---------------------------------------------------------------------------------------------------
