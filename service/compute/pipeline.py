@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,9 +127,12 @@ def register_images(
     control_centres_m: Array | None = None,
     groups: Sequence[int] | NDArray[np.int64] | None = None,
     estimate_scale: bool = False,
-    cost: Cost = "sampson",
+    cost: Cost = "cone",
     names: Sequence[str] = (),
     assignments: Sequence[Assignment] | None = None,
+    pose_covariance: Array | Literal["estimate", "exact"] = "estimate",
+    sphere_covariance_m2: Array | None = None,
+    intrinsics_covariance: Array | None = None,
 ) -> PipelineResult:
     """Identity, registration and evaluation of detected outlines.
 
@@ -145,6 +149,9 @@ def register_images(
         names: of the images.
         assignments: per image, which outlines are which registration spheres, where `locate_outlines` knows it;
             None: found here.
+        pose_covariance: of the poses, see `register`.
+        sphere_covariance_m2: (M, 3, 3) of the registration spheres; None takes them as exact.
+        intrinsics_covariance: of fx, fy, cx, cy, k1, k2, p1, p2, see `register`.
 
     Raises:
         DataError: lengths do not agree.
@@ -164,7 +171,8 @@ def register_images(
         )  # fmt: skip
     registration = register(
         outlines, assignments, poses, stations, registration_centres_m, radius_m, camera,
-        estimate_scale=estimate_scale, cost=cost,
+        estimate_scale=estimate_scale, cost=cost, pose_covariance=pose_covariance,
+        sphere_covariance_m2=sphere_covariance_m2, intrinsics_covariance=intrinsics_covariance,
     )  # fmt: skip
     controls = np.zeros((0, 3)) if control_centres_m is None else np.asarray(control_centres_m, dtype=np.float64)
     control = _find_controls(outlines, assignments, registration, controls, radius_m, camera)

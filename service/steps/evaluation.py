@@ -14,15 +14,16 @@ class Params(Record):
 
     registration: str
     images_of: tuple[str, ...]  # control captures
-    calibration: str
     scan: str  # the registered scan
-    control_scan: str  # scan or CT that still holds the control spheres
+    control_scan: str | None = None  # scan or CT that still holds the control spheres; None: spheres left out in turn
+    ct: str | None = None  # CT import, for the loop closures of the error budget
 
 
 class Result(Record):
-    """The paper's table: one row a source of poses."""
+    """The paper's table, one row a registration, and the error budget of each."""
 
     table: tuple[dict[str, Any], ...]
+    budgets: dict[str, dict[str, Any]]
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
@@ -33,11 +34,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
             "evaluate",
             {
                 "images": captured_images(context, params.images_of),
-                "camera": result_of(context, params.calibration)["camera"],
-                "outlines": registration["outlines_sha256"],
                 "registrations": registration["registrations"],
-                "spheres_m": result_of(context, params.scan)["spheres_m"],
-                "control_scan_spheres_m": result_of(context, params.control_scan)["spheres_m"],
+                "scan": result_of(context, params.scan),
+                "control_scan": None if params.control_scan is None else result_of(context, params.control_scan),
+                "ct": None if params.ct is None else result_of(context, params.ct),
                 "radius_m": context.protocol.spheres.radius_mm / 1000,
             },
         )

@@ -73,3 +73,20 @@ def hand_eye_of(context: StepContext, step_id: str, stations: Iterable[str]) -> 
         kept = ("model", "arm", "dh_deltas", "gear_cos_rad", "gear_sin_rad", "observed", "T_flange_camera")
         correction = {key: correction[key] for key in kept} | {"stations": mine}
     return {"T_flange_camera": result["T_flange_camera"], "arm_correction": correction}
+
+
+def intrinsics_covariance_of(context: StepContext, step_id: str) -> list[list[float]] | None:
+    """(8, 8) of fx, fy, cx, cy, k1, k2, p1, p2 of a calibration; None where its lens model has other parameters."""
+    record = (result_of(context, step_id)["details"].get("intrinsics") or {}).get("covariance")
+    if record is None:
+        return None
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    known = list(record["parameters"])
+    if not set(known) <= set(names):
+        return None
+    rows = record["matrix"]
+    # What the model holds fixed is known exactly; the solver needs a number that is not zero.
+    return [
+        [rows[known.index(a)][known.index(b)] if a in known and b in known else 1e-18 * (a == b) for b in names]
+        for a in names
+    ]

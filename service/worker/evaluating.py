@@ -12,6 +12,7 @@ import numpy as np
 
 from service.compute.budget.closure import Alignment, compare_shapes, locate_in_images
 from service.compute.budget.error_budget import (
+    CONTROL_SPHERES,
     ErrorBudget,
     MeasuredSpheres,
     Observation,
@@ -25,10 +26,10 @@ from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
 from service.compute.overlay import draw_overlay
 from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE, Detection
-from service.compute.registration.evaluation import Evaluation
 from service.compute.registration.evaluation import evaluate as evaluate_controls
 from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment
+from service.compute.resolution import resample
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
@@ -70,17 +71,9 @@ def evaluate(context: JobContext) -> JobAnswer:
     found: dict[str, Any] = {}
     for name, record in arguments["registrations"].items():
         registered = _registered(context, name, record, measured, radius_m, found)
-        answer = evaluate_controls(
-            registered.outlines,
-            registered.controls,
-            registered.T_scan_camera,
-            measured.control.centres_m,
-            radius_m,
-            registered.camera,
-        )
         budget = _budget(registered, measured, radius_m)
         budgets[name] = budget.as_json()
-        table.append(_row(registered, answer, budget))
+        table.append({**_row(registered, budget), **_errors(registered, measured, radius_m)})
         pictures[name] = partial(_overlays, context, registered, measured, radius_m)
     best = min(table, key=lambda row: row["mean_radial_error_mm"])
     # The best source, and beside it the robot's own poses: the eye sees the difference.
@@ -89,34 +82,75 @@ def evaluate(context: JobContext) -> JobAnswer:
     measures |= {f"{row['poses']}_mean_reprojection_error_px": row["mean_reprojection_error_px"] for row in table}
     measures["best_mean_radial_error_mm"] = best["mean_radial_error_mm"]
     measures["best_predicted_error_mm"] = best["predicted_error_mm"]
-    measures["control_normalised_chi2"] = best["control_normalised_chi2"]
+    if best["control_normalised_chi2"] is not None:
+        measures["control_normalised_chi2"] = best["control_normalised_chi2"]
     measures["control_spheres"] = float(len(measured.control.centres_m))
     refs.append(context.keep_json(table, kind="evaluation", name="evaluation.json"))
     refs.append(context.keep_json(budgets, kind="error_budget", name="error_budget.json"))
     return JobAnswer(measures, tuple(refs), {"table": table, "budgets": budgets})
 
 
-def _row(registered: _Registered, answer: Evaluation, budget: ErrorBudget) -> dict[str, Any]:
-    control = next(o for o in budget.observations if o.name == "control spheres")
+def _row(registered: _Registered, budget: ErrorBudget) -> dict[str, Any]:
+    control = next((o for o in budget.observations if o.name == CONTROL_SPHERES), None)
     registration = [c.sigma_m for c in budget.contributions if c.counted and c.name != "scan"]
     return {
         "poses": registered.name,
         "source": registered.record["poses"],
         "resolution": f"{registered.camera.width} × {registered.camera.height}",
-        "mean_radial_error_mm": answer.mean_radial_error_mm,
-        "mean_reprojection_error_px": answer.mean_reprojection_error_px,
-        "control_outlines": len(answer.errors),
         "images": len(registered.images),
         "predicted_error_mm": 1e3 * float(np.sqrt(np.sum(np.square(registration)))),
-        "control_error_mm": 1e3 * control.observed_m,
-        "control_normalised_chi2": control.normalised_chi2,
+        "control_error_mm": None if control is None else 1e3 * control.observed_m,
+        "control_normalised_chi2": None if control is None else control.normalised_chi2,
+    }
+
+
+def _errors(registered: _Registered, measured: _Measured, radius_m: float) -> dict[str, Any]:
+    """The paper's two errors, on control spheres where there are any, else on each sphere predicted by the others."""
+    if not len(measured.control.centres_m):
+        left_out = registered.record["leave_one_out"]
+        if left_out is None:
+            raise ComputeError(
+                "there are no control spheres, and too few registration spheres to predict one from the others",
+                remedy="Place control spheres, or more registration spheres",
+            )
+        kept = ("mean_radial_error_mm", "mean_reprojection_error_px")
+        errors = {key: left_out[key] for key in kept}
+        return {**errors, "evaluated_on": "each sphere left out", "control_outlines": 0}
+    answer = evaluate_controls(
+        registered.outlines,
+        registered.controls,
+        registered.T_scan_camera,
+        measured.control.centres_m,
+        radius_m,
+        registered.camera,
+    )
+    return {
+        "mean_radial_error_mm": answer.mean_radial_error_mm,
+        "mean_reprojection_error_px": answer.mean_reprojection_error_px,
+        "evaluated_on": "control spheres",
+        "control_outlines": len(answer.errors),
     }
 
 
 def _measured(arguments: Mapping[str, Any]) -> _Measured:
     """Scan, control scan and CT brought together by their spheres."""
     scan = _spheres(arguments["scan"])
-    both = _spheres(arguments["control_scan"])
+    control = _control(scan, arguments["control_scan"])
+    if arguments.get("ct") is None:
+        return _Measured(scan, control, None)
+    ct = _spheres(arguments["ct"])
+    shared = match_constellations(scan.centres_m, ct.centres_m).pairs
+    centres, covariance = np.full_like(scan.centres_m, np.nan), np.zeros((len(scan.centres_m), 3, 3))
+    for a, b in shared:
+        centres[a], covariance[a] = ct.centres_m[b], ct.covariance_m2[b]
+    return _Measured(scan, control, MeasuredSpheres(centres, covariance, ct.surface_rms_m))
+
+
+def _control(scan: MeasuredSpheres, control_scan: Mapping[str, Any] | None) -> MeasuredSpheres:
+    """The control spheres in the frame of the registered scan; none without a control scan."""
+    if control_scan is None:
+        return MeasuredSpheres(np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.0)
+    both = _spheres(control_scan)
     found = match_constellations(scan.centres_m, both.centres_m)
     pairs = np.array(found.pairs)
     here, there = pairs[:, 0], pairs[:, 1]
@@ -127,19 +161,11 @@ def _measured(arguments: Mapping[str, Any]) -> _Measured:
     if not extra:
         raise ComputeError("the control scan shows no sphere beside the registration spheres")
     R = alignment.T_a_b[:3, :3]
-    control = MeasuredSpheres(
+    return MeasuredSpheres(
         apply(alignment.T_a_b, both.centres_m[extra]),
         R @ both.covariance_m2[extra] @ R.T + alignment.covariance_at_m2(both.centres_m[extra]),
         both.surface_rms_m,
     )
-    if arguments.get("ct") is None:
-        return _Measured(scan, control, None)
-    ct = _spheres(arguments["ct"])
-    shared = match_constellations(scan.centres_m, ct.centres_m).pairs
-    centres, covariance = np.full_like(scan.centres_m, np.nan), np.zeros((len(scan.centres_m), 3, 3))
-    for a, b in shared:
-        centres[a], covariance[a] = ct.centres_m[b], ct.covariance_m2[b]
-    return _Measured(scan, control, MeasuredSpheres(centres, covariance, ct.surface_rms_m))
 
 
 def _spheres(result: Mapping[str, Any]) -> MeasuredSpheres:
@@ -186,7 +212,7 @@ def _budget(registered: _Registered, measured: _Measured, radius_m: float) -> Er
     """Contributions where the control spheres are: in the middle of the anatomy."""
     record = registered.record
     T_world_scan = np.array(record["T_world_scan"])
-    target = measured.control.centres_m.mean(axis=0)
+    target = (measured.control if len(measured.control.centres_m) else measured.scan).centres_m.mean(axis=0)
     components = {
         name: Alignment(T_world_scan, np.array(covariance)[:6, :6])
         for name, covariance in record["components"].items()
@@ -235,8 +261,12 @@ def _overlays(
             Detection(outline, markers.get(j), controls.get(j), None)
             for j, outline in enumerate(registered.outlines[i])
         ]
+        photograph = read_image(context.input(registered.images[i]["sha256"]))
+        if registered.record["full_camera"] is not None:
+            full = CameraModel.from_record(registered.record["full_camera"])
+            photograph = resample(photograph, full, registered.camera.width, registered.camera.height)
         picture = draw_overlay(
-            read_image(context.input(registered.images[i]["sha256"])),
+            photograph,
             registered.camera,
             detections,
             T_scan_camera=registered.T_scan_camera[i],

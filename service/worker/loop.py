@@ -18,11 +18,12 @@ from service.store.errors import LeaseLostError
 from service.store.records import Job, NewArtefact
 from service.store.store import Store
 from service.worker.calibrate import calibrate
+from service.worker.evaluating import evaluate
 from service.worker.job import Handler, JobContext
 from service.worker.layout import layout
 from service.worker.live import coverage_points, live_summary, live_view
 from service.worker.poses import hybrid, structure_from_motion
-from service.worker.registering import detect_spheres, evaluate, register
+from service.worker.registering import detect_spheres, register
 from service.worker.surfaces import ct_surface, locate_spheres
 
 _log = logging.getLogger(__name__)

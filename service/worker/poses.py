@@ -13,13 +13,15 @@ from service.compute.poses.hybrid import HybridPoses, hybrid_poses
 from service.compute.poses.sfm import SfmModel, SfmOptions, reconstruct
 from service.compute.poses.tracks import Tracks
 from service.worker.job import JobAnswer, JobContext
+from service.worker.photographs import photographs
 from service.worker.robot_poses import robot_camera_poses
 
 
 def structure_from_motion(context: JobContext) -> JobAnswer:
     """Run each wanted mapper on shared features; the robot's poses only choose which pairs are matched."""
     arguments = context.arguments
-    files = {image["viewpoint"]: context.input(image["sha256"]) for image in arguments["images"]}
+    images = arguments["images"]
+    files = dict(zip((image["viewpoint"] for image in images), photographs(context, images), strict=True))
     prior = {name: np.array(T) for name, T in (arguments.get("prior") or {}).items()}
     options = SfmOptions(**arguments["effort"])
     measures: dict[str, float] = {}

@@ -1,30 +1,25 @@
-"""Jobs on markers: detect their outlines, register the scan with one source of poses, evaluate on control spheres."""
+"""Jobs on markers: detect their outlines, and register the scan with one source of camera poses."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 
+from service.compute.budget.closure import Alignment
 from service.compute.camera_model import CameraModel
-from service.compute.images import read_image
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.records import SphereOutline
-from service.compute.overlay import draw_overlay
-from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE, Detection, locate_outlines, register_images
-from service.compute.registration.evaluation import evaluate as evaluate_controls
-from service.compute.registration.hypotheses import match, sightings
-from service.compute.registration.identity import Assignment
-from service.compute.registration.solve import RegistrationResult
-from service.compute.surfaces.constellations import match_constellations
+from service.compute.pipeline import locate_outlines, register_images
+from service.compute.registration.evaluation import leave_one_out
+from service.compute.registration.result import RegistrationResult
 from service.core.errors import ComputeError
-from service.core.geometry import Array, apply, inverse
-from service.core.model import ArtefactRef
+from service.core.geometry import Array, inverse
 from service.worker.job import JobAnswer, JobContext
+from service.worker.photographs import photographs
 from service.worker.robot_poses import robot_camera_poses
 
 
@@ -34,7 +29,7 @@ def detect_spheres(context: JobContext) -> JobAnswer:
     The robot's poses tell where to look; where they are too far off, the images are searched whole.
     """
     images = context.arguments["images"]
-    files = [context.input(image["sha256"]) for image in images]
+    files = photographs(context, images)
     located = locate_outlines(
         files,
         context.camera(),
@@ -67,24 +62,28 @@ def register(context: JobContext) -> JobAnswer:
     spheres = np.array(arguments["spheres_m"])
     radius_m = float(arguments["radius_m"])
     names = [image["viewpoint"] for image in images]
-    metric = source in ("robot", "hybrid")
-    solved = register_images(
-        outlines, poses, camera, spheres, radius_m, groups=groups, estimate_scale=not metric, names=names
+    solve = partial(
+        register_images,
+        outlines,
+        poses,
+        camera,
+        spheres,
+        radius_m,
+        groups=groups,
+        estimate_scale=source not in ("robot", "hybrid"),
+        names=names,
+        sphere_covariance_m2=np.array(arguments["sphere_covariance_m2"]),
     )
+    solved = solve()
     answer = solved.registration
-    centre = spheres.mean(axis=0)
-    measures = {
-        "rms_px": answer.rms_px,
-        "markers": float(len(solved.markers)),
-        "images": float(answer.n_images),
-        "excluded_outlines": float(len(answer.excluded)),
-        "predicted_error_mm": 1e3 * answer.sigma_at_m(centre),
-    }
-    result = {
+    components = {name: np.asarray(C, dtype=np.float64)[:6, :6] for name, C in answer.components.items()}
+    result: dict[str, Any] = {
         "poses": source,
+        "camera": camera.record(),
+        "outlines": arguments["outlines"],
+        "full_camera": arguments.get("full_camera"),
         "T_world_scan": answer.T_world_scan.tolist(),
         "scale": answer.scale,
-        "covariance": answer.covariance.tolist(),
         "rms_px": answer.rms_px,
         "T_world_station": {_station(images, groups, g): T.tolist() for g, T in answer.T_world_group.items()},
         "T_scan_camera": {
@@ -95,61 +94,53 @@ def register(context: JobContext) -> JobAnswer:
     if source == "hybrid":
         # The spheres are in these poses already: only their adjustment knows how well the scan is placed.
         adjusted = context.input_json(arguments["model"])
-        measures["predicted_error_mm"] = adjusted["predicted_error_mm"]
         T_scan_world = inverse(np.array(adjusted["T_world_scan"]))
         result |= {key: adjusted[key] for key in ("T_world_scan", "T_world_station")}
-        result["covariance"] = adjusted["scan_covariance"]
         result["T_scan_camera"] = {name: (T_scan_world @ T).tolist() for name, T in zip(names, poses, strict=True)}
+        components = {"adjustment": np.array(adjusted["scan_covariance"])[:6, :6], "spheres": components["spheres"]}
+    if arguments.get("intrinsics_covariance") is not None:
+        uncertain = solve(intrinsics_covariance=np.array(arguments["intrinsics_covariance"]))
+        components["intrinsics"] = _added(answer, uncertain.registration)
+    covariance = np.sum(list(components.values()), axis=0)
+    result["covariance"] = covariance.tolist()
+    result["components"] = {name: C.tolist() for name, C in components.items()}
+    placed = Alignment(np.array(result["T_world_scan"]), covariance)
+    predicted_m = float(np.sqrt(np.trace(placed.covariance_at_m2(spheres.mean(axis=0)[None])[0])))
+    measures = {
+        "rms_px": answer.rms_px,
+        "chi2_reduced": answer.chi2_reduced,
+        "markers": float(len(solved.markers)),
+        "images": float(answer.n_images),
+        "excluded_outlines": float(len(answer.excluded)),
+        "predicted_error_mm": 1e3 * predicted_m,
+    }
+    result["leave_one_out"] = left_out = _leave_one_out(answer)
+    if left_out is not None:
+        measures["leave_one_out_mm"] = left_out["mean_radial_error_mm"]
     ref = context.keep_json({**result, **_residuals(answer, names)}, kind="registration", name=f"{source}.json")
     return JobAnswer(measures, (ref,), result)
 
 
-def evaluate(context: JobContext) -> JobAnswer:
-    """The paper's table: errors on the control spheres, which took no part in the registration."""
-    arguments = context.arguments
-    camera, radius_m = context.camera(), float(arguments["radius_m"])
-    images = arguments["images"]
-    outlines = _outlines(context, images, camera)
-    spheres = np.array(arguments["spheres_m"])
-    both = np.array(arguments["control_scan_spheres_m"])
-    match = match_constellations(spheres, both)
-    controls = apply(match.T_a_b, both[list(match.missing_b)])
-    if not len(controls):
-        raise ComputeError("the control scan shows no sphere beside the registration spheres")
-    table: list[dict[str, Any]] = []
-    refs: list[ArtefactRef] = []
-    pictures: dict[str, Callable[[], list[ArtefactRef]]] = {}
-    for source, registration in arguments["registrations"].items():
-        cameras = registration["T_scan_camera"]
-        seen = [i for i, image in enumerate(images) if image["viewpoint"] in cameras]
-        T_scan_camera = np.array([cameras[images[i]["viewpoint"]] for i in seen])
-        mine = [outlines[i] for i in seen]
-        assignments = [
-            _controls(o, T, spheres, controls, radius_m, camera) for o, T in zip(mine, T_scan_camera, strict=True)
-        ]
-        answer = evaluate_controls(mine, assignments, T_scan_camera, controls, radius_m, camera)
-        table.append(
-            {
-                "poses": source,
-                "mean_radial_error_mm": answer.mean_radial_error_mm,
-                "mean_reprojection_error_px": answer.mean_reprojection_error_px,
-                "control_outlines": len(answer.errors),
-                "images": len(seen),
-            }
-        )
-        pictures[source] = partial(
-            _overlays, context, [images[i] for i in seen], source, mine, T_scan_camera, spheres, controls
-        )
-    best = min(table, key=lambda row: row["mean_radial_error_mm"])
-    # The best source, and beside it the robot's own poses: the eye sees the difference.
-    for source in dict.fromkeys((best["poses"], "robot")):
-        refs += pictures[source]() if source in pictures else []
-    measures = {f"{row['poses']}_mean_radial_error_mm": row["mean_radial_error_mm"] for row in table}
-    measures |= {f"{row['poses']}_mean_reprojection_error_px": row["mean_reprojection_error_px"] for row in table}
-    measures["best_mean_radial_error_mm"] = best["mean_radial_error_mm"]
-    measures["control_spheres"] = float(len(controls))
-    refs.append(context.keep_json(table, kind="evaluation", name="evaluation.json"))
-    return JobAnswer(measures, tuple(refs), {"table": table})
+def _leave_one_out(answer: RegistrationResult) -> dict[str, Any] | None:
+    """Every sphere as predicted by the others; None where a station sees too few to spare one."""
+    try:
+        left_out = leave_one_out(answer)
+    except ComputeError:
+        return None
+    return {
+        "mean_radial_error_mm": left_out.mean_radial_error_mm,
+        "mean_reprojection_error_px": left_out.mean_reprojection_error_px,
+        "spheres": {str(m): list(row) for m, row in left_out.per_sphere().items()},
+    }
+
+
+def _added(exact: RegistrationResult, uncertain: RegistrationResult) -> Array:
+    """(6, 6) what uncertain intrinsics add to the covariance, the poses being held; never negative."""
+    unit = np.sqrt(np.diag(exact.covariance)[:6])  # metres and radians do not mix
+    more = (uncertain.covariance - exact.covariance)[:6, :6] / np.outer(unit, unit)
+    values, vectors = np.linalg.eigh((more + more.T) / 2)
+    kept = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(unit, unit)
+    return np.asarray(kept, dtype=np.float64)
 
 
 def _poses(context: JobContext) -> tuple[Array, list[int], list[dict[str, Any]]]:
@@ -190,61 +181,3 @@ def _residuals(answer: RegistrationResult, names: Sequence[str]) -> dict[str, An
         "chi2_reduced": answer.chi2_reduced,
         "cost": answer.cost,
     }
-
-
-def _controls(
-    outlines: Sequence[SphereOutline],
-    T_scan_camera: Array,
-    spheres: Array,
-    controls: Array,
-    radius_m: float,
-    camera: CameraModel,
-) -> Assignment:
-    """Which outlines are control spheres: those that the registration predicts there, and no registration sphere."""
-    centres = apply(inverse(T_scan_camera), np.vstack([spheres, controls]))
-    pairs = match(sightings(outlines, radius_m, camera), centres, radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
-    markers = {outline: marker - len(spheres) for outline, marker, _ in pairs if marker >= len(spheres)}
-    return Assignment(markers, inverse(T_scan_camera))
-
-
-def _overlays(
-    context: JobContext,
-    images: Sequence[dict[str, Any]],
-    source: str,
-    outlines: Sequence[Sequence[SphereOutline]],
-    T_scan_camera: Array,
-    spheres: Array,
-    controls: Array,
-) -> list[ArtefactRef]:
-    """Pictures of one image a station, with detected and predicted outlines drawn over it."""
-    camera, radius_m = context.camera(), float(context.arguments["radius_m"])
-    first: dict[str, int] = {}
-    for i, image in enumerate(images):
-        first.setdefault(image["station"], i)
-    refs: list[ArtefactRef] = []
-    for i in first.values():
-        centres = apply(inverse(T_scan_camera[i]), np.vstack([spheres, controls]))
-        pairs = match(sightings(outlines[i], radius_m, camera), centres, radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
-        marker = {outline: m for outline, m, _ in pairs}
-        detections = [
-            Detection(
-                outline,
-                m if m is not None and m < len(spheres) else None,
-                m - len(spheres) if m is not None and m >= len(spheres) else None,
-                None,
-            )
-            for outline, m in ((o, marker.get(j)) for j, o in enumerate(outlines[i]))
-        ]
-        picture = draw_overlay(
-            read_image(context.input(images[i]["sha256"])),
-            camera,
-            detections,
-            T_scan_camera=T_scan_camera[i],
-            registration_centres_m=spheres,
-            control_centres_m=controls,
-            radius_m=radius_m,
-        )
-        jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
-        name = f"{source}_{images[i]['viewpoint']}.jpg"
-        refs.append(context.keep_bytes(jpeg, kind="overlay", media_type="image/jpeg", name=name))
-    return refs

@@ -10,14 +10,16 @@ import numpy as np
 from service.compute.budget.closure import Alignment, Closure, SeenSphere, compare_in_frame, compare_shapes
 from service.core.geometry import Array
 
+CONTROL_SPHERES = "control spheres"
 HONEST = (0.5, 2.0)  # normalised chi square between these: the covariances say what is observed
 
 _HOW = {
     "outlines": "covariances of the outlines from their edge points, scaled to the residuals",
     "common": "what every outline of the capture may have in common (edge bias)",
-    "intrinsics": "covariance of the camera calibration, carried through the registration",
+    "intrinsics": "covariance of the camera calibration, the poses held (those from the same images absorb part)",
     "poses": "covariance of the camera poses, their scatter estimated from the spheres' residuals",
     "spheres": "covariances of the sphere centres in the scan",
+    "adjustment": "covariance of the joint adjustment of tracks, robot poses and sphere outlines",
 }
 
 
@@ -140,7 +142,7 @@ def control_observation(
         uncertain + control.covariance_m2[index],
     )
     return _observation(
-        "control spheres", closure, "spheres that took no part in the registration, located in the images alone"
+        CONTROL_SPHERES, closure, "spheres that took no part in the registration, located in the images alone"
     )
 
 

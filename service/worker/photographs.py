@@ -1,0 +1,43 @@
+"""The photographs of a job as files, at their own size or at the resolution that the job asks for."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from service.compute.camera_model import CameraModel
+from service.compute.images import read_image
+from service.compute.resolution import resample
+from service.worker.job import JobContext
+
+_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+
+
+def photographs(context: JobContext, images: Sequence[Mapping[str, Any]]) -> list[Path]:
+    """One file an image. With `full_camera` among the arguments, reduced copies of the size of the job's camera."""
+    originals = [context.input(image["sha256"]) for image in images]
+    if "full_camera" not in context.arguments:
+        return originals
+    camera = context.camera()
+    folder = context.scratch / f"{camera.width}x{camera.height}"
+    folder.mkdir(exist_ok=True)
+    copies = [folder / f"{image['viewpoint']}.jpg" for image in images]
+    full = CameraModel.from_record(context.arguments["full_camera"])
+    reduce = partial(_reduce, full=full, width=camera.width, height=camera.height)
+    with ProcessPoolExecutor(min(len(images), os.cpu_count() or 1), mp_context=get_context("spawn")) as pool:
+        for done, _ in enumerate(pool.map(reduce, originals, copies), 1):
+            context.progress(f"images at {camera.width} × {camera.height}", done, len(images))
+    return copies
+
+
+def _reduce(original: Path, copy: Path, full: CameraModel, width: int, height: int) -> None:
+    cv2.setNumThreads(1)  # the pool already uses every core
+    _, data = cv2.imencode(".jpg", resample(read_image(original), full, width, height), _JPEG)
+    copy.write_bytes(data.tobytes())
