@@ -98,7 +98,7 @@ def size(million_faces: int) -> dict[str, float]:
     del a, b, c, d, i, X, Y, Z
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     wall, cpu = time.perf_counter(), time.process_time()
-    spheres = locate_spheres(vertices, faces, RADIUS_M, expected=len(centres))
+    spheres = locate_spheres(vertices.astype(np.float64), faces, RADIUS_M, expected=len(centres))
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     distance = [float(np.linalg.norm(centres - s.centre_m, axis=1).min()) for s in spheres]
     return {

@@ -23,11 +23,13 @@ from simulators.world import Scene
 
 def _decagon(height_m: float = 0.0) -> Array:
     turn = np.arange(10) * (2 * np.pi / 10)
-    return np.stack([0.2 * np.cos(turn), 0.2 * np.sin(turn), height_m * (np.arange(10) % 2)], axis=1)
+    return np.stack([0.2 * np.cos(turn), 0.2 * np.sin(turn), height_m * (np.arange(10) % 2)], axis=1).astype(
+        np.float64
+    )
 
 
 def _grid() -> Array:
-    return np.array([[0.1 * x, 0.12 * y, 0.0] for x in range(4) for y in range(3)])
+    return np.array([[0.1 * x, 0.12 * y, 0.0] for x in range(4) for y in range(3)], dtype=np.float64)
 
 
 def _mirrored() -> Array:
