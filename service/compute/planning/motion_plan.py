@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from service.compute.calibration.kinematics import JOINT_LIMIT_RAD
 from service.compute.planning.collision import ArmBody, Obstacles, nearest_contacts, straight_path
-from service.compute.planning.inverse import nearest_posture
+from service.compute.planning.inverse import postures
 from service.compute.planning.optics import DepthOfField, depths_m
 from service.core.geometry import Array, Transform, inverse, transform
 
@@ -87,6 +88,10 @@ def plan_motion(views: Sequence[tuple[str, Transform]], situation: Situation, or
     total = 0.0
     for i in sequence:
         blocked = _blocked(here, able[i].joints_rad, situation)
+        others = _able_postures(able[i].T_base_camera, situation)[1:] if blocked else []
+        free = next((q for q in others if not _blocked(here, q, situation)), None)
+        if free is not None:
+            able[i], blocked = replace(able[i], joints_rad=free), ""
         if blocked:
             refused.append(replace(able[i], outcome="refused", reason=f"on the way there {blocked}"))
             continue
@@ -166,15 +171,16 @@ def _length(path: Sequence[int], times_s: Array) -> float:
 
 
 def _place(name: str, T_base_camera: Transform, situation: Situation) -> PlannedView:
-    joints = _joints(T_base_camera, situation)
-    reason = infeasible_reason(T_base_camera, joints, situation)
-    if not reason and joints is not None:
-        return PlannedView(name, T_base_camera, "feasible", joints_rad=joints)
+    able = _able_postures(T_base_camera, situation)
+    if able:
+        return PlannedView(name, T_base_camera, "feasible", joints_rad=able[0])
+    nearest = next(iter(_postures(T_base_camera, situation)), None)
+    reason = infeasible_reason(T_base_camera, nearest, situation)
     for nudge in _NUDGES_DEG:
         turned = turned_about_scene(T_base_camera, situation.centre_m, float(np.radians(nudge)))
-        joints = _joints(turned, situation)
-        if joints is not None and not infeasible_reason(turned, joints, situation):
-            return PlannedView(name, turned, "nudged", reason, nudge, joints)
+        able = _able_postures(turned, situation)
+        if able:
+            return PlannedView(name, turned, "nudged", reason, nudge, able[0])
     return PlannedView(name, T_base_camera, "refused", reason)
 
 
@@ -185,10 +191,17 @@ def turned_about_scene(T_base_camera: Transform, centre_m: Array, angle_rad: flo
     return transform(R, centre_m - R @ centre_m) @ T_base_camera
 
 
-def _joints(T_base_camera: Transform, situation: Situation) -> Array | None:
-    """Joints (6,) in the posture in which the arm stands now: a change of posture on the way is no small motion."""
-    T_base_flange = T_base_camera @ inverse(situation.body.T_flange_camera)
-    return nearest_posture(situation.body.model, T_base_flange, situation.start_rad)
+def _postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
+    """Joints (6,) that reach a pose, nearest to where the arm stands first."""
+    start = situation.start_rad
+    found = postures(situation.body.model, T_base_camera @ inverse(situation.body.T_flange_camera))
+    found = found + 2 * np.pi * np.round((start - found) / (2 * np.pi))
+    found = np.where(np.abs(found) > JOINT_LIMIT_RAD, found - 2 * np.pi * np.sign(found), found)
+    return [found[i] for i in np.argsort(np.sum((found - start) ** 2, axis=1), kind="stable")]
+
+
+def _able_postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
+    return [q for q in _postures(T_base_camera, situation) if not infeasible_reason(T_base_camera, q, situation)]
 
 
 def _blocked(here: Array, there: Array, situation: Situation) -> str:
