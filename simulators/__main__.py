@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import logging
+import os
 import sys
 from collections.abc import Sequence
 from typing import Protocol, cast
@@ -55,6 +56,8 @@ def _parser(chosen: str | None) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one simulator; 0 after SIGTERM, 1 with a reason on stderr, 2 for wrong usage."""
+    # Linear algebra in one thread: its threads wait for one another where many processes share the cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     words = list(sys.argv[1:] if argv is None else argv)
     chosen = words[0] if words and words[0] in SIMULATORS else None
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 from typing import Any
 
 import typer
@@ -65,6 +66,9 @@ def orthocapture() -> None:
 
 def main() -> None:
     """Entry point of the distribution."""
+    # The matrices are small and the processes many: threads of the linear algebra wait for one another, ten times
+    # slower on a busy machine. It reads this when it is loaded, here and in every process started from here.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")
     app()
 
