@@ -13,17 +13,18 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, cone_of_sphere, ransac_cone
-from service.compute.markers.detect import refine_outline
 from service.compute.markers.edges import envelope_edges, profiles, sample
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.markers.refine import Approached, approach_outlines, measure_outlines, refine_outline
 from service.compute.registration.cost import skew
 from service.core.geometry import Array, Transform, apply, transform
 
 # Distances below are parts of a sphere's radius as the image shows it, unless the name has a unit.
-NEAR = 0.08  # a prediction as good as this needs no search: the outline's own refinement reaches a tenth
+NEAR = 0.08  # a prediction as good as this is approached at once, and searched only when that fails
 WIDE = 0.42  # the worst that is looked for: a robot that is off by millimetres
 _PLACE_GATE, _SIZE_GATE = 0.05, 0.04  # of a whole outline against the image's other spheres; of a part, in proportion
 _ROUGH_GATE = 0.12
+_APPROACH_GATE = 0.02  # of outlines approached, on whose agreement the others are predicted
 _LEAST_PART = 0.45  # of an outline that must be inside the image and not behind another sphere
 _REGION_RADIUS_PX = 24.0  # of a sphere in the reduced region on which a search runs
 _REGION_RAYS = 64
@@ -109,14 +110,21 @@ def _attempt(
 ) -> Located:
     centres, radius_m = expected.centres_m, expected.radius_m
     pose = expected.T_camera_scan
-    shown = visible_cones(pose, centres, radius_m, camera)
-    if expected.margin > NEAR:
-        pose = _approached_pose(image, camera, expected, shown)
+    starts = None
+    if expected.margin <= NEAR:
+        starts = _starts(image, camera, expected, pose, options)
+    if starts is None:
+        pose = _approached_pose(image, camera, expected, visible_cones(pose, centres, radius_m, camera))
+        starts = _starts(image, camera, expected, pose, options)
+    if starts is None:  # too few spheres to tell of one another
         shown = visible_cones(pose, centres, radius_m, camera)
+        found = [refine_outline(image, camera, cone, options) for cone in shown.values()]
+    else:
+        shown = starts
+        found = measure_outlines(image, camera, list(starts.values()), options)
     outlines: dict[int, SphereOutline] = {}
     missing: dict[int, str] = {}
-    for m, cone in shown.items():
-        outline = refine_outline(image, camera, cone, options)
+    for m, outline in zip(shown, found, strict=True):
         if outline is None:
             missing[m] = "no outline where it is predicted"
         elif not expected.tone.admits(outline):
@@ -133,6 +141,29 @@ def _attempt(
             del outlines[m]
             missing[m] = "not where the image's other spheres put it"
     return Located(outlines, missing, pose)
+
+
+def _starts(
+    image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, pose: Transform, options: DetectionOptions
+) -> dict[int, Approached] | None:
+    """Cones to measure, right to about a pixel: as approached, or where the spheres approached put the others.
+
+    None when the spheres approached do not agree on a pose.
+    """
+    centres, radius_m = expected.centres_m, expected.radius_m
+    shown = visible_cones(pose, centres, radius_m, camera)
+    near = approach_outlines(image, camera, list(shown.values()), options)
+    approached = {m: a for m, a in zip(shown, near, strict=True) if a is not None}
+    cones = {m: a.cone for m, a in approached.items()}
+    agreed = _agreed_pose(cones, expected, pose, _APPROACH_GATE, max(0.5 * len(shown), _POSE_SPHERES))
+    if agreed is None:
+        return None
+    out: dict[int, Approached] = {}
+    for m, cone in visible_cones(agreed, centres, radius_m, camera).items():
+        own = approached.get(m)
+        place, size = (np.inf, np.inf) if own is None else deviation(own.cone, cone)
+        out[m] = own if own is not None and place < _PLACE_GATE and size < _SIZE_GATE else Approached(cone)
+    return out
 
 
 def deviation(cone: Cone, predicted: Cone) -> tuple[float, float]:

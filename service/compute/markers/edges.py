@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -18,7 +19,7 @@ class Profiles:
     """Where the rays of a cone's neighbourhood fall in the image.
 
     `pixels` (K, J, 2) of K azimuths and J offsets; `inside` (K, J) whether in the image; `per_pixel_rad` (K,) the
-    angle that one pixel subtends across the outline there.
+    angle that one pixel subtends across the outline there. Of G cones, these have a first axis (G, ...).
     """
 
     azimuth_rad: Array
@@ -30,17 +31,27 @@ class Profiles:
 
 def profiles(cone: Cone, camera: CameraModel, n_azimuths: int, offsets_px: Array) -> Profiles:
     """Sample positions across the outline, through the lens's distortion, so that edges need no undistortion."""
+    where = profiles_of([cone], camera, n_azimuths, offsets_px)
+    return Profiles(where.azimuth_rad, offsets_px, where.pixels[0], where.inside[0], where.per_pixel_rad[0])
+
+
+def profiles_of(cones: Sequence[Cone], camera: CameraModel, n_azimuths: int, offsets_px: Array) -> Profiles:
+    """`profiles` of G cones at once."""
     azimuth = np.linspace(0.0, 2 * np.pi, n_azimuths, endpoint=False).astype(np.float64)
+    half = np.array([c.half_angle_rad for c in cones])[:, None]
+    frames = np.array([c.frame() for c in cones])
+    around = np.cos(azimuth)[:, None] * frames[:, None, :, 0] + np.sin(azimuth)[:, None] * frames[:, None, :, 1]
+    axis = frames[:, None, None, :, 2]
+
+    def projected(angles: Array) -> Array:
+        rays = np.sin(angles)[..., None] * around[:, :, None] + np.cos(angles)[..., None] * axis
+        return camera.project(rays.reshape(-1, 3)).reshape(*angles.shape, 2)
+
     delta = 0.5 / camera.fx
-    ends = [
-        camera.project(cone.rays(azimuth, np.full(n_azimuths, cone.half_angle_rad + sign * delta)))
-        for sign in (-1.0, 1.0)
-    ]
-    per_pixel = 2 * delta / np.linalg.norm(ends[1] - ends[0], axis=1)
-    angles = cone.half_angle_rad + per_pixel[:, None] * offsets_px
-    rays = cone.rays(azimuth[:, None], angles)
-    pixels = camera.project(rays.reshape(-1, 3)).reshape(n_azimuths, len(offsets_px), 2)
-    inside = np.all((pixels >= 1) & (pixels <= [camera.width - 2, camera.height - 2]), axis=2)
+    ends = projected(np.broadcast_to(half[..., None] + [-delta, delta], (len(cones), n_azimuths, 2)))
+    per_pixel = 2 * delta / np.linalg.norm(ends[..., 1, :] - ends[..., 0, :], axis=2)
+    pixels = projected(half[..., None] + per_pixel[..., None] * offsets_px)
+    inside = np.all((pixels >= 1) & (pixels <= [camera.width - 2, camera.height - 2]), axis=3)
     return Profiles(azimuth, offsets_px, pixels, inside, per_pixel)
 
 
@@ -58,19 +69,26 @@ def sample(image: NDArray[np.float32] | NDArray[np.uint8], pixels: Array) -> NDA
     return np.asarray(top * (1 - fy) + bottom * fy, dtype=np.float32)
 
 
-def sample_sharp(image: NDArray[np.uint8], pixels: Array) -> NDArray[np.float32]:
-    """Values (K, J, 3) at pixels (K, J, 2) by Lanczos interpolation, which does not blur.
+def sample_sharp(image: NDArray[np.uint8], pixels: Array) -> NDArray[np.uint8]:
+    """Values (..., J, 3) at pixels (..., J, 2) by Lanczos interpolation, which does not blur.
 
     Bilinear values are means of coded values: a blur behind the transfer curve, which moves edges of high contrast by
     a tenth of a pixel. Positions are rounded to 1/32 px, evenly up and down.
     """
-    h, w = image.shape[:2]
-    low = np.clip(np.floor(pixels.reshape(-1, 2).min(axis=0)).astype(int) - 4, 0, [w - 2, h - 2])
-    high = np.clip(np.ceil(pixels.reshape(-1, 2).max(axis=0)).astype(int) + 5, low + 2, [w, h])
-    patch = image[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-    at = (pixels - low).astype(np.float32)
-    values = cv2.remap(patch, at[..., 0], at[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
-    return np.clip(np.asarray(values, dtype=np.float32), 0, 255)
+    return _remapped(image, pixels, cv2.INTER_LANCZOS4)
+
+
+def sample_averaged(image: NDArray[np.uint8], pixels: Array, count: int) -> NDArray[np.uint8]:
+    """Means (..., J, 3) of `count` neighbouring values each along profiles (..., J * count, 2)."""
+    values = _remapped(image, pixels, cv2.INTER_LINEAR)
+    means = values.reshape(*values.shape[:-2], -1, count, 3).mean(axis=-2, dtype=np.float32)
+    return np.rint(means).astype(np.uint8)
+
+
+def _remapped(image: NDArray[np.uint8], pixels: Array, how: int) -> NDArray[np.uint8]:
+    at = pixels.reshape(-1, *pixels.shape[-2:]).astype(np.float32)
+    values = cv2.remap(image, at[..., 0], at[..., 1], how, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.uint8).reshape(*pixels.shape[:-1], 3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
-"""One outline at full resolution: edges of an envelope, RANSAC, the forward model of the limb; its covariance."""
+"""Outlines at full resolution: edges of an envelope, RANSAC, the forward model of the limb; their covariance."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +10,8 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, distance_gradient, ransac_cone
-from service.compute.markers.edges import envelope_edges, profiles, sample, sample_sharp
-from service.compute.markers.limb import LimbFit, fit_limb
+from service.compute.markers.edges import envelope_edges, profiles, profiles_of, sample, sample_averaged, sample_sharp
+from service.compute.markers.limb import fit_limb, masked_median
 from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
 from service.core.geometry import Array
 
@@ -19,10 +20,25 @@ from service.core.geometry import Array
 SYSTEMATIC_PER_BLUR = 0.05
 MOST_SIGMA_PX = 0.5  # of an edge point; where there is no outline, places within the search's reach scatter more
 TEXTURE_FACTOR = 3.0  # sigma of an edge point over the one its own profile tells
+REACH = 0.04  # of the radius: as far as `approach_outlines` sees
 _BLOCKS = 16  # of an outline, for the noise that neighbouring edge points share
 _TRIALS = 150  # of RANSAC: the rough outline is near
-_FIRST_PROFILES, _PROFILES = 48, 128
+_FIRST_PROFILES, _FIRST_OF_LARGE = 48, 32
+_MOST_PROFILES, _FEWEST_PROFILES = 128, 48
+_FINE_RADIUS_PX = 75.0  # up to here every profile counts; beyond, fewer tell the sphere's place in space as well
+_UNIT_RADIUS_PX = 60.0  # radius in samples of the first approach, which averages the pixels of larger outlines
+_LEAST_PART = 0.19  # of the profiles that must agree
 _START_BLUR_PX, _START_CHROMA_BLUR_PX = 0.7, 1.2
+_FOCUS = 1.3  # blur over the expected one from which on profiles were too short for it
+
+
+@dataclass(frozen=True, slots=True)
+class Approached:
+    """A cone as good as averaged pixels tell it, and the blurs to expect (px)."""
+
+    cone: Cone
+    blur_px: float = _START_BLUR_PX
+    chroma_blur_px: float = _START_CHROMA_BLUR_PX
 
 
 def refine_outline(
@@ -40,30 +56,81 @@ def refine_outline(
     cone = _by_envelope(image_bgr, camera, rough, options)
     if cone is None:
         return None
-    blurs = (_START_BLUR_PX, _START_CHROMA_BLUR_PX)
-    first = None
+    (approached,) = approach_outlines(image_bgr, camera, [cone], options)
+    if approached is None:
+        return None
+    return measure_outlines(image_bgr, camera, [approached], options, score=score)[0]
+
+
+def approach_outlines(
+    image_bgr: NDArray[np.uint8], camera: CameraModel, roughs: Sequence[Cone], options: DetectionOptions = DEFAULTS
+) -> list[Approached | None]:
+    """The cones near `roughs`, which must be right to REACH of their radii, on pixels averaged across the outline."""
+    if not roughs:
+        return []
+    radius_px = float(np.median([c.half_angle_rad for c in roughs])) * camera.fx
+    unit = max(1, round(radius_px / _UNIT_RADIUS_PX))
+    count = _FIRST_PROFILES if unit == 1 else _FIRST_OF_LARGE
+    out: list[Approached | None] = [None] * len(roughs)
+    todo = [(i, Approached(rough)) for i, rough in enumerate(roughs)]
     for _ in range(3):
-        first = _measure(image_bgr, camera, cone, _FIRST_PROFILES, 1.0, 2.5, 4, blurs, options)
-        if first is None:
-            return None
-        cone = first.cone
-        if first.limb.blur_px < 1.3 * max(1.0, blurs[0]):
+        if not todo:
             break
-        # Out of focus: the profiles were too short for it.
-        blurs = (first.limb.blur_px, first.limb.chroma_blur_px)
-    assert first is not None
-    blurs = (first.limb.blur_px, first.limb.chroma_blur_px)
-    best = _measure(image_bgr, camera, first.cone, _PROFILES, 0.5, 1.6, 3, blurs, options)
+        measured = _measure(image_bgr, camera, [a for _, a in todo], count, 1.0, 2.5, 4, unit, options)
+        again: list[tuple[int, Approached]] = []
+        for (i, before), found in zip(todo, measured, strict=True):
+            if found is None:
+                continue
+            if unit > 1:
+                out[i] = Approached(found.cone)  # finer than these samples, the blur is still to be found
+                continue
+            out[i] = Approached(found.cone, found.blur_px, found.chroma_blur_px)
+            if found.blur_px >= _FOCUS * max(1.0, before.blur_px):
+                again.append((i, out[i] or before))  # out of focus
+        todo = again
+    return out
+
+
+def measure_outlines(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    starts: Sequence[Approached],
+    options: DetectionOptions = DEFAULTS,
+    *,
+    score: float = 1.0,
+) -> list[SphereOutline | None]:
+    """The outlines at full resolution, starting from cones that are right to about a pixel; None as `refine_outline`.
+
+    An outline has more edge the larger it is, and the sphere's place in space is known the better: the number of
+    profiles falls as that allows.
+    """
+    if not starts:
+        return []
+    radius_px = float(np.median([s.cone.half_angle_rad for s in starts])) * camera.fx
+    wanted = _MOST_PROFILES * min(1.0, _FINE_RADIUS_PX / radius_px)
+    count = max(_FEWEST_PROFILES, _BLOCKS * round(wanted / _BLOCKS))
+    fine = radius_px < _FINE_RADIUS_PX
+    step, iterations = (0.5, 3) if fine else (1.0, 4)
+    found = _measure(image_bgr, camera, starts, count, step, 1.6 if fine else 2.5, iterations, 1, options)
+    for i, best in enumerate(found):
+        if best is not None and not fine and best.blur_px > _FOCUS * max(1.0, starts[i].blur_px):
+            longer = Approached(best.cone, best.blur_px, best.chroma_blur_px)
+            found[i] = _measure(image_bgr, camera, [longer], count, step, 2.5, iterations, 1, options)[0]
+    return [None if best is None else _outline(image_bgr, camera, best, options, score) for best in found]
+
+
+def _outline(
+    image: NDArray[np.uint8], camera: CameraModel, best: _Measured, options: DetectionOptions, score: float
+) -> SphereOutline | None:
     if (
-        best is None
-        or best.coverage < options.min_coverage
+        best.coverage < options.min_coverage
         or best.rms_px > options.max_rms_px
         or best.contrast < options.min_contrast
         or best.cone.axis[2] < 0.3
     ):
         return None
     middle = camera.project(best.cone.axis[None])[0]
-    colour = _median_colour(image_bgr, middle, 0.5 * best.cone.half_angle_rad * camera.fx)
+    colour = _median_colour(image, middle, 0.5 * best.cone.half_angle_rad * camera.fx)
     evidence = Evidence(
         best.coverage, best.rms_px, best.sigma_px, best.n_edges, best.systematic_px, best.contrast, colour, score,
         best.covariance,
@@ -95,7 +162,8 @@ class _Measured:
     """A cone by sub-pixel edges."""
 
     cone: Cone
-    limb: LimbFit
+    blur_px: float
+    chroma_blur_px: float
     coverage: float
     sigma_px: float
     rms_px: float
@@ -108,104 +176,123 @@ class _Measured:
 def _measure(
     image: NDArray[np.uint8],
     camera: CameraModel,
-    cone: Cone,
+    starts: Sequence[Approached],
     n_profiles: int,
-    step_px: float,
-    reach_px: float,
+    step: float,
+    reach: float,
     iterations: int,
-    blurs_px: tuple[float, float],
+    unit: int,
     options: DetectionOptions,
-) -> _Measured | None:
-    radius_px = cone.half_angle_rad * camera.fx
+) -> list[_Measured | None]:
+    """Cones near those given, from `n_profiles` each; lengths are in `unit` pixels, whose values are averaged."""
+    cones = [s.cone for s in starts]
+    radius = np.array([c.half_angle_rad for c in cones]) * camera.fx / unit
+    typical = float(np.median(radius))
     # Inside, as far as tells the limb's fall from the edge; outside, only what the blurred edge needs.
-    blur = max(1.0, blurs_px[0])
-    inner = float(np.clip(0.13 * radius_px, 4.0, 12.0)) + 2 * (blur - 1)
-    inner = min(inner, 0.6 * radius_px)
+    blur = max(1.0, float(np.median([s.blur_px for s in starts])))
+    inner = min(float(np.clip(0.13 * typical, 4.0, 12.0)) + 2 * (blur - 1), 0.6 * typical)
     outer = 4.0 + 2.5 * (blur - 1)
-    offsets = np.asarray(np.arange(-round(inner / step_px), round(outer / step_px) + 1) * step_px, dtype=np.float64)
-    where = profiles(cone, camera, n_profiles, offsets)
+    offsets = np.asarray(np.arange(-round(inner / step), round(outer / step) + 1) * step, dtype=np.float64)
+    finer = (offsets[:, None] * unit + np.arange(unit) - 0.5 * (unit - 1)).reshape(-1)
+    where = profiles_of(cones, camera, n_profiles, finer)
+    values = sample_sharp(image, where.pixels) if unit == 1 else sample_averaged(image, where.pixels, unit)
     limb = fit_limb(
-        sample_sharp(image, where.pixels), where, radius_px, srgb=options.srgb, blur_px=blurs_px[0],
-        chroma_blur_px=blurs_px[1], iterations=iterations, reach_px=reach_px,
+        values, offsets, np.all(where.inside, axis=2), radius, srgb=options.srgb,
+        blur=np.array([s.blur_px for s in starts]), chroma_blur=np.array([s.chroma_blur_px for s in starts]),
+        iterations=iterations, reach=reach,
     )  # fmt: skip
-    fit = _robust_cone(cone, where.azimuth_rad, limb, where.per_pixel_rad)
-    if fit is None or fit[4] > max(MOST_SIGMA_PX, 0.3 * limb.blur_px):
-        return None
-    fitted, used, residual, weights, scale, coverage = fit
-    covariance = _covariance(where.azimuth_rad, residual, weights, used, scale)
-    systematic = SYSTEMATIC_PER_BLUR * limb.blur_px
-    angle = float(np.median(where.per_pixel_rad))
-    return _Measured(
-        cone=fitted,
-        limb=limb,
-        coverage=coverage,
-        sigma_px=scale,
-        rms_px=float(np.sqrt(np.mean(residual[used] ** 2))),
-        n_edges=int(used.sum()),
-        contrast=float(np.median(limb.contrast[used])),
-        systematic_px=systematic,
-        covariance=(covariance + np.eye(3) * systematic**2) * angle**2,
-    )
+    azimuth, per_pixel = where.azimuth_rad, where.per_pixel_rad * unit
+    angle = np.median(per_pixel, axis=1)
+    fit = _robust_cones(azimuth, limb.offset * per_pixel / angle[:, None], limb.sigma, limb.ok)
+    covariance = _covariances(azimuth, fit)
+    contrast = masked_median(limb.contrast, fit.used)
+    out: list[_Measured | None] = []
+    for i, cone in enumerate(cones):
+        blur_px = float(limb.blur[i]) * unit
+        if not fit.good[i] or fit.scale[i] > max(MOST_SIGMA_PX, 0.3 * float(limb.blur[i])):
+            out.append(None)
+            continue
+        axis = cone.axis + cone.frame()[:, :2] @ fit.step[i, :2] * angle[i]
+        systematic = SYSTEMATIC_PER_BLUR * blur_px
+        out.append(
+            _Measured(
+                cone=Cone(axis / float(np.linalg.norm(axis)), cone.half_angle_rad + float(fit.step[i, 2] * angle[i])),
+                blur_px=blur_px,
+                chroma_blur_px=float(limb.chroma_blur[i]) * unit,
+                coverage=float(fit.coverage[i]),
+                sigma_px=float(fit.scale[i]) * unit,
+                rms_px=float(np.sqrt(np.mean(fit.residual[i, fit.used[i]] ** 2))) * unit,
+                n_edges=int(fit.used[i].sum()),
+                contrast=float(contrast[i]),
+                systematic_px=systematic,
+                covariance=(covariance[i] + np.eye(3) * (systematic / unit) ** 2) * angle[i] ** 2,
+            )
+        )
+    return out
 
 
-def _robust_cone(
-    cone: Cone, azimuth: Array, limb: LimbFit, per_pixel: Array
-) -> tuple[Cone, NDArray[np.bool_], Array, Array, float, float] | None:
-    """Cone by Tukey's weights on the geometric distances, linear in the small step from the cone of the profiles.
+@dataclass(frozen=True, slots=True)
+class _ConeFits:
+    """Of G cones: steps (G, 3), points used, residuals and weights (G, K), scale, coverage, whether there is one."""
 
-    Returns the cone, the points used, residuals (px), weights, their robust scale (px) and the coverage.
-    """
-    ok = limb.ok
-    if ok.sum() < 24:
-        return None
+    step: Array
+    used: NDArray[np.bool_]
+    residual: Array
+    weights: Array
+    scale: Array
+    coverage: Array
+    good: NDArray[np.bool_]
+
+
+def _robust_cones(azimuth: Array, offset: Array, sigma: Array, ok: NDArray[np.bool_]) -> _ConeFits:
+    """Cones by Tukey's weights on the geometric distances (G, K), linear in the small steps from the given cones."""
     J = -distance_gradient(azimuth)
-    scale_to = float(np.median(per_pixel))
-    offset = limb.offset_px * per_pixel / scale_to
+    least = max(12, round(_LEAST_PART * len(azimuth)))
+    good = ok.sum(axis=1) >= least
     # Texture beside the outline is no white noise, and no edge is known better than a few hundredths of a pixel.
-    base = 1.0 / ((TEXTURE_FACTOR * limb.sigma_px) ** 2 + 0.05**2)
-    weights = np.where(ok, base, 0.0)
-    residual, scale = offset, 1.0
-    step = np.zeros(3)
+    base = np.where(ok, 1.0 / ((TEXTURE_FACTOR * sigma) ** 2 + 0.05**2), 0.0)
+    weights, residual, scale = base, offset, np.ones(len(offset))
+    step = np.zeros((len(offset), 3))
     for _ in range(6):
-        w = J * weights[:, None]
-        normal = w.T @ J
-        if float(np.linalg.det(normal)) < 1e-9 * float(np.trace(normal)) ** 3:
-            return None  # an arc too short to tell
-        step = np.linalg.solve(normal, w.T @ offset)
-        residual = offset - J @ step
-        scale = max(0.03, 1.4826 * float(np.median(np.abs(residual[ok]))))
-        u = residual / (4.0 * scale)
-        weights = np.where(ok & (np.abs(u) < 1), base * (1 - u**2) ** 2, 0.0)
-        if (weights > 0).sum() < 24:
-            return None
-    used = ok & (np.abs(residual) < 3.5 * scale)
-    if used.sum() < 24:
-        return None
-    axis = cone.axis + cone.frame()[:, :2] @ step[:2] * scale_to
-    fitted = Cone(axis / float(np.linalg.norm(axis)), cone.half_angle_rad + float(step[2]) * scale_to)
-    coverage = float((ok & (np.abs(residual) < max(0.5, 3.5 * scale))).mean())
-    return fitted, used, residual, weights, scale, coverage
+        weighted = J.T * weights[:, None, :]  # (G, 3, K)
+        normal = weighted @ J
+        trace = np.trace(normal, axis1=1, axis2=2)
+        good = good & (np.linalg.det(normal) >= 1e-9 * trace**3) & (trace > 0)  # else an arc too short to tell
+        normal = np.where(good[:, None, None], normal, np.eye(3))
+        step = np.asarray(np.linalg.solve(normal, weighted @ offset[..., None])[..., 0], dtype=np.float64)
+        residual = offset - step @ J.T
+        size = np.abs(residual)
+        scale = np.maximum(0.03, 1.4826 * np.nan_to_num(masked_median(size, ok), posinf=1e3))
+        u = residual / (4.0 * scale[:, None])
+        weights = np.where(np.abs(u) < 1, base * (1 - u**2) ** 2, 0.0)
+        good = good & ((weights > 0).sum(axis=1) >= least)
+    size = np.abs(residual)
+    used = ok & (size < 3.5 * scale[:, None])
+    good = good & (used.sum(axis=1) >= least)
+    coverage = (ok & (size < np.maximum(0.5, 3.5 * scale)[:, None])).mean(axis=1)
+    return _ConeFits(step, used, residual, weights, scale, coverage, good)
 
 
-def _covariance(azimuth: Array, residual: Array, weights: Array, used: NDArray[np.bool_], scale: float) -> Array:
-    """(3, 3) of the cone's two directions and half angle in px², from the scatter of the edge points.
+def _covariances(azimuth: Array, fit: _ConeFits) -> Array:
+    """(G, 3, 3) of the cone's two directions and half angle, in squared units, from the scatter of the edge points.
 
     Neighbouring edge points share pixels, texture and shading, so they err alike. Means over blocks of the outline
     show by how much more than independent points would: that factor multiplies the plain covariance.
     """
     J = -distance_gradient(azimuth)
-    w = np.where(used, weights, 0.0)
-    w = w / max(float(w.max()), 1e-12)
-    normal_inverse = np.linalg.inv((J * w[:, None]).T @ J)
-    noise = np.asarray(normal_inverse @ ((J * w[:, None] ** 2).T @ J) @ normal_inverse, dtype=np.float64) * scale**2
-    block = (np.arange(len(azimuth)) * _BLOCKS) // len(azimuth)
-    total = np.bincount(block, w, _BLOCKS)
-    square = np.bincount(block, w * w, _BLOCKS)
-    sums = np.bincount(block, w * np.where(used, residual, 0.0), _BLOCKS)
-    filled = total > 0.25 * np.median(total)
+    w = np.where(fit.used & fit.good[:, None], fit.weights, 0.0)
+    w = np.where(fit.good[:, None], w / np.maximum(w.max(axis=1, keepdims=True), 1e-12), 1.0)
+    inverse = np.linalg.inv((J.T * w[:, None]) @ J)
+    noise = inverse @ ((J.T * w[:, None] ** 2) @ J) @ inverse * fit.scale[:, None, None] ** 2
+    blocks = (len(w), _BLOCKS, -1)
+    total = w.reshape(blocks).sum(axis=2)
+    square = (w * w).reshape(blocks).sum(axis=2)
+    sums = (w * np.where(fit.used, fit.residual, 0.0)).reshape(blocks).sum(axis=2)
+    filled = total > 0.25 * np.median(total, axis=1, keepdims=True)
     # Three parameters were fitted to these means.
-    factor = float(np.sum(sums[filled] ** 2 / square[filled])) / max(int(filled.sum()) - 3, 3) / scale**2
-    return noise * max(1.0, factor)
+    chi2 = np.where(filled, sums**2 / np.maximum(square, 1e-12), 0.0).sum(axis=1)
+    factor = chi2 / np.maximum(filled.sum(axis=1) - 3, 3) / fit.scale**2
+    return noise * np.maximum(1.0, factor)[:, None, None]
 
 
 def _median_colour(image: NDArray[np.uint8], middle: Array, reach: float) -> tuple[float, float, float]:
