@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import multiprocessing
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -19,8 +20,9 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.compute.images import read_image_of, read_reduced
 from service.compute.markers.cones import cone_of_sphere
-from service.compute.markers.detect import detect_spheres
+from service.compute.markers.detect import detect_spheres, find_rough
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.markers.refine import refine_outlines
 from service.compute.predicting import WIDE, Prediction, Tone, deviation, fit_pose, locate_predicted, tone_of
 from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment, identify
@@ -31,11 +33,13 @@ from service.core.geometry import Array, apply, inverse
 _ANCHORS = (2, 4)  # images of a station that are searched first; more when these do not agree
 _ANCHORS_WITHOUT_SCALE = (3, 6)
 ANCHOR_WIDTH_PX = 1000  # at least, of the reduced image on which an anchor is searched
+_ANCHOR_CANDIDATES = 36  # circles of an anchor that are looked at more closely, the best voted first
 _MOST_FAILED = 0.4  # of the images whose prediction may fail before the prediction itself is doubted
 _SAME_SPHERE = 0.15  # in radii: one unlisted sphere seen from two sides
 _GATE, _SIZE_GATE = 0.5, 0.12  # of an outline of a whole search, against its prediction
 
 Progress = Callable[[int, int], None]
+DetectFile = Callable[[Path, CameraModel, DetectionOptions], tuple[SphereOutline, ...]]
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
@@ -116,6 +120,7 @@ def detect_all(
     options: DetectionOptions = DEFAULTS,
     workers: int = 1,
     progress: Progress | None = None,
+    detect: DetectFile | None = None,
 ) -> tuple[tuple[SphereOutline, ...], ...]:
     """The outlines in all images, in the order given, every image searched whole.
 
@@ -125,13 +130,20 @@ def detect_all(
         options: of the detector.
         workers: processes; 1 computes here.
         progress: called with (done, all) after each image.
+        detect: another detector of one file, which can be pickled; None: `detect_file`.
 
     Raises:
         DataError: an image cannot be used; the first one is named.
     """
     with _mapping(workers, len(image_paths)) as mapped:
-        work = partial(detect_file, camera=camera, options=options)
+        work = partial(_detected, detect or detect_file, camera, options)
         return tuple(_counted(mapped(work, image_paths), len(image_paths), progress))
+
+
+def _detected(
+    detect: DetectFile, camera: CameraModel, options: DetectionOptions, path: Path
+) -> tuple[SphereOutline, ...]:
+    return detect(path, camera, options)
 
 
 def locate_outlines(
@@ -244,8 +256,16 @@ def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> _Found
 
 
 def _look_reduced(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
+    """The clearest outlines of an anchor. A doubtful one would do no harm, but identity needs only some."""
     image, smaller = read_reduced(path, camera, ANCHOR_WIDTH_PX)
-    return detect_spheres(image, smaller, options)
+    few = dataclasses.replace(options, max_candidates=min(_ANCHOR_CANDIDATES, options.max_candidates))
+    roughs = find_rough(image, smaller, few)
+    outlines = refine_outlines(image, smaller, [r.cone for r in roughs], few, scores=[r.score for r in roughs])
+    kept: list[SphereOutline] = []
+    for outline in outlines:
+        if outline is not None and all(deviation(outline.cone, other.cone)[0] > 0.6 for other in kept):
+            kept.append(outline)
+    return tuple(kept)
 
 
 def _provisional(

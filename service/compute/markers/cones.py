@@ -100,17 +100,20 @@ def angles_to(cone: Cone, rays: Array) -> Array:
 def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> Cone:
     """Least squares of the angular (geometric) distance of unit rays (N, 3) to the cone, by Gauss–Newton."""
     cone = start
-    w = np.sqrt(weights)
     for _ in range(iterations):
         frame = cone.frame()
         local = rays @ frame
         azimuth = np.arctan2(local[:, 1], local[:, 0])
         residual = angles_to(cone, rays)
         J = distance_gradient(azimuth)
-        step = np.linalg.lstsq(J * w[:, None], -residual * w, rcond=None)[0]
+        weighted = J.T * weights
+        try:
+            step = np.linalg.solve(weighted @ J, -weighted @ residual)
+        except np.linalg.LinAlgError:  # points in one place tell nothing
+            return cone
         axis = cone.axis + frame[:, :2] @ step[:2]
         cone = Cone(axis / np.linalg.norm(axis), cone.half_angle_rad + float(step[2]))
-        if float(np.abs(step).max()) < 1e-12:
+        if float(np.abs(step).max()) < 1e-8:
             break
     return cone
 
@@ -156,7 +159,6 @@ def ransac_cone(
 
     Returns None when no triple gives a cone within the bounds.
     """
-    n_slots = int(slots.max()) + 1 if len(slots) else 0
     if len(rays) < 8:
         return None
     order = np.argsort(slots, kind="stable")
@@ -171,12 +173,13 @@ def ransac_cone(
     if not np.any(good):
         return None
     axis, half = axis[good], half[good]
-    # |angle - half| < tolerance, by cosines: they fall as the angle grows.
-    cosine = rays @ axis.T
-    agree = (cosine > np.cos(half + tolerance_rad)) & (cosine < np.cos(np.maximum(half - tolerance_rad, 0)))  # (N, K)
-    votes = np.where(agree, strengths[:, None], 0.0)
+    # |angle - half| < tolerance, by cosines, which fall as the angle grows; in single precision, for speed.
+    far, close = np.cos(half + tolerance_rad), np.cos(np.maximum(half - tolerance_rad, 0))
+    off = np.abs((rays @ axis.T - 0.5 * (close + far)).astype(np.float32))  # (N, K)
+    agree = off < (0.5 * (close - far)).astype(np.float32)
+    votes = agree * strengths[:, None].astype(np.float32)
     starts = np.searchsorted(sorted_slots, np.unique(sorted_slots))
-    total = np.maximum.reduceat(votes, starts, axis=0).sum(axis=0) / max(n_slots, 1)
+    total = np.maximum.reduceat(votes, starts, axis=0).sum(axis=0)
     best = int(np.argmax(total))
     cone = Cone(axis[best], float(half[best]))
     inlier_sorted = agree[:, best]

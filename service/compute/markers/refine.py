@@ -29,6 +29,7 @@ _FINE_RADIUS_PX = 75.0  # up to here every profile counts; beyond, fewer tell th
 _UNIT_RADIUS_PX = 60.0  # radius in samples of the first approach, which averages the pixels of larger outlines
 _LEAST_PART = 0.19  # of the profiles that must agree
 _START_BLUR_PX, _START_CHROMA_BLUR_PX = 0.7, 1.2
+_ALIKE = 1.5  # radius over the smallest of outlines whose profiles are of one length
 _FOCUS = 1.3  # blur over the expected one from which on profiles were too short for it
 
 
@@ -53,13 +54,34 @@ def refine_outline(
 
     `rough` may come from the coarse search or from a prediction; it must be right to about a tenth of the radius.
     """
-    cone = _by_envelope(image_bgr, camera, rough, options)
-    if cone is None:
-        return None
-    (approached,) = approach_outlines(image_bgr, camera, [cone], options)
-    if approached is None:
-        return None
-    return measure_outlines(image_bgr, camera, [approached], options, score=score)[0]
+    return refine_outlines(image_bgr, camera, [rough], options, scores=[score])[0]
+
+
+def refine_outlines(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    roughs: Sequence[Cone],
+    options: DetectionOptions = DEFAULTS,
+    *,
+    scores: Sequence[float],
+) -> list[SphereOutline | None]:
+    """`refine_outline` of several, those of like size side by side."""
+    out: list[SphereOutline | None] = [None] * len(roughs)
+    found = {i: _by_envelope(image_bgr, camera, rough, options) for i, rough in enumerate(roughs)}
+    cones = {i: cone for i, cone in found.items() if cone is not None}
+    todo = sorted(cones, key=lambda i: cones[i].half_angle_rad)
+    while todo:
+        least = cones[todo[0]].half_angle_rad
+        alike = [i for i in todo if cones[i].half_angle_rad < _ALIKE * least]
+        todo = todo[len(alike) :]
+        near = approach_outlines(image_bgr, camera, [cones[i] for i in alike], options)
+        starts = {i: a for i, a in zip(alike, near, strict=True) if a is not None}
+        given = [scores[i] for i in starts]
+        for i, outline in zip(
+            starts, measure_outlines(image_bgr, camera, list(starts.values()), options, scores=given), strict=True
+        ):
+            out[i] = outline
+    return out
 
 
 def approach_outlines(
@@ -97,7 +119,7 @@ def measure_outlines(
     starts: Sequence[Approached],
     options: DetectionOptions = DEFAULTS,
     *,
-    score: float = 1.0,
+    scores: Sequence[float] = (),
 ) -> list[SphereOutline | None]:
     """The outlines at full resolution, starting from cones that are right to about a pixel; None as `refine_outline`.
 
@@ -116,7 +138,10 @@ def measure_outlines(
         if best is not None and not fine and best.blur_px > _FOCUS * max(1.0, starts[i].blur_px):
             longer = Approached(best.cone, best.blur_px, best.chroma_blur_px)
             found[i] = _measure(image_bgr, camera, [longer], count, step, 2.5, iterations, 1, options)[0]
-    return [None if best is None else _outline(image_bgr, camera, best, options, score) for best in found]
+    return [
+        None if best is None else _outline(image_bgr, camera, best, options, score)
+        for best, score in zip(found, scores or [1.0] * len(found), strict=True)
+    ]
 
 
 def _outline(
