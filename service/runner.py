@@ -126,7 +126,7 @@ class Runner:
                     self._append(StepStarted(step=step, attempt=attempt))
                 self._execute(step, attempt)
             case EvaluateGates(step, attempt, measures):
-                verdicts = evaluate_gates(self.protocol.step(step), attempt, measures)
+                verdicts = evaluate_gates(self.protocol.step(step), attempt, measures, state.skipped)
                 self._append(verdicts)
                 failed = [v for v in verdicts.verdicts if not v.passed]
                 for verdict in failed:

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
+from drivers.errors import DeviceFaultError
+from drivers.interfaces import CtSource, Mesh, ScanExport, ScannedMesh
 from service.compute.live import LiveView, find_spheres, paired, register_station, sharpness
 from service.compute.planning.coverage import (
     CoverageLimits,
@@ -22,6 +26,7 @@ from service.compute.planning.coverage import (
 )
 from service.compute.planning.information import (
     ViewInformation,
+    mounting_covariance,
     pose_covariance,
     pose_scatter,
     predicted_information,
@@ -31,13 +36,24 @@ from service.compute.planning.information import (
 from service.compute.planning.next_best_view import Candidate, Present, next_best_views
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
-from service.core.model import StepNote
+from service.core.model import GatesEvaluated, StepNote
 from service.store.store import Store
-from service.worker.job import JobContext
+from service.worker.job import JobAnswer, JobContext
 from service.worker.live import coverage_points, live_summary, live_view
-from tests.support.bench_rig import answer
+from service.worker.loop import HANDLERS, work
+from service.worker.robot_poses import robot_camera_poses
+from tests.support.bench_rig import BenchRig, answer
 from tests.support.bench_run import PROTOCOL, Bench, begin_run
-from tests.support.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, Scene, exact_outlines, render, scene
+from tests.support.sphere_images import (
+    CONTROL_M,
+    RADIUS_M,
+    REGISTRATION_M,
+    Scene,
+    camera,
+    exact_outlines,
+    render,
+    scene,
+)
 
 SPHERES_M = np.vstack([REGISTRATION_M, CONTROL_M])
 CENTRE_M = SPHERES_M.mean(axis=0)
@@ -95,6 +111,30 @@ def test_more_views_predict_less_error_and_one_sphere_none_at_all() -> None:
     one = predicted_information(made.T_world_camera[0], centre[None], RADIUS_M, centre, np.eye(3) * 1e-8)
     with pytest.raises(ComputeError, match="do not determine"):
         pose_covariance([one], NO_SCATTER)
+
+
+def test_an_error_of_the_mounting_moves_the_scan_with_the_cameras() -> None:
+    made = scene(6, seed=4)
+    centre = apply(made.T_world_scan, CENTRE_M)
+    views = informations(made)
+    T_flange_camera = transform(Rotation.from_rotvec([0.2, -0.1, 0.3]).as_matrix(), np.array([0.0, -0.05, 0.1]))
+    error = 1e-5 * np.array([3.0, -2.0, 5.0, 1.0, 2.0, -1.0])  # (d, w) in flange axes
+    wrong = transform(
+        Rotation.from_rotvec(error[3:]).as_matrix() @ T_flange_camera[:3, :3], T_flange_camera[:3, 3] + error[:3]
+    )
+    seen_from = [T @ inverse(T_flange_camera) @ wrong for T in made.T_world_camera]
+    normal, right = np.zeros((6, 6)), np.zeros(6)
+    for i, T in enumerate(seen_from):
+        outlines, which = exact_outlines(made, i, SPHERES_M, 0.0)
+        view = view_information(
+            T, made.T_world_scan, outlines, dict(enumerate(which)), SPHERES_M, RADIUS_M, centre, 1e-2
+        )
+        normal += view.information
+        right += view.information @ view.offset
+    moved = np.linalg.solve(normal, right)
+    pairs = [(v.information, T) for v, T in zip(views, made.T_world_camera, strict=True)]
+    predicted = mounting_covariance(pairs, T_flange_camera, np.outer(error, error), centre)
+    assert predicted == pytest.approx(np.outer(moved, moved), rel=0.05, abs=1e-12)
 
 
 # --- next best view -------------------------------------------------------------------------------------------
@@ -236,6 +276,7 @@ def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
         "T_flange_camera": np.eye(4).tolist(),
         "spheres_m": SPHERES_M.tolist(),
         "radius_m": RADIUS_M,
+        "hand_eye_covariance": (np.eye(6) * 1e-12).tolist(),
         "arm_sigma_m": 1e-3,
         "arm_sigma_rad": 1e-3,
         "limits": asdict(CoverageLimits()),
@@ -291,7 +332,7 @@ def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
 
 @pytest.fixture
 def begin(tmp_path: Path) -> Iterator[Callable[[str], Bench]]:
-    with Store.open(tmp_path / "runs") as opened:
+    with Store.open(tmp_path / "data") as opened:
         yield lambda text: begin_run(opened, text, tmp_path)
 
 
@@ -300,6 +341,159 @@ def test_a_capture_goes_on_without_numbers_where_what_they_need_was_skipped(begi
     bench = begin(PROTOCOL.replace("      purpose: dataset\n", f"      purpose: dataset\n{live}"))
     assert bench.run().status == "completed"
     assert [note.note for note in bench.payloads(StepNote) if note.step == "capture"] == ["no_live_numbers"]
+
+
+MEASURED = """\
+  - id: camera
+    kind: calibration
+    title: Calibrate
+    confirm: false
+    params:
+      solve: [intrinsics, hand_eye]
+      viewpoints:
+        - station: station_1
+          prefix: b
+          arcs: [{tilt_deg: 20, azimuth_from_deg: 0, azimuth_to_deg: 0, count: 1, distance_m: 0.6}]
+  - id: ct
+    kind: ct_import
+    title: CT
+    confirm: false
+    skippable: true
+    params: {source: mesh, spheres: 13, wait_s: 5}
+"""
+LIVE = "      live: {calibration: camera, hand_eye: camera, spheres_of: ct}\n"
+ENOUGH = """\
+      - {measure: predicted_target_error_mm, max: 0.14, unit: mm, unless_skipped: ct}
+    recovery: {retries: 2, wait_s: 0}"""
+
+
+class BenchCt:
+    """A CT suite that has segmented one mesh, or is out of order."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file = folder / "segmented.stl"
+        self.file.write_bytes(b"as it was exported")
+        self.works = True
+
+    def segmented_meshes(self) -> tuple[ScanExport, ...]:
+        if not self.works:
+            raise DeviceFaultError("the CT is out of order", where="ct")
+        return (ScanExport("segmented", (self.file,), "2026-11-21T10:00:00Z"),)
+
+    def read_mesh(self, export: ScanExport) -> ScannedMesh:
+        vertices_m, faces = hill()
+        return ScannedMesh(Mesh(vertices_m, faces, np.zeros_like(vertices_m)), "m", "known", {}, export)
+
+
+class MeasuringRig(BenchRig):
+    """The bench with a CT suite."""
+
+    suite: BenchCt
+
+    def ct(self) -> CtSource:
+        return cast(CtSource, self.suite)  # of its methods, those that the step uses
+
+
+def measured_run(
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, folder: Path, *, held_out_mm: float
+) -> Bench:
+    """A run whose images show the spheres exactly as they stand; a worker beside it."""
+    head, tail = PROTOCOL.split("  - id: capture\n")
+    tail = tail.replace("    recovery: {retries: 2, wait_s: 0}", ENOUGH).replace(
+        "distance_m: 0.6", "distance_m: 0.85"
+    )
+    tail = tail.replace("      purpose: dataset\n", f"      purpose: dataset\n{LIVE}")
+    bench = begin(head + MEASURED + "  - id: capture\n" + tail)
+    rig = MeasuringRig()
+    rig.suite = BenchCt(folder)
+    bench.rig = rig
+    made = camera(1200)
+    T_base_scan = transform(np.eye(3), np.array([0.0, 0.8, 0.0]))
+    T_flange_camera = rig.nominal_T_flange_camera().tolist()
+    hand_eye = {
+        "T_flange_camera": T_flange_camera,
+        "sigma": {"covariance": (np.eye(6) * 1e-12).tolist()},
+        "residuals": {"held_out_mm": {"b001": held_out_mm}, "held_out_deg": {"b001": 0.001}},
+        "arm_correction": None,
+    }
+    known: dict[str, Any] = {
+        "calibrate": {
+            "camera": asdict(made),
+            "T_flange_camera": T_flange_camera,
+            "hand_eye": hand_eye,
+            "details": {},
+        },
+        "locate_spheres": {"spheres_m": SPHERES_M.tolist(), "details": {}},
+    }
+    here: list[Array] = []
+
+    def look(context: JobContext) -> JobAnswer:
+        here[:] = robot_camera_poses(context.arguments, [context.arguments["image"]])
+        return live_view(context)
+
+    def exactly(*_args: Any) -> Any:
+        return exact_outlines(Scene(T_base_scan, np.array(here), made), 0, SPHERES_M, 0.1, margin_px=30)[0]
+
+    def serve(_what: str) -> None:
+        job = bench.store.claim_job("test", 30, kinds=list(known))
+        if job is not None:
+            bench.store.finish_job(job, measures={}, duration_s=0.1, result=known[job.kind])
+        work(bench.store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _total: None)
+
+    monkeypatch.setitem(HANDLERS, "live_view", look)  # pyright: ignore[reportArgumentType] - a Mapping to others
+    monkeypatch.setattr("service.worker.live.find_spheres", exactly)
+    bench.operator.on_show = serve
+    return bench
+
+
+def test_confirming_takes_the_suggested_views_and_the_gate_is_judged_again(
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench = measured_run(begin, monkeypatch, tmp_path, held_out_mm=0.5)
+    asked: list[str] = []
+
+    def more(question: Any, _state: Any) -> Any:
+        asked.append(question.text)
+        return answer(question, "confirm")
+
+    bench.script("capture", "recovery", more, more)
+    state = bench.run()
+    assert state.status == "completed"
+    suggestions = [n.data for n in bench.payloads(StepNote) if n.note == "suggested_viewpoints"]
+    assert 1 <= len(suggestions) == len(asked) <= 2
+    wanted = [view["viewpoint"] for note in suggestions for view in note["viewpoints"]]
+    assert wanted, "some views are suggested"
+    for text, note in zip(asked, suggestions, strict=True):
+        assert "predicted_target_error_mm" in text
+        assert all(view["viewpoint"] in text for view in note["viewpoints"])
+    assert bench.captured()[1:5] == ["v001", "v002", "v003", "v004"]
+    assert sorted(bench.captured()[5:]) == sorted(wanted), "by the names that were shown, and nothing again"
+    errors = [
+        verdict.value or 0.0
+        for gates in bench.payloads(GatesEvaluated)
+        for verdict in gates.verdicts
+        if verdict.measure == "predicted_target_error_mm"
+    ]
+    assert errors[0] > 0.14 >= errors[-1] > 0
+    assert all(later < earlier for earlier, later in pairwise(errors))
+    bench.must_verify()
+
+
+def test_without_the_ct_there_is_no_number_and_no_gate_on_it(
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench = measured_run(begin, monkeypatch, tmp_path, held_out_mm=0.5)
+    assert isinstance(bench.rig, MeasuringRig)
+    bench.rig.suite.works = False
+    bench.script("ct", "recovery", lambda question, _state: answer(question, "skip", reason="the scanner is down"))
+    state = bench.run()
+    assert state.status == "completed"
+    (gates,) = [g for g in bench.payloads(GatesEvaluated) if g.step == "capture"]
+    assert gates.passed
+    assert "predicted_target_error_mm" not in [v.measure for v in gates.verdicts]
+    assert [note.note for note in bench.payloads(StepNote) if note.step == "capture"] == ["no_live_numbers"]
+    assert [d.kind for d in state.deviations] == ["skip"]
+    assert any("no numbers while capturing" in line for line in bench.operator.told)
 
 
 def test_an_operator_is_told_what_is_missing_and_what_would_help(begin: Callable[[str], Bench]) -> None:

@@ -72,7 +72,7 @@ class RunStep:
 
 @dataclass(frozen=True, slots=True)
 class EvaluateGates:
-    """Append evaluate_gates(step, attempt, measures)."""
+    """Append evaluate_gates(step, attempt, measures, skipped steps)."""
 
     step: str
     attempt: int

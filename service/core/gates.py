@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from service.core.model import GatesEvaluated, GateVerdict
 from service.core.protocol import Gate, Step
 
 
-def evaluate_gates(step: Step, attempt: int, measures: Mapping[str, float]) -> GatesEvaluated:
-    """Judge every gate of a step. A measure that is missing or not a finite number fails."""
-    verdicts = tuple(_verdict(gate, measures.get(gate.measure)) for gate in step.gates)
+def evaluate_gates(
+    step: Step, attempt: int, measures: Mapping[str, float], skipped: Collection[str] = ()
+) -> GatesEvaluated:
+    """Judge every gate of a step. A measure that is missing or not a finite number fails.
+
+    Args:
+        skipped: identifiers of the skipped steps. A gate that names one of them in `unless_skipped` is not judged:
+            without that step there is no such number. The skip, with its reason, is in the record.
+    """
+    gates = [gate for gate in step.gates if gate.unless_skipped is None or gate.unless_skipped not in skipped]
+    verdicts = tuple(_verdict(gate, measures.get(gate.measure)) for gate in gates)
     passed = all(verdict.passed for verdict in verdicts)
     return GatesEvaluated(step=step.id, attempt=attempt, verdicts=verdicts, passed=passed)
 

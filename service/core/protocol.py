@@ -74,6 +74,8 @@ class Spheres(Record):
     radius_mm: Positive
     registration: Annotated[int, Field(ge=4)]  # how many
     control: Annotated[int, Field(ge=0)] = 0
+    # Where it is not told, the detector learns it from the clearest spheres of each image.
+    colour: Annotated[str, Field(pattern=r"^(white|grey|green|orange|#[0-9a-fA-F]{6})$")] | None = None
 
 
 class Board(Record):
@@ -121,6 +123,7 @@ class Gate(Record):
     max: Finite | None = None
     unit: str = ""
     why: str = ""
+    unless_skipped: str | None = None  # the earlier step without which there is no such number; skipped: no such gate
 
 
 class Recovery(Record):

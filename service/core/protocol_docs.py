@@ -100,4 +100,8 @@ def _mermaid(lines: Iterable[str]) -> list[str]:
 
 
 def _gates(gates: tuple[Gate, ...]) -> str:
-    return "; ".join(f"{gate.measure} {limits(gate.min, gate.max)} {gate.unit}".rstrip() for gate in gates)
+    return "; ".join(
+        f"{gate.measure} {limits(gate.min, gate.max)} {gate.unit}".rstrip()
+        + (f" (unless {gate.unless_skipped} is skipped)" if gate.unless_skipped else "")
+        for gate in gates
+    )

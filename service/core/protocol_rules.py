@@ -18,7 +18,7 @@ def rule_violations(data: dict[str, Plain]) -> Iterator[tuple[FieldPath, str]]:
             yield from _identity(step, at, seen)
             yield from _requires(step, at, seen, _all_ids(cast(list[Plain], steps)))
             yield from _irreversible(step, at)
-            yield from _gates(step, at)
+            yield from _gates(step, at, seen, cast(list[Plain], steps))
             if isinstance(step.get("id"), str):
                 seen.setdefault(str(step["id"]), index)
 
@@ -61,7 +61,9 @@ def _irreversible(step: dict[str, Plain], at: FieldPath) -> Iterator[tuple[Field
         yield (*at, "confirm"), "an irreversible step is always confirmed by a person"
 
 
-def _gates(step: dict[str, Plain], at: FieldPath) -> Iterator[tuple[FieldPath, str]]:
+def _gates(
+    step: dict[str, Plain], at: FieldPath, seen: dict[str, int], steps: list[Plain]
+) -> Iterator[tuple[FieldPath, str]]:
     gates = step.get("gates")
     measures: set[str] = set()
     for index, gate in enumerate(gates if isinstance(gates, list) else []):
@@ -73,6 +75,11 @@ def _gates(step: dict[str, Plain], at: FieldPath) -> Iterator[tuple[FieldPath, s
             yield where, "a gate needs limits: min, max or both"
         if _number(low) and _number(high) and cast(float, low) > cast(float, high):
             yield (*where, "max"), f"min {low} is above max {high}: nothing could pass"
+        unless = gate.get("unless_skipped")
+        if isinstance(unless, str):
+            named = steps[seen[unless]] if unless in seen else None
+            if not isinstance(named, dict) or named.get("skippable") is not True:
+                yield (*where, "unless_skipped"), f"{unless!r} is no earlier step that may be skipped"
         measure = gate.get("measure")
         if isinstance(measure, str):
             if measure in measures:

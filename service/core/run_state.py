@@ -175,6 +175,11 @@ class RunState:
         return self.status == "paused"
 
     @property
+    def skipped(self) -> frozenset[str]:
+        """Steps that an operator has left out; not those whose gates alone were overridden."""
+        return frozenset(name for name, step in self.steps.items() if step.skipped and not step.verdicts)
+
+    @property
     def terminal(self) -> bool:
         """Whether the run has ended, one way or the other."""
         return self.status in ("completed", "aborted")

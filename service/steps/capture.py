@@ -37,6 +37,8 @@ _WORTH_ANOTHER_TRY = (
     StaleImageError,
     UnreadableFileError,
 )
+#: How long a busy camera is left alone before the next try: nearly a minute in all.
+_BUSY_PAUSES_S = (0.5, 1.0, 2.0, 4.0, *(8.0,) * 6)
 NONE_REFUSED: Mapping[str, str] = {}
 
 
@@ -81,7 +83,7 @@ def capture_viewpoints(
     Raises DeviceError when a viewpoint fails for good, StepInterruptedError on pause.
     """
     camera = context.devices.camera()
-    wanted = _wanted_settings(context)
+    wanted = wanted_settings(context)
     _apply(context, camera, wanted)
     given_up = set(context.state.skipped_viewpoints)
     taken: set[str] = set()  # in this execution, successful or not
@@ -152,6 +154,38 @@ def _capture_with_retries(
             return
 
 
+def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, folder: Path) -> CapturedImage:
+    """One exposure without a robot; repeated, on a reopened camera, as often as the step's recovery allows.
+
+    Raises DeviceError when it fails for good, StepInterruptedError on pause.
+    """
+    for tries_left in range(context.step.recovery.retries, -1, -1):
+        inside = folder / str(tries_left)  # what an earlier try has left behind is not in the way
+        inside.mkdir()
+        try:
+            _apply(context, camera, wanted)
+            return _expose_when_free(context, camera, inside)
+        except _WORTH_ANOTHER_TRY as error:
+            if tries_left == 0:
+                raise
+            context.note("photograph_repeated", why=str(error))
+            context.checkpoint()
+            context.devices.reopen(camera)
+    raise AssertionError
+
+
+def _expose_when_free(context: StepContext, camera: Camera, folder: Path) -> CapturedImage:
+    """Release the shutter, and wait for a camera that is still busy with what came before."""
+    for pause_s in _BUSY_PAUSES_S:
+        try:
+            return camera.capture(folder)
+        except DeviceBusyError:
+            context.checkpoint()
+            context.progress("waiting for the camera, which is busy", 0, 1)
+            context.wait(pause_s)
+    return camera.capture(folder)
+
+
 def _apply(context: StepContext, camera: Camera, wanted: CameraSettings) -> None:
     """Set the camera, which may have dropped its link since it was last used."""
     try:
@@ -193,7 +227,7 @@ def _expose(
     """Take the picture and write it down: files first, then one transaction with rows and event."""
     environment = _environment(context)
     with tempfile.TemporaryDirectory(prefix="orthocapture-") as folder:
-        image = camera.capture(Path(folder))
+        image = _expose_when_free(context, camera, Path(folder))
         window = robot.samples(image.trigger_monotonic_s, image.trigger_monotonic_s + wanted.exposure_s + 0.3)
         pose = _mean_pose(window, settled)
         refs = [
@@ -297,7 +331,8 @@ def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
     )
 
 
-def _wanted_settings(context: StepContext) -> CameraSettings:
+def wanted_settings(context: StepContext) -> CameraSettings:
+    """The camera settings of the protocol."""
     camera = context.protocol.camera
     return CameraSettings(
         aperture_f=camera.aperture_f,

@@ -6,9 +6,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from drivers.interfaces import CameraSettings
 from service.core.model import ArtefactRef, Record
 from service.steps.arrivals import keep
+from service.steps.capture import photograph, wanted_settings
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 
 
@@ -30,16 +30,6 @@ class Result(Record):
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Take the photographs, let the worker find the spheres and search for near-symmetries; nothing moves."""
     camera = context.devices.camera()
-    wanted = context.protocol.camera
-    camera.apply(
-        CameraSettings(
-            aperture_f=wanted.aperture_f,
-            exposure_s=wanted.exposure_s,
-            iso=wanted.iso,
-            focus_mode=wanted.focus_mode,
-            image_quality=wanted.image_quality,
-        )
-    )
     kept: list[ArtefactRef] = []
     images: list[dict[str, Any]] = []
     for number in range(params.photographs):
@@ -48,7 +38,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         if number:
             context.wait(params.between_s)
         with tempfile.TemporaryDirectory(prefix="orthocapture-") as folder:
-            image = camera.capture(Path(folder))
+            image = photograph(context, camera, wanted_settings(context), Path(folder))
             ref = keep(
                 context, image.jpeg.path, device="camera", kind="layout_image", media_type=image.jpeg.media_type
             )

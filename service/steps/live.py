@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 
 from service.core.errors import ComputeError, ConfigurationError
@@ -14,7 +15,7 @@ from service.core.model import Record, ViewpointCaptured
 from service.core.protocol import Gate
 from service.core.run_state import JobState
 from service.steps.context import JobRequest, StepContext
-from service.steps.inputs import artefact_of, result_of
+from service.steps.inputs import artefact_of, hand_eye_of, result_of
 from service.steps.viewpoints import Viewpoint
 
 ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
@@ -37,8 +38,10 @@ class Live(Record):
     spheres_of: str  # step with the spheres and, for the coverage, the surface: the CT
     images_of: tuple[str, ...] = ()  # earlier capture steps that count too
     aim_mm: Annotated[float, Field(gt=0)] = 0.35  # of the suggestions, where no gate says it
-    arm_sigma_mm: Annotated[float, Field(gt=0)] = 1.0  # scatter of the robot's poses before any image tells
-    arm_sigma_mrad: Annotated[float, Field(gt=0)] = 1.0
+    # Scatter of the camera's poses before any image tells; without them what the hand-eye calibration's held-out
+    # views show.
+    arm_sigma_mm: Annotated[float, Field(gt=0)] | None = None
+    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None
     coverage: CoverageRule = CoverageRule()
     wait_s: Annotated[float, Field(ge=0)] = 60.0  # at the end of the step, for images still being looked at
 
@@ -60,7 +63,7 @@ class LiveAnalysis:
         try:
             spheres = _result(context, params.spheres_of, "spheres_m")
             camera = _result(context, params.calibration, "camera")
-            T_flange_camera = _result(context, params.hand_eye, "T_flange_camera")
+            mounting = _mounting(context, params)
             mesh = artefact_of(context, params.spheres_of, "ct_mesh").sha256
         except ConfigurationError as error:
             context.note("no_live_numbers", why=str(error))
@@ -69,11 +72,9 @@ class LiveAnalysis:
         limits = params.coverage.model_dump()
         shared: dict[str, Any] = {
             "camera": camera,
-            "T_flange_camera": T_flange_camera,
+            **mounting,
             "spheres_m": spheres,
             "radius_m": context.protocol.spheres.radius_mm / 1000,
-            "arm_sigma_m": params.arm_sigma_mm / 1000,
-            "arm_sigma_rad": params.arm_sigma_mrad / 1000,
             "limits": limits,
         }
         analysis = cls(context, params, shared)
@@ -95,9 +96,11 @@ class LiveAnalysis:
                 "station": capture.station,
                 "sha256": sha256,
                 "T_base_flange": [list(row) for row in capture.T_base_flange],
+                "joints_rad": list(capture.joints_rad),
             }
+            hand_eye = hand_eye_of(self.context, self.params.hand_eye, [capture.station])
             earlier = [job.artefacts[0].sha256 for job in self._finished()]
-            arguments = {**self.shared, "image": image, "surface": self._surface(), "earlier": earlier}
+            arguments = {**self.shared, **hand_eye, "image": image, "surface": self._surface(), "earlier": earlier}
             self.context.evidence.enqueue(JobRequest("live_view", arguments), sha256)
         self._tell()
 
@@ -227,6 +230,24 @@ def _result(context: StepContext, step: str, name: str) -> Any:
     if found is None:
         raise ConfigurationError(f"step {step!r} gives no {name}", where=f"step {context.step.id}, live")
     return found
+
+
+def _mounting(context: StepContext, params: Live) -> dict[str, Any]:
+    """T_flange_camera, its covariance and the scatter of the camera's poses, as the hand-eye calibration states them.
+
+    With the arm's correction, where there is one: all three are of the poses that the images get.
+    """
+    record = _result(context, params.hand_eye, "hand_eye")
+    best = record["arm_correction"] or record
+    held_out = {key: np.array(list(best["residuals"][key].values())) for key in ("held_out_mm", "held_out_deg")}
+    sigma_m = float(np.sqrt(np.mean(held_out["held_out_mm"] ** 2))) / 1e3
+    sigma_rad = float(np.radians(np.sqrt(np.mean(held_out["held_out_deg"] ** 2))))
+    return {
+        "T_flange_camera": best["T_flange_camera"],
+        "hand_eye_covariance": best["sigma"]["covariance"],
+        "arm_sigma_m": sigma_m if params.arm_sigma_mm is None else params.arm_sigma_mm / 1e3,
+        "arm_sigma_rad": sigma_rad if params.arm_sigma_mrad is None else params.arm_sigma_mrad / 1e3,
+    }
 
 
 def _fails(gate: Gate, measures: Mapping[str, float]) -> bool:

@@ -33,6 +33,7 @@ from service.compute.planning.coverage import (
 )
 from service.compute.planning.information import (
     ViewInformation,
+    mounting_covariance,
     point_sigmas_m,
     pose_covariance,
     pose_scatter,
@@ -43,6 +44,7 @@ from service.compute.planning.next_best_view import Candidate, Present, next_bes
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.worker.job import JobAnswer, JobContext
+from service.worker.robot_poses import robot_camera_poses
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +65,17 @@ class _Station:
     solved: Provisional
     informations: tuple[ViewInformation, ...]
     P: Array
+    mounting: Array  # (6, 6) of the scan's pose, from the hand-eye's covariance
     centre_m: Array  # (3,) base frame
     targets_m: Array  # (T, 3) relative to the centre, base axes
 
-    def error_m(self, P: Array) -> float:
-        covariance = pose_covariance([v.information for v in self.informations], P)
+    def error_m(self) -> float:
+        return self._worst_m(pose_covariance([v.information for v in self.informations], self.P) + self.mounting)
+
+    def outline_limited_m(self) -> float:
+        return self._worst_m(pose_covariance([v.information for v in self.informations], np.zeros((6, 6))))
+
+    def _worst_m(self, covariance: Array) -> float:
         return float(point_sigmas_m(covariance, self.targets_m).max())
 
 
@@ -103,7 +111,7 @@ def live_view(context: JobContext) -> JobAnswer:
     earlier = _records(context, arguments["earlier"], camera, surface)
     mine = [r for r in earlier if r.station == image["station"]]
     known = next((r.T_base_scan for r in reversed(mine) if r.T_base_scan is not None), None)
-    T_base_camera = np.array(image["T_base_flange"]) @ np.array(arguments["T_flange_camera"])
+    (T_base_camera,) = robot_camera_poses(arguments, [image])
     pixels = read_image(context.input(image["sha256"]))
     predicted = None if known is None else inverse(T_base_camera) @ known
     outlines = find_spheres(pixels, camera, spheres, radius_m, predicted)
@@ -132,8 +140,9 @@ def live_view(context: JobContext) -> JobAnswer:
         measures["spheres_expected"] = float(len(expected_spheres(T_camera_scan, spheres, radius_m, camera)))
         measures["registration_rms_px"] = float(np.median(own)) if own else float("nan")
         measures["images"] = float(len(station.solved.used))
-        measures["predicted_target_error_mm"] = 1e3 * station.error_m(station.P)
-        measures["outline_limited_error_mm"] = 1e3 * station.error_m(np.zeros((6, 6)))
+        measures["predicted_target_error_mm"] = 1e3 * station.error_m()
+        measures["outline_limited_error_mm"] = 1e3 * station.outline_limited_m()
+        measures["pose_scatter_mm"] = 1e3 * float(np.sqrt(np.trace(station.P[:3, :3])))
         if surface is not None:
             visible = _seen(context, surface, view, T_base_scan, camera)
             min_views = int(arguments["limits"]["min_views"])
@@ -169,8 +178,8 @@ def live_summary(context: JobContext) -> JobAnswer:
     measures: dict[str, float] = {"live_images": float(sum(len(s.solved.used) for s in stations.values()))}
     masks = [r.seen for r in records]
     if stations and not reasons:
-        measures["predicted_target_error_mm"] = 1e3 * max(s.error_m(s.P) for s in stations.values())
-        measures["outline_limited_error_mm"] = 1e3 * max(s.error_m(np.zeros((6, 6))) for s in stations.values())
+        measures["predicted_target_error_mm"] = 1e3 * max(s.error_m() for s in stations.values())
+        measures["outline_limited_error_mm"] = 1e3 * max(s.outline_limited_m() for s in stations.values())
     if surface is not None:
         measures["specimen_coverage"] = covered_fraction(masks, limits.min_views)
     suggestions: list[dict[str, Any]] = []
@@ -178,7 +187,12 @@ def live_summary(context: JobContext) -> JobAnswer:
     if here is not None:
         counts = np.array(masks, dtype=np.int64).sum(axis=0)
         present = Present(
-            tuple(v.information for v in here.informations), here.P, here.targets_m, counts, limits.min_views
+            tuple(v.information for v in here.informations),
+            here.P,
+            here.targets_m,
+            counts,
+            limits.min_views,
+            here.mounting,
         )
         found = next_best_views(
             present,
@@ -194,7 +208,7 @@ def live_summary(context: JobContext) -> JobAnswer:
         "next_best_views": suggestions,
         "reasons": reasons,
         "stations": {
-            name: {"predicted_target_error_mm": 1e3 * s.error_m(s.P), "images": len(s.solved.used)}
+            name: {"predicted_target_error_mm": 1e3 * s.error_m(), "images": len(s.solved.used)}
             for name, s in stations.items()
         },
     }
@@ -221,9 +235,15 @@ def _solve(
     )  # fmt: skip
     targets = spheres if surface is None else surface.points_m[:: max(1, len(surface.points_m) // 200)]
     scatter = pose_scatter(informations, sigma_m, sigma_rad)
-    station = _Station(solved, informations, scatter, centre, apply(T, targets) - centre)
-    station.error_m(scatter)  # raises while the views do not determine the pose
-    return station
+    # Raises while the views do not determine the pose, as the next line would without saying so.
+    pose_covariance([v.information for v in informations], scatter)
+    mounting = mounting_covariance(
+        [(i.information, v.T_base_camera) for i, v in zip(informations, views, strict=True)],
+        np.array(arguments["T_flange_camera"]),
+        np.array(arguments["hand_eye_covariance"]),
+        centre,
+    )
+    return _Station(solved, informations, scatter, mounting, centre, apply(T, targets) - centre)
 
 
 def _candidates(

@@ -148,6 +148,27 @@ def pose_covariance(informations: Iterable[Array], P: Array) -> Array:
     return inverse_normal @ middle @ inverse_normal
 
 
+def mounting_covariance(
+    views: Iterable[tuple[Array, Transform]], T_flange_camera: Transform, covariance: Array, centre_m: Array
+) -> Array:
+    """Covariance (6, 6) of the scan's pose from what is not known of the camera's mounting, which all views share.
+
+    Args:
+        views: information (6, 6) and T_base_camera of each; they must determine the pose.
+        covariance: (6, 6) of T_flange_camera, as (d, w) in flange axes with R → exp(w) R, t → t + d.
+        centre_m: (3,) base frame.
+    """
+    normal, moved = np.zeros((6, 6)), np.zeros((6, 6))
+    for information, T_base_camera in views:
+        R = T_base_camera[:3, :3] @ T_flange_camera[:3, :3].T
+        lever = skew(centre_m - T_base_camera[:3, 3])
+        normal += information
+        moved += information @ np.block([[R, -lever @ R], [np.zeros((3, 3)), R]])
+    d = np.sqrt(np.diag(normal))
+    M = np.linalg.solve(normal / np.outer(d, d), moved / d[:, None]) / d[:, None]
+    return M @ covariance @ M.T
+
+
 def target_error(
     views: Sequence[ViewInformation], centre_m: Array, *, sigma_m: float, sigma_rad: float
 ) -> TargetError:

@@ -34,6 +34,7 @@ class Present:
     targets_m: Array = field(repr=False)  # (T, 3) points that matter, relative to the scene's centre, base axes
     seen_count: NDArray[np.int64] = field(repr=False)  # (N,) views of each surface point, of all stations
     min_views: int = 2
+    shared: Array | None = field(default=None, repr=False)  # (6, 6) of what no further view makes better
 
     def error_m(self, *more: Array) -> float:
         """Predicted error of the worst target with these further informations; infinite if undetermined."""
@@ -41,6 +42,8 @@ class Present:
             covariance = pose_covariance([*self.informations, *more], self.pose_covariance)
         except ComputeError:
             return float("inf")
+        if self.shared is not None:
+            covariance = covariance + self.shared
         return float(point_sigmas_m(covariance, self.targets_m).max())
 
 
