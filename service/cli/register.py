@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json as json_module
 import os
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import typer
@@ -13,11 +14,15 @@ import typer
 from drivers.mesh_file import MeshUnit
 from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
 from service.cli.spheres import SeedsOption, spheres_of
-from service.compute.locating import LocatedOutlines, detect_all, locate_outlines, searched_whole
+from service.compute.locating import DetectFile, LocatedOutlines, detect_all, locate_outlines, searched_whole
+from service.compute.marker_files import detect_file_by_masks, read_boxes
+from service.compute.markers.detectors import options_for
 from service.compute.pipeline import register_images
 from service.compute.poses.pose_files import read_camera_json, read_poses, read_spheres_json
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array
+
+DetectorName = Literal["classical", "paper"]
 
 _IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
@@ -47,11 +52,28 @@ def register_command(
     full_search: Annotated[
         bool, typer.Option("--full-search", help="Search every image whole, not only where the poses say.")
     ] = False,
+    sphere_colour: Annotated[
+        str | None,
+        typer.Option(
+            "--sphere-colour", help="white, grey, green, orange or #rrggbb; learnt in each image by default."
+        ),
+    ] = None,
+    detector: Annotated[
+        DetectorName, typer.Option("--detector", help="paper: the published chain, for comparison; searches whole.")
+    ] = "classical",
+    boxes: Annotated[
+        Path | None,
+        typer.Option(
+            "--boxes", help="For --detector paper: JSON {image: [[left, top, right, bottom], …]} of another detector."
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Register posed images with a scan by the spheres that both show, and say how well it fits."""
     with reporting_errors(json):
         files = _images(images)
+        options = options_for(sphere_colour)
+        detect = _file_detector(detector, boxes, [file.name for file in files])
         model = read_camera_json(camera)
         known = read_poses(poses, [file.name for file in files])
         registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control, seeds)
@@ -62,8 +84,9 @@ def register_command(
             def show(done: int, total: int) -> None:
                 progress("spheres in images", done, total)
 
-            if full_search:
-                located = searched_whole(detect_all(files, model, workers=processes, progress=show))
+            if full_search or detector == "paper":
+                detected = detect_all(files, model, options, processes, show, detect=detect)
+                located = searched_whole(detected)
             else:
                 located = locate_outlines(
                     files,
@@ -73,6 +96,7 @@ def register_command(
                     radius_m,
                     control_centres_m=control_m,
                     metric=not estimate_scale,
+                    options=options,
                     workers=processes,
                     progress=show,
                 )
@@ -108,6 +132,15 @@ def register_command(
                 f"{evaluation.mean_reprojection_error_px:.2f} px mean reprojection error"
             )
         console.print(f"written: {out}")
+
+
+def _file_detector(detector: DetectorName, boxes: Path | None, names: list[str]) -> DetectFile | None:
+    """What looks at one file; None for the default."""
+    if detector == "classical":
+        if boxes is not None:
+            raise typer.BadParameter("--boxes needs --detector paper")
+        return None
+    return partial(detect_file_by_masks, boxes=None if boxes is None else read_boxes(boxes, names))
 
 
 def _search(located: LocatedOutlines, names: list[str]) -> dict[str, object]:

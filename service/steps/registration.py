@@ -34,6 +34,7 @@ class Params(Record):
     scan: str
     poses: tuple[Literal["robot", "colmap", "glomap", "hybrid"], ...] = ("robot", "colmap", "glomap", "hybrid")
     structure_from_motion: StructureFromMotion = StructureFromMotion()
+    detector: Literal["classical", "paper"] = "classical"  # "paper" searches every image whole, for comparison
     reduced: tuple[
         str, ...
     ] = ()  # "1920x1080": resolutions at which structure from motion is compared, as in the paper
@@ -116,7 +117,10 @@ def _at_one_resolution(
     prior: dict[str, Any] | None,
 ) -> _Answers:
     run_jobs = context.evidence.run_jobs
-    (detected,) = run_jobs(JobRequest("detect_spheres", shared))
+    search: dict[str, Any] = {"detector": params.detector}
+    if context.protocol.spheres.colour is not None:
+        search["colour"] = context.protocol.spheres.colour
+    (detected,) = run_jobs(JobRequest("detect_spheres", {**shared, **search}))
     markers = {**shared, "outlines": detected.artefacts[0].sha256}
     by_poses: dict[str, JobResult] = {}
     if "robot" in poses:

@@ -11,9 +11,12 @@ import numpy as np
 
 from service.compute.budget.closure import Alignment
 from service.compute.camera_model import CameraModel
+from service.compute.locating import detect_all, locate_outlines, searched_whole
+from service.compute.marker_files import detect_file_by_masks
 from service.compute.markers.archive import outline_from_record, outline_record
+from service.compute.markers.detectors import options_for
 from service.compute.markers.records import SphereOutline
-from service.compute.pipeline import locate_outlines, register_images
+from service.compute.pipeline import register_images
 from service.compute.registration.evaluation import leave_one_out
 from service.compute.registration.result import RegistrationResult
 from service.core.errors import ComputeError
@@ -28,19 +31,32 @@ def detect_spheres(context: JobContext) -> JobAnswer:
 
     The robot's poses tell where to look; where they are too far off, the images are searched whole.
     """
-    images = context.arguments["images"]
+    arguments = context.arguments
+    images = arguments["images"]
     files = photographs(context, images)
-    located = locate_outlines(
-        files,
-        context.camera(),
-        robot_camera_poses(context.arguments, images),
-        np.array(context.arguments["spheres_m"]),
-        float(context.arguments["radius_m"]),
-        groups=_numbered(image["station"] for image in images),
-        scenes=_numbered(image["step"] for image in images),
-        workers=min(len(files), os.cpu_count() or 1),
-        progress=lambda done, total: context.progress("spheres in images", done, total),
-    )
+    workers = min(len(files), os.cpu_count() or 1)
+
+    def show(done: int, total: int) -> None:
+        context.progress("spheres in images", done, total)
+
+    options = options_for(arguments.get("colour"))
+    if arguments.get("detector", "classical") == "paper":
+        located = searched_whole(
+            detect_all(files, context.camera(), options, workers, show, detect=detect_file_by_masks)
+        )
+    else:
+        located = locate_outlines(
+            files,
+            context.camera(),
+            robot_camera_poses(arguments, images),
+            np.array(arguments["spheres_m"]),
+            float(arguments["radius_m"]),
+            groups=_numbered(image["station"] for image in images),
+            scenes=_numbered(image["step"] for image in images),
+            options=options,
+            workers=workers,
+            progress=show,
+        )
     records = [[outline_record(outline) for outline in found] for found in located.outlines]
     found = dict(zip((image["viewpoint"] for image in images), records, strict=True))
     total = sum(map(len, records))

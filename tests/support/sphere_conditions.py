@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
+from service.compute.markers.cones import Cone
 from service.core.geometry import Array
 from tests.support.sphere_images import RADIUS_M
 
@@ -62,8 +63,31 @@ def _ground(shape: tuple[int, int], kind: str, rng: np.random.Generator) -> Arra
     return np.asarray((share * a + (1 - share) * b) * fine, dtype=np.float64)
 
 
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """An image (H, W, 3) BGR uint8, and the index of the sphere that each pixel shows (H, W), -1 for none."""
+
+    image: NDArray[np.uint8]
+    owner: NDArray[np.int16]
+
+    def visible(self, cam: CameraModel, index: int, cone: Cone) -> float:
+        """The part of a sphere's outline that is in the image with nothing in front of it."""
+        azimuth = np.linspace(0.0, 2 * np.pi, 180, endpoint=False)
+        rim = cam.project(cone.rays(azimuth, np.full(180, cone.half_angle_rad - 1.5 / cam.fx)))
+        x, y = np.rint(rim).astype(int).T
+        here = (x >= 1) & (y >= 1) & (x < cam.width - 1) & (y < cam.height - 1)
+        here[here] = self.owner[y[here], x[here]] == index
+        return float(here.mean())
+
+
 def render_look(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int = 0) -> NDArray[np.uint8]:
     """Image (H, W, 3) BGR uint8 of spheres with centres (M, 3) in the camera frame."""
+    return picture_of(cam, centres_camera_m, look, seed).image
+
+
+def picture_of(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int = 0) -> Picture:
+    """The same with what is seen of each sphere."""
+    owner = np.full((cam.height, cam.width), -1, dtype=np.int16)
     rng = np.random.default_rng(seed)
     image = _ground((cam.height, cam.width), look.ground, rng) * (0.35 + 0.65 * sum(s for _, s in look.lamps))
     order = np.argsort(-np.linalg.norm(centres_camera_m, axis=1)) if len(centres_camera_m) else []
@@ -81,7 +105,8 @@ def render_look(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int
         if look.posts:
             foot = (round(u + 1.9 * radius * np.cos(away)), round(v + 1.9 * radius * np.sin(away)))
             cv2.line(image, (round(u), round(v)), foot, (0.12, 0.16, 0.2), max(3, round(0.5 * radius)), cv2.LINE_AA)
-        _draw_sphere(image, cam, c, look, rng)
+            cv2.line(owner, (round(u), round(v)), foot, -1, max(3, round(0.5 * radius)))
+        _draw_sphere(image, owner, cam, int(index), c, look, rng)
     for _ in range(look.wires):
         k = int(rng.integers(len(centres_camera_m)))
         u, v = cam.project(centres_camera_m[k][None])[0]
@@ -93,6 +118,7 @@ def render_look(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int
         ]
         tone = float(rng.choice([0.04, 0.6]))
         cv2.line(image, ends[0], ends[1], (tone, tone, tone), max(2, round(0.12 * radius)), cv2.LINE_AA)
+        cv2.line(owner, ends[0], ends[1], -1, max(2, round(0.12 * radius)))
     for k in range(look.tissue):
         u, v = cam.project(centres_camera_m[k % len(centres_camera_m)][None])[0]
         radius = RADIUS_M / centres_camera_m[k % len(centres_camera_m)][2] * cam.fx
@@ -100,6 +126,7 @@ def render_look(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int
         cv2.ellipse(
             mask, (round(u), round(v + 1.25 * radius)), (round(1.6 * radius), round(0.75 * radius)), 0, 0, 360, 1, -1
         )
+        owner[mask > 0] = -1
         image[mask > 0] = _ground((cam.height, cam.width), look.ground, rng)[mask > 0]
     image = cv2.GaussianBlur(image, (0, 0), look.blur_px)
     image += rng.normal(size=image.shape) * look.noise * np.sqrt(0.15 + np.maximum(image, 0))
@@ -112,10 +139,18 @@ def render_look(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int
     assert ok
     decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert decoded is not None
-    return np.asarray(decoded, dtype=np.uint8)
+    return Picture(np.asarray(decoded, dtype=np.uint8), owner)
 
 
-def _draw_sphere(image: Array, cam: CameraModel, c: Array, look: Look, rng: np.random.Generator) -> None:
+def _draw_sphere(
+    image: Array,
+    owner: NDArray[np.int16],
+    cam: CameraModel,
+    index: int,
+    c: Array,
+    look: Look,
+    rng: np.random.Generator,
+) -> None:
     n = 5
     u, v = cam.project(c[None])[0]
     reach = 1.2 * RADIUS_M / c[2] * cam.fx + 3
@@ -154,5 +189,6 @@ def _draw_sphere(image: Array, cam: CameraModel, c: Array, look: Look, rng: np.r
     box = (y1 - y0 + 1, n, x1 - x0 + 1, n)
     cover = hit.reshape(box).mean(axis=(1, 3))[..., None]
     patch = image[y0 : y1 + 1, x0 : x1 + 1]
+    owner[y0 : y1 + 1, x0 : x1 + 1][cover[..., 0] > 0.5] = index
     patch *= 1 - cover
     patch += colour.reshape(*box, 3).mean(axis=(1, 3))

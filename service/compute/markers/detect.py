@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,12 +10,26 @@ from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.candidates import Candidate, colour_gradient, edges, find_candidates
+from service.compute.markers.colours import ColourModel, given_colour, learn_colour
 from service.compute.markers.cones import Cone, ransac_cone
 from service.compute.markers.edges import envelope_edges, profiles, sample
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.compute.markers.refine import refine_outline
 from service.core.errors import DataError
 from service.core.geometry import Array
+
+# A disc with wires, stains or highlights on it, or on ground of its own colour, counts if it has the spheres' colour.
+_DOUBTFUL_INTERIOR, _DOUBTFUL_LEAK = 0.3, 0.36
+_LEAST_SHARE, _DOUBTFUL_SHARE = 0.35, 0.55  # of a disc's pixels that must have the spheres' colour
+_CLEAN_SHARE, _CLEAN_INTERIOR = 0.85, 0.03
+_AROUND, _MOST_AROUND = (1.1, 1.35), 0.35  # the ring beside a disc, in radii, and how much of it may have the colour
+_DOUBTFUL_COVERAGE = 0.58
+_ALTERNATIVES = 3  # rough outlines of one place that are tried until one holds
+_WHOLE = 0.8  # coverage of an outline that needs no second look
+_OTHER_STARTS = (0.95, 1.06)  # of the radius, for the second look
+_LEAST_UNAIDED = 0.5  # coverage below which only a prediction can tell what is outline
+_WIDER = 1.07
+_SAME_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +40,14 @@ class RoughSphere:
     coverage: float  # of the outline by edges, weighted by their strength
     interior_edges: float  # edge pixels inside over area
     mask_loss: float  # false positives and negatives of the ellipse against the mask, over the ellipse's area
+    leak: float  # part of the outline across which the disc's colour goes on without an edge
     colour_bgr: tuple[float, float, float]
+    plain: bool  # passes every test by itself
 
     @property
     def score(self) -> float:
         """0..1: a whole, clean disc has about 0.9."""
-        clean = max(0.0, 1.0 - 6.0 * self.interior_edges)
+        clean = max(0.0, 1.0 - 6.0 * self.interior_edges) if self.plain else 0.3
         return float(self.coverage * clean * (1.0 - 0.5 * min(1.0, self.mask_loss)))
 
 
@@ -53,11 +69,50 @@ def detect_spheres(
         )
     roughs = find_rough(image_bgr, camera, options)
     found: list[SphereOutline] = []
-    for rough in sorted(roughs, key=lambda r: -r.score):
+    for rough in roughs:
+        if any(_apart_rad(rough.cone, o.cone) < 0.6 * o.cone.half_angle_rad for o in found):
+            continue
         outline = refine_outline(image_bgr, camera, rough.cone, options, score=rough.score)
+        if outline is None and rough.coverage > _DOUBTFUL_COVERAGE:
+            # Shading within a blurred outline can hold the rough one too far inside.
+            wider = Cone(rough.cone.axis, _WIDER * rough.cone.half_angle_rad)
+            outline = refine_outline(image_bgr, camera, wider, options, score=rough.score)
+        if outline is not None and outline.coverage < _WHOLE:
+            outline = _confirmed(image_bgr, camera, outline, options)
+        if outline is not None and not rough.plain and outline.coverage < _DOUBTFUL_COVERAGE:
+            continue
         if outline is not None and all(_distinct(outline, other) for other in found):
             found.append(outline)
     return tuple(found)
+
+
+def _confirmed(
+    image: NDArray[np.uint8], camera: CameraModel, outline: SphereOutline, options: DetectionOptions
+) -> SphereOutline | None:
+    """The outline, or a better one near it; None where what is seen agrees with two outlines.
+
+    Where only parts of an outline are seen, shading or a border beside it can be taken for the rest.
+    """
+    if outline.coverage < _LEAST_UNAIDED:
+        return None
+    others: list[SphereOutline] = []
+    for factor in _OTHER_STARTS:
+        start = Cone(outline.cone.axis, factor * outline.cone.half_angle_rad)
+        again = refine_outline(image, camera, start, options, score=outline.score)
+        if again is not None:
+            others.append(again)
+    best = max([outline, *others], key=lambda o: o.coverage)
+    if any(_contradict(best, other, camera) for other in [outline, *others]):
+        return None
+    return best
+
+
+def _contradict(best: SphereOutline, other: SphereOutline, camera: CameraModel) -> bool:
+    """Whether two outlines of one place are nearly as good and differ by more than both admit."""
+    tilt = best.cone.frame()[:, :2].T @ (other.cone.axis - best.cone.axis)
+    d = np.append(tilt, other.cone.half_angle_rad - best.cone.half_angle_rad)
+    chi2 = float(d @ np.linalg.solve(best.cone_covariance + other.cone_covariance, d)) / 3
+    return float(np.linalg.norm(d)) * camera.fx > _SAME_PX and chi2 > 9.0 and other.coverage > 0.85 * best.coverage
 
 
 def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions) -> list[RoughSphere]:
@@ -85,7 +140,7 @@ def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: Detec
         if rough is not None:
             kept.append(rough)
     kept.sort(key=lambda r: -r.score)
-    return _consistent(_without_overlaps(kept))
+    return _without_overlaps(_of_one_colour(coarse, coarse_camera, kept, options))
 
 
 def _examine(
@@ -123,15 +178,14 @@ def _examine(
     if cone.axis[2] < 0.3:
         return None
     interior, loss, leak, colour = _interior(coarse, edge_map, cone, camera, votes < 0.3)
-    if (
-        leak > options.max_leak
-        or interior > options.max_interior_edges
-        or loss > 0.6
-        or coverage < 0.8 * options.min_coverage
-    ):
+    bad = loss > 0.6 or coverage < 0.8 * options.min_coverage
+    if bad or leak > _DOUBTFUL_LEAK or interior > _DOUBTFUL_INTERIOR:
         return None
-    rough = RoughSphere(cone, coverage, interior, loss, colour)
-    return rough if rough.score >= options.min_score else None
+    plain = leak <= options.max_leak and interior <= options.max_interior_edges
+    rough = RoughSphere(cone, coverage, interior, loss, leak, colour, plain)
+    if plain and rough.score < options.min_score:
+        rough = replace(rough, plain=False)
+    return rough if rough.plain or coverage > _DOUBTFUL_COVERAGE else None
 
 
 def _interior(
@@ -194,38 +248,78 @@ def _on(inner: Cone, outer: Cone) -> bool:
 
 
 def _without_overlaps(roughs: list[RoughSphere]) -> list[RoughSphere]:
+    """Without what lies on larger discs, and not too many for one place."""
     # Stains and highlights are discs too, but on a sphere.
     whole = [r for r in roughs if r.coverage > 0.6 and r.mask_loss < 0.4]
     roughs = [r for r in roughs if not any(_on(r.cone, w.cone) for w in whole)]
     kept: list[RoughSphere] = []
     for rough in roughs:
-        for other in kept:
-            between = float(np.arccos(np.clip(rough.cone.axis @ other.cone.axis, -1, 1)))
-            if between < 0.6 * max(rough.cone.half_angle_rad, other.cone.half_angle_rad):
-                break
-        else:
+        same = [
+            k for k in kept
+            if _apart_rad(rough.cone, k.cone) < 0.6 * max(rough.cone.half_angle_rad, k.cone.half_angle_rad)
+        ]  # fmt: skip
+        if len(same) < _ALTERNATIVES:
             kept.append(rough)
     return kept
 
 
-def _consistent(roughs: list[RoughSphere]) -> list[RoughSphere]:
-    """Doubtful discs must have the colour of the clearest ones: all markers come from one batch."""
-    clear = [r for r in roughs if r.score > 0.7]
-    if len(clear) < 3:
-        return roughs
-    tones = _chromaticity([r.colour_bgr for r in clear])
-    middle = np.median(tones, axis=0)
-    spread = max(6.0, 2 * float(np.median(np.abs(tones - middle))))
-    own = _chromaticity([r.colour_bgr for r in roughs])
-    far = np.linalg.norm(own - middle, axis=1) > 3.5 * spread
-    return [r for r, off in zip(roughs, far, strict=True) if r.score > 0.7 or not off]
+def _of_one_colour(
+    coarse: NDArray[np.uint8], camera: CameraModel, roughs: list[RoughSphere], options: DetectionOptions
+) -> list[RoughSphere]:
+    """The discs that have the spheres' colour; doubtful ones only when it is known, from clear ones or in advance."""
+    given = None
+    if options.colour_bgr is not None:
+        given = given_colour(options.colour_bgr, options.colour_tolerance, srgb=options.srgb)
+        roughs = [r for r in roughs if _share(coarse, camera, r.cone, given) >= _LEAST_SHARE]
+    firm = [r for r in roughs if r.coverage > 0.6]
+    model = learn_colour(
+        np.array([r.colour_bgr for r in firm]).reshape(-1, 3),
+        np.array([r.coverage * (1 - 0.5 * r.mask_loss) * (1.0 if r.plain else 0.5) for r in firm]),
+        np.array([r.score > 0.5 for r in firm], dtype=np.bool_),
+        srgb=options.srgb,
+    )
+    model = model or given
+    if model is None:
+        return [r for r in roughs if r.plain]
+    kept: list[RoughSphere] = []
+    for rough in roughs:
+        share = _share(coarse, camera, rough.cone, model)
+        if rough.plain:
+            good = share >= _LEAST_SHARE
+        elif rough.leak > options.max_leak:
+            # Ground of the spheres' colour: what stands before it is smooth.
+            good = share >= _CLEAN_SHARE and rough.interior_edges < _CLEAN_INTERIOR
+        else:
+            # Something lies across the disc; its surroundings must be of another colour.
+            around = _share(coarse, camera, rough.cone, model, _AROUND)
+            good = share >= _DOUBTFUL_SHARE and around < _MOST_AROUND
+        if good:
+            kept.append(rough)
+    return kept
 
 
-def _chromaticity(colours: list[tuple[float, float, float]]) -> Array:
-    pixels = np.array(colours, dtype=np.float32).reshape(1, -1, 3) / 255
-    return cv2.cvtColor(pixels, cv2.COLOR_BGR2LAB)[0, :, 1:].astype(np.float64)
+def _share(
+    coarse: NDArray[np.uint8],
+    camera: CameraModel,
+    cone: Cone,
+    model: ColourModel,
+    reach: tuple[float, float] = (0.0, 0.92),
+) -> float:
+    """The part of a disc, or of the ring between two shares of its radius, that has the spheres' colour."""
+    low, high = reach
+    rings = np.sqrt(low**2 + (high**2 - low**2) * (np.arange(8) + 0.5) / 8)
+    azimuth = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+    at = camera.project(cone.rays(azimuth[:, None], rings * cone.half_angle_rad).reshape(-1, 3))
+    x, y = np.rint(at).astype(int).T
+    here = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    if not here.any():
+        return 0.0
+    return float(np.mean(model.distance(coarse[y[here], x[here]].astype(np.float64)) < 1.0))
+
+
+def _apart_rad(a: Cone, b: Cone) -> float:
+    return float(np.arccos(np.clip(a.axis @ b.axis, -1, 1)))
 
 
 def _distinct(a: SphereOutline, b: SphereOutline) -> bool:
-    between = float(np.arccos(np.clip(a.cone.axis @ b.cone.axis, -1, 1)))
-    return between > 0.6 * max(a.cone.half_angle_rad, b.cone.half_angle_rad)
+    return _apart_rad(a.cone, b.cone) > 0.6 * max(a.cone.half_angle_rad, b.cone.half_angle_rad)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
+from service.compute.markers.colours import colour_of
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.paper_chain import detect_by_masks
-from service.compute.markers.records import DetectionOptions, SphereOutline
+from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 
 
 class Detector(Protocol):
@@ -22,6 +24,18 @@ class Detector(Protocol):
     ) -> tuple[SphereOutline, ...]:
         """The outlines, the most certain first."""
         ...
+
+
+def options_for(colour: str | None) -> DetectionOptions:
+    """The default options with the spheres' colour, by name or as #rrggbb; None: it is learnt.
+
+    Raises:
+        ConfigurationError: no such colour.
+    """
+    if colour is None:
+        return DEFAULTS
+    colour_bgr, tolerance = colour_of(colour)
+    return replace(DEFAULTS, colour_bgr=colour_bgr, colour_tolerance=tolerance)
 
 
 DETECTORS: Mapping[str, Detector] = {"classical": detect_spheres, "paper": detect_by_masks}

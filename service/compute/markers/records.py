@@ -32,6 +32,8 @@ class DetectionOptions:
     n_points: int = 200  # L, points sampled equidistantly on an outline
     srgb: bool = True  # pixel values carry the sRGB transfer curve
     seed: int = 0  # of RANSAC
+    colour_bgr: tuple[float, float, float] | None = None  # of the spheres, 0..255; None: learnt in each image
+    colour_tolerance: float = 0.18  # in chromaticity, of the colour given: see colours.chromaticity
 
 
 DEFAULTS = DetectionOptions()

@@ -1,0 +1,95 @@
+"""The colour of the spheres: names, and how far a colour is from it, whatever the light's strength."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.core.errors import ConfigurationError
+from service.core.geometry import Array
+
+Colour = tuple[float, float, float]  # B, G, R as coded in an image, 0..255
+
+# Typical matte plastic under neutral light, and how far a sphere that bears the name may be from it.
+NAMED_BGR: Mapping[str, tuple[Colour, float]] = {
+    "white": ((230.0, 230.0, 230.0), 0.16),
+    "grey": ((140.0, 140.0, 140.0), 0.16),
+    "green": ((75.0, 200.0, 130.0), 0.3),  # from yellowish to dark green
+    "orange": ((56.0, 139.0, 236.0), 0.22),
+}
+_HEX_TOLERANCE = 0.18  # the light's colour and the camera's white balance
+_LEARNT_TOLERANCE = (0.07, 0.16)  # least and greatest distance from the colour of the clearest spheres
+_MEMBERS = 3  # discs of one colour from which it is learnt
+
+
+@dataclass(frozen=True, slots=True)
+class ColourModel:
+    """The chromaticity of the spheres in an image (2,) and how far from it a pixel of theirs may be."""
+
+    middle: Array
+    tolerance: float
+    srgb: bool
+
+    def distance(self, colours_bgr: Array) -> Array:
+        """(N,) of colours (N, 3), in tolerances: up to 1 is a sphere's."""
+        return np.linalg.norm(chromaticity(colours_bgr, srgb=self.srgb) - self.middle, axis=1) / self.tolerance
+
+
+def colour_of(text: str) -> tuple[Colour, float]:
+    """A colour and its tolerance in chromaticity by its name (white, grey, green, orange) or as #rrggbb.
+
+    Raises:
+        ConfigurationError: neither.
+    """
+    word = text.strip().lower()
+    if word in NAMED_BGR:
+        return NAMED_BGR[word]
+    if len(word) == 7 and word[0] == "#" and all(c in "0123456789abcdef" for c in word[1:]):
+        r, g, b = (int(word[i : i + 2], 16) for i in (1, 3, 5))
+        return (float(b), float(g), float(r)), _HEX_TOLERANCE
+    raise ConfigurationError(
+        f"{text!r} is no colour of spheres", remedy=f"Give one of {', '.join(NAMED_BGR)}, or #rrggbb"
+    )
+
+
+def learn_colour(colours_bgr: Array, weights: Array, clear: NDArray[np.bool_], *, srgb: bool) -> ColourModel | None:
+    """The colour that most of the discs share (all markers come from one batch); None when too few agree.
+
+    Args:
+        colours_bgr: (N, 3) median colours of discs.
+        weights: (N,) how much each looks like a sphere.
+        clear: (N,) discs that pass every test by themselves; one at least must be of the colour.
+        srgb: the values carry the sRGB curve.
+    """
+    if len(colours_bgr) < _MEMBERS:
+        return None
+    tones = chromaticity(colours_bgr, srgb=srgb)
+    near = np.linalg.norm(tones[:, None] - tones[None], axis=2) < _LEARNT_TOLERANCE[0]
+    total = near @ weights
+    members = near[int(np.argmax(total))]
+    if members.sum() < _MEMBERS or not np.any(members & clear) or float(total.max()) < 0.4 * float(weights.sum()):
+        return None
+    middle = np.median(tones[members], axis=0)
+    spread = float(np.median(np.linalg.norm(tones[members] - middle, axis=1)))
+    return ColourModel(middle, float(np.clip(4 * spread, *_LEARNT_TOLERANCE)), srgb)
+
+
+def given_colour(colour_bgr: Colour, tolerance: float, *, srgb: bool) -> ColourModel:
+    """The model of a colour that is known before."""
+    return ColourModel(chromaticity(np.array([colour_bgr]), srgb=srgb)[0], tolerance, srgb)
+
+
+def chromaticity(colours_bgr: Array, *, srgb: bool = True) -> Array:
+    """(N, 2) opponent colours over luma, of colours (N, 3) 0..255; the light's strength cancels.
+
+    Red minus green and blue minus yellow over the sum: a stronger lamp scales all channels alike.
+    """
+    x = np.asarray(colours_bgr, dtype=np.float64).reshape(-1, 3) / 255
+    if srgb:
+        x = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    total = np.maximum(x.sum(axis=1), 0.02)  # black has no colour
+    b, g, r = x.T
+    return np.stack([(r - g) / total, (b - 0.5 * (r + g)) / total], axis=1)
