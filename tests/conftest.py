@@ -1,4 +1,4 @@
-"""What holds for every test: one thread of linear algebra a process, as in the program itself (service/cli/main.py)."""
+"""What holds for every test: one thread of linear algebra a process, as in the program (service/cli/main.py)."""
 
 from __future__ import annotations
 
