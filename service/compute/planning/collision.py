@@ -7,6 +7,7 @@ is no safety function.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import combinations
 
 import numpy as np
 
@@ -125,19 +126,20 @@ def nearest_contacts(
         clearances.append(clearance)
 
     T_specimen_base = inverse(obstacles.T_base_specimen)
+    to_specimen = segment_box_distance_m(
+        apply(T_specimen_base, starts), apply(T_specimen_base, ends), obstacles.specimen_half_m
+    )
+    between = [p for p in combinations(range(len(LINKS)), 2) if (LINKS[p[0]], LINKS[p[1]]) not in allowed]
+    first, second = [i for i, _ in between], [j for _, j in between]
+    gaps = segment_distance_m(starts[:, first], ends[:, first], starts[:, second], ends[:, second])
+    for k, (i, j) in enumerate(between):
+        add(LINKS[i], LINKS[j], gaps[:, k] - radii[i] - radii[j])
     for i, link in enumerate(LINKS):
-        for j in range(i + 1, len(LINKS)):
-            if (link, LINKS[j]) not in allowed:
-                gap = segment_distance_m(starts[:, i], ends[:, i], starts[:, j], ends[:, j])
-                add(link, LINKS[j], gap - radii[i] - radii[j])
         if (link, "table") not in allowed:
             lowest = np.minimum(starts[:, i, 2], ends[:, i, 2]) - radii[i]
             add(link, "table", lowest - obstacles.table_z_m)
         if (link, "specimen") not in allowed:
-            gap = segment_box_distance_m(
-                apply(T_specimen_base, starts[:, i]), apply(T_specimen_base, ends[:, i]), obstacles.specimen_half_m
-            )
-            add(link, "specimen", gap - radii[i])
+            add(link, "specimen", to_specimen[:, i] - radii[i])
         if (link, "spheres") not in allowed:
             for sphere in obstacles.spheres:
                 gap = segment_distance_m(starts[:, i], ends[:, i], sphere.start_m, sphere.end_m)

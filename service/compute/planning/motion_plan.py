@@ -107,8 +107,10 @@ def infeasible_reason(T_base_camera: Transform, joints_rad: Array | None, situat
     if joints_rad is None:
         return "the arm does not reach it"
     contact = nearest_contacts(situation.body, situation.obstacles, joints_rad[None])[0]
-    if contact.clearance_m < situation.margin_m:
-        return str(contact)
+    return str(contact) if contact.clearance_m < situation.margin_m else _blurred(T_base_camera, situation)
+
+
+def _blurred(T_base_camera: Transform, situation: Situation) -> str:
     if situation.sharp is not None and len(situation.must_be_sharp_m):
         near, far = depths_m(T_base_camera, situation.must_be_sharp_m)
         if near < situation.sharp.near_m or far > situation.sharp.far_m:
@@ -201,7 +203,11 @@ def _postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
 
 
 def _able_postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
-    return [q for q in _postures(T_base_camera, situation) if not infeasible_reason(T_base_camera, q, situation)]
+    found = _postures(T_base_camera, situation)
+    if not found or _blurred(T_base_camera, situation):
+        return []
+    contacts = nearest_contacts(situation.body, situation.obstacles, np.array(found))
+    return [q for q, contact in zip(found, contacts, strict=True) if contact.clearance_m >= situation.margin_m]
 
 
 def _blocked(here: Array, there: Array, situation: Situation) -> str:
