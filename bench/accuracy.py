@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -23,16 +23,15 @@ from drivers.mesh_file import read_mesh_file
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, detect_all, register_images
+from service.compute.poses.hybrid import HybridPoses, hybrid_poses
 from service.compute.poses.pose_files import read_camera_json, read_poses_csv, read_spheres_json
-from service.compute.poses.sfm import Mapper, SfmModel, SfmOptions, reconstruct
+from service.compute.poses.sfm import Effort, Mapper, SfmModel, options_for, reconstruct
 from service.compute.registration.cost import residuals
 from service.compute.registration.evaluation import true_error_m
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.geometry import Array, Transform, align_points, apply, inverse
 
 RESULTS = Path(__file__).parent / "results"
-SOURCES = ("truth", "robot", "colmap", "glomap")
-QUALITY = SfmOptions(max_features=8000, first_octave=-1, neighbours=10)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +50,7 @@ class Capture:
     true_registration_m: Array
     true_control_m: Array
     radius_m: float
+    covariance_m2: Array  # (M, 3, 3) of registration_m, as the location in the mesh states it
     T_world_scan: Transform  # truth
 
     @property
@@ -71,7 +71,9 @@ def read_capture(seed: int, folder: Path) -> Capture:
     order = sorted(set(station.values()))
     T_flange_camera = np.array(truth["T_flange_camera"])
     scan = read_mesh_file(folder / "scan.ply", "mm")
-    found = np.array([s.centre_m for s in locate_spheres(scan.mesh.vertices_m, scan.mesh.faces, spheres.radius_m)])
+    located = locate_spheres(scan.mesh.vertices_m, scan.mesh.faces, spheres.radius_m)
+    found = np.array([s.centre_m for s in located])
+    chosen = _nearest(found, spheres.registration_m)
     return Capture(
         seed=seed,
         folder=folder,
@@ -80,33 +82,56 @@ def read_capture(seed: int, folder: Path) -> Capture:
         T_world_camera=np.array([poses[file.name] for file in files]),
         T_base_camera=np.array([flange[file.name] @ T_flange_camera for file in files]),
         stations=[order.index(station[file.name]) for file in files],
-        registration_m=_nearest(found, spheres.registration_m),
-        control_m=_nearest(found, spheres.control_m),
+        registration_m=found[chosen],
+        control_m=found[_nearest(found, spheres.control_m)],
         true_registration_m=spheres.registration_m,
         true_control_m=spheres.control_m,
         radius_m=spheres.radius_m,
+        covariance_m2=np.array([located[k].covariance for k in chosen]),
         T_world_scan=np.array(truth["T_world_scan"]),
     )
 
 
-def measure(capture: Capture, sources: Sequence[str], workers: int) -> dict[str, Any]:
+class Reconstructions:
+    """Models of one capture, made when asked for, on shared features."""
+
+    def __init__(self, capture: Capture, folder: Path, effort: Effort) -> None:
+        self._capture, self._folder = capture, folder
+        self._effort: Effort = effort
+        self._made: dict[Mapper, SfmModel] = {}
+
+    def model(self, mapper: Mapper) -> SfmModel:
+        """By COLMAP's incremental or the global mapper."""
+        if mapper not in self._made:
+            c = self._capture
+            files = dict(zip(c.names, c.files, strict=True))
+            prior = dict(zip(c.names, c.T_world_camera, strict=True))  # chooses which images are matched, no more
+            options = options_for(self._effort, c.camera)
+            self._made[mapper] = reconstruct(
+                files, c.camera, self._folder, mapper, T_world_camera_prior=prior, options=options
+            )
+        return self._made[mapper]
+
+
+def measure(capture: Capture, sources: Sequence[str], effort: Effort, workers: int) -> dict[str, Any]:
     """One row for each source of poses."""
     started = time.monotonic()
     outlines = detect_all(capture.files, capture.camera, workers=workers)
     detection_s = time.monotonic() - started
     rows: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory(prefix="orthocapture-bench-") as scratch:
+        models = Reconstructions(capture, Path(scratch), effort)
         for source in sources:
             started = time.monotonic()
-            rows[source] = SOURCE[source](capture, outlines, Path(scratch))
+            rows[source] = SOURCE[source](capture, outlines, models)
             rows[source]["seconds"] = time.monotonic() - started
     return {
         "scene": capture.seed,
         "width": capture.camera.width,
         "images": len(capture.files),
+        "effort": effort,
         "detection_s": detection_s,
-        "scan_spheres_mm": 1e3
-        * float(np.sqrt(np.mean((capture.registration_m - capture.true_registration_m) ** 2) * 3)),
+        "scan_spheres_mm": 1e3 * _rms_distance(capture.registration_m, capture.true_registration_m),
         "sources": rows,
     }
 
@@ -114,41 +139,56 @@ def measure(capture: Capture, sources: Sequence[str], workers: int) -> dict[str,
 Outlines = Sequence[Sequence[SphereOutline]]
 
 
-def _from_truth(capture: Capture, outlines: Outlines, scratch: Path) -> dict[str, float]:
-    del scratch
-    solved = _registered(capture, outlines, capture.T_world_camera)
+def _from_truth(capture: Capture, outlines: Outlines, models: Reconstructions) -> dict[str, float]:
+    del models
+    solved = _registered(capture, outlines, capture.T_world_camera, pose_covariance="exact")
     return {**_errors(capture, outlines, solved), **_outline_errors(capture, outlines, solved)}
 
 
-def _from_robot(capture: Capture, outlines: Outlines, scratch: Path) -> dict[str, float]:
-    del scratch
+def _from_robot(capture: Capture, outlines: Outlines, models: Reconstructions) -> dict[str, float]:
+    del models
     solved = _registered(capture, outlines, capture.T_base_camera, groups=capture.stations)
     return _errors(capture, outlines, solved)
 
 
-def _from_sfm(mapper: Mapper) -> Callable[[Capture, Outlines, Path], dict[str, float]]:
-    def solve(capture: Capture, outlines: Outlines, scratch: Path) -> dict[str, float]:
-        model = _sfm_model(capture, scratch, mapper)
+def _from_sfm(mapper: Mapper) -> Callable[[Capture, Outlines, Reconstructions], dict[str, float]]:
+    def solve(capture: Capture, outlines: Outlines, models: Reconstructions) -> dict[str, float]:
+        model = models.model(mapper)
         index = [i for i, name in enumerate(capture.names) if name in model.T_world_camera]
         poses = np.array([model.T_world_camera[capture.names[i]] for i in index])
         solved = _registered(capture, [outlines[i] for i in index], poses, estimate_scale=True)
         rms_mm = _camera_rms_mm(poses, capture.T_world_camera[index])
-        return {**_errors(capture, outlines, solved, index), "camera_rms_mm": rms_mm}
+        return {**_errors(capture, [outlines[i] for i in index], solved, index), "camera_rms_mm": rms_mm}
 
     return solve
 
 
-def _sfm_model(capture: Capture, scratch: Path, mapper: Mapper) -> SfmModel:
-    files = dict(zip(capture.names, capture.files, strict=True))
-    prior = dict(zip(capture.names, capture.T_world_camera, strict=True))  # chooses which images are matched, no more
-    return reconstruct(files, capture.camera, scratch, mapper, T_world_camera_prior=prior, options=QUALITY)
+def _from_hybrid(capture: Capture, outlines: Outlines, models: Reconstructions) -> dict[str, float]:
+    model = models.model("incremental")
+    index = [capture.names.index(name) for name in model.T_world_camera]
+    mine = [outlines[i] for i in index]
+    answer = hybrid_poses(
+        np.array(list(model.T_world_camera.values())),
+        model.tracks,
+        mine,
+        capture.camera,
+        capture.registration_m,
+        capture.radius_m,
+        T_base_camera=capture.T_base_camera[index],
+        groups=[capture.stations[i] for i in index],
+        sphere_covariance_m2=capture.covariance_m2,
+    )
+    solved = _registered(capture, mine, answer.T_world_camera)
+    rms_mm = _camera_rms_mm(answer.T_world_camera, capture.T_world_camera[index])
+    return {**_errors(capture, mine, solved, index, answer), "camera_rms_mm": rms_mm}
 
 
-SOURCE: Mapping[str, Callable[[Capture, Outlines, Path], dict[str, float]]] = {
+SOURCE: Mapping[str, Callable[[Capture, Outlines, Reconstructions], dict[str, float]]] = {
     "truth": _from_truth,
     "robot": _from_robot,
     "colmap": _from_sfm("incremental"),
     "glomap": _from_sfm("global"),
+    "hybrid": _from_hybrid,
 }
 
 
@@ -159,6 +199,7 @@ def _registered(
     *,
     groups: Sequence[int] | None = None,
     estimate_scale: bool = False,
+    pose_covariance: Literal["estimate", "exact"] = "estimate",
 ) -> PipelineResult:
     return register_images(
         outlines,
@@ -169,27 +210,34 @@ def _registered(
         control_centres_m=capture.control_m,
         groups=groups,
         estimate_scale=estimate_scale,
+        pose_covariance=pose_covariance,
+        sphere_covariance_m2=capture.covariance_m2,
     )
 
 
 def _errors(
-    capture: Capture, outlines: Outlines, solved: PipelineResult, index: Sequence[int] | None = None
+    capture: Capture,
+    outlines: Outlines,
+    solved: PipelineResult,
+    index: Sequence[int] | None = None,
+    adjusted: HybridPoses | None = None,
 ) -> dict[str, float]:
+    """Of a registration, or of an adjustment that has placed the scan itself."""
     at = list(range(len(capture.files))) if index is None else list(index)
     centre = capture.true_registration_m.mean(axis=0)
     T_scan_camera_true = inverse(capture.T_world_scan) @ capture.T_world_camera[at]
-    error_m = true_error_m(solved.registration.T_scan_camera, T_scan_camera_true, centre)
-    sigma_m = solved.registration.sigma_at_m(centre)
+    T_scan_camera = solved.registration.T_scan_camera if adjusted is None else adjusted.T_scan_camera
+    error_m = true_error_m(T_scan_camera, T_scan_camera_true, centre)
+    sigma_m = solved.registration.sigma_at_m(centre) if adjusted is None else adjusted.sigma_at_m(centre)
     assert solved.evaluation is not None
     wrong = 0
-    for assignment, control, i in zip(solved.assignments, solved.control_assignments, at, strict=True):
+    for k, (assignment, control) in enumerate(zip(solved.assignments, solved.control_assignments, strict=True)):
         for markers, centres in ((assignment.markers, capture.registration_m), (control.markers, capture.control_m)):
             for outline, marker in markers.items():
-                c = apply(inverse(T_scan_camera_true[at.index(i)]), centres[marker])
-                cone = outlines[i][outline].cone
-                wrong += bool(
-                    np.arccos(np.clip(cone.axis @ c / np.linalg.norm(c), -1, 1)) > 0.3 * cone.half_angle_rad
-                )
+                c = apply(inverse(T_scan_camera_true[k]), centres[marker])
+                cone = outlines[k][outline].cone
+                off_rad = np.arccos(np.clip(cone.axis @ c / np.linalg.norm(c), -1, 1))
+                wrong += bool(off_rad > 0.3 * cone.half_angle_rad)
     return {
         "true_error_mm": 1e3 * error_m,
         "sigma_mm": 1e3 * sigma_m,
@@ -233,8 +281,8 @@ def _rms_distance(a: Array, b: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((a - b) ** 2, axis=1))))
 
 
-def _nearest(found: Array, wanted: Array) -> Array:
-    return np.array([found[np.argmin(np.linalg.norm(found - w, axis=1))] for w in wanted])
+def _nearest(found: Array, wanted: Array) -> list[int]:
+    return [int(np.argmin(np.linalg.norm(found - w, axis=1))) for w in wanted]
 
 
 def summarise(captures: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
@@ -278,9 +326,9 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         f"{computer['system']}, Python {computer['python']}.",
         "",
         "True error: displacement at the centre of the registration spheres against the simulator's truth. The",
-        "spheres are located in the simulated scan. Robot: the arm's reported poses with the true hand-eye. Sigma: 3D,",
-        "at the same point. Radial and reprojection error: control spheres. Wrong or false: outlines that are not the",
-        "sphere they were taken for.",
+        "spheres are located in the simulated scan. Robot: the arm's reported poses with the true hand-eye. Sigma:",
+        "3D, at the same point, so that (error/sigma)² is 1 in the mean. Radial and reprojection error: control",
+        "spheres. Wrong or false: outlines that are not the sphere they were taken for.",
     ]
     for width in dict.fromkeys(capture["width"] for capture in record["captures"]):
         here = [capture for capture in record["captures"] if capture["width"] == width]
@@ -290,15 +338,20 @@ def as_markdown(record: Mapping[str, Any]) -> str:
             f"## {width} px wide, {', '.join(map(str, images))} images, {len(here)} scenes: median / worst",
             "",
         ]
-        lines.append("| poses | " + " | ".join(heading for _, heading, _ in _COLUMNS) + " | within 3 sigma |")
-        lines.append("|---|" + "---:|" * (len(_COLUMNS) + 1))
+        headings = [heading for _, heading, _ in _COLUMNS] + ["within 3 sigma", "mean (error/sigma)²"]
+        lines.append(f"| poses | {' | '.join(headings)} |")
+        lines.append("|---|" + "---:|" * len(headings))
         for source, row in summarise(here).items():
             cells = [
                 f"{row[key]['median']:.{digits}f} / {row[key]['worst']:.{digits}f}" if key in row else ""
                 for key, _, digits in _COLUMNS
             ]
-            inside = [capture["sources"][source]["normalised"] <= 3 for capture in here]
-            lines.append(f"| {source} | " + " | ".join(cells) + f" | {sum(inside)} of {len(inside)} |")
+            normalised = [
+                capture["sources"][source]["normalised"] for capture in here if source in capture["sources"]
+            ]
+            cells.append(f"{sum(n <= 3 for n in normalised)} of {len(normalised)}")
+            cells.append(f"{statistics.fmean(n**2 for n in normalised):.2f}")
+            lines.append(f"| {source} | {' | '.join(cells)} |")
         lines += ["", "| scene | poses | true error (mm) | sigma (mm) | radial (mm) |", "|---:|---|---:|---:|---:|"]
         for capture in here:
             for source, row in capture["sources"].items():
@@ -315,7 +368,8 @@ def main() -> int:
     parser.add_argument("--scenes", type=int, nargs="+", default=list(range(1, 11)), metavar="SEED")
     parser.add_argument("--width", type=int, default=1920)
     parser.add_argument("--views", type=int, default=20)
-    parser.add_argument("--sources", nargs="+", default=list(SOURCES), choices=list(SOURCE))
+    parser.add_argument("--sources", nargs="+", default=list(SOURCE), choices=list(SOURCE))
+    parser.add_argument("--effort", default="normal", choices=get_args(Effort), help="of structure from motion")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--cache", type=Path, default=CACHE)
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -326,7 +380,7 @@ def main() -> int:
     captures: list[dict[str, Any]] = []
     for seed in options.scenes:
         folder = render_scene(seed, options.width, options.views, cache=options.cache, workers=options.workers)
-        captures.append(measure(read_capture(seed, folder), options.sources, options.workers))
+        captures.append(measure(read_capture(seed, folder), options.sources, options.effort, options.workers))
         rows = captures[-1]["sources"].items()
         print(seed, {source: round(row["true_error_mm"], 4) for source, row in rows}, file=sys.stderr, flush=True)
         record = {"date": options.date, "commit": commit(), "machine": machine(), "captures": captures}
