@@ -21,7 +21,8 @@ from service.compute.markers.records import Evidence, SphereOutline, outline_fro
 from service.compute.pipeline import detect_all, register_images
 from service.compute.registration.evaluation import evaluate, leave_one_out, true_error_m
 from service.compute.registration.identity import Assignment
-from service.compute.registration.solve import CommonErrors, RegistrationResult, register
+from service.compute.registration.problem import CommonErrors, expected_common_errors
+from service.compute.registration.solve import RegistrationResult, register
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from simulators.world import RADIUS_M, Scene
 
@@ -116,6 +117,8 @@ def rendered(capture: Capture, outlines: list[tuple[SphereOutline, ...]]) -> dic
 # Drawn outlines
 
 
+DISTANCE_M = 0.67
+EXPECTED = expected_common_errors(CAMERA.fx * RADIUS_M / DISTANCE_M)
 NOTHING_COMMON = CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=1e-5)
 
 
@@ -137,8 +140,8 @@ CASES = (
     Case("the same, their covariance stated", pose=SFM_NOISE, told=True),
     Case("outlines, poses as of an arm", pose=ARM_NOISE),
     Case("outlines, spheres of the scan 0.02 mm", spheres_m=2e-5),
-    Case("outlines, common errors", common=CommonErrors()),
-    Case("all", pose=SFM_NOISE, spheres_m=2e-5, common=CommonErrors()),
+    Case("outlines, common errors", common=EXPECTED),
+    Case("all", pose=SFM_NOISE, spheres_m=2e-5, common=EXPECTED),
 )
 
 
@@ -148,7 +151,7 @@ def drawn(seed: int, case: Case, views: int = 18) -> tuple[RegistrationResult, T
     scan_m = _LABORATORIES[seed % len(_LABORATORIES)]
     T_world_scan = transform(Rotation.random(rng=rng), rng.uniform(-0.3, 0.3, 3))
     centre = scan_m.mean(axis=0)
-    f, light = CAMERA.fx, rng.normal(size=3) * case.common.light_px * 0.67 / CAMERA.fx
+    f, light = CAMERA.fx, rng.normal(size=3) * case.common.light_px * DISTANCE_M / CAMERA.fx
     shift = rng.normal(size=2) * case.common.shift_px / f
     growth = float(rng.normal()) * case.common.growth_px / f
     covariance = np.eye(3) * (case.outline_px / f) ** 2

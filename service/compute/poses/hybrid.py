@@ -20,7 +20,8 @@ from service.compute.poses.adjustment import Solution, solve
 from service.compute.poses.bundle import Data, Sigmas, SphereSightings, State, whitening_of
 from service.compute.poses.tracks import Tracks
 from service.compute.registration.identity import identify
-from service.compute.registration.solve import COMMON, CommonErrors, RegistrationResult, register
+from service.compute.registration.problem import CommonErrors, expected_common_errors
+from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, transform
 
@@ -32,7 +33,7 @@ class HybridOptions:
     Attributes:
         sphere_sigma_m: standard deviation of a sphere's position in the scan, for each coordinate, where no
             covariance of it is given.
-        common_errors: sizes of what all outlines have in common; solved for.
+        common_errors: sizes of what all outlines have in common, solved for; None: as `expected_common_errors`.
         most_observations: of tracks that take part; more gain next to nothing and cost time and memory.
         robot_sigma_m: of the robot's positions, to begin with; estimated from the data.
         robot_sigma_rad: of its orientations, likewise.
@@ -40,7 +41,7 @@ class HybridOptions:
     """
 
     sphere_sigma_m: float = 5e-6
-    common_errors: CommonErrors = COMMON
+    common_errors: CommonErrors | None = None
     most_observations: int = 200_000
     robot_sigma_m: float = 1e-3
     robot_sigma_rad: float = 2e-3
@@ -205,7 +206,8 @@ def hybrid_poses(
         bases=bases,
         camera=camera,
     )
-    common = settings.common_errors
+    f = 0.5 * (camera.fx + camera.fy)
+    common = settings.common_errors or expected_common_errors(f * float(np.mean(sightings.half_angles)))
     spheres = sphere_covariance_m2
     if spheres is None:
         spheres = np.broadcast_to(settings.sphere_sigma_m**2 * np.eye(3), (len(centres_scan_m), 3, 3))
@@ -216,7 +218,7 @@ def hybrid_poses(
         centres=centres_scan_m,
         centre_whitening=whitening_of(spheres),
         common_sigma_px=np.repeat([common.shift_px, common.growth_px, common.light_px], [2, 1, 3]),
-        light_unit_m=distance_m / (0.5 * (camera.fx + camera.fy)),
+        light_unit_m=distance_m / f,
         radius_m=radius_m,
         robot=T_base_camera if order else None,
         group=group,

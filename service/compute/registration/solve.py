@@ -35,7 +35,6 @@ from service.compute.registration.variance import (
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, transform
 
-COMMON = CommonErrors()
 _ROUNDS = 8
 _STEPS = 25
 
@@ -57,7 +56,7 @@ def register(
     pose_covariance: Array | Literal["estimate", "exact"] = "estimate",
     sphere_covariance_m2: Array | None = None,
     intrinsics_covariance: Array | None = None,
-    common_errors: CommonErrors = COMMON,
+    common_errors: CommonErrors | None = None,
 ) -> RegistrationResult:
     """Solve T_world_scan (and scale, and every station's base) by Gauss–Newton over all outlines.
 
@@ -84,7 +83,7 @@ def register(
         sphere_covariance_m2: (M, 3, 3) of the centres; None takes them as exact.
         intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only where the errors
             of the poses do not depend on those of the intrinsics. None leaves them to the error budget.
-        common_errors: sizes of what all outlines of a capture have in common.
+        common_errors: sizes of what all outlines of a capture have in common; None: as `expected_common_errors`.
 
     Raises:
         ComputeError: too few outlines to determine the answer, or no convergence.
@@ -127,8 +126,7 @@ def _start(problem: Problem, assignments: Sequence[Assignment], poses: Array, gr
     scale = 1.0
     if problem.with_scale:
         scales = [a.scale for a in assignments if a.scale is not None]
-        if scales:
-            scale = float(np.median(scales))
+        scale = float(np.median(scales)) if scales else _scale(problem, assignments, poses, groups)
     bases: list[Transform] = []
     for g in problem.groups:
         candidates: list[Transform] = []
@@ -153,6 +151,30 @@ def _start(problem: Problem, assignments: Sequence[Assignment], poses: Array, gr
         np.zeros(problem.size - problem.common_column),
         np.zeros((n, 6)),
     )
+
+
+def _scale(problem: Problem, assignments: Sequence[Assignment], poses: Array, groups: NDArray[np.int64]) -> float:
+    """Of the camera positions p, from the assignments' own poses: R_i c_i + scale p_i is the same place for all i."""
+    middle = problem.centres.mean(axis=0)
+    upper, lower = 0.0, 0.0
+    for g in problem.groups:
+        mine = {
+            i: poses[i][:3, :3] @ apply(a.T_camera_scan, middle)
+            for i, a in enumerate(assignments)
+            if int(groups[i]) == g and a.T_camera_scan is not None
+        }
+        if len(mine) < 2:
+            continue
+        seen = np.array(list(mine.values()))
+        position = poses[list(mine), :3, 3] - poses[list(mine), :3, 3].mean(axis=0)
+        upper -= float(np.sum(position * (seen - seen.mean(axis=0))))
+        lower += float(np.sum(position**2))
+    if upper <= 0.0 or lower <= 0.0:
+        raise ComputeError(
+            "the scale of the camera positions cannot be told from the images' own readings",
+            remedy="Use poses of several images of the same scene, from different places",
+        )
+    return upper / lower
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +240,9 @@ def _solve(problem: Problem, start: State, noise: PoseNoise, *, robust: bool, co
             blocks = _blocks(problem, rows, weights)
         else:
             settled = False
-        factor, scales = estimate(
-            blocks, noise, prior, prior @ state.prior_values(problem), (factor, np.maximum(scales, 0.3))
-        )
+        before = np.maximum(scales, 0.3)
+        factor, scales = estimate(blocks, noise, prior, prior @ state.prior_values(problem), (factor, before))
+        settled = settled and bool(np.all(scales < 2 * before))
         root = noise.root(scales)
         state = _descend(problem, state, _Weighting(weights, root, factor), "cone")
         if settled:

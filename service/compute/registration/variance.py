@@ -12,6 +12,7 @@ from service.core.geometry import Array
 
 _FACTOR = (0.02, 1e4)  # of the outlines' variance
 _POSE = (1e-3, 1e3)  # of the square roots below
+_GROWTH = 5.0  # of the square roots of the pose noise in one estimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +66,14 @@ def estimate(
 
     Source: Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal",
     Biometrika 58(3), 1971. A wide prior on each logarithm keeps few residuals from saying much.
+
+    The pose noise grows at most fivefold at a time: residuals far larger than stated send the first step of the
+    minimiser to poses that are known by nothing, from where neither it nor the solution comes back.
     """
     n_free = len(start[1]) if noise.free else 0
+    most = np.log(np.clip(_GROWTH * start[1][:n_free], max(noise.least, _POSE[0]) * _GROWTH, _POSE[1]))
     lower = [np.log(_FACTOR[0]) / 2, *([np.log(noise.least)] * n_free)]
-    upper = [np.log(_FACTOR[1]) / 2, *([np.log(_POSE[1])] * n_free)]
+    upper = [np.log(_FACTOR[1]) / 2, *most.tolist()]
 
     def cost(y: Array) -> float:
         factor = float(np.exp(2 * y[0]))
