@@ -132,7 +132,7 @@ def measure_outlines(
     wanted = _MOST_PROFILES * min(1.0, _FINE_RADIUS_PX / radius_px)
     count = max(_FEWEST_PROFILES, _BLOCKS * round(wanted / _BLOCKS))
     fine = radius_px < _FINE_RADIUS_PX
-    step, iterations = (0.5, 3) if fine else (1.0, 4)
+    step, iterations = (0.5, 3) if fine else (0.7, 4)
     found = _measure(image_bgr, camera, starts, count, step, 1.6 if fine else 2.5, iterations, 1, options)
     for i, best in enumerate(found):
         if best is not None and not fine and best.blur_px > _FOCUS * max(1.0, starts[i].blur_px):
