@@ -207,6 +207,16 @@ def test_gates(measures: dict[str, float], passed: bool) -> None:
     assert [v.measure for v in result.verdicts] == ["views", "sharp"]
 
 
+def test_a_gate_falls_away_with_the_step_that_would_have_made_it_measurable() -> None:
+    step = toy_protocol().step("capture")
+    gates = tuple(g.model_copy(update={"unless_skipped": "ct"}) if g.measure == "sharp" else g for g in step.gates)
+    step = step.model_copy(update={"gates": gates})
+    assert not evaluate_gates(step, 1, {"views": 3.0}).passed
+    without = evaluate_gates(step, 1, {"views": 3.0}, skipped={"ct"})
+    assert without.passed
+    assert [v.measure for v in without.verdicts] == ["views"]
+
+
 def test_failed_gates_ask_and_can_be_overridden_only_with_leave_and_reason() -> None:
     log = at_capture()
     log.begin()

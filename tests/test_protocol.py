@@ -76,6 +76,13 @@ FAULTS: list[tuple[str, str, str, str, str]] = [
     ("min: 0.2, max: 1.0", "unit: px", "measure: sharp", "steps[1].gates[1]", "needs limits"),
     ("min: 0.2, max: 1.0", "min: 2, max: 1.0", "measure: sharp", "steps[1].gates[1].max", "min 2 is above max 1.0"),
     ("measure: sharp", "measure: views", "min: 0.2", "steps[1].gates[1].measure", "second gate on 'views'"),
+    (
+        "min: 0.2,",
+        "unless_skipped: scan, min: 0.2,",
+        "measure: sharp",
+        "steps[1].gates[1].unless_skipped",
+        "'scan' is no earlier step that may be skipped",
+    ),
     ("min: 0.2,", "min: .nan,", ".nan", "steps[1].gates[1].min", "valid number"),
     ("views: 3}", "views: 0}", "views: 0", "steps[1].params.views", "greater than or equal to 1"),
     ("views: 3}", "views: many}", "views: many", "steps[1].params.views", "valid integer"),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import DeviceUnavailableError
+from drivers.errors import DeviceBusyError, DeviceTimeoutError, DeviceUnavailableError
 from drivers.interfaces import SafetyState
 from service.core.decide import AskOperator
 from service.core.errors import ComputeError, ConfigurationError
@@ -45,6 +45,14 @@ CALIBRATION = """\
           prefix: b
           arcs: [{tilt_deg: 20, azimuth_from_deg: 0, azimuth_to_deg: 0, count: 1, distance_m: 0.6}]
     gates: [{measure: rms_px, max: 0.5}]
+"""
+LAYOUT = """\
+  - id: layout
+    kind: layout_check
+    title: Look at the spheres
+    confirm: false
+    gates: [{measure: spheres_seen, min: 10}]
+    recovery: {retries: 2, wait_s: 0}
 """
 
 
@@ -348,6 +356,45 @@ def test_exif_that_departs_from_the_settings_fails_its_gate_until_the_image_is_t
     assert bench.captured() == [*VIEWS, "v003"]
     verdicts = [c.verdicts["settings"] for c in bench.payloads(ViewpointCaptured)]
     assert verdicts == [True, True, False, True, True]
+
+
+def test_a_busy_camera_is_left_alone_until_it_is_free(bench: Bench) -> None:
+    def busy(exposure: int) -> None:
+        if exposure in (2, 3, 4, 5, 6):
+            raise DeviceBusyError("I/O in progress", where="camera")
+
+    bench.rig.shutter.on_capture = busy
+    assert bench.run().status == "completed"
+    assert bench.captured() == VIEWS
+    assert not bench.payloads(ViewpointFailed), "a busy camera is no failure"
+    assert bench.rig.shutter.opened == 1
+
+
+def test_a_photograph_by_hand_is_repeated_on_a_reopened_camera(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL.replace("  - id: capture\n", LAYOUT + "  - id: capture\n"))
+
+    def late(exposure: int) -> None:
+        if exposure == 1:
+            raise DeviceTimeoutError("1 file(s) were due, came: none", where="camera")
+        if exposure in (2, 3, 4):
+            raise DeviceBusyError("I/O in progress", where="camera")
+
+    def work(_what: str) -> None:
+        job = bench.store.claim_job("worker 1", 30)
+        if job is not None:
+            bench.store.finish_job(
+                job, measures={"spheres_seen": 10.0}, duration_s=1.0, result={"spheres_m": [], "details": {}}
+            )
+
+    bench.rig.shutter.on_capture, bench.operator.on_show = late, work
+    state = bench.run()
+    assert state.status == "completed"
+    assert not bench.payloads(StepFailed)
+    assert bench.rig.shutter.opened == 2
+    (note,) = [note for note in bench.payloads(StepNote) if note.note == "photograph_repeated"]
+    assert "came: none" in note.data["why"]
+    photographs = [row for row in bench.store.artefacts(bench.run_id) if row.ref.kind == "layout_image"]
+    assert len(photographs) == 1
 
 
 def test_a_failed_job_shows_the_workers_reason_and_a_repeated_step_enqueues_it_anew(
