@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.cones import Cone, cone_ellipse, cone_of_sphere, fit_cone, ransac_cone
-from service.compute.markers.detect import detect_spheres, refine_outline
+from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DetectionOptions, SphereOutline
+from service.compute.markers.refine import refine_outline
 from service.core.errors import DataError
 from service.core.geometry import Array
 from tests.support.sphere_conditions import Look, render_look

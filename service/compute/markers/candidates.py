@@ -78,6 +78,18 @@ def _apart(a: Candidate, b: Candidate) -> bool:
     return abs(a.x - b.x) > near or abs(a.y - b.y) > near or not 0.72 < a.radius / b.radius < 1.39
 
 
+def _keep_best(
+    best: NDArray[np.float32], best_index: NDArray[np.uint8], index: int, planes: list[NDArray[np.float32]]
+) -> None:
+    """Raises `best` to the sum of the planes where that is more, and notes the radius there."""
+    total = planes[0]
+    for plane in planes[1:]:
+        total = cv2.add(total, plane)
+    more = total > best
+    np.copyto(best, total, where=more)
+    best_index[more] = index
+
+
 def _search(
     image: NDArray[np.uint8], least: float, greatest: float, min_vote: float, to_input: float
 ) -> list[Candidate]:
@@ -92,22 +104,25 @@ def _search(
     radii = np.arange(max(3, int(least) - 1), int(np.ceil(greatest)) + 2)
     margin = int(radii[-1])  # a centre may lie outside the image
     rows, columns = h + 2 * margin, w + 2 * margin
-    votes = np.zeros((len(radii), rows, columns), dtype=np.float32)
+    # A circle's votes spread over neighbouring radii: each plane counts with the two beside it.
+    best = np.zeros((rows, columns), dtype=np.float32)
+    best_index = np.zeros((rows, columns), dtype=np.uint8)
+    planes: list[NDArray[np.float32]] = []
     for i, r in enumerate(radii):
-        total: NDArray[np.int64] | None = None
-        for sign in (1, -1):
-            cx = np.rint(xs + sign * r * dx).astype(np.int64) + margin
-            cy = np.rint(ys + sign * r * dy).astype(np.int64) + margin
-            count = np.bincount(cy * columns + cx, minlength=rows * columns).astype(np.int64)
-            total = count if total is None else total + count
-        assert total is not None
-        plane = total.reshape(rows, columns).astype(np.float32) / (2 * np.pi * float(r))
-        votes[i] = cv2.boxFilter(plane, -1, (5, 5), normalize=False)
-    summed = votes.copy()
-    summed[1:] += votes[:-1]
-    summed[:-1] += votes[1:]
-    best_index = np.argmax(summed, axis=0)
-    best = np.take_along_axis(summed, best_index[None], axis=0)[0]
+        flat = np.concatenate(
+            [
+                np.rint(ys + sign * r * dy + margin).astype(np.int32) * columns
+                + np.rint(xs + sign * r * dx + margin).astype(np.int32)
+                for sign in (1, -1)
+            ]
+        )
+        plane = np.bincount(flat, minlength=rows * columns).reshape(rows, columns).astype(np.float32)
+        plane *= np.float32(1 / (2 * np.pi * float(r)))
+        planes = [*planes[-2:], np.asarray(cv2.boxFilter(plane, -1, (5, 5), normalize=False), dtype=np.float32)]
+        if i == 0:
+            continue
+        _keep_best(best, best_index, i - 1, planes)
+    _keep_best(best, best_index, len(radii) - 1, planes[-2:])
     peak = (best >= cv2.dilate(best, np.ones((7, 7), np.uint8))) & (best > min_vote)
     py, px = np.nonzero(peak)
     strongest = np.argsort(-best[py, px])[:150]

@@ -21,7 +21,8 @@ NAMED_BGR: Mapping[str, tuple[Colour, float]] = {
     "orange": ((56.0, 139.0, 236.0), 0.22),
 }
 _HEX_TOLERANCE = 0.18  # the light's colour and the camera's white balance
-_LEARNT_TOLERANCE = (0.07, 0.16)  # least and greatest distance from the colour of the clearest spheres
+_ALIKE = 0.07  # distance of discs of one colour
+_LEARNT_TOLERANCE = (0.1, 0.16)  # least and greatest distance of a pixel from the colour of the clearest spheres
 _MEMBERS = 3  # discs of one colour from which it is learnt
 
 
@@ -67,7 +68,7 @@ def learn_colour(colours_bgr: Array, weights: Array, clear: NDArray[np.bool_], *
     if len(colours_bgr) < _MEMBERS:
         return None
     tones = chromaticity(colours_bgr, srgb=srgb)
-    near = np.linalg.norm(tones[:, None] - tones[None], axis=2) < _LEARNT_TOLERANCE[0]
+    near = np.linalg.norm(tones[:, None] - tones[None], axis=2) < _ALIKE
     total = near @ weights
     members = near[int(np.argmax(total))]
     if members.sum() < _MEMBERS or not np.any(members & clear) or float(total.max()) < 0.4 * float(weights.sum()):

@@ -14,13 +14,16 @@ from service.compute.markers.colours import ColourModel, given_colour, learn_col
 from service.compute.markers.cones import Cone, ransac_cone
 from service.compute.markers.edges import envelope_edges, profiles, sample
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
-from service.compute.markers.refine import refine_outline
+from service.compute.markers.refine import refine_outlines
 from service.core.errors import DataError
 from service.core.geometry import Array
 
 # A disc with wires, stains or highlights on it, or on ground of its own colour, counts if it has the spheres' colour.
 _DOUBTFUL_INTERIOR, _DOUBTFUL_LEAK = 0.3, 0.36
 _LEAST_SHARE, _DOUBTFUL_SHARE = 0.35, 0.55  # of a disc's pixels that must have the spheres' colour
+_POSSIBLE_SHARE = 0.2  # below it a circle is not looked at, once the colour is known
+_CLEAR, _CLEAR_SPHERES = 0.6, 4  # score of discs, and how many of them, from which it is known
+_SIZES = (0.4, 2.5)  # of a sphere in the image, over the median of the clear ones
 _CLEAN_SHARE, _CLEAN_INTERIOR = 0.85, 0.03
 _AROUND, _MOST_AROUND = (1.1, 1.35), 0.35  # the ring beside a disc, in radii, and how much of it may have the colour
 _DOUBTFUL_COVERAGE = 0.58
@@ -28,8 +31,10 @@ _ALTERNATIVES = 3  # rough outlines of one place that are tried until one holds
 _WHOLE = 0.8  # coverage of an outline that needs no second look
 _OTHER_STARTS = (0.95, 1.06)  # of the radius, for the second look
 _LEAST_UNAIDED = 0.5  # coverage below which only a prediction can tell what is outline
-_WIDER = 1.07
+_STARTS = (1.0, 1.08, 1.2)  # of the rough radius, tried until one holds
+_TRIALS = 200  # of RANSAC, on a coarse outline
 _SAME_PX = 0.5
+_DISTINCT = 0.85  # of the larger radius: of a sphere nearer behind another too little is seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,23 +72,45 @@ def detect_spheres(
             f"the camera model is for {camera.width}×{camera.height}",
             remedy="Use the calibration made at this image size, and images that no program has rotated or resized",
         )
-    roughs = find_rough(image_bgr, camera, options)
+    todo = find_rough(image_bgr, camera, options)
     found: list[SphereOutline] = []
-    for rough in roughs:
-        if any(_apart_rad(rough.cone, o.cone) < 0.6 * o.cone.half_angle_rad for o in found):
-            continue
-        outline = refine_outline(image_bgr, camera, rough.cone, options, score=rough.score)
-        if outline is None and rough.coverage > _DOUBTFUL_COVERAGE:
-            # Shading within a blurred outline can hold the rough one too far inside.
-            wider = Cone(rough.cone.axis, _WIDER * rough.cone.half_angle_rad)
-            outline = refine_outline(image_bgr, camera, wider, options, score=rough.score)
-        if outline is not None and outline.coverage < _WHOLE:
-            outline = _confirmed(image_bgr, camera, outline, options)
-        if outline is not None and not rough.plain and outline.coverage < _DOUBTFUL_COVERAGE:
-            continue
-        if outline is not None and all(_distinct(outline, other) for other in found):
-            found.append(outline)
-    return tuple(found)
+    while todo:
+        # One rough outline of each place at a time, the best first; all places side by side.
+        now: list[RoughSphere] = []
+        for rough in todo:
+            if all(_apart_rad(rough.cone, n.cone) > 0.6 * n.cone.half_angle_rad for n in now):
+                now.append(rough)
+        for outline in _refined(image_bgr, camera, now, options):
+            if all(_distinct(outline, other) for other in found):
+                found.append(outline)
+        todo = [
+            r for r in todo
+            if all(r is not n for n in now)
+            and all(_apart_rad(r.cone, o.cone) > 0.6 * o.cone.half_angle_rad for o in found)
+        ]  # fmt: skip
+    return tuple(sorted(found, key=lambda o: -o.score))
+
+
+def _refined(
+    image: NDArray[np.uint8], camera: CameraModel, roughs: list[RoughSphere], options: DetectionOptions
+) -> list[SphereOutline]:
+    """The outlines of those that hold at full resolution."""
+    kept: list[SphereOutline] = []
+    # Shading within a blurred outline can hold the rough one too far inside.
+    for factor in _STARTS:
+        starts = [Cone(r.cone.axis, factor * r.cone.half_angle_rad) for r in roughs]
+        outlines = refine_outlines(image, camera, starts, options, scores=[r.score for r in roughs])
+        lost: list[RoughSphere] = []
+        for rough, outline in zip(roughs, outlines, strict=True):
+            sure = outline
+            if outline is not None and outline.coverage < _WHOLE:
+                sure = _confirmed(image, camera, outline, options)
+            if sure is not None and (rough.plain or sure.coverage > _LEAST_UNAIDED):
+                kept.append(sure)
+            elif rough.coverage > _LEAST_UNAIDED:
+                lost.append(rough)
+        roughs = lost
+    return kept
 
 
 def _confirmed(
@@ -95,12 +122,9 @@ def _confirmed(
     """
     if outline.coverage < _LEAST_UNAIDED:
         return None
-    others: list[SphereOutline] = []
-    for factor in _OTHER_STARTS:
-        start = Cone(outline.cone.axis, factor * outline.cone.half_angle_rad)
-        again = refine_outline(image, camera, start, options, score=outline.score)
-        if again is not None:
-            others.append(again)
+    starts = [Cone(outline.cone.axis, factor * outline.cone.half_angle_rad) for factor in _OTHER_STARTS]
+    again = refine_outlines(image, camera, starts, options, scores=[outline.score] * len(starts))
+    others = [o for o in again if o is not None]
     best = max([outline, *others], key=lambda o: o.coverage)
     if any(_contradict(best, other, camera) for other in [outline, *others]):
         return None
@@ -131,16 +155,24 @@ def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: Detec
     edge_map = edges(*colour_gradient(coarse))
     rng = np.random.default_rng(options.seed)
     kept: list[RoughSphere] = []
+    model = None
+    if options.colour_bgr is not None:
+        model = given_colour(options.colour_bgr, options.colour_tolerance, srgb=options.srgb)
     for candidate in candidates:
         middle = np.append(coarse_camera.normalise(np.array([[candidate.x, candidate.y]]))[0], 1.0)
         angle = float(np.arctan(candidate.radius / coarse_camera.fx))
         if any(_within(middle, k.cone) and angle < 1.4 * k.cone.half_angle_rad for k in kept if k.score > 0.6):
             continue  # a highlight or a shadow on a sphere that is already known
+        here = Cone(middle / float(np.linalg.norm(middle)), angle)
+        if model is not None and _share(coarse, coarse_camera, here, model) < _POSSIBLE_SHARE:
+            continue
         rough = _examine(coarse, edge_map, coarse_camera, candidate, options, rng)
         if rough is not None:
             kept.append(rough)
+            if rough.score > _CLEAR and sum(k.score > _CLEAR for k in kept) >= _CLEAR_SPHERES:
+                model = _learnt(kept, options) or model
     kept.sort(key=lambda r: -r.score)
-    return _without_overlaps(_of_one_colour(coarse, coarse_camera, kept, options))
+    return _without_overlaps(_of_one_size(_of_one_colour(coarse, coarse_camera, kept, options)))
 
 
 def _examine(
@@ -166,7 +198,7 @@ def _examine(
         rays = cone.rays(where.azimuth_rad[points.slot], cone.half_angle_rad + points.offset_px * per_pixel)
         bounds = (0.6 * cone.half_angle_rad, 1.5 * cone.half_angle_rad)
         tolerance = max(0.9, 0.02 * candidate.radius) * float(np.median(per_pixel))
-        fit = ransac_cone(rays, points.strength, points.slot, bounds, tolerance, rng)
+        fit = ransac_cone(rays, points.strength, points.slot, bounds, tolerance, rng, _TRIALS)
         if fit is None:
             return None
         cone, inlier = fit
@@ -185,7 +217,8 @@ def _examine(
     rough = RoughSphere(cone, coverage, interior, loss, leak, colour, plain)
     if plain and rough.score < options.min_score:
         rough = replace(rough, plain=False)
-    return rough if rough.plain or coverage > _DOUBTFUL_COVERAGE else None
+    least = _LEAST_UNAIDED if interior < _CLEAN_INTERIOR else _DOUBTFUL_COVERAGE
+    return rough if rough.plain or coverage > least else None
 
 
 def _interior(
@@ -271,14 +304,7 @@ def _of_one_colour(
     if options.colour_bgr is not None:
         given = given_colour(options.colour_bgr, options.colour_tolerance, srgb=options.srgb)
         roughs = [r for r in roughs if _share(coarse, camera, r.cone, given) >= _LEAST_SHARE]
-    firm = [r for r in roughs if r.coverage > 0.6]
-    model = learn_colour(
-        np.array([r.colour_bgr for r in firm]).reshape(-1, 3),
-        np.array([r.coverage * (1 - 0.5 * r.mask_loss) * (1.0 if r.plain else 0.5) for r in firm]),
-        np.array([r.score > 0.5 for r in firm], dtype=np.bool_),
-        srgb=options.srgb,
-    )
-    model = model or given
+    model = _learnt(roughs, options) or given
     if model is None:
         return [r for r in roughs if r.plain]
     kept: list[RoughSphere] = []
@@ -286,16 +312,33 @@ def _of_one_colour(
         share = _share(coarse, camera, rough.cone, model)
         if rough.plain:
             good = share >= _LEAST_SHARE
-        elif rough.leak > options.max_leak:
-            # Ground of the spheres' colour: what stands before it is smooth.
-            good = share >= _CLEAN_SHARE and rough.interior_edges < _CLEAN_INTERIOR
         else:
-            # Something lies across the disc; its surroundings must be of another colour.
-            around = _share(coarse, camera, rough.cone, model, _AROUND)
-            good = share >= _DOUBTFUL_SHARE and around < _MOST_AROUND
+            # Something lies across the disc, whose surroundings are of another colour; or, on ground of the spheres'
+            # colour, what stands before it is smooth.
+            across = share >= _DOUBTFUL_SHARE and _share(coarse, camera, rough.cone, model, _AROUND) < _MOST_AROUND
+            good = across or (share >= _CLEAN_SHARE and rough.interior_edges < _CLEAN_INTERIOR)
         if good:
             kept.append(rough)
     return kept
+
+
+def _of_one_size(roughs: list[RoughSphere]) -> list[RoughSphere]:
+    """Without discs much smaller or larger than the clear ones: equal spheres stand at like distances."""
+    clear = [r.cone.half_angle_rad for r in roughs if r.score > _CLEAR]
+    if len(clear) < _CLEAR_SPHERES:
+        return roughs
+    middle = float(np.median(clear))
+    return [r for r in roughs if _SIZES[0] < r.cone.half_angle_rad / middle < _SIZES[1]]
+
+
+def _learnt(roughs: list[RoughSphere], options: DetectionOptions) -> ColourModel | None:
+    firm = [r for r in roughs if r.coverage > 0.6]
+    return learn_colour(
+        np.array([r.colour_bgr for r in firm]).reshape(-1, 3),
+        np.array([r.coverage * (1 - 0.5 * r.mask_loss) * (1.0 if r.plain else 0.5) for r in firm]),
+        np.array([r.score > 0.3 for r in firm], dtype=np.bool_),
+        srgb=options.srgb,
+    )
 
 
 def _share(
@@ -322,4 +365,4 @@ def _apart_rad(a: Cone, b: Cone) -> float:
 
 
 def _distinct(a: SphereOutline, b: SphereOutline) -> bool:
-    return _apart_rad(a.cone, b.cone) > 0.6 * max(a.cone.half_angle_rad, b.cone.half_angle_rad)
+    return _apart_rad(a.cone, b.cone) > _DISTINCT * max(a.cone.half_angle_rad, b.cone.half_angle_rad)
