@@ -30,7 +30,8 @@ from service.compute.pipeline import register_images
 from service.compute.poses.pose_files import read_camera_json, read_poses, read_spheres_json
 
 RESULTS = Path(__file__).parent / "results"
-FILES = (("scene01_1920_20", (16, 32, 64)), ("scene01_9504_12", (108,)))
+FILES = (("scene01_9504_12", (16, 32, 64, 108)), ("scene01_1920_20", (250, 1000)))
+SOLVE_FROM = "scene01_1920_20"
 SOLVED = (16, 32, 64, 108, 250, 500, 1000)
 POSE_NOISE_M = 2e-5  # of repeated poses, so that no two are equal
 
@@ -183,13 +184,22 @@ def main() -> None:
             (Path(folder), tuple(map(int, counts.split(","))))
             for folder, counts in (word.rsplit(":", 1) for word in options.files)
         ]
-    rows = [compare(folder, n, options.workers) for folder, counts in wanted for n in counts]
-    solved = [one(["solve", str(CACHE / FILES[0][0]), str(n), "1"]) for n in options.solved]
+    rows: list[dict[str, object]] = []
+    solved = [one(["solve", str(CACHE / SOLVE_FROM), str(n), "1"]) for n in options.solved]
+    for folder, counts in wanted:
+        for n in counts:
+            rows.append(compare(folder, n, options.workers))
+            write(rows, solved, options.out)  # after each, since they take long
+
+
+def write(rows: list[dict[str, object]], solved: list[dict[str, object]], out: Path) -> None:
+    """The results as JSON and Markdown."""
+    rows = sorted(rows, key=lambda row: (-int(str(row["width"])), int(str(row["images"]))))
     here = machine()
     name = f"register_scale-{datetime.now(UTC):%Y-%m-%d}"
-    options.out.mkdir(parents=True, exist_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
     document = {"machine": here, "files": rows, "solved": solved}
-    (options.out / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    (out / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     files = {
         "width": "{:d}", "images": "{:d}", "distinct": "{:d}", "workers": "{:d}", "decode_wall_s": "{:.1f}",
         "wall_s": "{:.1f}", "wall_ratio": "{:.2f}", "cpu_ratio": "{:.2f}", "solve_s": "{:.1f}",
@@ -218,7 +228,7 @@ identity sought in all images; memory of the process before and at its peak.
 
 {markdown(joint, solved)}
 """
-    (options.out / f"{name}.md").write_text(text, encoding="utf-8")
+    (out / f"{name}.md").write_text(text, encoding="utf-8")
     print(text)
 
 
