@@ -26,8 +26,12 @@ docs: $(READY)
 	$(BIN)/orthocapture protocol schema > docs/protocol.schema.json
 	$(BIN)/orthocapture protocol diagram protocols/exvivo_spine.yaml > docs/state_machine.md
 
+# Measurements that take long; each is a script of its own and writes to bench/results.
 bench: $(READY)
 	$(BIN)/python -m bench.demo_accuracy
+	$(BIN)/python -m bench.accuracy
+	$(BIN)/python -m bench.marker_speed
+	$(BIN)/python -m bench.register_scale
 
 # A new lock: needs uv (pip install uv).
 lock:
