@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
+from service.compute.marker_files import detect_file_by_masks, read_boxes
 from service.compute.markers.detectors import DETECTORS
 from service.compute.markers.paper_chain import detect_by_masks, find_boxes, fit_ellipse, sphere_mask
+from service.core.errors import DataError
 from tests.support.sphere_images import CONTROL_M, REGISTRATION_M, exact_outlines, render, scene
 
 EVERY = np.vstack([REGISTRATION_M, CONTROL_M])
@@ -53,3 +59,16 @@ def test_an_ellipse_is_fitted_to_a_mask_by_its_false_pixels() -> None:
 def test_where_nothing_differs_there_is_no_mask() -> None:
     grey = np.full((200, 300, 3), 120, dtype=np.uint8)
     assert sphere_mask(grey, (50.0, 50.0, 120.0, 120.0)) is None
+
+
+def test_boxes_in_a_file_are_of_one_image_each(tmp_path: Path) -> None:
+    made = scene(1, width=1200, seed=2)
+    image = render(made.camera, made.centres_camera(0, EVERY))
+    box = find_boxes(image)[0]
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    (tmp_path / "boxes.json").write_text(json.dumps({"a.png": [box]}))
+    boxes = read_boxes(tmp_path / "boxes.json", ["a.png", "b.png"])
+    assert len(detect_file_by_masks(tmp_path / "a.png", made.camera, boxes=boxes)) == 1
+    assert detect_file_by_masks(tmp_path / "a.png", made.camera, boxes={}) == ()
+    with pytest.raises(DataError, match=r"a\.png"):
+        read_boxes(tmp_path / "boxes.json", ["b.png"])

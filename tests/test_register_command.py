@@ -317,3 +317,15 @@ def test_wrong_usage_has_status_2(capture: Capture, tmp_path: Path, changes: dic
     result = register(capture, tmp_path / "result.json", **changes)
     assert result.exit_code == 2
     assert words in result.output
+
+
+def test_the_papers_detector_takes_the_boxes_of_another(capture: Capture, few: Path, tmp_path: Path) -> None:
+    boxes = tmp_path / "boxes.json"
+    boxes.write_text(json.dumps({"DSC00001.JPG": [[10, 10, 5, 20]]}))
+    result = register(capture, tmp_path / "out.json", images=few, detector="paper", boxes=boxes)
+    assert result.exit_code != 0
+    assert "no area" in result.output
+    boxes.write_text(json.dumps({"other.jpg": []}))
+    assert "other.jpg" in register(capture, tmp_path / "out.json", images=few, detector="paper", boxes=boxes).output
+    assert "paper" in register(capture, tmp_path / "out.json", images=few, boxes=boxes).output
+    assert "mauve" in register(capture, tmp_path / "out.json", images=few, sphere_colour="mauve").output
