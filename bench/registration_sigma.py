@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import datetime
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,8 @@ from service.compute.registration.solve import RegistrationResult, register
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from simulators.world import RADIUS_M, Scene
 
-RESULT = Path(__file__).parent / "results" / "registration_sigma.json"
+RESULTS = Path(__file__).parent / "results"
+SOURCES = ("true", "disturbed", "smooth", "robot")
 CENTRE_M = np.array([0.0, 0.0, 0.05])
 SFM_NOISE = (3e-5 / np.sqrt(3), np.radians(0.003) / np.sqrt(3))  # a coordinate: 0.03 mm and 0.003° in all
 ARM_NOISE = (4e-4, 4e-4)
@@ -48,6 +50,18 @@ def disturbed(poses: Array, noise: tuple[float, float], rng: np.random.Generator
     return out
 
 
+def disturbed_smoothly(poses: Array, noise: tuple[float, float], rng: np.random.Generator) -> Array:
+    """Poses (N, 4, 4) with errors that are linear in the camera's position, as a weak reconstruction bends."""
+    out = poses.copy()
+    place = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+    place /= np.sqrt(np.mean(np.sum(place**2, axis=1)))
+    bend, twist = rng.normal(size=(3, 3)) * noise[0], rng.normal(size=(3, 3)) * noise[1]
+    for T, x in zip(out, place, strict=True):
+        T[:3, :3] = Rotation.from_rotvec(twist @ x).as_matrix() @ T[:3, :3]
+        T[:3, 3] += bend @ x
+    return out
+
+
 # Rendered scenes
 
 
@@ -65,7 +79,7 @@ def outlines_of(capture: Capture, workers: int, cache: Path | None) -> list[tupl
 
 
 def rendered(capture: Capture, outlines: list[tuple[SphereOutline, ...]]) -> dict[str, dict[str, float]]:
-    """Registrations of a scene from true poses, from poses disturbed like those of SfM, from the robot's."""
+    """Registrations of a scene from true poses, from poses disturbed like those of SfM or bent, from the robot's."""
     rng = np.random.default_rng([capture.seed, 0x516])
     spheres, controls = capture.true_registration_m, capture.true_control_m
     centre = spheres.mean(axis=0)
@@ -73,6 +87,7 @@ def rendered(capture: Capture, outlines: list[tuple[SphereOutline, ...]]) -> dic
     sources: dict[str, tuple[Array, list[int]]] = {
         "true": (capture.T_world_camera, [0] * len(outlines)),
         "disturbed": (disturbed(capture.T_world_camera, SFM_NOISE, rng), [0] * len(outlines)),
+        "smooth": (disturbed_smoothly(capture.T_world_camera, SFM_NOISE, rng), [0] * len(outlines)),
         "robot": (capture.T_base_camera, capture.stations),
     }
     out: dict[str, dict[str, float]] = {}
@@ -227,38 +242,92 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--outlines", type=Path, help="folder that keeps detected outlines between runs")
-    parser.add_argument("--out", type=Path, default=RESULT)
+    parser.add_argument("--large", type=int, nargs="*", default=[1, 2, 3], metavar="SEED", help="4752 px wide")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat(), help="today")
     options = parser.parse_args()
     cases: list[dict[str, Any]] = []
-    for case in CASES:
+    for case in CASES if options.seeds else ():
         cases.append(monte_carlo(case, options.seeds))
         print(cases[-1], flush=True)
-    scenes: list[dict[str, Any]] = []
-    for seed in options.scenes:
-        capture = read_capture(seed, render_scene(seed, 1920, 20, cache=CACHE, workers=options.workers))
-        scenes.append({"scene": seed, **rendered(capture, outlines_of(capture, options.workers, options.outlines))})
-        print(scenes[-1], flush=True)
+    scenes: dict[str, list[dict[str, Any]]] = {}
+    captures = [(1920, 20, seed) for seed in options.scenes] + [(4752, 18, seed) for seed in options.large]
+    for width, views, seed in captures:
+        folder = render_scene(seed, width, views, cache=CACHE, workers=options.workers)
+        capture = read_capture(seed, folder)
+        row = rendered(capture, outlines_of(capture, options.workers, options.outlines))
+        scenes.setdefault(str(width), []).append({"scene": seed, **row})
+        print(width, seed, {source: round(row[source]["normalised"], 2) for source in SOURCES}, flush=True)
     record: dict[str, Any] = {
-        "commit": commit(), "machine": machine(), "drawn": cases, "rendered": scenes, "summary": summary(scenes),
+        "date": options.date, "commit": commit(), "machine": machine(), "drawn": cases, "rendered": scenes,
+        "summary": {width: summary(rows) for width, rows in scenes.items()},
     }  # fmt: skip
-    options.out.parent.mkdir(exist_ok=True)
-    options.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    print(json.dumps(record["summary"], indent=1))
+    options.results.mkdir(parents=True, exist_ok=True)
+    stem = options.results / f"registration_sigma-{options.date}"
+    stem.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    stem.with_suffix(".md").write_text(as_markdown(record), encoding="utf-8")
+    print(as_markdown(record))
 
 
 def summary(scenes: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     """Median and worst of the errors, and how they compare with their sigmas, for each source of poses."""
     out: dict[str, dict[str, float]] = {}
-    for source in ("true", "disturbed", "robot") if scenes else ():
+    for source in SOURCES if scenes else ():
         rows = [s[source] for s in scenes]
         n = np.array([r["normalised"] for r in rows])
         out[source] = {
             **{f"{k}_median": float(np.median([r[k] for r in rows])) for k in rows[0]},
             "true_error_mm_worst": max(r["true_error_mm"] for r in rows),
+            **(
+                {"error_chi2_mean": float(np.mean([r["error_chi2"] for r in rows]))}
+                if "error_chi2" in rows[0]
+                else {}
+            ),
             "within_3_sigma": float(np.mean(n < 3)),
-            "normalised_rms": float(np.sqrt(np.mean(n**2))),
+            "normalised_chi2": float(np.mean(n**2)),
         }
     return out
+
+
+def as_markdown(record: dict[str, Any]) -> str:
+    """The record as a person reads it."""
+    lines = [
+        f"# Stated sigmas of the registration, {record['date']}",
+        "",
+        f"Commit {record['commit']}. chi²: mean square of the true error at the spheres' centre over its stated "
+        "sigma (3D); of all six numbers in the metric of their covariance, a degree of freedom; of the residuals.",
+        "",
+        "## Drawn outlines, 18 images",
+        "",
+        "| errors drawn | seeds | true error, median (mm) | within 3 sigma | chi² | chi² of six | of residuals |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    lines += [
+        f"| {c['case']} | {c['seeds']} | {c['true_error_mm_median']:.4f} | {100 * c['within_3_sigma']:.1f} % | "
+        f"{c['normalised_rms'] ** 2:.2f} | {c['error_chi2']:.2f} | {c['residual_chi2']:.2f} |"
+        for c in record["drawn"]
+    ]
+    for width, rows in record["summary"].items():
+        lines += [
+            "",
+            f"## Rendered scenes, {width} px wide, {len(record['rendered'][width])} scenes",
+            "",
+            "True sphere centres. Robot: the cameras as refined in brackets; its sigma is that of poses as given.",
+            "",
+            "| poses | true error, median / worst (mm) | sigma (mm) | within 3 sigma | chi² | of six | of residuals "
+            "| control spheres, normalised |",
+            "|---|---:|---:|---:|---:|---:|---:|---:|",
+        ]
+        lines += [
+            f"| {source} | {row['true_error_mm_median']:.4f} / {row['true_error_mm_worst']:.4f}"
+            + (f" ({row['true_error_refined_mm_median']:.4f})" if source == "robot" else "")
+            + f" | {row['sigma_mm_median']:.4f} | {100 * row['within_3_sigma']:.0f} % | {row['normalised_chi2']:.2f}"
+            + " | "
+            + (f"{row['error_chi2_mean']:.2f}" if "error_chi2_mean" in row else "")
+            + f" | {row['residual_chi2_median']:.2f} | {row['control_normalised_median']:.2f} |"
+            for source, row in rows.items()
+        ]
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.registration.identity import Assignment
-from service.compute.registration.solve import CommonErrors, RegistrationResult, register
+from service.compute.registration.cost import skew
+from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.problem import CommonErrors
+from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse, transform
 from tests.support.sphere_images import RADIUS_M, REGISTRATION_M, Scene, exact_outlines, scene
+from tests.support.tracked_scene import tracked_scene
 
 NOTHING_COMMON = CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=1e-5)
 TARGET = np.array([0.02, -0.01, 0.05])
@@ -142,3 +145,38 @@ def test_a_turned_frame_changes_nothing() -> None:
     other = Scene(turned @ made.T_world_scan, turned @ made.T_world_camera, made.camera)
     a, b = (solved(m, 0, pose_sigma=(1e-9, 1e-9)) for m in (made, other))
     assert a.sigma_at_m(TARGET) == pytest.approx(b.sigma_at_m(TARGET), rel=0.05)
+
+
+def test_refined_cameras_are_placed_as_well_as_stated() -> None:
+    """The scan against the cameras with the errors of an arm taken off."""
+    made = scene(8, seed=4)
+    truth = inverse(made.T_world_scan) @ made.T_world_camera
+    squares: list[float] = []
+    for seed in range(12):
+        result = solved(made, seed, pose_sigma=(4e-4, 4e-4), sphere_sigma_m=2e-5)
+        moved = [apply(a @ inverse(b), TARGET) - TARGET
+                 for a, b in zip(result.T_scan_camera_refined, truth, strict=True)]  # fmt: skip
+        turned = result.T_world_scan[:3, :3] @ TARGET
+        J = np.hstack([np.eye(3), -skew(turned)])
+        C = J @ result.refined_covariance @ J.T
+        error = result.T_world_scan[:3, :3] @ np.mean(moved, axis=0)
+        squares.append(float(error @ np.linalg.solve(C, error)) / 3)
+        assert np.trace(C) < 0.2 * result.sigma_at_m(TARGET) ** 2
+        assert np.sum(list(result.refined_components().values()), axis=0) == pytest.approx(result.refined_covariance)
+    assert 0.4 < np.mean(squares) < 2.2
+
+
+@pytest.mark.parametrize("with_scale", [True, False])
+@pytest.mark.parametrize("seed", [1, 6, 8])
+def test_exact_outlines_and_poses_of_another_unit(seed: int, with_scale: bool) -> None:
+    """Residuals hundreds of times what the outlines state are the poses'; the scale may have to be found first."""
+    made = tracked_scene(seed)
+    found = identify(made.outlines, REGISTRATION_M, made.camera, made.poses, radius_m=RADIUS_M, metric=False)
+    assignments = [Assignment(a.markers, a.T_camera_scan, a.scale if with_scale else None) for a in found]
+    result = register(
+        made.outlines, assignments, made.poses, [0] * len(made.poses), REGISTRATION_M, RADIUS_M, made.camera,
+        estimate_scale=True,
+    )  # fmt: skip
+    assert result.scale == pytest.approx(made.scale, rel=1e-3)
+    assert result.pose_sigma[0] < 1e-3
+    assert not result.excluded

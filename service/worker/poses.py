@@ -80,6 +80,8 @@ def hybrid(context: JobContext) -> JobAnswer:
         float(arguments["radius_m"]),
         T_base_camera=robot_camera_poses(arguments, images),
         groups=[stations.index(image["station"]) for image in images],
+        # The camera is held: overlays and control spheres are read with the calibrated one, which must fit the poses.
+        sphere_covariance_m2=np.array(arguments["sphere_covariance_m2"]),
         names=names,
     )
     measures = {

@@ -102,11 +102,15 @@ def register(context: JobContext) -> JobAnswer:
         "scale": answer.scale,
         "rms_px": answer.rms_px,
         "T_world_station": {_station(images, groups, g): T.tolist() for g, T in answer.T_world_group.items()},
-        "T_scan_camera": {
-            name: T.tolist() for name, T in zip(names, answer.T_scan_camera, strict=True) if np.isfinite(T).all()
-        },
+        "T_scan_camera": _cameras(names, answer.T_scan_camera),
         "excluded": [f"{names[r.image]}, sphere {r.marker}: {r.reason}" for r in answer.excluded],
     }
+    if source == "robot":
+        # The outlines tell the error of an arm's single pose (some 0.3 mm) better than the arm does.
+        result["T_scan_camera_given"] = result["T_scan_camera"]
+        result["T_scan_camera"] = _cameras(names, answer.T_scan_camera_refined)
+        result["covariance_given"] = answer.covariance[:6, :6].tolist()
+        components = answer.refined_components()
     if source == "hybrid":
         # The spheres are in these poses already: only their adjustment knows how well the scan is placed.
         adjusted = context.input_json(arguments["model"])
@@ -116,7 +120,7 @@ def register(context: JobContext) -> JobAnswer:
         components = {"adjustment": np.array(adjusted["scan_covariance"])[:6, :6], "spheres": components["spheres"]}
     if arguments.get("intrinsics_covariance") is not None:
         uncertain = solve(intrinsics_covariance=np.array(arguments["intrinsics_covariance"]))
-        components["intrinsics"] = _added(answer, uncertain.registration)
+        components["intrinsics"] = _added(answer, uncertain.registration, refined=source == "robot")
     covariance = np.sum(list(components.values()), axis=0)
     result["covariance"] = covariance.tolist()
     result["components"] = {name: C.tolist() for name, C in components.items()}
@@ -130,17 +134,21 @@ def register(context: JobContext) -> JobAnswer:
         "excluded_outlines": float(len(answer.excluded)),
         "predicted_error_mm": 1e3 * predicted_m,
     }
-    result["leave_one_out"] = left_out = _leave_one_out(answer)
+    result["leave_one_out"] = left_out = _leave_one_out(answer, refined=source == "robot")
     if left_out is not None:
         measures["leave_one_out_mm"] = left_out["mean_radial_error_mm"]
     ref = context.keep_json({**result, **_residuals(answer, names)}, kind="registration", name=f"{source}.json")
     return JobAnswer(measures, (ref,), result)
 
 
-def _leave_one_out(answer: RegistrationResult) -> dict[str, Any] | None:
+def _cameras(names: Sequence[str], T_scan_camera: Array) -> dict[str, list[list[float]]]:
+    return {name: T.tolist() for name, T in zip(names, T_scan_camera, strict=True) if np.isfinite(T).all()}
+
+
+def _leave_one_out(answer: RegistrationResult, *, refined: bool) -> dict[str, Any] | None:
     """Every sphere as predicted by the others; None where a station sees too few to spare one."""
     try:
-        left_out = leave_one_out(answer)
+        left_out = leave_one_out(answer, refined=refined)
     except ComputeError:
         return None
     return {
@@ -150,10 +158,11 @@ def _leave_one_out(answer: RegistrationResult) -> dict[str, Any] | None:
     }
 
 
-def _added(exact: RegistrationResult, uncertain: RegistrationResult) -> Array:
+def _added(exact: RegistrationResult, uncertain: RegistrationResult, *, refined: bool) -> Array:
     """(6, 6) what uncertain intrinsics add to the covariance, the poses being held; never negative."""
-    unit = np.sqrt(np.diag(exact.covariance)[:6])  # metres and radians do not mix
-    more = (uncertain.covariance - exact.covariance)[:6, :6] / np.outer(unit, unit)
+    both = [r.refined_covariance if refined else r.covariance[:6, :6] for r in (exact, uncertain)]
+    unit = np.sqrt(np.diag(both[0]))  # metres and radians do not mix
+    more = (both[1] - both[0]) / np.outer(unit, unit)
     values, vectors = np.linalg.eigh((more + more.T) / 2)
     kept = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(unit, unit)
     return np.asarray(kept, dtype=np.float64)

@@ -17,6 +17,7 @@ _HOW = {
     "outlines": "covariances of the outlines from their edge points, scaled to the residuals",
     "common": "what every outline of the capture may have in common (edge bias)",
     "intrinsics": "covariance of the camera calibration, the poses held (those from the same images absorb part)",
+    "outlines and poses": "covariances of the outlines, scaled to the residuals, each camera pose refined by its own",
     "poses": "covariance of the camera poses, their scatter estimated from the spheres' residuals",
     "spheres": "covariances of the sphere centres in the scan",
     "adjustment": "covariance of the joint adjustment of tracks, robot poses and sphere outlines",

@@ -43,10 +43,10 @@ def expected_common_errors(radius_px: float) -> CommonErrors:
     """What the outlines of the detector have in common when their mean radius is `radius_px`.
 
     Light from one side makes the edge of the lit limb err otherwise than that of the dark one; the mean of such a
-    bias round the outline is growth, its difference between the sides light, and both are about as large. On ten rendered
-    scenes with 60 px radius the truth was: growth -0.020…-0.028 px, light 0.016 px rms a coordinate, shift 0.003 px
-    in x and 0.008 px in y rms. Three of them with 150 px radius: growth -0.004…-0.008 px, shift 0.006 px, light
-    0.030 px; there the detector averages along its profiles, and light goes neither with the pixel nor with the
+    bias round the outline is growth, its difference between the sides light, and both are about as large. On ten
+    rendered scenes with 60 px radius the truth was: growth -0.020…-0.028 px, light 0.016 px rms a coordinate, shift
+    0.003 px in x and 0.008 px in y rms. Three of them with 150 px radius: growth -0.004…-0.008 px, shift 0.006 px,
+    light 0.030 px; there the detector averages along its profiles, and light goes neither with the pixel nor with the
     sphere but as the square root of the radius between them. Other lights, colours and a renderer of another kind
     (bench/outlines.py) gave growth of -0.04 px and displacements of single images of 0.05 px rms, at most twice
     that: light is therefore taken above what the first renderer asks for.

@@ -84,6 +84,41 @@ class RegistrationResult:
         """Outlines left out, with the reason."""
         return tuple(r for r in self.residuals if r.excluded)
 
+    @property
+    def refined_covariance(self) -> Array:
+        """(6, 6) of the scan's place against `T_scan_camera_refined`, of all images with outlines on the average.
+
+        Of (d, w) of exp(w) R, t + d in world axes, R that of T_world_scan. Through the refined cameras the errors of
+        the poses matter as far as the outlines could not tell them; `covariance` is that through the poses as given.
+        """
+        return np.sum(list(self.refined_components().values()), axis=0)
+
+    def refined_components(self) -> dict[str, Array]:
+        """Parts of `refined_covariance`; noise of outlines and of poses, which cannot be parted any more, are one."""
+        s = self.solution
+        problem, gain = s.problem, s.pose_gain()
+        seen = np.unique(problem.image)
+        T_base_camera = s.state.cameras(problem, refined=True)
+        by_common, own = np.zeros((6, problem.size)), np.zeros((6, 6))
+        for i in seen:
+            k = int(problem.station[i])
+            base = s.state.bases[k]
+            # A point X of base axes moves by d + w x (X - t_base); the camera's error takes off d' + w' x (X - t_i).
+            by_pose = np.eye(6)
+            by_pose[:3, 3:] = -skew(base[:3, 3] - T_base_camera[i, :3, 3])
+            to_world = np.kron(np.eye(2), self.T_world_scan[:3, :3] @ base[:3, :3].T) / len(seen)
+            by_common[:, 6 * k : 6 * k + 6] += to_world
+            by_common -= to_world @ by_pose @ gain[i]
+            part = to_world @ by_pose
+            own += part @ s.marginal.Q[i] @ part.T
+        prior, inside = problem.prior(), slice(problem.sphere_column, problem.common_column)
+        through = by_common @ s.covariance
+        spheres = through[:, inside] @ prior[inside, inside] @ through[:, inside].T
+        common = through[:, problem.common_column :]
+        common = common @ prior[problem.common_column :, problem.common_column :] @ common.T
+        noise = through @ by_common.T + own - spheres - common
+        return {"outlines and poses": noise, "common": common, "spheres": spheres}
+
     def sigma_map_m(self, points_scan_m: Array) -> Array:
         """Predicted standard deviation (N,) in m, 3D, of points (N, 3) of the scan: target registration error."""
         return np.sqrt(_variance_m2(points_scan_m @ self.T_world_scan[:3, :3].T, self.covariance))
