@@ -183,9 +183,9 @@ def main() -> None:
         print(lines[-1], flush=True)
         if options.notes:
             print("\n".join(f"    {note}" for note in tally.notes), flush=True)
-    if options.write:
-        target = RESULTS / f"sphere_conditions-{datetime.datetime.now(datetime.UTC):%Y-%m-%d}.md"
-        target.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        if options.write:
+            target = RESULTS / f"sphere_conditions-{datetime.datetime.now(datetime.UTC):%Y-%m-%d}.md"
+            target.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
