@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import field_validator
 
@@ -24,6 +24,11 @@ class StructureFromMotion(Record):
     neighbours: int = 12  # pairs an image, chosen by the robot's poses
 
 
+# "robot" is what the paper compares with: the arm's poses as reported. "robot_corrected" takes off what the hand-eye
+# calibration found of the arm's errors, and what the spheres show of each pose's.
+Source = Literal["robot", "robot_corrected", "colmap", "glomap", "hybrid"]
+
+
 class Params(Record):
     """Which images, which scan, which camera poses."""
 
@@ -32,12 +37,10 @@ class Params(Record):
     calibration: str  # step with the intrinsics
     hand_eye: str  # step with T_flange_camera
     scan: str
-    poses: tuple[Literal["robot", "colmap", "glomap", "hybrid"], ...] = ("robot", "colmap", "glomap", "hybrid")
+    poses: tuple[Source, ...] = get_args(Source)
     structure_from_motion: StructureFromMotion = StructureFromMotion()
     detector: Literal["classical", "paper"] = "classical"  # "paper" searches every image whole, for comparison
-    reduced: tuple[
-        str, ...
-    ] = ()  # "1920x1080": resolutions at which structure from motion is compared, as in the paper
+    reduced: tuple[str, ...] = ()  # "1920x1080": lower resolutions, for the comparison that the paper makes
     reduced_poses: tuple[Literal["colmap", "glomap"], ...] = ("colmap",)
 
     @field_validator("reduced")
@@ -122,9 +125,10 @@ def _at_one_resolution(
         search["colour"] = context.protocol.spheres.colour
     (detected,) = run_jobs(JobRequest("detect_spheres", {**shared, **search}))
     markers = {**shared, "outlines": detected.artefacts[0].sha256}
-    by_poses: dict[str, JobResult] = {}
-    if "robot" in poses:
-        (by_poses["robot"],) = run_jobs(JobRequest("register", {**markers, "poses": "robot"}))
+    from_robot = {"robot": {**markers, "arm_correction": None}, "robot_corrected": markers}
+    asked = [source for source in from_robot if source in poses]
+    registered = run_jobs(*(JobRequest("register", {**from_robot[source], "poses": source}) for source in asked))
+    by_poses = dict(zip(asked, registered, strict=True))
     wanted = [_MAPPERS[p] for p in poses if p in _MAPPERS]
     if "hybrid" in poses and not wanted:
         wanted = ["incremental"]
@@ -132,7 +136,7 @@ def _at_one_resolution(
         return _Answers(detected, (), by_poses)
     if prior is None and by_poses:
         # Registered robot poses share one frame over both stations: they tell which images see the same thing.
-        prior = by_poses["robot"].result["T_scan_camera"]
+        prior = by_poses[asked[-1]].result["T_scan_camera"]
     effort = params.structure_from_motion.model_dump()
     request = JobRequest("structure_from_motion", {**shared, "mappers": wanted, "effort": effort, "prior": prior})
     reconstructed = run_jobs(request)

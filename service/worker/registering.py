@@ -86,7 +86,7 @@ def register(context: JobContext) -> JobAnswer:
         spheres,
         radius_m,
         groups=groups,
-        estimate_scale=source not in ("robot", "hybrid"),
+        estimate_scale=source not in ("robot", "robot_corrected", "hybrid"),
         names=names,
         sphere_covariance_m2=np.array(arguments["sphere_covariance_m2"]),
     )
@@ -105,7 +105,7 @@ def register(context: JobContext) -> JobAnswer:
         "T_scan_camera": _cameras(names, answer.T_scan_camera),
         "excluded": [f"{names[r.image]}, sphere {r.marker}: {r.reason}" for r in answer.excluded],
     }
-    if source == "robot":
+    if source == "robot_corrected":
         # The outlines tell the error of an arm's single pose (some 0.3 mm) better than the arm does.
         result["T_scan_camera_given"] = result["T_scan_camera"]
         result["T_scan_camera"] = _cameras(names, answer.T_scan_camera_refined)
@@ -120,7 +120,7 @@ def register(context: JobContext) -> JobAnswer:
         components = {"adjustment": np.array(adjusted["scan_covariance"])[:6, :6], "spheres": components["spheres"]}
     if arguments.get("intrinsics_covariance") is not None:
         uncertain = solve(intrinsics_covariance=np.array(arguments["intrinsics_covariance"]))
-        components["intrinsics"] = _added(answer, uncertain.registration, refined=source == "robot")
+        components["intrinsics"] = _added(answer, uncertain.registration, refined=source == "robot_corrected")
     covariance = np.sum(list(components.values()), axis=0)
     result["covariance"] = covariance.tolist()
     result["components"] = {name: C.tolist() for name, C in components.items()}
@@ -134,7 +134,7 @@ def register(context: JobContext) -> JobAnswer:
         "excluded_outlines": float(len(answer.excluded)),
         "predicted_error_mm": 1e3 * predicted_m,
     }
-    result["leave_one_out"] = left_out = _leave_one_out(answer, refined=source == "robot")
+    result["leave_one_out"] = left_out = _leave_one_out(answer, refined=source == "robot_corrected")
     if left_out is not None:
         measures["leave_one_out_mm"] = left_out["mean_radial_error_mm"]
     ref = context.keep_json({**result, **_residuals(answer, names)}, kind="registration", name=f"{source}.json")
@@ -172,7 +172,7 @@ def _poses(context: JobContext) -> tuple[Array, list[int], list[dict[str, Any]]]
     """(N, 4, 4) poses in the frame of each image's group, the groups, and the images that have a pose."""
     arguments = context.arguments
     images = arguments["images"]
-    if arguments["poses"] == "robot":
+    if arguments["poses"] in ("robot", "robot_corrected"):
         stations = sorted({image["station"] for image in images})
         return robot_camera_poses(arguments, images), [stations.index(image["station"]) for image in images], images
     model = context.input_json(arguments["model"])["T_world_camera"]
