@@ -64,7 +64,8 @@ def register_command(
     boxes: Annotated[
         Path | None,
         typer.Option(
-            "--boxes", help="For --detector paper: JSON {image: [[left, top, right, bottom], …]} of another detector."
+            "--boxes",
+            help="For --detector paper: JSON of another detector, boxes (left, top, right, bottom) by image.",
         ),
     ] = None,
     json: JsonOption = False,
