@@ -36,6 +36,8 @@ from service.core.geometry import Array, apply, inverse
 from service.core.model import ArtefactRef
 from service.worker.job import JobAnswer, JobContext
 
+_COMMON = ("common", "intrinsics")  # components that move all spheres alike
+
 
 @dataclass(frozen=True, slots=True)
 class _Measured:
@@ -233,7 +235,8 @@ def _budget(registered: _Registered, measured: _Measured, radius_m: float) -> Er
     )
     observations: list[Observation] = []
     if controls:
-        placed = Alignment(T_world_scan, np.array(record["covariance"])[:6, :6])
+        own = [c.covariance for name, c in components.items() if name not in _COMMON] or [np.zeros((6, 6))]
+        placed = Alignment(T_world_scan, np.sum(own, axis=0))
         observations.append(control_observation(placed, controls, measured.control))
     places = locate_in_images(
         registered.outlines,

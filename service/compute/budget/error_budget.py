@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,6 +44,7 @@ class Observation:
     normalised_chi2: float
     n: int
     how: str
+    hides_common: bool = False  # what all spheres have in common cancels in this comparison
 
     @property
     def verdict(self) -> str:
@@ -52,6 +53,8 @@ class Observation:
         if self.normalised_chi2 > high:
             factor = float(np.sqrt(self.normalised_chi2))
             return f"larger than predicted: the stated errors are {factor:.1f} times too small here"
+        if self.normalised_chi2 < low and self.hides_common:
+            return "smaller than predicted: errors common to all spheres do not show here"
         if self.normalised_chi2 < low:
             factor = float(1 / np.sqrt(max(self.normalised_chi2, 1e-12)))
             return f"smaller than predicted: the stated errors are {factor:.1f} times too large here"
@@ -128,8 +131,11 @@ def control_observation(
 ) -> Observation:
     """Control spheres where the images see them, against where scan and registration say they are.
 
+    Control and registration spheres are seen by the same camera: an error that moves all outlines alike moves both,
+    and does not show.
+
     Args:
-        registration: T_world_scan with its covariance.
+        registration: T_world_scan with its covariance, as far as it can be told apart from such errors.
         seen: located in the images through the registered cameras, by index into `control`; scan frame.
         control: measured by the scanner; scan frame.
     """
@@ -142,9 +148,8 @@ def control_observation(
         control.centres_m[index],
         uncertain + control.covariance_m2[index],
     )
-    return _observation(
-        CONTROL_SPHERES, closure, "spheres that took no part in the registration, located in the images alone"
-    )
+    how = "spheres that took no part in the registration, located in the images alone"
+    return replace(_observation(CONTROL_SPHERES, closure, how), hides_common=True)
 
 
 def loop_observations(
