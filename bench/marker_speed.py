@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from bench.machine import machine
-from bench.scenes import CACHE
+from bench.scenes import rendered
 from service.compute.images import read_image, read_reduced
 from service.compute.locating import ANCHOR_WIDTH_PX
 from service.compute.markers.detect import detect_spheres
@@ -121,12 +121,13 @@ def table(results: list[dict[str, object]]) -> str:
 def main() -> None:
     """Measure the folders and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folders", type=Path, nargs="*", default=[CACHE / name for name in SCENES])
+    parser.add_argument("folders", type=Path, nargs="*", help="rendered captures")
     parser.add_argument("--most", type=int, default=6, help="images of a folder")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    results = [measure(folder, options.most) for folder in options.folders]
+    folders = options.folders or [rendered(name) for name in SCENES]
+    results = [measure(folder, options.most) for folder in folders]
     name = f"marker_speed-{datetime.now(UTC):%Y-%m-%d}"
     options.out.mkdir(parents=True, exist_ok=True)
     here = machine()

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from bench.machine import machine
-from bench.scenes import CACHE
+from bench.scenes import rendered
 from service.compute.images import read_image
 from service.compute.locating import detect_all, locate_outlines
 from service.compute.pipeline import register_images
@@ -178,14 +178,15 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
-    wanted = [(CACHE / name, counts) for name, counts in FILES]
-    if options.files is not None:
+    if options.files is None:
+        wanted = [(rendered(name), counts) for name, counts in FILES]
+    else:
         wanted = [
             (Path(folder), tuple(map(int, counts.split(","))))
             for folder, counts in (word.rsplit(":", 1) for word in options.files)
         ]
     rows: list[dict[str, object]] = []
-    solved = [one(["solve", str(CACHE / SOLVE_FROM), str(n), "1"]) for n in options.solved]
+    solved = [one(["solve", str(rendered(SOLVE_FROM)), str(n), "1"]) for n in options.solved]
     for folder, counts in wanted:
         for n in counts:
             rows.append(compare(folder, n, options.workers))

@@ -110,6 +110,12 @@ def render_scene(seed: int, width: int, views: int, *, cache: Path = CACHE, work
     return folder
 
 
+def rendered(name: str, cache: Path = CACHE) -> Path:
+    """The folder of a name such as scene01_1920_20: seed, width, number of views; made when it is not there yet."""
+    seed, width, views = name.removeprefix("scene").split("_")
+    return render_scene(int(seed), int(width), int(views), cache=cache)
+
+
 def _render(task: tuple[int, int, Path, Shot, int]) -> None:
     seed, width, path, shot, number = task
     if path.is_file():
