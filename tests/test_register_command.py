@@ -282,12 +282,12 @@ def test_photographs_that_show_too_few_spheres(capture: Capture, few: Path, tmp_
     refused(register(capture, out, images=few), out, "too few spheres", "DSC00001.JPG", "what to do")
 
 
-def test_a_mesh_without_faces(capture: Capture, tmp_path: Path) -> None:
+def test_a_cloud_of_three_points(capture: Capture, tmp_path: Path) -> None:
     (_, data), *_ = encode("ply", "points.ply", np.eye(3) * 100, np.empty((0, 3), np.int64), None)
     (tmp_path / "points.ply").write_bytes(data)
     out = tmp_path / "result.json"
     result = register(capture, out, spheres=None, mesh=tmp_path / "points.ply", radius_mm=15, mesh_unit="mm")
-    refused(result, out, "faces", "points.ply")
+    refused(result, out, "found 0 spheres", "unit")
 
 
 def test_a_control_index_that_the_mesh_has_not(capture: Capture, tmp_path: Path) -> None:

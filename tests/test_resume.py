@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.support.rig import REPOSITORY, command, orthocapture, simulated_rig
+from tests.support.rig import REPOSITORY, command, orthocapture, simulated_rig, without_calibration_and_ct
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -26,6 +26,7 @@ def short_protocol(folder: Path) -> Path:
         {"tilt_deg": 25, "azimuth_from_deg": -40, "azimuth_to_deg": 40, "count": 6, "distance_m": 0.62}
     ]
     capture["gates"][0]["min"] = 6
+    without_calibration_and_ct(capture)
     protocol["steps"] = [capture]
     path = folder / "short.yaml"
     path.write_text(yaml.safe_dump(protocol))

@@ -23,7 +23,7 @@ from service.core.model import ViewpointCaptured
 from service.rig import load_rig
 from service.station import Station
 from service.store.store import Store
-from tests.support.rig import REPOSITORY, RIG_LOCK, orthocapture, simulated_rig
+from tests.support.rig import REPOSITORY, RIG_LOCK, orthocapture, simulated_rig, without_calibration_and_ct
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
 
@@ -222,6 +222,7 @@ def two_station_protocol(folder: Path) -> Path:
         ]
         next(gate for gate in step["gates"] if gate["measure"] == "viewpoints_captured")["min"] = 2
         step.pop("requires", None)
+        without_calibration_and_ct(step)
     protocol["steps"] = [captures[0], change, captures[1]]
     path = folder / "two_stations.yaml"
     path.write_text(yaml.safe_dump(protocol))

@@ -59,3 +59,10 @@ def simulated_rig(folder: Path, *options: str) -> Generator[dict[str, Any]]:
             process.wait(timeout=30)
             if process.stdout is not None:
                 process.stdout.close()
+
+
+def without_calibration_and_ct(capture_step: dict[str, Any]) -> None:
+    """A capture step of demo.yaml for a protocol that has no calibration and no CT before it."""
+    capture_step["params"].pop("live", None)
+    measured_from_them = ("optics_departures", "predicted_target_error_mm", "specimen_coverage")
+    capture_step["gates"] = [gate for gate in capture_step["gates"] if gate["measure"] not in measured_from_them]
