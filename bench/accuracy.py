@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import dataclasses
 import datetime
 import json
 import statistics
@@ -28,6 +29,7 @@ from service.compute.poses.pose_files import read_camera_json, read_poses_csv, r
 from service.compute.poses.sfm import Effort, Mapper, SfmModel, options_for, reconstruct
 from service.compute.registration.cost import residuals
 from service.compute.registration.evaluation import true_error_m
+from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.geometry import Array, Transform, align_points, apply, inverse
 
@@ -157,6 +159,8 @@ def _from_sfm(mapper: Mapper) -> Callable[[Capture, Outlines, Reconstructions], 
         index = [i for i, name in enumerate(capture.names) if name in model.T_world_camera]
         poses = np.array([model.T_world_camera[capture.names[i]] for i in index])
         solved = _registered(capture, [outlines[i] for i in index], poses, estimate_scale=True)
+        stated = with_joint_pose_covariance(solved.registration, model.joint_pose_covariance())
+        solved = dataclasses.replace(solved, registration=stated)
         rms_mm = _camera_rms_mm(poses, capture.T_world_camera[index])
         return {**_errors(capture, [outlines[i] for i in index], solved, index), "camera_rms_mm": rms_mm}
 

@@ -142,7 +142,11 @@ def _at_one_resolution(
     reconstructed = run_jobs(request)
     models = {ref.original_name.removesuffix(".json"): ref for ref in reconstructed[0].artefacts}
     sources = [p for p in poses if p in _MAPPERS]
-    requests = [JobRequest("register", {**markers, "poses": p, "model": models[_MAPPERS[p]].sha256}) for p in sources]
+    requests: list[JobRequest] = []
+    for source in sources:
+        mapper = _MAPPERS[source]
+        model = {"model": models[mapper].sha256, "tracks": models[f"{mapper}_tracks.npz"].sha256}
+        requests.append(JobRequest("register", {**markers, "poses": source, **model}))
     if "hybrid" in poses:
         # It starts from one reconstruction and adds the robot and the spheres.
         begun = {"model": models[wanted[0]].sha256, "tracks": models[f"{wanted[0]}_tracks.npz"].sha256}

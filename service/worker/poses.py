@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from service.compute.markers.archive import outline_from_record
 from service.compute.poses.hybrid import HybridPoses, hybrid_poses
+from service.compute.poses.pose_covariance import blocks
 from service.compute.poses.sfm import SfmModel, SfmOptions, reconstruct
 from service.compute.poses.tracks import Tracks
+from service.core.geometry import Array
 from service.worker.job import JobAnswer, JobContext
 from service.worker.photographs import photographs
 from service.worker.robot_poses import robot_camera_poses
@@ -39,11 +42,12 @@ def structure_from_motion(context: JobContext) -> JobAnswer:
         measures[f"{mapper}_images"] = float(model.n_registered)
         measures[f"{mapper}_missing"] = float(len(model.missing))
         measures[f"{mapper}_reprojection_px"] = model.mean_reprojection_error_px
+        joint = model.joint_pose_covariance()
         data = {
             "mapper": mapper,
             "T_world_camera": {name: T.tolist() for name, T in model.T_world_camera.items()},
             "pose_covariance": {
-                name: C.tolist() for name, C in zip(model.T_world_camera, model.pose_covariance(), strict=True)
+                name: C.tolist() for name, C in zip(model.T_world_camera, blocks(joint), strict=True)
             },
             "mean_reprojection_error_px": model.mean_reprojection_error_px,
             "mean_track_length": model.mean_track_length,
@@ -53,11 +57,10 @@ def structure_from_motion(context: JobContext) -> JobAnswer:
             "seconds": model.seconds,
         }
         artefacts.append(context.keep_json(data, kind="sfm_model", name=f"{mapper}.json"))
-        artefacts.append(
-            context.keep_bytes(
-                _packed(model), kind="sfm_tracks", media_type="application/octet-stream", name=f"{mapper}_tracks.npz"
-            )
-        )
+        packed = _packed(model, joint)
+        media_type = "application/octet-stream"
+        name = f"{mapper}_tracks.npz"
+        artefacts.append(context.keep_bytes(packed, kind="sfm_tracks", media_type=media_type, name=name))
     return JobAnswer(measures, tuple(artefacts))
 
 
@@ -110,8 +113,8 @@ def _record(answer: HybridPoses, names: list[str], stations: list[str]) -> dict[
     }
 
 
-def _packed(model: SfmModel) -> bytes:
-    """The tracks as a compressed NumPy archive, images by name."""
+def _packed(model: SfmModel, joint_pose_covariance: Array) -> bytes:
+    """The tracks and the joint covariance of the poses as a compressed NumPy archive, images by name."""
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
@@ -120,8 +123,17 @@ def _packed(model: SfmModel) -> bytes:
         point=model.tracks.point.astype(np.int32),
         pixels=model.tracks.pixels.astype(np.float32),
         points=model.tracks.points,
+        pose_covariance=joint_pose_covariance,
     )
     return buffer.getvalue()
+
+
+def joint_pose_covariance(data: bytes, names: Sequence[str]) -> Array:
+    """(6 N, 6 N) of a packed model, for the images named, in their order."""
+    with np.load(io.BytesIO(data)) as archive:
+        order = json.loads(str(archive["names"]))
+        rows = (6 * np.array([order.index(name) for name in names])[:, None] + np.arange(6)).ravel()
+        return np.asarray(archive["pose_covariance"][np.ix_(rows, rows)], dtype=np.float64)
 
 
 def _unpacked(data: bytes, names: list[str]) -> Tracks:

@@ -18,11 +18,13 @@ from service.compute.markers.detectors import options_for
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import register_images
 from service.compute.registration.evaluation import leave_one_out
+from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.registration.result import RegistrationResult
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse
 from service.worker.job import JobAnswer, JobContext
 from service.worker.photographs import photographs
+from service.worker.poses import joint_pose_covariance
 from service.worker.robot_poses import robot_camera_poses
 
 
@@ -92,7 +94,11 @@ def register(context: JobContext) -> JobAnswer:
     )
     solved = solve()
     answer = solved.registration
-    components = {name: np.asarray(C, dtype=np.float64)[:6, :6] for name, C in answer.components.items()}
+    stated = answer
+    if "tracks" in arguments:
+        joint = joint_pose_covariance(context.input(arguments["tracks"]).read_bytes(), names)
+        stated = with_joint_pose_covariance(answer, joint)
+    components = {name: np.asarray(C, dtype=np.float64)[:6, :6] for name, C in stated.components.items()}
     result: dict[str, Any] = {
         "poses": source,
         "camera": camera.record(),

@@ -135,12 +135,16 @@ class SfmModel:
         """(P, 3) triangulated points."""
         return self.tracks.points
 
-    def pose_covariance(self) -> Array:
-        """(N, 6, 6) of each pose after the positions were laid over the true ones by a similarity; the model's unit.
+    def joint_pose_covariance(self) -> Array:
+        """(6 N, 6 N) of the poses after the positions were laid over the true ones by a similarity; the model's unit.
 
         Increments (d, w) of exp(w) R, t + d in the model's axes. Takes a second or so.
         """
-        return blocks(similarity_covariance(np.array(list(self.T_world_camera.values())), self.tracks, self.camera))
+        return similarity_covariance(np.array(list(self.T_world_camera.values())), self.tracks, self.camera)
+
+    def pose_covariance(self) -> Array:
+        """(N, 6, 6) the same of each pose alone."""
+        return blocks(self.joint_pose_covariance())
 
 
 def reconstruct(
