@@ -22,7 +22,7 @@ from service.compute.markers.records import Evidence, SphereOutline, outline_fro
 from service.compute.pipeline import detect_all, register_images
 from service.compute.registration.evaluation import evaluate, leave_one_out, true_error_m
 from service.compute.registration.identity import Assignment
-from service.compute.registration.problem import CommonErrors, expected_common_errors
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from simulators.world import RADIUS_M, Scene
@@ -133,7 +133,7 @@ def rendered(capture: Capture, outlines: list[tuple[SphereOutline, ...]]) -> dic
 
 
 DISTANCE_M = 0.67
-EXPECTED = expected_common_errors(CAMERA.fx * RADIUS_M / DISTANCE_M)
+EXPECTED = EXPECTED_COMMON_ERRORS
 NOTHING_COMMON = CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=1e-5)
 
 

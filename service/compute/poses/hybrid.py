@@ -20,7 +20,7 @@ from service.compute.poses.adjustment import Solution, solve
 from service.compute.poses.bundle import Data, Sigmas, SphereSightings, State, whitening_of
 from service.compute.poses.tracks import Tracks
 from service.compute.registration.identity import identify
-from service.compute.registration.problem import CommonErrors, expected_common_errors
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, transform
@@ -33,7 +33,7 @@ class HybridOptions:
     Attributes:
         sphere_sigma_m: standard deviation of a sphere's position in the scan, for each coordinate, where no
             covariance of it is given.
-        common_errors: sizes of what all outlines have in common, solved for; None: as `expected_common_errors`.
+        common_errors: sizes of what all outlines have in common, solved for; None: `EXPECTED_COMMON_ERRORS`.
         most_observations: of tracks that take part; more gain next to nothing and cost time and memory.
         robot_sigma_m: of the robot's positions, to begin with; estimated from the data.
         robot_sigma_rad: of its orientations, likewise.
@@ -207,7 +207,7 @@ def hybrid_poses(
         camera=camera,
     )
     f = 0.5 * (camera.fx + camera.fy)
-    common = settings.common_errors or expected_common_errors(f * float(np.mean(sightings.half_angles)))
+    common = settings.common_errors or EXPECTED_COMMON_ERRORS
     spheres = sphere_covariance_m2
     if spheres is None:
         spheres = np.broadcast_to(settings.sphere_sigma_m**2 * np.eye(3), (len(centres_scan_m), 3, 3))

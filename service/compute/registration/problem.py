@@ -17,10 +17,6 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 _CHUNK = 500  # outlines whose points are expanded at a time
-_REFERENCE_RADIUS_PX = 60.0  # of the outlines that these were measured on
-_SHIFT_PX = 0.015
-_GROWTH_PX = 0.03
-_LIGHT_PX = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,19 +35,13 @@ class CommonErrors:
     light_px: float
 
 
-def expected_common_errors(radius_px: float) -> CommonErrors:
-    """What the outlines of the detector have in common when their mean radius is `radius_px`.
-
-    Light from one side makes the edge of the lit limb err otherwise than that of the dark one; the mean of such a
-    bias round the outline is growth, its difference between the sides light, and both are about as large. On ten
-    rendered scenes with 60 px radius the truth was: growth -0.020…-0.028 px, light 0.016 px rms a coordinate, shift
-    0.003 px in x and 0.008 px in y rms. Three of them with 150 px radius: growth -0.004…-0.008 px, shift 0.006 px,
-    light 0.030 px; there the detector averages along its profiles, and light goes neither with the pixel nor with the
-    sphere but as the square root of the radius between them. Other lights, colours and a renderer of another kind
-    (bench/outlines.py) gave growth of -0.04 px and displacements of single images of 0.05 px rms, at most twice
-    that: light is therefore taken above what the first renderer asks for.
-    """
-    return CommonErrors(_SHIFT_PX, _GROWTH_PX, _LIGHT_PX * float(np.sqrt(max(1.0, radius_px / _REFERENCE_RADIUS_PX))))
+# Light from one side makes the edge of the lit limb err otherwise than that of the dark one; the mean of such a bias
+# round the outline is growth, its difference between the sides light, and both are about as large. The truth on ten
+# rendered scenes with outlines of 60 px radius: growth -0.020…-0.031 px, light 0.016 px rms a coordinate, shift
+# 0.003 px in x and 0.008 px in y rms; on three with 150 px radius: growth -0.008 px, light 0.017 px (bench/accuracy.py,
+# bench/registration_sigma.py). Other lights, colours and a renderer of another kind (bench/outlines.py) gave growth of
+# -0.04 px and displacements of single images of 0.05 px rms: light is taken above what the first renderer asks for.
+EXPECTED_COMMON_ERRORS = CommonErrors(shift_px=0.015, growth_px=0.03, light_px=0.02)
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +185,7 @@ def assemble(
     order = sorted(set(used_groups), key=lambda g: (g != first, g))
     f = 0.5 * (camera.fx + camera.fy)
     half = [outlines[i][j].cone.half_angle_rad for i, j, _ in members]
-    e = common_errors or expected_common_errors(f * float(np.mean(half)))
+    e = common_errors or EXPECTED_COMMON_ERRORS
     sigma = np.maximum([e.light_px, e.light_px, e.light_px, e.shift_px, e.shift_px, e.growth_px], 1e-6)
     prior = np.diag(1 / sigma**2)
     n_intrinsics = 0

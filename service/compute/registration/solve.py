@@ -83,7 +83,7 @@ def register(
         sphere_covariance_m2: (M, 3, 3) of the centres; None takes them as exact.
         intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only where the errors
             of the poses do not depend on those of the intrinsics. None leaves them to the error budget.
-        common_errors: sizes of what all outlines of a capture have in common; None: as `expected_common_errors`.
+        common_errors: sizes of what all outlines of a capture have in common; None: `EXPECTED_COMMON_ERRORS`.
 
     Raises:
         ComputeError: too few outlines to determine the answer, or no convergence.
