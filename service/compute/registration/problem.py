@@ -35,12 +35,13 @@ class CommonErrors:
     light_px: float
 
 
-# Light from one side makes the edge of the lit limb err otherwise than that of the dark one; the mean of such a bias
-# round the outline is growth, its difference between the sides light, and both are about as large. The truth on ten
-# rendered scenes with outlines of 60 px radius: growth -0.020…-0.031 px, light 0.016 px rms a coordinate, shift
-# 0.003 px in x and 0.008 px in y rms; on three with 150 px radius: growth -0.008 px, light 0.017 px (bench/accuracy.py,
-# bench/registration_sigma.py). Other lights, colours and a renderer of another kind (bench/outlines.py) gave growth of
-# -0.04 px and displacements of single images of 0.05 px rms: light is taken above what the first renderer asks for.
+# Light from one side makes the edge of the lit limb err otherwise than that of the dark one; the mean of such a
+# bias round the outline is growth, its difference between the sides light, and both are about as large. The truth
+# on ten rendered scenes with outlines of 60 px radius: growth -0.020…-0.031 px, light 0.016 px rms a coordinate,
+# shift 0.003 px in x and 0.008 px in y rms; on three with 150 px radius: growth -0.008 px, light 0.017 px
+# (bench/accuracy.py, bench/registration_sigma.py). Other lights, colours and a renderer of another kind
+# (bench/outlines.py) gave growth of -0.04 px and displacements of single images of 0.05 px rms: light is taken
+# above what the first renderer asks for.
 EXPECTED_COMMON_ERRORS = CommonErrors(shift_px=0.015, growth_px=0.03, light_px=0.02)
 
 
