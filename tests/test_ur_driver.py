@@ -143,6 +143,7 @@ def test_linear_motion_runs_straight(robot: RobotArm) -> None:
     begin = time.monotonic()
     robot.move_linear(goal, speed_m_s=0.1, acceleration_m_s2=0.5)
     wait_for(lambda: not robot.is_moving())
+    wait_for(lambda: robot.settle(SettleCriteria()).settled)  # the last tenth of a millimetre is crept
     path = np.array([s.T_base_flange[:3, 3] for s in robot.samples(begin, time.monotonic())]) - start[:3, 3]
     direction = np.array([0.0, 2.0, 1.0]) / np.sqrt(5)
     assert np.max(np.linalg.norm(path - np.outer(path @ direction, direction), axis=1)) < 2e-4
