@@ -12,17 +12,22 @@ from service.core.gates import evaluate_gates
 from service.core.lifecycle import lifecycle
 from service.core.model import (
     ActionRefused,
+    ControlTaken,
     DeviceOpened,
     DeviceTrouble,
     Event,
+    EvidenceExported,
     FilesKept,
     GatesEvaluated,
+    ItemTicked,
     JobEnqueued,
     JobFailed,
     JobFinished,
     OperatorAction,
+    RecordCorrected,
     RunAborted,
     RunCompleted,
+    RunReleased,
     RunStarted,
     SessionStarted,
     StepFailed,
@@ -37,7 +42,9 @@ from service.core.model import (
 from service.core.moves import UNMEASURED, change, deviate, go, pass_on, supersede
 from service.core.operator_effects import apply_action
 from service.core.protocol import Protocol
+from service.core.release import refuse_release
 from service.core.run_state import (
+    Correction,
     Failure,
     JobState,
     Note,
@@ -76,7 +83,9 @@ def advance(protocol: Protocol, state: RunState, event: Event) -> RunState:
         raise _impossible(event, "a run begins with run_started, once")
     if state.started and event.run_id != state.run_id:
         raise _impossible(event, f"belongs to another run than {state.run_id}")
-    handler = _HANDLERS[type(event.payload)]
+    handler = _HANDLERS.get(type(event.payload))
+    if handler is None:
+        raise _impossible(event, "it belongs to the site, not to a run")
     return replace(handler(protocol, state, event, event.payload), seq=event.seq)
 
 
@@ -139,7 +148,12 @@ def _run_started(protocol: Protocol, state: RunState, event: Event, p: RunStarte
     if (p.protocol_id, p.protocol_version) != (protocol.id, protocol.version):
         raise _impossible(event, f"the run is of protocol {p.protocol_id} {p.protocol_version}, not of the given one")
     return replace(
-        state, run_id=event.run_id, operator=p.operator, simulated=p.simulated, auto_confirm=p.auto_confirm
+        state,
+        run_id=event.run_id,
+        operator=p.operator,
+        simulated=p.simulated,
+        auto_confirm=p.auto_confirm,
+        people=frozenset({p.operator}),
     )
 
 
@@ -166,7 +180,7 @@ def _run_completed(protocol: Protocol, state: RunState, event: Event, p: RunComp
         if state.status == "aborted" or redone_just_before:
             return _void(state, event)
         raise _impossible(event, f"the run is {state.status} at {state.current}, {state.phase}")
-    return _system(protocol, state, event, "advance")
+    return replace(_system(protocol, state, event, "advance"), completed_sha256=event.sha256)
 
 
 def _run_aborted(protocol: Protocol, state: RunState, event: Event, p: RunAborted) -> RunState:
@@ -309,6 +323,36 @@ def _action_refused(protocol: Protocol, state: RunState, event: Event, p: Action
     return deviate(state, event, "refused", p.step, f"{p.action} refused: {p.why}")
 
 
+def _item_ticked(protocol: Protocol, state: RunState, event: Event, p: ItemTicked) -> RunState:
+    """A mark that comes too late, or for an item that the protocol does not have, has no effect."""
+    if state.terminal or (p.step, p.attempt, "ready") != (state.current, state.step.attempt, state.phase):
+        return _void(state, event)
+    items = [item for item in protocol.step(p.step).checklist if item in state.step.ticked and item != p.item]
+    if p.ticked and p.item in protocol.step(p.step).checklist:
+        items.append(p.item)
+    return change(state, p.step, ticked=tuple(items))
+
+
+def _control_taken(protocol: Protocol, state: RunState, event: Event, p: ControlTaken) -> RunState:
+    return replace(state, controller=event.actor, people=state.people | {event.actor})
+
+
+def _record_corrected(protocol: Protocol, state: RunState, event: Event, p: RecordCorrected) -> RunState:
+    correction = Correction(event.seq, p.of_seq, p.field, p.old, p.new, p.reason, event.actor)
+    return replace(state, corrections=(*state.corrections, correction))
+
+
+def _run_released(protocol: Protocol, state: RunState, event: Event, p: RunReleased) -> RunState:
+    refusal = refuse_release(state, event.actor, p.signed_sha256)
+    if refusal is not None:
+        return deviate(state, event, "refused", None, f"release had no effect: {refusal}")
+    return replace(state, released_by=event.actor)
+
+
+def _evidence_exported(protocol: Protocol, state: RunState, event: Event, p: EvidenceExported) -> RunState:
+    return state
+
+
 _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunState]] = {
     RunStarted: _run_started,
     SessionStarted: _session_started,
@@ -330,5 +374,10 @@ _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunStat
     RunCompleted: _run_completed,
     RunAborted: _run_aborted,
     ActionRefused: _action_refused,
+    ItemTicked: _item_ticked,
+    ControlTaken: _control_taken,
+    RecordCorrected: _record_corrected,
+    RunReleased: _run_released,
+    EvidenceExported: _evidence_exported,
     OperatorAction: apply_action,
 }

@@ -273,6 +273,115 @@ class JobFailed(Record):
     message: str
 
 
+# --- people --------------------------------------------------------------------------------------------------
+
+
+class ItemTicked(Record):
+    """A checklist item marked done, or not done after all, on the screen; every screen shows the same."""
+
+    kind: Literal["item_ticked"] = "item_ticked"
+    step: str
+    attempt: int
+    item: str
+    ticked: bool
+
+
+class ControlTaken(Record):
+    """From here on one screen alone may act on the run; the others look on."""
+
+    kind: Literal["control_taken"] = "control_taken"
+    screen: str  # name of the sign-in whose screen it is
+    previous: str  # person who had control before; "" for nobody
+    how: Literal["free", "handed_over", "taken_over"]
+    reason: str = ""
+
+
+class RecordCorrected(Record):
+    """A value of an earlier event was wrong. The original stays; readers see both."""
+
+    kind: Literal["record_corrected"] = "record_corrected"
+    of_seq: int
+    field: str  # path in the payload: environment.light_lux
+    old: Any
+    new: Any
+    reason: str
+
+
+class RunReleased(Record):
+    """A second person's signature that allows the export of a completed run."""
+
+    kind: Literal["run_released"] = "run_released"
+    meaning: str
+    signed_sha256: str  # of the run_completed event
+
+
+class EvidenceExported(Record):
+    """A bundle, a data set or a report left the system."""
+
+    kind: Literal["evidence_exported"] = "evidence_exported"
+    what: Literal["bundle", "dataset", "report"]
+    file_name: str
+    sha256: str
+    size_bytes: int
+    head_sha256: str  # of the chain when it was made
+
+
+# --- the site: what happens outside of runs, in a chain of its own -----------------------------------------------
+
+
+class SiteOpened(Record):
+    """Root of the site's chain."""
+
+    kind: Literal["site_opened"] = "site_opened"
+    software: dict[str, str]
+
+
+class ServiceStarted(Record):
+    """A web process came up: what changed since the last time, and what is open."""
+
+    kind: Literal["service_started"] = "service_started"
+    host: str
+    pid: int
+    address: str
+    software: dict[str, str]
+    changed: dict[str, tuple[str, str]]  # distribution or file → before, now ("" for none)
+    configuration: dict[str, str]  # rig and protocol files → SHA-256
+    clock_jump_s: float | None  # UTC against monotonic since the last start of this boot; None: cannot be told
+    unsigned_runs: tuple[str, ...]  # with events after their last checkpoint
+    open_runs: tuple[str, ...]
+
+
+class AccountChanged(Record):
+    """An account was made or changed; secrets are never in it."""
+
+    kind: Literal["account_changed"] = "account_changed"
+    account: str
+    field: str  # created, role, state, password, pin, lock_out
+    old: str
+    new: str
+    reason: str = ""
+
+
+class SignInRecorded(Record):
+    """Somebody signed in or out, or failed to."""
+
+    kind: Literal["sign_in_recorded"] = "sign_in_recorded"
+    account: str
+    outcome: Literal["signed_in", "refused", "locked_out", "signed_out", "screen_locked", "screen_unlocked", "ended"]
+    screen: str = ""
+    address: str = ""
+
+
+class KeyChanged(Record):
+    """The key that signs checkpoints was made, or replaced by another."""
+
+    kind: Literal["key_changed"] = "key_changed"
+    key_id: str  # SHA-256 of the raw public key
+    public_key: str  # base64 of the 32 raw bytes (RFC 8032)
+    previous_key_id: str  # "" for the first
+    reason: str
+
+
 # --- end -----------------------------------------------------------------------------------------------------
 
 
@@ -311,7 +420,17 @@ Payload = Annotated[
     | JobFinished
     | JobFailed
     | RunCompleted
-    | RunAborted,
+    | RunAborted
+    | ItemTicked
+    | ControlTaken
+    | RecordCorrected
+    | RunReleased
+    | EvidenceExported
+    | SiteOpened
+    | ServiceStarted
+    | AccountChanged
+    | SignInRecorded
+    | KeyChanged,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)

@@ -18,6 +18,7 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
     refusal = refuse(protocol, state, p, event.actor)
     if refusal is not None:
         return deviate(state, event, "refused", p.step, f"{p.action} had no effect: {refusal}")
+    state = replace(state, people=state.people | {event.actor})
     if p.automatic:
         state = deviate(
             state, event, "automatic", state.current, f"{p.action} given automatically on a simulated rig"

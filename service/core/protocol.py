@@ -184,6 +184,8 @@ class ProtocolFields(Record):
     camera: CameraSection
     motion: Motion = Motion()
     settle: Settle = Settle()
+    # Whether a person who took no part in the run must release it before anything of it is exported.
+    release: Literal["none", "second_person"] = "none"
 
 
 class Protocol(ProtocolFields):

@@ -132,6 +132,19 @@ class Trouble:
 
 
 @dataclass(frozen=True, slots=True)
+class Correction:
+    """A RecordCorrected with who and when."""
+
+    seq: int
+    of_seq: int
+    field: str
+    old: Any
+    new: Any
+    reason: str
+    actor: str
+
+
+@dataclass(frozen=True, slots=True)
 class RunState:
     """The fold of a run's events."""
 
@@ -151,6 +164,11 @@ class RunState:
     overtaken: tuple[int, ...] = ()  # seq of events that arrived after an operator's action had made them void
     troubles: tuple[Trouble, ...] = ()
     last_redo_seq: int = 0
+    people: frozenset[str] = frozenset()  # who took part: started it, controlled it, acted on it
+    controller: str = ""  # who has control of it on a screen
+    corrections: tuple[Correction, ...] = ()
+    completed_sha256: str = ""  # of the run_completed event: what a release binds
+    released_by: str = ""
 
     @property
     def step(self) -> StepState:

@@ -12,6 +12,7 @@ from service.core.errors import StoreError
 from service.core.model import PAYLOAD, ArtefactRef
 from service.store.artefacts import record_sha256
 from service.store.events import ROOT, canonical, event_sha256, parse_canonical, references
+from service.store.records import SITE
 
 Rows = Sequence[Mapping[str, Any]]
 _REF_COLUMNS = tuple(ArtefactRef.model_fields)
@@ -158,9 +159,10 @@ def _end_faults(run_id: str, run_rows: Rows, head_rows: Rows, event_rows: Rows) 
     if not run_rows:
         yield Fault(run_id, None, "", "the run's own row is missing")
     for row in run_rows:
-        if first is None or first["sha256"] != row["root_sha256"] or first["kind"] != "run_started":
-            yield Fault(run_id, 1, "", "the chain does not begin with the run_started that the run's row names")
-        elif _payload_of(first)[0] is not None and parse_canonical(first["payload"])["simulated"] != bool(
+        kind = "site_opened" if run_id == SITE else "run_started"
+        if first is None or first["sha256"] != row["root_sha256"] or first["kind"] != kind:
+            yield Fault(run_id, 1, "", f"the chain does not begin with the {kind} that the run's row names")
+        elif _payload_of(first)[0] is not None and parse_canonical(first["payload"]).get("simulated", False) != bool(
             row["simulated"]
         ):
             yield Fault(run_id, 1, "", "the run's row and its first event disagree on whether it was simulated")

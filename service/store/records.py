@@ -8,6 +8,8 @@ from typing import Any
 
 from service.core.model import ArtefactRef
 
+SITE = "site"  # name of the chain that holds what happens outside of runs: sign-ins, accounts, keys, starts
+
 
 @dataclass(frozen=True, slots=True)
 class NewArtefact:

@@ -10,18 +10,18 @@ from typing import Any, Self
 from sqlalchemy import Connection, insert, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
-from service.core.model import ArtefactRef, Event, JobFinished, Payload, RunStarted
+from service.core.model import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
 from service.store import jobs as queue
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, read_artefacts
 from service.store.database import Database, database_path, open_database
 from service.store.errors import UnknownRunError
 from service.store.events import ROOT, append, read_events
 from service.store.leases import RunLease, acquire, check_lease
-from service.store.records import Artefact, Job, NewArtefact, NewJob, RunRow
+from service.store.records import SITE, Artefact, Job, NewArtefact, NewJob, RunRow
 from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock, utc_text
 from service.store.tables import heads, runs
 
-_OWN_KINDS = frozenset({"run_started", "job_enqueued", "job_finished", "job_failed"})
+_OWN_KINDS = frozenset({"run_started", "site_opened", "job_enqueued", "job_finished", "job_failed"})
 
 
 class Store:
@@ -71,6 +71,16 @@ class Store:
             ) from error
         return cls(open_database(data_dir, files), folder, clock or SystemClock(), ids, database_path(data_dir))
 
+    @property
+    def database(self) -> Database:
+        """For what has tables of its own beside the evidence: people, screens."""
+        return self._database
+
+    @property
+    def clock(self) -> Clock:
+        """Where its times come from."""
+        return self._clock
+
     def close(self) -> None:
         """Close the database."""
         self._database.close()
@@ -116,23 +126,53 @@ class Store:
 
     def create_run(self, payload: RunStarted, actor: str, artefacts: Sequence[NewArtefact]) -> str:
         """Begin a run: its first event, with protocol and rig among the artefacts. Returns the run's name."""
-        now = self._clock.utc_now()
-        run_id = self._ids.new_run(now)
+        run_id = self._ids.new_run(self._clock.utc_now())
         with self._database.writing() as connection:
-            # The run's row holds the hash of the root event, which refers to the row: keys are checked at commit.
-            connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
-            connection.execute(insert(heads).values(run_id=run_id, seq=0, sha256=ROOT))
-            (root,) = append(connection, self._clock, run_id, [payload], actor)
-            connection.execute(
-                insert(runs).values(
-                    run_id=run_id,
-                    created_utc=utc_text(now),
-                    simulated=int(payload.simulated),
-                    root_sha256=root.sha256,
-                )
-            )
-            insert_artefacts(connection, self._folder, [root], artefacts)
+            self._begin_chain(connection, run_id, payload, actor, artefacts)
         return run_id
+
+    def record_site(
+        self, payloads: Sequence[Payload], *, actor: str, software: Mapping[str, str] | None = None
+    ) -> list[Event]:
+        """Append events to the site's chain, which the first of them begins. `software`: for its root."""
+        with self._database.writing() as connection:
+            return self.append_site(connection, payloads, actor=actor, software=software)
+
+    def append_site(
+        self,
+        connection: Connection,
+        payloads: Sequence[Payload],
+        *,
+        actor: str,
+        software: Mapping[str, str] | None = None,
+    ) -> list[Event]:
+        """The same within a transaction of `database.writing()`: what is recorded and what is done are one."""
+        if connection.execute(select(runs.c.run_id).where(runs.c.run_id == SITE)).first() is None:
+            self._begin_chain(connection, SITE, SiteOpened(software=dict(software or {})), actor, ())
+        return append(connection, self._clock, SITE, payloads, actor)
+
+    def _begin_chain(
+        self,
+        connection: Connection,
+        run_id: str,
+        payload: RunStarted | SiteOpened,
+        actor: str,
+        artefacts: Sequence[NewArtefact],
+    ) -> None:
+        # The run's row holds the hash of the root event, which refers to the row: keys are checked at commit.
+        connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
+        connection.execute(insert(heads).values(run_id=run_id, seq=0, sha256=ROOT))
+        (root,) = append(connection, self._clock, run_id, [payload], actor)
+        simulated = isinstance(payload, RunStarted) and payload.simulated
+        connection.execute(
+            insert(runs).values(
+                run_id=run_id,
+                created_utc=utc_text(self._clock.utc_now()),
+                simulated=int(simulated),
+                root_sha256=root.sha256,
+            )
+        )
+        insert_artefacts(connection, self._folder, [root], artefacts)
 
     def runs(self) -> list[RunRow]:
         """All runs, oldest first."""
@@ -259,10 +299,11 @@ class Store:
 
 
 def read_runs(connection: Connection) -> list[RunRow]:
-    """All runs, oldest first."""
+    """All runs, oldest first; the site's chain is not among them."""
     statement = (
         select(runs, heads.c.seq, heads.c.sha256)
         .outerjoin(heads, heads.c.run_id == runs.c.run_id)
+        .where(runs.c.run_id != SITE)
         .order_by(runs.c.created_utc, runs.c.run_id)
     )
     return [

@@ -17,7 +17,7 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 
-APPEND_ONLY = ("runs", "events", "artefacts")
+APPEND_ONLY = ("runs", "events", "artefacts", "checkpoints", "timestamps")
 TRIGGERS = tuple(f"{table}_no_{verb}" for table in APPEND_ONLY for verb in ("update", "delete", "replace"))
 
 metadata = MetaData()
@@ -134,5 +134,90 @@ leases = Table(
     Column("boot", Text, nullable=False),
     Column("pid", Integer, nullable=False),
     Column("process_started_s", REAL, nullable=False),
+    sqlite_strict=True,
+)
+
+# Signatures over the chain: each covers every event up to its own.
+checkpoints = Table(
+    "checkpoints",
+    metadata,
+    Column("run_id", Text, nullable=False),
+    Column("seq", Integer, nullable=False),  # of the last event that it covers
+    Column("sha256", Text, nullable=False),  # of that event
+    Column("at_utc", Text, nullable=False),
+    Column("key_id", Text, nullable=False),  # SHA-256 of the raw public key
+    Column("signature", Text, nullable=False),  # base64, Ed25519 over service.store.signing.statement
+    PrimaryKeyConstraint("run_id", "seq"),
+    ForeignKeyConstraint(["run_id", "seq"], ["events.run_id", "events.seq"]),
+    sqlite_strict=True,
+)
+
+# RFC 3161: what a time-stamp authority says of a checkpoint.
+timestamps = Table(
+    "timestamps",
+    metadata,
+    Column("run_id", Text, nullable=False),
+    Column("seq", Integer, nullable=False),  # of the checkpoint
+    Column("authority", Text, nullable=False),
+    Column("at_utc", Text, nullable=False),
+    Column("token", Text, nullable=False),  # base64 of the DER TimeStampResp
+    PrimaryKeyConstraint("run_id", "seq", "authority"),
+    ForeignKeyConstraint(["run_id", "seq"], ["checkpoints.run_id", "checkpoints.seq"]),
+    sqlite_strict=True,
+)
+
+# People. What changes here is recorded in the site's chain; the rows are the present state.
+accounts = Table(
+    "accounts",
+    metadata,
+    Column("account", Text, primary_key=True),  # the name to sign in with
+    Column("full_name", Text, nullable=False),
+    Column("role", Text, nullable=False),
+    Column("state", Text, nullable=False),
+    Column("password_hash", Text, nullable=False),  # argon2id; "" while invited
+    Column("pin_hash", Text, nullable=False),  # argon2id; "" for none
+    Column("failures", Integer, nullable=False),  # in a row
+    Column("locked_until_utc_s", REAL, nullable=False),
+    Column("created_utc", Text, nullable=False),
+    CheckConstraint("role IN ('technician', 'supervisor', 'auditor', 'administrator')", name="accounts_role"),
+    CheckConstraint("state IN ('invited', 'active', 'disabled')", name="accounts_state"),
+    sqlite_strict=True,
+)
+
+# One-time links: for the first administrator, and for everyone whom an administrator invites.
+invitations = Table(
+    "invitations",
+    metadata,
+    Column("token_sha256", Text, primary_key=True),
+    Column("account", Text, nullable=False),  # "" for the first administrator, who chooses one
+    Column("expires_utc_s", REAL, nullable=False),
+    Column("used", Integer, nullable=False),
+    sqlite_strict=True,
+)
+
+sessions = Table(
+    "sessions",
+    metadata,
+    Column("token_sha256", Text, primary_key=True),
+    Column("account", Text, ForeignKey("accounts.account"), nullable=False),
+    Column("screen", Text, nullable=False, unique=True),  # a short name for people and for the record
+    Column("csrf", Text, nullable=False),
+    Column("created_utc_s", REAL, nullable=False),
+    Column("seen_utc_s", REAL, nullable=False),  # last deliberate act, not the page's own requests
+    Column("locked", Integer, nullable=False),
+    Column("pin_failures", Integer, nullable=False),
+    sqlite_strict=True,
+)
+
+# Which screen may act on a run, and who asks for it.
+control = Table(
+    "control",
+    metadata,
+    Column("run_id", Text, ForeignKey("runs.run_id"), primary_key=True),
+    Column("screen", Text, nullable=False),  # "" for nobody
+    Column("account", Text, nullable=False),
+    Column("asked_by_screen", Text, nullable=False),
+    Column("asked_by_account", Text, nullable=False),
+    Column("asked_utc_s", REAL, nullable=False),
     sqlite_strict=True,
 )

@@ -1,0 +1,1 @@
+"""What a runner tells the screens while it works; never evidence."""

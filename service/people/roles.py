@@ -1,0 +1,28 @@
+"""Who may do what: one table of roles and permissions for every route."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+Role = Literal["technician", "supervisor", "auditor", "administrator"]
+Permission = Literal[
+    "read",  # every page of every run, the audit's included
+    "operate",  # start and drive a run: tick, confirm, redo, skip, pause, resume, abort; take control
+    "sign",  # sign a step
+    "correct",  # correct a recorded value, with reason
+    "release",  # release a completed run as second person
+    "export",  # make a bundle, a report or a data set
+    "administer",  # accounts, invitations, signing key
+]
+ROLES: tuple[Role, ...] = ("technician", "supervisor", "auditor", "administrator")
+_GRANTED: dict[Role, frozenset[Permission]] = {
+    "technician": frozenset({"read", "operate", "sign"}),
+    "supervisor": frozenset({"read", "operate", "sign", "correct", "release", "export"}),
+    "auditor": frozenset({"read"}),
+    "administrator": frozenset({"read", "administer"}),
+}
+
+
+def may(role: Role, permission: Permission) -> bool:
+    """Whether a role has a permission."""
+    return permission in _GRANTED[role]

@@ -1,0 +1,1 @@
+"""The pages: guided screen for technicians, read-only view for auditors."""

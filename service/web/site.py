@@ -1,0 +1,50 @@
+"""What every page works on: the data folder, the rig, the people, and the runners started from here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import Annotated, cast
+
+from fastapi import Depends, Request
+
+from service.evidence import RunLog
+from service.people.people import People
+from service.rig import Rig
+from service.runs import recorded_run
+from service.store.store import Store
+from service.web.launch import Launcher
+
+
+@dataclass
+class Site:
+    """One data folder behind one web process."""
+
+    data: Path
+    rig: Rig
+    protocols: Path  # folder of protocol files that can be started
+    store: Store
+    people: People
+    launcher: Launcher
+    secure: bool = True  # cookies are sent over TLS, or to this machine, only
+    idle_lock_s: float = 600.0
+    _logs: dict[str, RunLog] = field(default_factory=dict[str, RunLog])
+    _lock: Lock = field(default_factory=Lock)
+
+    def run(self, run_id: str) -> RunLog:
+        """Protocol, events and state of a run, as recorded up to now. Raises UnknownRunError, IntegrityError."""
+        with self._lock:
+            if run_id not in self._logs:
+                protocol, _ = recorded_run(self.store, run_id)
+                self._logs[run_id] = RunLog(self.store, run_id, protocol)
+            log = self._logs[run_id]
+            log.refresh()
+            return log
+
+
+def _site(request: Request) -> Site:
+    return cast(Site, request.app.state.site)
+
+
+Here = Annotated[Site, Depends(_site)]
