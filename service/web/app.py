@@ -1,0 +1,49 @@
+"""The web application: its routers, its safety headers, and errors that say what happened and nothing of the inside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fastapi import FastAPI
+from fastapi.staticfiles import StaticFiles
+
+from service.web import (
+    account_pages,
+    acting,
+    audit_pages,
+    calibration_pages,
+    capture_pages,
+    export_pages,
+    home_pages,
+    media,
+    run_pages,
+    scene_pages,
+    stream,
+)
+from service.web.security import install_security
+from service.web.site import Site
+
+_PAGES = (
+    account_pages,
+    home_pages,
+    run_pages,
+    acting,
+    stream,
+    capture_pages,
+    media,
+    scene_pages,
+    calibration_pages,
+    audit_pages,
+    export_pages,
+)
+
+
+def create_app(site: Site) -> FastAPI:
+    """The application over one data folder."""
+    app = FastAPI(title="orthocapture", docs_url=None, redoc_url=None, openapi_url="/openapi.json")
+    app.state.site = site
+    install_security(app)
+    for page in _PAGES:
+        app.include_router(page.router)
+    app.mount("/static", StaticFiles(directory=Path(__file__).with_name("static")), name="static")
+    return app

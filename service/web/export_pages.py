@@ -1,0 +1,7 @@
+"""What leaves the system: release by a second person, bundle, report, data set."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+router = APIRouter()
