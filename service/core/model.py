@@ -346,7 +346,9 @@ class ServiceStarted(Record):
     software: dict[str, str]
     changed: dict[str, tuple[str, str]]  # distribution or file → before, now ("" for none)
     configuration: dict[str, str]  # rig and protocol files → SHA-256
+    boot: str  # boot id, "" where the system has none
     clock_jump_s: float | None  # UTC against monotonic since the last start of this boot; None: cannot be told
+    heads: dict[str, tuple[int, str]]  # run → last event's number and hash, of the runs that grew since the last start
     unsigned_runs: tuple[str, ...]  # with events after their last checkpoint
     open_runs: tuple[str, ...]
 

@@ -144,9 +144,12 @@ checkpoints = Table(
     Column("run_id", Text, nullable=False),
     Column("seq", Integer, nullable=False),  # of the last event that it covers
     Column("sha256", Text, nullable=False),  # of that event
+    Column("artefacts_sha256", Text, nullable=False),  # over record_sha256 of the artefact rows up to it
+    Column("site_seq", Integer, nullable=False),  # where the site's chain was: it says which key was valid
+    Column("site_sha256", Text, nullable=False),
     Column("at_utc", Text, nullable=False),
     Column("key_id", Text, nullable=False),  # SHA-256 of the raw public key
-    Column("signature", Text, nullable=False),  # base64, Ed25519 over service.store.signing.statement
+    Column("signature", Text, nullable=False),  # base64, Ed25519 over service.store.checkpoints.statement
     PrimaryKeyConstraint("run_id", "seq"),
     ForeignKeyConstraint(["run_id", "seq"], ["events.run_id", "events.seq"]),
     sqlite_strict=True,
