@@ -48,6 +48,7 @@ from service.core.protocol import Protocol
 from service.core.recovery import recovery_policy
 from service.core.run_state import RunState
 from service.evidence import RunLog, StepEvidence
+from service.monitor.snapshot import Doing
 from service.steps import step_kinds
 from service.steps.context import Devices, StepContext, StepInterruptedError, StepOutcome
 from service.store.leases import RunLease
@@ -56,6 +57,9 @@ from service.store.store import Store
 _LEASE_S = 30.0
 _POLL_S = 0.1
 _PEDAL_RETRY_S = 30.0
+# Where the robot will move, one press arms the pedal and a second one within this time confirms: what holding the
+# button is on a screen.
+_PEDAL_SECOND_PRESS_S = (0.5, 6.0)
 
 
 class Operator(Interface):
@@ -73,6 +77,18 @@ class Operator(Interface):
 
     def tell(self, message: str) -> None:
         """One line on what happened."""
+        ...
+
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
+        """Called several times a second, whatever the runner does: for what screens show."""
+        ...
+
+    def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
+        """The checklist items that count as done when the foot pedal confirms."""
+        ...
+
+    def prepare(self, step: str, attempt: int) -> None:
+        """The work of a step is about to begin: a simulated technician does now what was confirmed as done."""
         ...
 
 
@@ -93,6 +109,7 @@ class Runner:
     _asked: AskOperator | None = field(init=False, default=None)
     _pedal: int | None = field(init=False, default=None)  # presses when the open question was first asked
     _pedal_again_s: float = field(init=False, default=0.0)
+    _armed_s: float | None = field(init=False, default=None)  # time of the press that armed the pedal
 
     def run(self) -> RunState:
         """Take the lease, record the session, and act on decisions until the run ends or an operator stops it.
@@ -123,6 +140,7 @@ class Runner:
                 self._ask(decision, state)
             case RunStep(step, attempt, begin):
                 if begin:
+                    self.operator.prepare(step, attempt)
                     self._append(StepStarted(step=step, attempt=attempt))
                 self._execute(step, attempt)
             case EvaluateGates(step, attempt, measures):
@@ -143,12 +161,14 @@ class Runner:
                 self._append(RunAborted(reason=reason))
             case Halt():
                 self.operator.show("paused", 0, 0)
+                self.operator.attend("paused", state, pedal_armed=False)
                 self.wait(_POLL_S)
 
     # --- operator ---
 
     def _ask(self, question: AskOperator, state: RunState) -> None:
-        answer = self._pedal_press(question) or self.operator.poll(question, state)
+        answer = self._pedal_press(question, state) or self.operator.poll(question, state)
+        self.operator.attend("asking", state, pedal_armed=self._armed_s is not None)
         if answer is None:
             self.wait(_POLL_S)
             return
@@ -166,25 +186,40 @@ class Runner:
         )
         self.operator.tell(f"refused: {refusal}")
 
-    def _pedal_press(self, question: AskOperator) -> OperatorAction | None:
-        """A press of the foot pedal since the question was asked confirms it, hands-free."""
+    def _pedal_press(self, question: AskOperator, state: RunState) -> OperatorAction | None:
+        """A press of the foot pedal since the question was asked confirms it, hands-free; motion needs two."""
         if question != self._asked:
-            self._asked, self._pedal = question, None
-        if self.monotonic_s() < self._pedal_again_s:
+            self._asked, self._pedal, self._armed_s = question, None, None
+        if not self._pressed() or "confirm" not in question.options:
             return None
+        earliest_s, latest_s = _PEDAL_SECOND_PRESS_S
+        if step_kinds()[self.protocol.step(question.step).kind].moves_robot:
+            since_s = None if self._armed_s is None else self.monotonic_s() - self._armed_s
+            if since_s is None or since_s < earliest_s:  # a bounce, or a foot that slipped, arms anew
+                self._armed_s = self.monotonic_s()
+                self.operator.tell(f"pedal: press again within {latest_s:.0f} s to let the robot move")
+                return None
+            self._armed_s = None
+        checklist = self.operator.ticked(question, state)
+        return OperatorAction(action="confirm", step=question.step, checklist=checklist, via="pedal")
+
+    def _pressed(self) -> bool:
+        """Whether the pedal was pressed since the last look; the first look at a question only counts."""
+        if self._armed_s is not None and self.monotonic_s() - self._armed_s > _PEDAL_SECOND_PRESS_S[1]:
+            self._armed_s = None
+        if self.monotonic_s() < self._pedal_again_s:
+            return False
         try:
             lightbox = self.devices.lightbox()
             presses = lightbox.pedal_presses() if lightbox is not None else 0
         except DeviceError as error:
             self._pedal_again_s = self.monotonic_s() + _PEDAL_RETRY_S
             self.operator.tell(f"the foot pedal does not work: {error}")
-            return None
+            return False
         if self._pedal is None or presses < self._pedal:  # a box that was switched off counts from zero
             self._pedal = presses
-        if presses == self._pedal or "confirm" not in question.options:
-            return None
-        self._pedal = presses
-        return OperatorAction(action="confirm", step=question.step, checklist=question.checklist, via="pedal")
+        pressed, self._pedal = presses != self._pedal, presses
+        return pressed
 
     def _opened(self, device: str, report: DeviceReport) -> None:
         self._append(DeviceOpened(device=device, report=dataclasses.asdict(report)))
@@ -246,6 +281,7 @@ class Runner:
         """Called by steps wherever they may stop: keeps the lease, and notices what operators have asked for."""
         self._keep_lease()
         state = self._log.refresh()
+        self.operator.attend("pausing" if state.paused else "working", state, pedal_armed=False)
         if state.paused:
             raise StepInterruptedError("paused")
         if state.terminal or (state.current, state.step.attempt, state.phase) != (step, attempt, "running"):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from importlib.metadata import entry_points
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -40,6 +41,11 @@ _PATH_FIELDS = ("folder", "port", "path")
 D = TypeVar("D", bound=Device)
 
 
+@cache
+def _installed() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
 class Station:
     """The devices of one rig, built on first use and kept open until `close`."""
 
@@ -59,6 +65,10 @@ class Station:
             self._connect(name, device)
             self._open[name] = device
         return self._open[name]
+
+    def opened(self, kind: str) -> dict[str, Device]:
+        """Open devices of a kind by name."""
+        return {name: device for name, device in self._open.items() if self.kind_of(name) == kind}
 
     def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
         """Have every device that is opened from now on reported, by its name."""
@@ -149,7 +159,7 @@ class Station:
         if settings is None:
             raise ConfigurationError(f"the rig has no device {name!r}", where=str(self.rig.path))
         driver = settings.get("driver")
-        points = {point.name: point for point in entry_points(group=GROUP)}
+        points = _installed()
         if driver not in points:
             raise ConfigurationError(
                 f"no driver {driver!r} is installed", where=where, remedy=f"Installed: {', '.join(sorted(points))}"

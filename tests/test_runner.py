@@ -251,6 +251,29 @@ def test_the_pedal_confirms_what_is_asked_now_and_nothing_that_is_asked_later(be
     assert silent == 3
 
 
+def test_where_the_robot_will_move_the_pedal_is_pressed_twice_within_seconds(bench: Bench) -> None:
+    box = bench.rig.box
+    assert box is not None
+
+    def press(after_s: float) -> Answer:
+        def act(_question: AskOperator, _state: RunState) -> None:
+            bench.ahead_s += after_s
+            box.presses += 1
+
+        return act
+
+    def look(_question: AskOperator, _state: RunState) -> None:
+        assert not bench.rig.arm.moves
+
+    # The second press comes too late and arms anew, the third bounces, the fourth counts.
+    bench.script("capture", "confirm", look, press(0), press(10), press(0.1), look, press(2))
+    assert bench.run().status == "completed"
+    confirmed = [a for a in bench.payloads(OperatorAction) if a.step == "capture"]
+    assert [(a.action, a.via) for a in confirmed] == [("confirm", "pedal")]
+    assert ("asking", True) in bench.operator.attended
+    assert sum("press again" in line for line in bench.operator.told) == 3
+
+
 def test_a_run_without_a_light_box_works(bench: Bench) -> None:
     bench.rig.box = None
     assert bench.run().status == "completed"

@@ -18,18 +18,22 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.model import OperatorAction
 from service.core.protocol import Protocol
 from service.core.run_state import RunState
+from service.monitor.reporter import Reporter
+from service.monitor.snapshot import Doing
 
 
 class Display:
     """Progress with the time left, and one line for each thing that happened. On stderr: stdout is for results."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, reporter: Reporter) -> None:
         self.console = console
+        self.reporter = reporter
         self._progress: Progress | None = None
         self._what = ""
 
     def show(self, what: str, done: int, total: int) -> None:
         """Update the bar; a new `what` starts a new one."""
+        self.reporter.show(what, done, total)
         if not self.console.is_terminal:
             return
         if self._progress is None or what != self._what:
@@ -55,18 +59,58 @@ class Display:
 
     def tell(self, message: str) -> None:
         """Print one line."""
+        self.reporter.tell(message)
         self.clear()
         self.console.print(f"  {message}", highlight=False, markup=False)
 
 
 @dataclass
-class TerminalOperator:
-    """A person who types; the terminal is polled so that pedal and web can answer as well."""
+class _Operator:
+    """What all who answer have in common."""
 
     name: str
     protocol: Protocol
     display: Display
     hands: SimulatedHands
+
+    def show(self, what: str, done: int, total: int) -> None:
+        """Progress."""
+        self.display.show(what, done, total)
+
+    def tell(self, message: str) -> None:
+        """News."""
+        self.display.tell(message)
+
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
+        """For the screens."""
+        self.display.reporter.attend(doing, state.current, state.step.attempt, pedal_armed=pedal_armed)
+
+    def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
+        """The whole list: so the terminal says what a confirmation means."""
+        return question.checklist
+
+    def prepare(self, step: str, attempt: int) -> None:
+        """The simulated technician's hands, if there are any."""
+        self.hands.do(self.protocol.step(step), attempt)
+
+
+@dataclass
+class ScreenOperator(_Operator):
+    """People at screens: their answers come as events; here only the pedal is attended to."""
+
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
+        """Nothing: the web process appends what people do."""
+        return None
+
+    def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
+        """What was ticked on a screen: the pedal is another way to press the button there, and no more than that."""
+        return state.steps[question.step].ticked
+
+
+@dataclass
+class TerminalOperator(_Operator):
+    """A person who types; the terminal is polled so that pedal and web can answer as well."""
+
     descriptor: int = 0  # of the terminal
     preview: Callable[[str], str] = lambda _step: ""  # what a step is going to do, where that can be told
     _asked: AskOperator | None = None
@@ -84,8 +128,6 @@ class TerminalOperator:
         action = self._action(question, verb, reason.strip())
         if action is not None:
             self._asked = None
-            if action.action == "confirm":
-                self.hands.do(self.protocol.step(question.step), state.steps[question.step].attempt)
         return action
 
     def _line(self) -> str | None:
@@ -127,26 +169,13 @@ class TerminalOperator:
             }
         )
 
-    def show(self, what: str, done: int, total: int) -> None:
-        """Progress."""
-        self.display.show(what, done, total)
-
-    def tell(self, message: str) -> None:
-        """News."""
-        self.display.tell(message)
-
 
 @dataclass
-class AutomaticOperator:
-    """Confirms and signs on a simulated rig, after the simulated technician's hands did what the step asks for."""
-
-    name: str
-    protocol: Protocol
-    display: Display
-    hands: SimulatedHands
+class AutomaticOperator(_Operator):
+    """Confirms and signs on a simulated rig."""
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction:
-        """Do what a technician would do, then say so; recorded as automatic."""
+        """Say yes; recorded as automatic."""
         if question.for_ == "recovery":
             raise OrthocaptureError(
                 question.text,
@@ -156,13 +185,4 @@ class AutomaticOperator:
         base: dict[str, Any] = {"action": question.for_, "step": question.step, "via": "auto", "automatic": True}
         if question.for_ == "sign":
             return OperatorAction(**base, meaning="automatic, simulated rig", signed_sha256=question.sign_sha256)
-        self.hands.do(self.protocol.step(question.step), state.steps[question.step].attempt)
         return OperatorAction(**base, checklist=question.checklist)
-
-    def show(self, what: str, done: int, total: int) -> None:
-        """Progress."""
-        self.display.show(what, done, total)
-
-    def tell(self, message: str) -> None:
-        """News."""
-        self.display.tell(message)

@@ -10,13 +10,14 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import psutil
 import typer
 from rich.markup import escape
 from rich.table import Table
 
+from drivers.interfaces import Camera, Lightbox, RobotArm
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -27,13 +28,14 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.hands import SimulatedHands
-from service.cli.operators import AutomaticOperator, Display, TerminalOperator
+from service.cli.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
 from service.core.actions import VERBS, record_to_sign, refuse
 from service.core.errors import ConfigurationError
 from service.core.fold import fold
 from service.core.model import ActionRefused, OperatorAction
 from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState
+from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import Rig, load_rig
 from service.runner import Runner
 from service.runs import recorded_rig, recorded_run, require_simulated, start_run
@@ -79,6 +81,9 @@ def resume_command(
     data: DataOption = DEFAULT_DATA,
     auto_confirm: AutoOption = False,
     worker: WorkerOption = True,
+    screens: Annotated[
+        bool, typer.Option("--screens", help="Questions are answered in the browser (`orthocapture serve`).")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Go on with a run after a crash, a power cut or a pause: nothing captured is lost or taken twice."""
@@ -86,7 +91,7 @@ def resume_command(
         run_id = store.find_run(run)
         _, root = recorded_run(store, run_id)
         rig = recorded_rig(store, root)
-        state = drive(store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker)
+        state = drive(store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker, screens=screens)
         _report_end(run_id, state, json=json)
 
 
@@ -193,28 +198,50 @@ def next_best_views(state: RunState) -> list[dict[str, Any]]:
     return [] if newest is None else list(newest.result["next_best_views"])
 
 
-def drive(store: Store, run_id: str, rig: Rig, *, data: Path, auto_confirm: bool, worker: bool) -> RunState:
-    """Run the runner in this process, with a worker beside it, until the run ends."""
+def drive(
+    store: Store,
+    run_id: str,
+    rig: Rig,
+    *,
+    data: Path,
+    auto_confirm: bool,
+    worker: bool,
+    screens: bool = False,
+) -> RunState:
+    """Run the runner in this process, with a worker beside it, until the run ends. `screens`: people answer there."""
     protocol, root = recorded_run(store, run_id)
-    display = Display(error_console)
+    station = Station(rig)
+    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera)
+    display = Display(error_console, reporter)
     hands = SimulatedHands(rig.section.hands if rig.section.simulated else None)
     if auto_confirm:
         require_simulated(rig)
-    operator = (
-        AutomaticOperator(root.operator, protocol, display, hands)
-        if auto_confirm
-        else TerminalOperator(root.operator, protocol, display, hands, preview=partial(_preview, protocol, rig))
-    )
-    station = Station(rig)
+    if auto_confirm:
+        operator = AutomaticOperator(root.operator, protocol, display, hands)
+    elif screens:
+        operator = ScreenOperator(root.operator, protocol, display, hands)
+    else:
+        preview = partial(_preview, protocol, rig)
+        operator = TerminalOperator(root.operator, protocol, display, hands, preview=preview)
     # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _worker(data, wanted=worker):
             return Runner(store, run_id, protocol, station, operator).run()
     finally:
+        reporter.end()
         display.clear()
         station.close()
         signal.signal(signal.SIGTERM, before)
+
+
+def open_devices(station: Station) -> OpenDevices:
+    """What is open now, for the screens."""
+    return OpenDevices(
+        robots=cast(dict[str, RobotArm], station.opened("robot")),
+        cameras=cast(dict[str, Camera], station.opened("camera")),
+        lightboxes=cast(dict[str, Lightbox], station.opened("lightbox")),
+    )
 
 
 def _preview(protocol: Protocol, rig: Rig, step: str) -> str:

@@ -38,7 +38,7 @@ class Snapshot(Record):
     total: int = 0
     messages: tuple[Message, ...] = ()  # newest last
     robot: RobotPhase = "unknown"
-    robot_station: str = ""
+    robot_name: str = ""  # in rig.yaml
     speed_fraction: float | None = None
     camera_battery_fraction: float | None = None
     camera_free_bytes: int | None = None

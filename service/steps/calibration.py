@@ -79,4 +79,4 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     return StepOutcome({**measures, **answer.measures}, answer.artefacts, result.model_dump(mode="json"))
 
 
-KIND = StepKind("calibration", Params, Result, execute)
+KIND = StepKind("calibration", Params, Result, execute, moves_robot=True)

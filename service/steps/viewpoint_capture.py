@@ -67,4 +67,4 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     return StepOutcome(measures=measures, result=result.model_dump())
 
 
-KIND = StepKind("viewpoint_capture", Params, Result, execute)
+KIND = StepKind("viewpoint_capture", Params, Result, execute, moves_robot=True)

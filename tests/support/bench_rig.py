@@ -37,6 +37,7 @@ from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, from_rotation_vector, to_rotation_vector, transform
 from service.core.model import OperatorAction
 from service.core.run_state import RunState
+from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, OpticsSection
 from service.steps.context import StationLayout
 
@@ -307,6 +308,8 @@ class ScriptedOperator:
     on_show: Callable[[str], None] = lambda _what: None
     asked: list[AskOperator] = field(default_factory=list[AskOperator])
     told: list[str] = field(default_factory=list[str])
+    attended: list[tuple[Doing, bool]] = field(default_factory=list[tuple[Doing, bool]])
+    prepared: list[tuple[str, int]] = field(default_factory=list[tuple[str, int]])
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
         self.asked.append(question)
@@ -318,6 +321,16 @@ class ScriptedOperator:
 
     def tell(self, message: str) -> None:
         self.told.append(message)
+
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
+        if not self.attended or self.attended[-1] != (doing, pedal_armed):
+            self.attended.append((doing, pedal_armed))
+
+    def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
+        return question.checklist
+
+    def prepare(self, step: str, attempt: int) -> None:
+        self.prepared.append((step, attempt))
 
 
 def other_settings(applied: CameraSettings) -> CameraSettings:

@@ -69,12 +69,19 @@ class Bench:
     data: Path
     rig: BenchRig = field(default_factory=BenchRig)
     operator: ScriptedOperator = field(default_factory=ScriptedOperator)
+    ahead_s: float = 0.0  # how far the runner's clock is put forward
 
     def run(self) -> RunState:
         """A runner process's life."""
         protocol, _ = recorded_run(self.store, self.run_id)
         return Runner(
-            self.store, self.run_id, protocol, self.rig, self.operator, wait=lambda s: time.sleep(min(s, 0.002))
+            self.store,
+            self.run_id,
+            protocol,
+            self.rig,
+            self.operator,
+            monotonic_s=lambda: time.monotonic() + self.ahead_s,
+            wait=lambda s: time.sleep(min(s, 0.002)),
         ).run()
 
     def act(self, verb: str, **fields: object) -> None:

@@ -1,0 +1,178 @@
+"""Gathers what the screens show of a run's devices and machine, and writes it down twice a second."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from os import getpid
+from pathlib import Path
+from typing import Any
+
+from drivers.errors import DeviceError
+from drivers.interfaces import Camera, Lightbox, RobotArm, SafetyState
+from service.core.errors import OrthocaptureError
+from service.monitor.snapshot import Doing, Message, RobotPhase, Snapshot, frames_wanted, write_frame, write_snapshot
+
+_log = logging.getLogger(__name__)
+_EVERY_S = 0.4
+_FRAME_S = 0.3
+_LIGHT_S = 3.0
+_CAMERA_S = 30.0  # asking a camera for its battery takes time that exposures want
+_MESSAGES = 12
+_STOPS: Mapping[SafetyState, RobotPhase] = {
+    SafetyState.PROTECTIVE_STOP: "protective_stop",
+    SafetyState.SAFEGUARD_STOP: "safeguard_stop",
+    SafetyState.EMERGENCY_STOP: "emergency_stop",
+    SafetyState.FAULT: "fault",
+    SafetyState.UNKNOWN: "unknown",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class OpenDevices:
+    """What is open at this moment, by role and name in rig.yaml; nothing is opened for a banner's sake."""
+
+    robots: Mapping[str, RobotArm] = field(default_factory=dict[str, RobotArm])
+    cameras: Mapping[str, Camera] = field(default_factory=dict[str, Camera])
+    lightboxes: Mapping[str, Lightbox] = field(default_factory=dict[str, Lightbox])
+
+
+@dataclass
+class Reporter:
+    """Called by the runner's own thread, so that no device is spoken to behind its back.
+
+    A device that does not answer becomes "unknown" on the screens; a disk that refuses the file is logged. Neither
+    disturbs the capture.
+    """
+
+    data: Path
+    run_id: str
+    devices: Callable[[], OpenDevices]
+    camera: Callable[[], Camera]  # opens it: for the live view, which somebody asked for
+    monotonic_s: Callable[[], float] = time.monotonic
+    _news: deque[Message] = field(default_factory=lambda: deque(maxlen=_MESSAGES))
+    _progress: tuple[str, int, int] = ("", 0, 0)
+    _known: dict[str, Any] = field(default_factory=dict[str, Any])
+    _due_s: dict[str, float] = field(default_factory=dict[str, float])
+
+    def show(self, what: str, done: int, total: int) -> None:
+        """Progress of the work under way."""
+        self._progress = (what, done, total)
+
+    def tell(self, message: str) -> None:
+        """One line of news."""
+        self._news.append(Message(at_utc=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"), text=message))
+        self._due_s.pop("snapshot", None)
+
+    def attend(self, doing: Doing, step: str, attempt: int, *, pedal_armed: bool = False) -> None:
+        """Write how things stand, if it is time again."""
+        changed = (doing, step, attempt, pedal_armed) != self._known.get("at")
+        if not changed and not self._due("snapshot", _EVERY_S):
+            return
+        if changed and self._known.get("at", ("", ""))[1] != step:
+            self._progress = ("", 0, 0)
+        self._known["at"] = (doing, step, attempt, pedal_armed)
+        devices = self.devices()
+        robot = self._robot(devices)
+        if doing == "paused" and robot["robot"] == "moving":
+            doing = "pausing"
+        what, done, total = self._progress
+        snapshot = Snapshot(
+            at_utc_s=time.time(),
+            pid=getpid(),
+            doing=doing,
+            step=step,
+            attempt=attempt,
+            what=what,
+            done=done,
+            total=total,
+            messages=tuple(self._news),
+            pedal_armed=pedal_armed,
+            **robot,
+            **self._light(devices),
+            **self._camera(devices),
+            disk_free_bytes=shutil.disk_usage(self.data).free,
+        )
+        self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
+        if doing in ("asking", "paused"):
+            self._frame()
+
+    def end(self) -> None:
+        """The runner ends, whatever the reason: what is shown from now on does not come from it."""
+        step, attempt = self._known.get("at", ("", "", 0, False))[1:3]
+        last = Snapshot(at_utc_s=time.time(), pid=getpid(), doing="ended", step=step, attempt=attempt)
+        self._write(
+            lambda: write_snapshot(self.data, self.run_id, last.model_copy(update={"messages": tuple(self._news)}))
+        )
+
+    def _robot(self, devices: OpenDevices) -> dict[str, Any]:
+        for name, robot in devices.robots.items():
+            try:
+                state, moving = robot.state(), robot.is_moving()
+            except DeviceError:
+                return {"robot": "unknown", "robot_name": name}
+            stop = _STOPS.get(state.sample.safety)
+            phase: RobotPhase = stop or (
+                "moving" if moving or _turns(state.sample.joint_velocities_rad_s) else "standing"
+            )
+            return {"robot": phase, "robot_name": name, "speed_fraction": state.speed_fraction}
+        return {"robot": "not_connected"}
+
+    def _light(self, devices: OpenDevices) -> Mapping[str, Any]:
+        for box in devices.lightboxes.values():
+            if self._due("light", _LIGHT_S):
+                try:
+                    reading = box.read()
+                except DeviceError:
+                    self._known["light"] = {}
+                else:
+                    self._known["light"] = {"light_lux": reading.light_lux, "temperature_c": reading.temperature_c}
+        return self._known.get("light", {})
+
+    def _camera(self, devices: OpenDevices) -> Mapping[str, Any]:
+        for camera in devices.cameras.values():
+            if self._due("camera", _CAMERA_S):
+                try:
+                    report = camera.report()
+                except DeviceError:
+                    self._known["camera"] = {}
+                else:
+                    self._known["camera"] = {
+                        "camera_battery_fraction": report.battery_fraction,
+                        "camera_free_bytes": report.free_bytes,
+                    }
+        return self._known.get("camera", {})
+
+    def _frame(self) -> None:
+        """A frame of the live view while somebody looks; only between works, when the camera is idle."""
+        if not frames_wanted(self.data, self.run_id) or not self._due("frame", _FRAME_S):
+            return
+        try:
+            jpeg = self.camera().preview()
+        except OrthocaptureError as error:
+            self.tell(f"the live view does not work: {error}")
+            self._due_s["frame"] = self.monotonic_s() + _CAMERA_S
+            return
+        self._write(lambda: write_frame(self.data, self.run_id, jpeg))
+
+    def _due(self, what: str, every_s: float) -> bool:
+        now_s = self.monotonic_s()
+        if now_s < self._due_s.get(what, 0.0):
+            return False
+        self._due_s[what] = now_s + every_s
+        return True
+
+    def _write(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except OSError as error:
+            _log.warning("the screens cannot be told: %s", error)
+
+
+def _turns(velocities_rad_s: Any) -> bool:
+    return bool(abs(velocities_rad_s).max() > 0.001)
