@@ -19,3 +19,7 @@ class LeaseLostError(StoreError):
 
 class StoreVersionError(StoreError):
     """The database was written by another version of the software."""
+
+
+class SigningKeyError(StoreError):
+    """The private key that signs checkpoints is missing, unusable or badly kept; what is recorded stays as it is."""

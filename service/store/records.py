@@ -91,3 +91,29 @@ class RunRow:
     root_sha256: str
     head_seq: int
     head_sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A signature over a chain up to one event, and over the artefact rows up to there."""
+
+    run_id: str
+    seq: int  # of the last event that it covers
+    sha256: str  # of that event
+    artefacts_sha256: str  # over the rows' record_sha256
+    site_seq: int  # where the site's chain was when it was signed; it says which key was valid
+    site_sha256: str
+    at_utc: str
+    key_id: str
+    signature: str  # base64
+
+
+@dataclass(frozen=True, slots=True)
+class Timestamp:
+    """What a time-stamp authority says of a checkpoint (RFC 3161)."""
+
+    run_id: str
+    seq: int  # of the checkpoint
+    authority: str  # address
+    at_utc: str  # when it was asked; the authority's own time is in the token
+    token: str  # base64 of the DER TimeStampResp

@@ -13,11 +13,12 @@ from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.model import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
 from service.store import jobs as queue
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, read_artefacts
+from service.store.checkpoints import read_checkpoints, read_timestamps
 from service.store.database import Database, database_path, open_database
 from service.store.errors import UnknownRunError
 from service.store.events import ROOT, append, read_events
-from service.store.leases import RunLease, acquire, check_lease
-from service.store.records import SITE, Artefact, Job, NewArtefact, NewJob, RunRow
+from service.store.leases import RunLease, acquire, check_lease, is_held
+from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
 from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock, utc_text
 from service.store.tables import heads, runs
 
@@ -218,17 +219,40 @@ class Store:
             self._require_run(connection, run_id)
             return read_events(connection, run_id, after_seq)
 
+    def head(self, run_id: str) -> int:
+        """Number of a run's last event."""
+        with self._database.reading() as connection:
+            seq: int | None = connection.execute(select(heads.c.seq).where(heads.c.run_id == run_id)).scalar()
+        if seq is None:
+            raise UnknownRunError(f"there is no run {run_id!r}", where=str(self.database_path))
+        return seq
+
     def artefacts(self, run_id: str) -> list[Artefact]:
         """All recorded artefacts of a run, in the order of its events."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return read_artefacts(connection, run_id)
 
+    def checkpoints(self, run_id: str) -> list[Checkpoint]:
+        """All signatures over a run's chain (or the site's), oldest first; service.store.signing makes them."""
+        with self._database.reading() as connection:
+            return read_checkpoints(connection, run_id)
+
+    def timestamps(self, run_id: str) -> list[Timestamp]:
+        """What time-stamp authorities say of a run's checkpoints, oldest first."""
+        with self._database.reading() as connection:
+            return read_timestamps(connection, run_id)
+
     def lease(self, run_id: str, holder: str, seconds: float) -> RunLease:
         """The sole right to drive a run. Raises LeaseHeldError while a living process has it."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
         return acquire(self._database, self._clock, self._ids, run_id=run_id, holder=holder, seconds=seconds)
+
+    def driven(self, run_id: str) -> bool:
+        """Whether a living process holds the lease of a run."""
+        with self._database.reading() as connection:
+            return is_held(connection, self._clock, run_id)
 
     def _require_run(self, connection: Connection, run_id: str) -> None:
         if connection.execute(select(runs.c.run_id).where(runs.c.run_id == run_id)).first() is None:
