@@ -1,0 +1,176 @@
+"""What stands around every page of a run: its name, its navigation, the robot banner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from service.core.model import RunStarted
+from service.core.run_state import RunState
+from service.monitor.snapshot import Snapshot, read_snapshot
+from service.web.site import Site
+
+Tone = Literal["moving", "standing", "paused", "unknown", "stop"]
+NOT_THE_STOP = "This screen is not the emergency stop."
+_AT_THE_ROBOT = "This software cannot clear a stop; a person does it at the robot, and nothing moves again by itself."
+
+
+@dataclass(frozen=True, slots=True)
+class Banner:
+    """How the robot stands, in words."""
+
+    key: str  # moving, standing, paused, pausing, protective_stop …
+    tone: Tone
+    icon: str
+    title: str
+    text: str
+    remedy: str = ""  # what a person does at the robot
+    assertive: bool = False  # screen readers interrupt for it
+
+
+@dataclass(frozen=True, slots=True)
+class Tab:
+    """A page of a run."""
+
+    href: str
+    text: str
+    below: bool = False  # also the current one on pages below it
+
+
+@dataclass(frozen=True, slots=True)
+class RunFrame:
+    """What base.html.j2 needs to know of a run."""
+
+    run_id: str
+    name: str
+    protocol_id: str
+    protocol_version: str
+    protocol_sha256: str
+    simulated: bool
+    live: bool  # not ended: news may come
+    banner: Banner
+    tabs: tuple[Tab, ...]
+
+
+def run_frame(site: Site, run_id: str) -> RunFrame:
+    """The frame of a run's pages. Raises UnknownRunError."""
+    log = site.run(run_id)
+    root = log.events[0].payload
+    assert isinstance(root, RunStarted)  # site.run has read it the same way
+    here = f"/runs/{run_id}"
+    return RunFrame(
+        run_id=run_id,
+        name=run_id,
+        protocol_id=root.protocol_id,
+        protocol_version=root.protocol_version,
+        protocol_sha256=root.protocol_sha256,
+        simulated=root.simulated,
+        live=not log.state.terminal,
+        banner=robot_banner(log.state, read_snapshot(site.data, run_id), driven=site.launcher.driven(run_id)),
+        tabs=(
+            Tab(here, "Step"),
+            Tab(f"{here}/capture", "Capture"),
+            Tab(f"{here}/scene", "3D view"),
+            Tab(f"{here}/calibration", "Calibration"),
+            Tab(f"/audit/runs/{run_id}", "Audit", below=True),
+        ),
+    )
+
+
+def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner:
+    """What to say of the robot. What is not known for certain is said to be unknown."""
+    if state.terminal:
+        return Banner("ended", "standing", "end", "The run has ended.", "It drives no robot any more.")
+    if snapshot.doing in ("unknown", "ended"):
+        return _silent(driven=driven)
+    stop = _STOPS.get(snapshot.robot)
+    if stop is not None:
+        return stop
+    if snapshot.robot == "moving":
+        return _moving(state, snapshot)
+    if snapshot.robot == "not_connected":
+        title = "Paused. The robot is not connected." if state.paused else "Robot not connected."
+        text = (
+            "No connection to it is open: so far nothing has needed it. It may still be moved from its own pendant."
+        )
+        return Banner("not_connected", "paused" if state.paused else "standing", "open", title, text)
+    if state.paused:
+        if snapshot.doing == "paused":
+            return Banner(
+                "paused", "paused", "pause", "Paused. The robot stands still.", "It moves only after Resume."
+            )
+        return Banner("pausing", "paused", "pause", "Pausing…", "The robot may still move. Wait for Paused.")
+    text = "A step is under way: it may move at any moment." if snapshot.doing == "working" else NOT_THE_STOP
+    return Banner("standing", "standing", "standing", "The robot stands still.", text)
+
+
+def _silent(*, driven: bool) -> Banner:
+    if driven:
+        title, text = (
+            "Robot: unknown.",
+            "The program that drives it has not told anything for 5 s. Look at the robot.",
+        )
+    else:
+        title, text = "Robot: unknown.", "The program that drives it does not run. Look at the robot."
+    return Banner("unknown", "unknown", "unknown", title, f"{text} {NOT_THE_STOP}")
+
+
+def _moving(state: RunState, snapshot: Snapshot) -> Banner:
+    if state.paused or snapshot.doing in ("pausing", "paused"):
+        return Banner("pausing", "paused", "pause", "Pausing…", "The robot still moves. Wait for Paused.")
+    speed = "" if snapshot.speed_fraction is None else f" Speed slider {snapshot.speed_fraction:.0%}."
+    return Banner(
+        "moving", "moving", "moving", "The robot moves.", f"Stay outside of its reach.{speed} {NOT_THE_STOP}"
+    )
+
+
+_STOPS: dict[str, Banner] = {
+    "emergency_stop": Banner(
+        "emergency_stop",
+        "stop",
+        "stop",
+        "Emergency stop.",
+        "The robot is stopped and without power. What was captured is safe.",
+        "Make sure that nobody is in danger and find out why it was pressed. Then, at the robot: release the "
+        "emergency stop button, confirm on the teach pendant, switch the arm on and release its brakes. "
+        + _AT_THE_ROBOT,
+        assertive=True,
+    ),
+    "protective_stop": Banner(
+        "protective_stop",
+        "stop",
+        "stop",
+        "Protective stop.",
+        "The robot stopped itself: it touched something, or a limit was near. What was captured is safe.",
+        "Look at what it touched and clear its path. Check that specimen, spheres and camera have not moved. Then, on "
+        "the teach pendant: wait 5 s and choose Enable robot. " + _AT_THE_ROBOT,
+        assertive=True,
+    ),
+    "safeguard_stop": Banner(
+        "safeguard_stop",
+        "stop",
+        "stop",
+        "Safeguard stop.",
+        "A door, a light curtain or a scanner holds the robot. What was captured is safe.",
+        "Leave the guarded area, close it and reset the safeguard at the robot. " + _AT_THE_ROBOT,
+        assertive=True,
+    ),
+    "fault": Banner(
+        "fault",
+        "stop",
+        "stop",
+        "The robot reports a fault.",
+        "It does not move. What was captured is safe.",
+        "Read the log on the teach pendant and do what it asks for; restart the arm there. " + _AT_THE_ROBOT,
+        assertive=True,
+    ),
+    "unknown": Banner(
+        "unknown",
+        "unknown",
+        "unknown",
+        "Robot: unknown.",
+        f"It does not answer. Take it as moving and stay outside of its reach. {NOT_THE_STOP}",
+        "Check that the controller is switched on and its network cable is in. The software goes on asking it.",
+        assertive=True,
+    ),
+}
