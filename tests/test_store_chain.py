@@ -126,7 +126,9 @@ def test_database_is_durable_and_strict(store: Store) -> None:
 def test_migrations_make_the_tables_of_the_metadata(store: Store) -> None:
     engine = create_engine(f"sqlite:///{store.database_path}")
     with engine.connect() as connection:
-        assert compare_metadata(MigrationContext.configure(connection), metadata) == []
+        # The full-text index brings tables of its own, which SQLAlchemy has no words for.
+        options = {"include_name": lambda name, kind, _parent: kind != "table" or not name.startswith("event_words")}
+        assert compare_metadata(MigrationContext.configure(connection, opts=options), metadata) == []
     engine.dispose()
 
 

@@ -17,7 +17,7 @@ from sqlalchemy import (
     UniqueConstraint,
 )
 
-APPEND_ONLY = ("runs", "events", "artefacts", "checkpoints", "timestamps")
+APPEND_ONLY = ("runs", "events", "artefacts", "checkpoints", "timestamps", "event_index")
 TRIGGERS = tuple(f"{table}_no_{verb}" for table in APPEND_ONLY for verb in ("update", "delete", "replace"))
 
 metadata = MetaData()
@@ -49,6 +49,23 @@ events = Table(
     UniqueConstraint("run_id", "previous_sha256", name="events_no_fork"),
     CheckConstraint("seq >= 1", name="events_seq"),
     CheckConstraint("length(sha256) = 64 AND length(previous_sha256) = 64", name="events_hash_length"),
+    sqlite_strict=True,
+)
+
+# What auditors filter events by, written with every event by the trigger events_indexed. Beside it the full-text
+# index `event_words` (FTS5, contentless, rowid = position), which SQLAlchemy cannot describe.
+event_index = Table(
+    "event_index",
+    metadata,
+    Column("position", Integer, primary_key=True),  # over all runs, in the order of writing
+    Column("run_id", Text, nullable=False),
+    Column("seq", Integer, nullable=False),
+    Column("kind", Text, nullable=False),
+    Column("step", Text),
+    Column("device", Text),
+    Column("actor", Text, nullable=False),
+    UniqueConstraint("run_id", "seq", name="event_index_once"),
+    Index("event_index_by_kind", "run_id", "kind", "seq"),
     sqlite_strict=True,
 )
 
