@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,6 +17,14 @@ from service.core.run_state import RunState
 from service.store.store import Store
 
 
+class ArtefactReader(Protocol):
+    """Where the files of the evidence are."""
+
+    def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
+        """The read-only file of an artefact. Raises IntegrityError when missing or, with `verify`, altered."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class RunSummary:
     """What is recorded of a run."""
@@ -25,7 +34,7 @@ class RunSummary:
     root: RunStarted
     state: RunState
     events: Sequence[Event]
-    store: Store
+    store: ArtefactReader
 
     def result(self, kind: str) -> Mapping[str, Any]:
         """The Result of the last passed step of a kind; empty if there is none."""

@@ -6,11 +6,22 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from service.compute.camera_model import CameraModel
 from service.core.model import ArtefactRef
-from service.store.store import Store
+
+
+class ArtefactStore(Protocol):
+    """What a job needs of the store; a replay gives it one that reads the evidence and writes elsewhere."""
+
+    def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
+        """The read-only file of an artefact. Raises IntegrityError when missing or, with `verify`, altered."""
+        ...
+
+    def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Keep bytes; the reference to them."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +38,7 @@ class JobContext:
     """What a handler may touch: its arguments, verified inputs, a scratch folder and the store for its outputs."""
 
     arguments: Mapping[str, Any]
-    store: Store
+    store: ArtefactStore
     scratch: Path
     progress: Callable[[str, int, int], None]
 

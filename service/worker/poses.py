@@ -54,7 +54,6 @@ def structure_from_motion(context: JobContext) -> JobAnswer:
             "missing": list(model.missing),
             "models": model.n_models,
             "points": len(model.points_world),
-            "seconds": model.seconds,
         }
         artefacts.append(context.keep_json(data, kind="sfm_model", name=f"{mapper}.json"))
         packed = _packed(model, joint)

@@ -1,0 +1,77 @@
+"""A run as the evidence has it, read without the means to change anything."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.core.errors import IntegrityError
+from service.core.fold import fold
+from service.core.model import Event, RunStarted
+from service.core.protocol import Protocol, parse_protocol
+from service.core.run_state import RunState
+from service.dataset.summary import RunSummary
+from service.steps import params_models
+from service.store.artefacts import ArtefactFiles, read_artefacts
+from service.store.database import open_read_only
+from service.store.events import read_events
+from service.store.records import Artefact
+from service.store.seam import DurableFiles, RandomIds
+from service.store.store import read_runs, resolve_run
+
+
+class RecordedFiles:
+    """The files of a data folder, to be read."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self._files = ArtefactFiles(data_dir / "artefacts", DurableFiles(), RandomIds())
+
+    def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
+        """The file of an artefact. Raises IntegrityError when missing or, with `verify`, altered."""
+        return self._files.verified_path(sha256) if verify else self._files.path(sha256)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedRun:
+    """Events, their fold, and the files of one run."""
+
+    data_dir: Path
+    run_id: str
+    root: RunStarted
+    protocol: Protocol
+    protocol_source: str
+    events: Sequence[Event]
+    state: RunState
+    artefacts: Sequence[Artefact]
+    files: RecordedFiles
+
+    def summary(self) -> RunSummary:
+        """The same for the report's and the data set's functions."""
+        return RunSummary(self.run_id, self.protocol, self.root, self.state, self.events, self.files)
+
+
+def read_run(data_dir: Path, name: str) -> RecordedRun:
+    """A run by its name, the beginning of its name, or `latest`.
+
+    Raises:
+        UnknownRunError: there is no such run.
+        StoreError: there is no database, or it cannot be read as one.
+        IntegrityError: its events cannot have happened, or its protocol file is missing or altered.
+    """
+    database = open_read_only(data_dir, DurableFiles())
+    try:
+        with database.reading() as connection:
+            run_id = resolve_run(read_runs(connection), name)
+            events = read_events(connection, run_id, 0)
+            artefacts = read_artefacts(connection, run_id)
+    finally:
+        database.close()
+    root = events[0].payload if events else None
+    if not isinstance(root, RunStarted):
+        raise IntegrityError("the run's first event is not run_started", where=run_id)
+    files = RecordedFiles(data_dir)
+    content = files.artefact_path(root.protocol.sha256, verify=True).read_bytes()
+    loaded = parse_protocol(content, params_models(), name=root.protocol.original_name)
+    state = fold(loaded.protocol, events)
+    return RecordedRun(data_dir, run_id, root, loaded.protocol, loaded.source, events, state, artefacts, files)
