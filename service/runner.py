@@ -28,7 +28,7 @@ from service.core.decide import (
     decide,
     evaluate_gates,
 )
-from service.core.errors import OrthocaptureError
+from service.core.errors import OrthocaptureError, StoreError
 from service.core.model import (
     ActionRefused,
     DeviceOpened,
@@ -52,6 +52,7 @@ from service.monitor.snapshot import Doing
 from service.steps import step_kinds
 from service.steps.context import Devices, StepContext, StepInterruptedError, StepOutcome
 from service.store.leases import RunLease
+from service.store.signing import checkpoint
 from service.store.store import Store
 
 _LEASE_S = 30.0
@@ -126,12 +127,15 @@ class Runner:
                 SessionStarted(resumed=resumed, software=software_versions(), host=socket.gethostname(), pid=getpid())
             )
             self.devices.watch(self._opened)
-            while True:
-                self._keep_lease()
-                state = self._log.refresh()
-                if state.terminal:
-                    return state
-                self._act(state)
+            try:
+                while True:
+                    self._keep_lease()
+                    state = self._log.refresh()
+                    if state.terminal:
+                        return state
+                    self._act(state)
+            finally:
+                self._seal()
 
     def _act(self, state: RunState) -> None:
         decision = decide(self.protocol, state)
@@ -151,6 +155,7 @@ class Runner:
                     self.operator.tell(f"{step}: {verdict.measure} = {verdict.value} is outside its limits")
             case Accept(step, attempt):
                 self._append(StepPassed(step=step, attempt=attempt))
+                self._seal()
                 self.operator.tell(f"{self.protocol.step(step).title}: passed")
             case Retry(step, attempt, why, wait_s):
                 self.wait(wait_s)
@@ -289,6 +294,13 @@ class Runner:
 
     def _append(self, *payloads: Payload, actor: str = "runner") -> None:
         self.store.record(self.run_id, payloads, actor=actor, lease=self._lease)
+
+    def _seal(self) -> None:
+        """Sign the chain as it stands. A seal that fails is told; the next one covers what it would have."""
+        try:
+            checkpoint(self.store, self.run_id)
+        except StoreError as error:
+            self.operator.tell(f"the record could not be signed: {error}")
 
     def _keep_lease(self) -> None:
         if self.monotonic_s() > self._renew_at_s:

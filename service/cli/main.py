@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 # Loaded when asked for: `status` must not wait for the numerics that `register` needs.
 _COMMANDS = {
     "demo": "service.cli.demo:demo_command",
+    "serve": "service.cli.serve:serve_command",
     "run": "service.cli.run:run_command",
     "resume": "service.cli.run:resume_command",
     "act": "service.cli.run:act_command",

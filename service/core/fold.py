@@ -334,7 +334,8 @@ def _item_ticked(protocol: Protocol, state: RunState, event: Event, p: ItemTicke
 
 
 def _control_taken(protocol: Protocol, state: RunState, event: Event, p: ControlTaken) -> RunState:
-    return replace(state, controller=event.actor, people=state.people | {event.actor})
+    controller = event.actor if p.screen else ""
+    return replace(state, controller=controller, people=state.people | {event.actor})
 
 
 def _record_corrected(protocol: Protocol, state: RunState, event: Event, p: RecordCorrected) -> RunState:

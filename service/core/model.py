@@ -290,7 +290,7 @@ class ControlTaken(Record):
     """From here on one screen alone may act on the run; the others look on."""
 
     kind: Literal["control_taken"] = "control_taken"
-    screen: str  # name of the sign-in whose screen it is
+    screen: str  # name of the sign-in whose screen it is; "" when control was given back
     previous: str  # person who had control before; "" for nobody
     how: Literal["free", "handed_over", "taken_over"]
     reason: str = ""
@@ -348,7 +348,9 @@ class ServiceStarted(Record):
     configuration: dict[str, str]  # rig and protocol files → SHA-256
     boot: str  # boot id, "" where the system has none
     clock_jump_s: float | None  # UTC against monotonic since the last start of this boot; None: cannot be told
-    heads: dict[str, tuple[int, str]]  # run → last event's number and hash, of the runs that grew since the last start
+    heads: dict[
+        str, tuple[int, str]
+    ]  # run → last event's number and hash, of the runs that grew since the last start
     unsigned_runs: tuple[str, ...]  # with events after their last checkpoint
     open_runs: tuple[str, ...]
 

@@ -109,6 +109,16 @@ class RunLease:
         self.release()
 
 
+def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
+    """Whether somebody has the lease of a run who may still live."""
+    row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
+    return row is not None and _is_live(row, clock.utc_now().timestamp())
+
+
+def _is_live(row: Row[Any], now_utc_s: float) -> bool:
+    return now_utc_s < row.until_utc_s and not identity_of(row).is_surely_dead()
+
+
 def acquire(database: Database, clock: Clock, ids: Ids, *, run_id: str, holder: str, seconds: float) -> RunLease:
     """Take the lease of a run. Raises LeaseHeldError naming who has it and how long."""
     token = ids.new_token()
@@ -116,7 +126,7 @@ def acquire(database: Database, clock: Clock, ids: Ids, *, run_id: str, holder: 
         now = clock.utc_now().timestamp()
         row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
         if row is not None:
-            if now < row.until_utc_s and not identity_of(row).is_surely_dead():
+            if _is_live(row, now):
                 raise LeaseHeldError(
                     f"another process drives this run: {row.holder}",
                     where=f"process {row.pid} on {row.host}",

@@ -2,6 +2,215 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from typing import Annotated
 
-router = APIRouter()
+from fastapi import APIRouter, Depends, Form, Path
+from fastapi.responses import RedirectResponse
+
+from service.core.actions import refuse
+from service.core.errors import ConfigurationError, IllegalTransitionError
+from service.core.model import (
+    ActionRefused,
+    ControlTaken,
+    DeviceOpened,
+    DeviceTrouble,
+    ItemTicked,
+    JobEnqueued,
+    JobFailed,
+    JobFinished,
+    OperatorAction,
+    OperatorVerb,
+    SessionStarted,
+    StepNote,
+    ViewpointCaptured,
+)
+from service.core.protocol import load_protocol
+from service.core.run_state import RunState
+from service.evidence import RunLog
+from service.people.control import Control
+from service.people.errors import NotAllowedError
+from service.rig import load_rig
+from service.runs import start_run
+from service.steps import params_models
+from service.web.security import Signed, requires
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["acting"])
+
+RunId = Annotated[str, Path(max_length=64)]
+Short = Annotated[str, Form(max_length=200)]
+Words = Annotated[str, Form(max_length=2000)]
+Number = Annotated[int, Form(ge=0, le=2**31)]
+# Events that change nothing of what the person was looking at when deciding.
+_HARMLESS = (
+    ActionRefused,
+    ControlTaken,
+    DeviceOpened,
+    DeviceTrouble,
+    ItemTicked,
+    JobEnqueued,
+    JobFailed,
+    JobFinished,
+    SessionStarted,
+    StepNote,
+    ViewpointCaptured,
+)
+
+
+@router.post("/runs", name="start_run", dependencies=[Depends(requires("operate"))])
+def start(site: Here, person: Signed, protocol: Short) -> RedirectResponse:
+    """Begin a run of one of the protocol files; nothing moves before somebody confirms."""
+    known = {path.name: path for path in site.protocol_files()}
+    if protocol not in known:
+        raise ConfigurationError(
+            f"there is no protocol file {protocol!r}", where=str(site.protocols), remedy="Reload the page"
+        )
+    loaded = load_protocol(known[protocol], params_models())
+    run_id = start_run(site.store, loaded, load_rig(site.rig.path), operator=person.account, auto_confirm=False)
+    Control(site.store).take(run_id, person)
+    site.launcher.start(run_id)
+    return _back(run_id)
+
+
+@router.post("/runs/{run_id}/go-on", name="go_on", dependencies=[Depends(requires("operate"))])
+def go_on(site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
+    """Start the process that drives the run again, after it ended."""
+    log = site.run(run_id)
+    if log.state.terminal:
+        raise IllegalTransitionError(f"the run is {log.state.status}", where=run_id)
+    Control(site.store).require(run_id, person)
+    site.launcher.start(run_id)
+    return _back(run_id)
+
+
+@router.post("/runs/{run_id}/ticks", name="tick", dependencies=[Depends(requires("operate"))])
+def tick(
+    site: Here,
+    person: Signed,
+    run_id: RunId,
+    step: Short,
+    attempt: Number,
+    item: Words,
+    ticked: Annotated[bool, Form()],
+) -> RedirectResponse:
+    """Mark a checklist item; every screen shows the same."""
+    log = site.run(run_id)
+    Control(site.store).require(run_id, person)
+    now = log.state.step
+    if log.state.terminal or (step, attempt, "ready") != (now.step, now.attempt, now.phase):
+        raise _out_of_date(log.state)
+    if item not in log.protocol.step(step).checklist:
+        raise IllegalTransitionError("there is no such item in the checklist", where=step)
+    if (item in now.ticked) != ticked:
+        site.store.record(
+            run_id, [ItemTicked(step=step, attempt=attempt, item=item, ticked=ticked)], actor=person.account
+        )
+    return _back(run_id)
+
+
+@router.post(
+    "/runs/{run_id}/actions", name="act", dependencies=[Depends(requires("operate", while_locked=("pause",)))]
+)
+def act(
+    site: Here,
+    person: Signed,
+    run_id: RunId,
+    verb: Annotated[OperatorVerb, Form()],
+    step: Short = "",
+    attempt: Number = 0,
+    viewpoint: Short = "",
+    reason: Words = "",
+    meaning: Words = "",
+    password: Annotated[str, Form(max_length=1000)] = "",
+    signed_sha256: Short = "",
+    seen_seq: Number = 0,
+) -> RedirectResponse:
+    """Append what the person does if it is allowed now; otherwise append the refusal and say why.
+
+    Pausing needs neither control of the run nor an unlocked screen: it is the safe direction.
+    """
+    log = site.run(run_id)
+    if verb != "pause":
+        Control(site.store).require(run_id, person)
+    if verb in ("confirm", "sign", "skip"):
+        _require_current(log, step, attempt, seen_seq)
+    if verb == "sign":
+        if not person.may("sign"):
+            raise NotAllowedError(f"the role {person.role} may not sign", where=run_id)
+        site.people.check_password(person.account, password)
+    action = OperatorAction(
+        action=verb,
+        step=step or log.state.current,
+        viewpoint=viewpoint or None,
+        reason=reason.strip(),
+        checklist=log.state.step.ticked if verb == "confirm" else (),
+        meaning=meaning.strip(),
+        signed_sha256=signed_sha256,
+        via="web",
+    )
+    _append(site, log, action, person.account)
+    return _back(run_id)
+
+
+def _append(site: Site, log: RunLog, action: OperatorAction, actor: str) -> None:
+    refusal = refuse(log.protocol, log.state, action, actor)
+    if refusal is not None:
+        record = ActionRefused(action=action.action, step=action.step, why=str(refusal))
+        site.store.record(log.run_id, [record], actor=actor)
+        raise refusal
+    site.store.record(log.run_id, [action], actor=actor)
+
+
+def _require_current(log: RunLog, step: str, attempt: int, seen_seq: int) -> None:
+    """A page that shows an earlier question must not answer a later one."""
+    state = log.state
+    since = (event.payload for event in log.events[seen_seq:])
+    if (step, attempt) != (state.current, state.step.attempt) or not all(isinstance(p, _HARMLESS) for p in since):
+        raise _out_of_date(state)
+
+
+def _out_of_date(state: RunState) -> IllegalTransitionError:
+    return IllegalTransitionError(
+        "the page was out of date: the run has gone on since it was shown",
+        where=state.current,
+        remedy="Read what it shows now and decide again; nothing was done",
+    )
+
+
+# --- control ----------------------------------------------------------------------------------------------------
+
+
+@router.post("/runs/{run_id}/control/take", name="take_control", dependencies=[Depends(requires("operate"))])
+def take_control(site: Here, person: Signed, run_id: RunId, reason: Words = "") -> RedirectResponse:
+    """Take control of a run that nobody controls; a supervisor takes it from somebody with a reason."""
+    control = Control(site.store)
+    if reason.strip():
+        control.take_over(run_id, person, reason)
+    else:
+        control.take(run_id, person)
+    return _back(run_id)
+
+
+@router.post("/runs/{run_id}/control/ask", name="ask_for_control", dependencies=[Depends(requires("operate"))])
+def ask_for_control(site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
+    """Ask whoever has control to hand it over."""
+    Control(site.store).ask(run_id, person)
+    return _back(run_id)
+
+
+@router.post("/runs/{run_id}/control/answer", name="answer_for_control", dependencies=[Depends(requires("operate"))])
+def answer_for_control(site: Here, person: Signed, run_id: RunId, grant: Annotated[bool, Form()]) -> RedirectResponse:
+    """Hand control over to the screen that asked for it, or keep it."""
+    Control(site.store).answer(run_id, person, grant=grant)
+    return _back(run_id)
+
+
+@router.post("/runs/{run_id}/control/release", name="release_control", dependencies=[Depends(requires("operate"))])
+def release_control(site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
+    """Give control up; the run goes on and waits at its next question."""
+    Control(site.store).release(run_id, person)
+    return _back(run_id)
+
+
+def _back(run_id: str) -> RedirectResponse:
+    return RedirectResponse(f"/runs/{run_id}", status_code=303)

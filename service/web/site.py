@@ -29,6 +29,7 @@ class Site:
     launcher: Launcher
     secure: bool = True  # cookies are sent over TLS, or to this machine, only
     idle_lock_s: float = 600.0
+    hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask
     _logs: dict[str, RunLog] = field(default_factory=dict[str, RunLog])
     _lock: Lock = field(default_factory=Lock)
 
@@ -41,6 +42,10 @@ class Site:
             log = self._logs[run_id]
             log.refresh()
             return log
+
+    def protocol_files(self) -> list[Path]:
+        """Protocols that can be started."""
+        return sorted(self.protocols.glob("*.yaml"))
 
 
 def _site(request: Request) -> Site:

@@ -2,6 +2,64 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+import asyncio
+import json
+import time
+from collections.abc import AsyncGenerator
+from typing import Annotated
 
-router = APIRouter()
+from fastapi import APIRouter, Depends, Path, Request
+from fastapi.responses import StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from service.monitor.snapshot import read_snapshot
+from service.web.security import requires, token_of
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["stream"])
+
+_LOOK_S = 0.3
+_BEAT_S = 1.5  # a page that hears nothing for twice this says that the connection is lost
+_CHECK_S = 10.0
+RunId = Annotated[str, Path(max_length=64)]
+
+
+@router.get("/runs/{run_id}/stream", name="stream", dependencies=[Depends(requires("read"))])
+async def stream(request: Request, site: Here, run_id: RunId) -> StreamingResponse:
+    """`changed` with {"seq", "monitor"} whenever events were appended or the runner told something new."""
+    await run_in_threadpool(site.store.head, run_id)  # an unknown run is refused before the stream begins
+    return StreamingResponse(
+        _news(request, site, run_id),
+        media_type="text/event-stream",
+        headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
+    )
+
+
+async def _news(request: Request, site: Site, run_id: str) -> AsyncGenerator[str]:
+    told: tuple[int, float] | None = None
+    beat_s = checked_s = time.monotonic()
+    while not await request.is_disconnected():
+        now_s = time.monotonic()
+        news = await run_in_threadpool(_newest, site, run_id)
+        if news != told:
+            told, beat_s = news, now_s
+            yield f"event: changed\ndata: {json.dumps({'seq': news[0], 'monitor': news[1]})}\n\n"
+        elif now_s - beat_s > _BEAT_S:
+            beat_s = now_s
+            yield "event: beat\ndata: {}\n\n"
+        if now_s - checked_s > _CHECK_S:
+            checked_s = now_s
+            if not await run_in_threadpool(_signed_in, site, token_of(request, site)):
+                yield "event: signed_out\ndata: {}\n\n"
+                return
+        await asyncio.sleep(_LOOK_S)
+
+
+def _signed_in(site: Site, token: str) -> bool:
+    return site.people.person(token, idle_lock_s=site.idle_lock_s, deliberate=False) is not None
+
+
+def _newest(site: Site, run_id: str) -> tuple[int, float]:
+    snapshot = read_snapshot(site.data, run_id)
+    # A runner that has fallen silent is news as well, once.
+    return site.store.head(run_id), 0.0 if snapshot.stale else snapshot.at_utc_s

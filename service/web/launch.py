@@ -1,0 +1,54 @@
+"""Starts the process that drives a run, detached from this one: a restart of the web does not disturb a capture."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+
+from service.core.errors import ConfigurationError
+from service.monitor.snapshot import log_path
+from service.store.store import Store
+
+
+@dataclass
+class Launcher:
+    """Runners of one data folder. Whether one lives is asked of the database: it may have another parent."""
+
+    data: Path
+    store: Store
+    _children: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict[str, "subprocess.Popen[bytes]"])
+    _lock: Lock = field(default_factory=Lock)
+
+    def driven(self, run_id: str) -> bool:
+        """Whether a living process drives the run, or one has just been started to do so."""
+        with self._lock:
+            child = self._children.get(run_id)
+            if child is not None and child.poll() is None:
+                return True
+        return self.store.driven(run_id)
+
+    def start(self, run_id: str) -> None:
+        """Start a runner. Raises ConfigurationError when the run has one, or it cannot be started."""
+        if self.driven(run_id):
+            raise ConfigurationError("a process drives this run already", where=run_id, remedy="Reload the page")
+        log = log_path(self.data, run_id)
+        command = [sys.executable, "-m", "service.cli.main", "resume", run_id, "--data", str(self.data), "--screens"]
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            with log.open("ab") as output:
+                child = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    start_new_session=True,  # neither Ctrl-C nor the end of this process reaches it
+                )
+        except OSError as error:
+            raise ConfigurationError(
+                f"the process that drives the run cannot be started: {error.strerror or error}", where=str(log)
+            ) from error
+        with self._lock:
+            self._children[run_id] = child
