@@ -1,0 +1,203 @@
+"""A browser before the served pages, for tests: Chromium, screens, `orthocapture serve` as a process, axe."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+
+from service.people.people import People
+from service.people.roles import Role
+from service.store.store import Store
+from tests.support.rig import REPOSITORY, command
+
+TABLET = (1024, 768)
+DESKTOP = (1920, 1080)
+PASSWORD = "correct horse battery"
+PIN = "246810"
+_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# Without the last ones a browser looks up its maker's hosts at every start. SwiftShader draws the 3D view.
+_OPTIONS = (
+    "--no-sandbox",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+_RULES = {"runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]}}
+
+
+@contextmanager
+def chromium() -> Generator[Browser]:
+    """The system's Chromium, without a window."""
+    path = next((found for name in _NAMES if (found := shutil.which(name))), None)
+    if path is None:
+        pytest.fail(
+            "Chromium is not installed, and the browser tests need it: `sudo apt-get install chromium` on Debian, "
+            "`sudo snap install chromium` on Ubuntu, `brew install --cask chromium` on macOS",
+            pytrace=False,
+        )
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=_OPTIONS)
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@dataclass
+class Served:
+    """`orthocapture serve` as a process; can be killed and started again on the same port."""
+
+    rig: Path
+    data: Path
+    options: tuple[str, ...] = ()
+    url: str = ""
+    set_up: str = ""
+    _process: subprocess.Popen[str] | None = None
+
+    def start(self) -> None:
+        """Start, and wait until it answers."""
+        port = self.url.rpartition(":")[2] or "0"
+        words = ["serve", "--rig", str(self.rig), "--data", str(self.data), "--port", port, "--json", *self.options]
+        with (self.data.parent / "serve.log").open("a") as log:
+            self._process = subprocess.Popen(
+                command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True
+            )
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        assert line, self.log()
+        ready = json.loads(line)
+        self.url, self.set_up = ready["url"], ready["set_up"]
+
+    def kill(self, how: signal.Signals = signal.SIGKILL) -> None:
+        """End it; what it had started goes on."""
+        if self._process is not None:
+            self._process.send_signal(how)
+            self._process.wait(timeout=20)
+            assert self._process.stdout is not None
+            self._process.stdout.close()
+            self._process = None
+
+    def log(self) -> str:
+        """What it and its runners had to say."""
+        logs = [self.data.parent / "serve.log", *(self.data / "monitor").glob("*.log")]
+        return "\n".join(f"{path.name}: {path.read_text()}" for path in logs if path.exists())
+
+    def end_runners(self) -> None:
+        """End the processes that drive runs, and wait for them."""
+        for path in (self.data / "monitor").glob("*.json"):
+            pid = int(json.loads(path.read_text())["pid"])
+            try:
+                os.kill(pid, signal.SIGTERM)
+            except ProcessLookupError:
+                continue
+            deadline_s = time.monotonic() + 20
+            while Path(f"/proc/{pid}/status").exists() and time.monotonic() < deadline_s:
+                if "State:\tZ" in Path(f"/proc/{pid}/status").read_text():
+                    break
+                time.sleep(0.1)
+
+
+@contextmanager
+def served(rig: Path, data: Path, *options: str) -> Generator[Served]:
+    """The pages over a data folder, until the block ends."""
+    server = Served(rig, data, options)
+    server.start()
+    try:
+        yield server
+    finally:
+        server.end_runners()
+        server.kill(signal.SIGTERM)
+
+
+def add_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
+    """Accounts with PASSWORD and PIN, made as the pages make them: an administrator invites, people accept."""
+    with Store.open(data) as store:
+        desk = People(store)
+        token = desk.accounts.set_up(desk.first_link() or "", "admin", "Ada Administrator", PASSWORD, PIN)
+        administrator = desk.person(token, idle_lock_s=600, deliberate=True)
+        assert administrator is not None
+        for account, role in people:
+            link = desk.accounts.invite(administrator, account, f"{account.title()} Example", role)
+            desk.accounts.accept(link, PASSWORD, PIN)
+        desk.sign_out(administrator)
+
+
+@dataclass
+class Screen:
+    """A tablet or a desktop with one person before it."""
+
+    context: BrowserContext
+    page: Page
+    url: str
+
+    def go(self, path: str) -> None:
+        """Open a page; it must load."""
+        response = self.page.goto(self.url + path)
+        assert response is not None, f"{path}: no answer"
+        assert response.ok, f"{path}: {response.status}"
+
+    def sign_in(self, account: str, password: str = PASSWORD) -> None:
+        """Through the page, as people do."""
+        self.go("/sign-in")
+        self.page.get_by_label("Account").fill(account)
+        self.page.get_by_label("Password").fill(password)
+        self.page.get_by_role("button", name="Sign in").click()
+        expect(self.page.get_by_role("button", name="Sign out")).to_be_visible()
+
+    def hold(self, name: str, seconds: float = 1.8) -> None:
+        """Press a button of that name and keep it pressed."""
+        button = self.page.get_by_role("button", name=name)
+        expect(button).to_be_enabled(timeout=20_000)
+        button.scroll_into_view_if_needed()
+        button.hover()
+        self.page.mouse.down()
+        self.page.wait_for_timeout(1000 * seconds)
+        self.page.mouse.up()
+
+
+@contextmanager
+def screen(
+    browser: Browser, url: str, size: tuple[int, int] = TABLET, *, dark: bool = False, touch: bool = False
+) -> Generator[Screen]:
+    """A screen whose page must not complain: script errors and refused content fail the test."""
+    context = browser.new_context(
+        viewport={"width": size[0], "height": size[1]},
+        color_scheme="dark" if dark else "light",
+        has_touch=touch,
+        base_url=url,
+    )
+    complaints: list[str] = []
+    page = context.new_page()
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("console", lambda message: complaints.append(message.text) if "Content Security" in message.text else None)
+    try:
+        yield Screen(context, page, url)
+    finally:
+        context.close()
+    assert not complaints, complaints
+
+
+def accessibility_faults(page: Page) -> list[str]:
+    """What axe finds against WCAG 2.2 AA: rule, and where."""
+    found: dict[str, Any] = Axe().run(page, options=_RULES).response
+    return [
+        f"{violation['id']}: {violation['help']} at {node['target']}: {node['html'][:120]}"
+        for violation in found["violations"]
+        for node in violation["nodes"]
+    ]
