@@ -1,0 +1,174 @@
+"""Small copies of large photographs, kept in DIR/cache: made once, replaced as a whole, never evidence."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from service.core.errors import DataError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+PICTURES = frozenset({"image/jpeg", "image/png"})
+WIDTHS = (64, 96, 160, 320, 640)  # of thumbnails: a few sizes, so that nobody fills the disk with thousands
+IMAGE_WIDTHS = (*WIDTHS[3:], 960, 1280, 1920)
+#: Drawn on the screen's copy, so that every screen shows the same; version of all that follows.
+_VERSION = "1"
+_DECODING = threading.BoundedSemaphore(2)  # the capture and its worker need the processor more
+_MOST_PIXELS = 250_000_000
+_SAFE_NAME = re.compile(r"[^\w.+() -]+")
+
+MarkKind = Literal["registration", "control", "sphere", "unassigned"]
+# BGR. Line style and label say the same as the colour.
+_COLOURS: dict[MarkKind, tuple[int, int, int]] = {
+    "registration": (90, 230, 90),
+    "control": (255, 190, 60),
+    "sphere": (90, 230, 90),
+    "unassigned": (70, 170, 255),
+}
+_DASHES: dict[MarkKind, tuple[int, int] | None] = {  # drawn, left out: segments of the outline; None: all drawn
+    "registration": None,
+    "control": (7, 5),
+    "sphere": None,
+    "unassigned": (2, 4),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """The outline of one sphere in one image.
+
+    Attributes:
+        kind: what it is of.
+        label: written into it.
+        outline_px: (L, 2) points in pixels of the image as captured.
+    """
+
+    kind: MarkKind
+    label: str
+    outline_px: NDArray[np.float64]
+
+
+def nearest_width(width: int, among: Sequence[int] = WIDTHS) -> int:
+    """The smallest size on offer that is at least `width`, or the largest."""
+    return next((known for known in among if known >= width), among[-1])
+
+
+def cached(folder: Path, key: str, suffix: str, make: Callable[[], bytes]) -> Path:
+    """The file of a key, made when it is not there. Raises OSError, and what `make` raises."""
+    digest = hashlib.sha256(f"{_VERSION} {key}".encode()).hexdigest()
+    path = folder / "cache" / digest[:2] / f"{digest}{suffix}"
+    if not path.is_file():
+        content = make()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.part")
+        temporary.write_bytes(content)
+        temporary.replace(path)
+    return path
+
+
+def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = ()) -> bytes:
+    """A JPEG of this width, or of the picture's own where that is smaller, with outlines drawn over it.
+
+    A photograph is decoded at an eighth, a quarter or half of its size, never in full when that is wider than needed.
+
+    Raises:
+        DataError: it is no picture that can be decoded.
+    """
+    import cv2  # noqa: PLC0415 - a web process starts without it
+    import numpy as np  # noqa: PLC0415
+
+    data = np.fromfile(path, np.uint8)
+    full = picture_size(data.tobytes())
+    if full[0] * full[1] > _MOST_PIXELS:
+        raise DataError(f"the picture has {full[0]} × {full[1]} pixels, which is too many to show", where=path.name)
+    how = cv2.IMREAD_COLOR
+    for flag, k in (
+        (cv2.IMREAD_REDUCED_COLOR_8, 8),
+        (cv2.IMREAD_REDUCED_COLOR_4, 4),
+        (cv2.IMREAD_REDUCED_COLOR_2, 2),
+    ):
+        if full[0] // k >= width:
+            how = flag
+            break
+    with _DECODING:
+        try:
+            image = cv2.imdecode(data, how | cv2.IMREAD_IGNORE_ORIENTATION)
+        except cv2.error as error:
+            raise DataError("the picture cannot be decoded", where=path.name) from error
+        if image is None:
+            raise DataError("the file is not a picture that can be decoded", where=path.name)
+        height, present = image.shape[:2]
+        if present > width:
+            image = cv2.resize(image, (width, max(1, round(height * width / present))), interpolation=cv2.INTER_AREA)
+        picture = np.asarray(image, dtype=np.uint8)
+        if marks:
+            draw_marks(picture, marks, picture.shape[1] / full[0])
+        quality = 80 if width <= WIDTHS[-1] else 88
+        done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise DataError("the picture cannot be encoded", where=path.name)
+    return encoded.tobytes()
+
+
+def draw_marks(picture: NDArray[np.uint8], marks: Sequence[Mark], scale: float) -> None:
+    """Draw outlines into a picture (H, W, 3): solid, dashed or dotted by kind, each with its label in its middle."""
+    import cv2  # noqa: PLC0415 - a web process starts without it
+    import numpy as np  # noqa: PLC0415
+
+    width = max(1, round(picture.shape[1] / 700))
+    for mark in marks:
+        colour = _COLOURS[mark.kind]
+        curve = np.rint(((mark.outline_px + 0.5) * scale - 0.5) * 16).astype(np.int32)
+        for segment in _segments(curve, _DASHES[mark.kind]):
+            for tone, extra in (((0, 0, 0), 2), (colour, 0)):
+                closed = len(segment) == len(curve)
+                cv2.polylines(picture, [segment], closed, tone, width + extra, cv2.LINE_AA, shift=4)
+        if mark.label and picture.shape[1] >= WIDTHS[-1]:
+            size = picture.shape[1] / 1700
+            x, y = np.rint(mark.outline_px.mean(axis=0) * scale).astype(int)
+            place = (int(x - 9 * size * len(mark.label)), int(y + 9 * size))
+            for tone, thickness in (((0, 0, 0), 3 * width), (colour, width)):
+                cv2.putText(picture, mark.label, place, cv2.FONT_HERSHEY_SIMPLEX, size, tone, thickness, cv2.LINE_AA)
+
+
+def _segments(curve: NDArray[np.int32], dash: tuple[int, int] | None) -> list[NDArray[np.int32]]:
+    if dash is None:
+        return [curve]
+    on, off = dash
+    return [curve[k : k + on + 1] for k in range(0, len(curve), on + off)]
+
+
+def picture_size(data: bytes) -> tuple[int, int]:
+    """Width and height of a JPEG or PNG, from its header.
+
+    Raises:
+        DataError: it is neither, or its header is damaged.
+    """
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    at = 2
+    if data[:2] == b"\xff\xd8":
+        while at + 9 <= len(data) and data[at] == 0xFF:
+            marker = data[at + 1]
+            if marker == 0xFF:  # fill byte
+                at += 1
+                continue
+            if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
+                return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    raise DataError("the file is not a picture", remedy="Only JPEG and PNG are shown")
+
+
+def safe_name(name: str, sha256: str) -> str:
+    """A file name for whoever downloads: no folder, nothing that a shell or a header could take amiss."""
+    last = _SAFE_NAME.sub("_", name.replace("\\", "/").rsplit("/", 1)[-1]).strip(" .")
+    return last[-120:].lstrip(" .") or sha256[:12]

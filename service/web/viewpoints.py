@@ -1,0 +1,110 @@
+"""The images of a run: which is valid, which was replaced and why, and what the live numbers found in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from service.core.model import ViewpointCaptured, ViewpointFailed
+from service.core.run_state import JobState, StepState, Superseded
+from service.evidence import RunLog
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """One exposure in the record.
+
+    Attributes:
+        replaced: by what and why, where it is no longer valid.
+        live: the job that looked at the image while the capture ran; None where there is none.
+    """
+
+    seq: int
+    at_utc: str
+    payload: ViewpointCaptured
+    replaced: Superseded | None
+    live: JobState | None
+
+    @property
+    def sha256(self) -> str:
+        """Of the photograph."""
+        return self.payload.artefacts[0].sha256
+
+
+def captures_of(log: RunLog, step: str) -> list[Capture]:
+    """Every exposure of a step, in order, the replaced ones included."""
+    replaced = replaced_events(log)
+    live = live_jobs(log.state.steps[step])
+    out: list[Capture] = []
+    for event in log.events:
+        payload = event.payload
+        if isinstance(payload, ViewpointCaptured) and payload.step == step and event.seq not in log.state.overtaken:
+            job = live.get(payload.artefacts[0].sha256)
+            out.append(Capture(event.seq, event.at_utc, payload, replaced.get(event.seq), job))
+    return out
+
+
+def valid_capture(log: RunLog, step: str, viewpoint: str) -> Capture | None:
+    """The exposure of a viewpoint that counts now."""
+    seq = log.state.steps[step].captured.get(viewpoint)
+    return None if seq is None else capture_at(log, seq)
+
+
+def capture_at(log: RunLog, seq: int) -> Capture | None:
+    """The exposure that an event records; None where the event is of another kind."""
+    if not 1 <= seq <= len(log.events):
+        return None
+    event = log.events[seq - 1]
+    if not isinstance(event.payload, ViewpointCaptured) or event.payload.step not in log.state.steps:
+        return None
+    job = live_jobs(log.state.steps[event.payload.step]).get(event.payload.artefacts[0].sha256)
+    return Capture(seq, event.at_utc, event.payload, replaced_events(log).get(seq), job)
+
+
+def find_capture(
+    log: RunLog, viewpoint: str, *, step: str = "", attempt: int | None = None, seq: int | None = None
+) -> Capture | None:
+    """The exposure of a viewpoint: that of an event, the last of an attempt, or the valid one.
+
+    Without a step the last step that has it.
+    """
+    if seq is not None:
+        found = capture_at(log, seq)
+        return found if found is not None and found.payload.viewpoint == viewpoint else None
+    steps = [step] if step else [s.id for s in reversed(log.protocol.steps)]
+    for name in steps:
+        if name not in log.state.steps:
+            continue
+        if attempt is None:
+            found = valid_capture(log, name, viewpoint)
+        else:
+            mine = [c for c in captures_of(log, name) if c.payload.viewpoint == viewpoint]
+            found = next((c for c in reversed(mine) if c.payload.attempt == attempt), None)
+        if found is not None:
+            return found
+    return None
+
+
+def live_jobs(state: StepState) -> Mapping[str, JobState]:
+    """By photograph: what the live numbers found in it, or that they are still looking."""
+    found: dict[str, JobState] = {}
+    for job in sorted(state.jobs.values(), key=lambda j: j.enqueued_seq):
+        if job.kind == "live_view":
+            found[str(job.arguments["image"]["sha256"])] = job
+    return found
+
+
+def replaced_events(log: RunLog) -> Mapping[int, Superseded]:
+    """By event number: what replaced an exposure."""
+    return {seq: past for past in log.state.superseded for seq in past.captured.values()}
+
+
+def last_failures(log: RunLog, step: str) -> Mapping[str, str]:
+    """By viewpoint: the words of its last failure in the current attempt."""
+    attempt = log.state.steps[step].attempt
+    return {
+        event.payload.viewpoint: event.payload.message
+        for event in log.events
+        if isinstance(event.payload, ViewpointFailed)
+        and (event.payload.step, event.payload.attempt) == (step, attempt)
+    }
