@@ -19,7 +19,7 @@ from drivers.errors import DeviceFaultError
 from drivers.interfaces import CtSource, Mesh, ScanExport, ScannedMesh
 from service.compute.calibration.arm_correction import ArmCorrection, corrected_T_base_flange
 from service.compute.calibration.kinematics import arm_model
-from service.compute.live import LiveView, find_spheres, paired, register_station, sharpness
+from service.compute.live import LiveView, clipped_fraction, find_spheres, paired, register_station, sharpness
 from service.compute.planning.coverage import (
     CoverageLimits,
     CoverageSurface,
@@ -248,6 +248,15 @@ def test_prediction_finds_what_a_search_of_the_whole_image_finds(pictures: tuple
     assert blurred.edge_px > 1.5 * quality.edge_px
 
 
+def test_clipped_pixels_are_counted_whichever_channel_clips() -> None:
+    image = np.full((400, 600, 3), 200, dtype=np.uint8)
+    assert clipped_fraction(image) == 0.0
+    image[:100, :, 0] = 255
+    assert clipped_fraction(image) == pytest.approx(0.25)
+    image[200:300, :300, 2] = 254  # a clipped pixel after JPEG
+    assert clipped_fraction(image) == pytest.approx(0.375)
+
+
 def test_images_register_one_after_the_other(pictures: tuple[Scene, list[Any]]) -> None:
     made, images = pictures
     known, views = None, list[LiveView]()
@@ -329,6 +338,7 @@ def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
             **reported[i],
         }
         done = live_view(job(image=taken, surface=surface if i else None, earlier=earlier))
+        assert 0.0 <= done.measures["clipped_fraction"] < 0.01
         raw = live_view(job(image=taken, surface=None, earlier=uncorrected, arm_correction=None)) if i < 2 else None
         if raw is not None:
             uncorrected.append(raw.artefacts[0].sha256)

@@ -30,6 +30,7 @@ from service.core.geometry import Array, Transform, apply, inverse
 _POINTS = 25  # of an outline in the provisional solution: its three numbers need no more
 _GATE = 0.5  # of a radius, what a robot that is off by millimetres still meets
 _SIZE_GATE = 0.12
+_FULL_SCALE = 254  # of 255: JPEG moves a clipped 255 by one
 _MARGIN = 1.1  # of the outline's radius: a sphere nearer to the image's border is not expected to be found
 
 
@@ -171,6 +172,11 @@ def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], c
         float(np.median([o.coverage for o in outlines])),
         float(np.median([o.rms_px for o in outlines])),
     )
+
+
+def clipped_fraction(image_bgr: NDArray[np.uint8]) -> float:
+    """Share of the pixels of an image (H, W, 3) with a channel at the end of its scale, by a sixteenth of them."""
+    return float(np.mean(image_bgr[::4, ::4].max(axis=2) >= _FULL_SCALE))
 
 
 def paired(

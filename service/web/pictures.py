@@ -124,7 +124,7 @@ def draw_marks(picture: NDArray[np.uint8], marks: Sequence[Mark], scale: float) 
     import cv2  # noqa: PLC0415 - a web process starts without it
     import numpy as np  # noqa: PLC0415
 
-    width = max(1, round(picture.shape[1] / 700))
+    width = max(1, round(picture.shape[1] / 500))
     for mark in marks:
         colour = _COLOURS[mark.kind]
         curve = np.rint(((mark.outline_px + 0.5) * scale - 0.5) * 16).astype(np.int32)

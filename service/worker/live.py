@@ -17,6 +17,7 @@ from service.compute.images import read_image
 from service.compute.live import (
     LiveView,
     Provisional,
+    clipped_fraction,
     expected_spheres,
     find_spheres,
     paired,
@@ -122,6 +123,7 @@ def live_view(context: JobContext) -> JobAnswer:
         "outline_coverage": quality.coverage,
         "outline_rms_px": quality.rms_px,
         "edge_width_px": quality.edge_px,
+        "clipped_fraction": clipped_fraction(pixels),
     }
     result: dict[str, Any] = {"viewpoint": image["viewpoint"], "station": image["station"], "reason": ""}
     visible = np.zeros(0 if surface is None else len(surface.points_m), dtype=bool)
