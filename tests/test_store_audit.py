@@ -18,7 +18,8 @@ from service.store.audit import show, verify
 from service.store.database import database_path
 from service.store.errors import UnknownRunError
 from service.store.events import event_sha256
-from service.store.records import NewArtefact, NewJob
+from service.store.records import SITE, NewArtefact, NewJob
+from service.store.signing import checkpoint
 from service.store.store import Store
 from tests.support.store import CountedIds, SteppedClock, capture, rows, start_run, tamper
 
@@ -27,7 +28,7 @@ RUN = "20261121-120000-000003"
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """Seven events: run_started, three viewpoints, job_enqueued, job_finished, step_note."""
+    """Seven events, signed: run_started, three viewpoints, job_enqueued, job_finished, step_note."""
     folder = tmp_path / "data"
     with Store.open(folder, SteppedClock(), CountedIds()) as store:
         run = start_run(store)
@@ -40,6 +41,7 @@ def data(tmp_path: Path) -> Path:
         ref = store.put_bytes(b"{}", kind="result", media_type="application/json", original_name="result.json")
         store.finish_job(job, measures={"rms_px": 0.4}, duration_s=1.0, artefacts=[NewArtefact(ref, "worker 1")])
         store.record(run, [StepNote(step="capture", attempt=1, note="end")], actor="runner")
+        checkpoint(store, run)
     return folder
 
 
@@ -54,6 +56,7 @@ def test_untouched_evidence_verifies(data: Path) -> None:
     assert report.ok
     assert report.first_fault is None
     assert (report.events, report.artefacts, report.files, report.jobs, report.notes) == (7, 6, 6, 1, ())
+    assert (report.checkpoints, report.unsigned_events, len(report.key_ids)) == (1, {RUN: 0}, 1)
     assert seen[-1] == (report.bytes_hashed, report.bytes_hashed)
     assert report.heads[RUN] == rows(data, "SELECT sha256 FROM events WHERE seq = 7")[0][0]
 
@@ -206,7 +209,7 @@ def test_each_run_is_verified_by_itself(data: Path) -> None:
     tamper(data, f"UPDATE events SET actor = 'Eve' WHERE run_id = '{second}'")
     assert verify(data, RUN).ok
     assert not verify(data, second).ok
-    assert set(verify(data).runs) == {RUN, second}
+    assert set(verify(data).runs) == {RUN, second, SITE}
     with pytest.raises(UnknownRunError):
         verify(data, "nothing")
 

@@ -348,9 +348,7 @@ class ServiceStarted(Record):
     configuration: dict[str, str]  # rig and protocol files → SHA-256
     boot: str  # boot id, "" where the system has none
     clock_jump_s: float | None  # UTC against monotonic since the last start of this boot; None: cannot be told
-    heads: dict[
-        str, tuple[int, str]
-    ]  # run → last event's number and hash, of the runs that grew since the last start
+    heads: dict[str, tuple[int, str]]  # run → number and hash of its last event, where it grew since the last start
     unsigned_runs: tuple[str, ...]  # with events after their last checkpoint
     open_runs: tuple[str, ...]
 

@@ -2,40 +2,50 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, select, text
+from sqlalchemy import Connection, Table, select, text
 
 from service.core.errors import StoreError
 from service.store import audit_checks as checks
+from service.store import audit_signatures as signatures
 from service.store.artefacts import TEMPORARY, hash_file, read_artefacts, relative_path
-from service.store.audit_checks import Fault, FileState
+from service.store.audit_checks import ChainFacts, Fault, FileState
+from service.store.checkpoints import read_checkpoints, read_timestamps
 from service.store.database import database_path, open_read_only
 from service.store.errors import UnknownRunError
 from service.store.events import read_events
-from service.store.records import Artefact, RunRow
+from service.store.records import SITE, Artefact, Checkpoint, RunRow, Timestamp
 from service.store.seam import DurableFiles
 from service.store.store import read_runs
-from service.store.tables import TRIGGERS, artefacts, events, heads, jobs, runs
+from service.store.tables import TRIGGERS, artefacts, checkpoints, events, heads, jobs, runs
+from service.store.timestamping import timestamp_findings
 
 Progress = Callable[[str, int, int], None]  # what is being done, done, total (bytes)
 
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
-    """What was checked and what is wrong. `ok` means no fault; notes are no faults."""
+    """What was checked and what is wrong. `ok` means no fault; notes are no faults.
+
+    The site's chain is always checked too, because it holds the keys; the numbers are those of `runs`.
+    """
 
     data_dir: str
-    runs: tuple[str, ...]
+    runs: tuple[str, ...]  # those asked for
     heads: Mapping[str, str]  # run → sha256 of its last event: compare it with one written down elsewhere
     events: int
     artefacts: int
     files: int
     bytes_hashed: int
     jobs: int
+    checkpoints: int
+    timestamps: int
+    unsigned_events: Mapping[str, int]  # run → events after its last checkpoint
+    key_ids: tuple[str, ...]  # fingerprints of the site's keys, oldest first: compare them as well
     faults: tuple[Fault, ...]  # in the order of the chain
     notes: tuple[str, ...]
 
@@ -64,11 +74,25 @@ class EvidenceRecord:
     artefacts: tuple[Artefact, ...]
 
 
-def verify(data_dir: Path, run_id: str | None = None, progress: Progress | None = None) -> AuditReport:
-    """Walk the chain and hash every file again, of one run or of all.
+def verify(
+    data_dir: Path,
+    run_id: str | None = None,
+    progress: Progress | None = None,
+    *,
+    certificates: Path | None = None,
+    files: bool = True,
+) -> AuditReport:
+    """Walk the chain and hash every file again, of one run or of all, and check every signature.
 
-    A chain rewritten from some event to its end, hashes included, verifies by itself; it shows in `heads`,
-    which then differ from those written down before.
+    A chain rewritten from some event to its end, hashes included, is found by its checkpoints, whose key an
+    intruder does not have. What comes after the last checkpoint is told as a note; only `heads` covers it.
+
+    Args:
+        data_dir: the data folder.
+        run_id: one run, or None for all.
+        progress: told how many bytes were hashed.
+        certificates: of the time-stamp authorities (PEM). Without it only what a time stamp was given for is checked.
+        files: False leaves the files alone, which a note tells.
 
     Raises:
         UnknownRunError: there is no such run.
@@ -77,23 +101,62 @@ def verify(data_dir: Path, run_id: str | None = None, progress: Progress | None 
     database = open_read_only(data_dir, DurableFiles())
     try:
         with database.reading() as connection:
-            evidence = _read(connection, run_id)
+            return _verify(data_dir, connection, run_id, progress, certificates, with_files=files)
     finally:
         database.close()
+
+
+def _verify(
+    data_dir: Path,
+    connection: Connection,
+    run_id: str | None,
+    progress: Progress | None,
+    certificates: Path | None,
+    *,
+    with_files: bool,
+) -> AuditReport:
+    evidence = _read(connection, run_id)
     folder = data_dir / "artefacts"
-    files, hashed = _hash_files(folder, evidence, progress)
-    faults: list[Fault] = [Fault(None, None, "", problem) for problem in evidence.damage]
-    for run in evidence.run_ids:
-        faults += checks.run_faults(
+    files, hashed = _hash_files(folder, evidence, progress) if with_files else (None, 0)
+    chains = {SITE: ChainFacts()} | {run: ChainFacts() for run in evidence.run_ids}
+    found: dict[str, list[Fault]] = {run: [] for run in chains}
+    for run, facts in chains.items():
+        if run == SITE and not evidence.has_site:
+            continue
+        found[run] += checks.run_faults(
             run,
-            run_rows=[row for row in evidence.runs if row["run_id"] == run],
-            head_rows=[row for row in evidence.heads if row["run_id"] == run],
-            event_rows=[row for row in evidence.events if row["run_id"] == run],
-            artefact_rows=[row for row in evidence.artefacts if row["run_id"] == run],
-            job_rows=[row for row in evidence.jobs if row["run_id"] == run],
+            run_rows=evidence.runs.get(run, []),
+            head_rows=evidence.heads.get(run, []),
+            event_rows=_stream(connection, run),
+            artefact_rows=evidence.artefacts.get(run, []),
+            job_rows=evidence.jobs.get(run, []),
             files=files,
+            facts=facts,
         )
-    notes, foreign = _unlisted(folder, evidence.every_sha256)
+    site = chains[SITE]
+    keys = signatures.key_history(site, evidence.checkpoints[SITE])
+    found[SITE] += keys.faults
+    notes = list(keys.notes)
+    unsigned: dict[str, int] = {}
+    stamps = 0
+    for run, facts in chains.items():
+        signed = evidence.checkpoints[run]
+        rows = evidence.artefacts.get(run, [])
+        found[run] += signatures.checkpoint_faults(run, signed, facts, site, keys.periods, rows)
+        found[run] += signatures.start_faults(run, facts, site)
+        faults, said = timestamp_findings(signed, evidence.timestamps[run], certificates)
+        found[run] += faults
+        count, note = signatures.unsigned(run, signed, len(facts.sha256_at))
+        notes += [*said, *([note] if note else [])]
+        if run in evidence.run_ids:
+            unsigned[run] = count
+            stamps += len(evidence.timestamps[run])
+    orphans, foreign = _unlisted(folder, evidence.every_sha256) if with_files else ([], [])
+    if not with_files:
+        notes.append("the files were not read again: only records and signatures were checked")
+    ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
+    faults = [Fault(None, None, "", problem) for problem in evidence.damage]
+    faults += [fault for run in ordered for fault in found[run]]
     faults += foreign
     faults += [
         Fault(
@@ -105,14 +168,18 @@ def verify(data_dir: Path, run_id: str | None = None, progress: Progress | None 
     return AuditReport(
         data_dir=str(data_dir),
         runs=evidence.run_ids,
-        heads={row["run_id"]: row["sha256"] for row in evidence.heads},
-        events=len(evidence.events),
-        artefacts=len(evidence.artefacts),
-        files=len(files),
+        heads={row["run_id"]: row["sha256"] for heads in evidence.heads.values() for row in heads},
+        events=sum(len(chains[run].sha256_at) for run in evidence.run_ids),
+        artefacts=sum(len(evidence.artefacts.get(run, [])) for run in evidence.run_ids),
+        files=len(files or {}),
         bytes_hashed=hashed,
-        jobs=len(evidence.jobs),
+        jobs=sum(len(evidence.jobs.get(run, [])) for run in evidence.run_ids),
+        checkpoints=sum(len(evidence.checkpoints[run]) for run in evidence.run_ids),
+        timestamps=stamps,
+        unsigned_events=unsigned,
+        key_ids=tuple(keys.periods),
         faults=tuple(faults),
-        notes=tuple(notes),
+        notes=(*notes, *orphans),
     )
 
 
@@ -152,14 +219,21 @@ def list_runs(data_dir: Path) -> list[RunRow]:
         database.close()
 
 
+_Rows = dict[str, list[dict[str, Any]]]  # by run
+
+
 @dataclass(frozen=True, slots=True)
 class _Evidence:
+    """Everything but the events, which may be many: they pass by once."""
+
     run_ids: tuple[str, ...]
-    runs: list[dict[str, Any]]
-    heads: list[dict[str, Any]]
-    events: list[dict[str, Any]]
-    artefacts: list[dict[str, Any]]
-    jobs: list[dict[str, Any]]
+    has_site: bool
+    runs: _Rows
+    heads: _Rows
+    artefacts: _Rows
+    jobs: _Rows
+    checkpoints: Mapping[str, list[Checkpoint]]
+    timestamps: Mapping[str, list[Timestamp]]
     every_sha256: frozenset[str]
     triggers: frozenset[str]
     damage: tuple[str, ...]
@@ -168,22 +242,30 @@ class _Evidence:
 def _read(connection: Connection, run_id: str | None) -> _Evidence:
     damage = [str(row[0]) for row in connection.execute(text("PRAGMA quick_check(5)"))]
     known = set(connection.execute(select(runs.c.run_id)).scalars())
-    # A run whose row was deleted is still there in its events.
+    # A run whose row was deleted is still there in its events, or in what signs them.
     known |= set(connection.execute(select(events.c.run_id).distinct()).scalars())
+    known |= set(connection.execute(select(checkpoints.c.run_id).distinct()).scalars())
     if run_id is not None and run_id not in known:
         raise UnknownRunError(f"there is no run {run_id!r}", remedy="List the runs with `orthocapture status`")
     chosen = tuple(sorted(known)) if run_id is None else (run_id,)
+    read = tuple({*chosen, SITE})
 
-    def rows(statement: Any) -> list[dict[str, Any]]:
-        return [dict(row) for row in connection.execute(statement).mappings() if row["run_id"] in chosen]
+    def rows(table: Table, *order: Any) -> _Rows:
+        grouped: _Rows = {}
+        statement = select(table).where(table.c.run_id.in_(read)) if run_id is not None else select(table)
+        for row in connection.execute(statement.order_by(*order)).mappings():
+            grouped.setdefault(str(row["run_id"]), []).append(dict(row))
+        return grouped
 
     return _Evidence(
         run_ids=chosen,
-        runs=rows(select(runs)),
-        heads=rows(select(heads)),
-        events=rows(select(events).order_by(events.c.run_id, events.c.seq)),
-        artefacts=rows(select(artefacts).order_by(artefacts.c.run_id, artefacts.c.seq, artefacts.c.position)),
-        jobs=rows(select(jobs).order_by(jobs.c.position)),
+        has_site=SITE in known,
+        runs=rows(runs),
+        heads=rows(heads),
+        artefacts=rows(artefacts, artefacts.c.run_id, artefacts.c.seq, artefacts.c.position),
+        jobs=rows(jobs, jobs.c.position),
+        checkpoints={run: read_checkpoints(connection, run) for run in read},
+        timestamps={run: read_timestamps(connection, run) for run in read},
         every_sha256=frozenset(connection.execute(select(artefacts.c.sha256)).scalars()),
         triggers=frozenset(
             connection.execute(text("SELECT name FROM sqlite_master WHERE type = 'trigger'")).scalars()
@@ -192,8 +274,13 @@ def _read(connection: Connection, run_id: str | None) -> _Evidence:
     )
 
 
+def _stream(connection: Connection, run_id: str) -> Iterator[Mapping[Any, Any]]:
+    statement = select(events).where(events.c.run_id == run_id).order_by(events.c.seq)
+    return iter(connection.execution_options(yield_per=500).execute(statement).mappings())
+
+
 def _hash_files(folder: Path, evidence: _Evidence, progress: Progress | None) -> tuple[dict[str, FileState], int]:
-    wanted = {row["sha256"]: int(row["size_bytes"]) for row in evidence.artefacts}
+    wanted = {row["sha256"]: int(row["size_bytes"]) for rows in evidence.artefacts.values() for row in rows}
     total, done = sum(wanted.values()), 0
     states: dict[str, FileState] = {}
     for sha256, size in wanted.items():

@@ -1,9 +1,9 @@
-"""The pure part of the audit: rows and hashes in, faults out. No database, no files."""
+"""The pure part of the audit: rows and hashes in, faults out. No database, no files. Signatures: audit_signatures."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from pydantic_core import ValidationError
@@ -11,11 +11,12 @@ from pydantic_core import ValidationError
 from service.core.errors import StoreError
 from service.core.model import PAYLOAD, ArtefactRef
 from service.store.artefacts import record_sha256
-from service.store.events import ROOT, canonical, event_sha256, parse_canonical, references
+from service.store.events import ROOT, canonical, event_sha256_of_text, parse_canonical, references
 from service.store.records import SITE
 
 Rows = Sequence[Mapping[str, Any]]
 _REF_COLUMNS = tuple(ArtefactRef.model_fields)
+_OF_JOBS = frozenset({"job_enqueued", "job_finished", "job_failed"})
 _JOB_COLUMNS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
 
 
@@ -51,18 +52,39 @@ class FileState:
     problem: str
 
 
+@dataclass
+class ChainFacts:
+    """What other checks need to know of a chain, gathered while its events pass by once."""
+
+    sha256_at: dict[int, str] = field(default_factory=dict[int, str])
+    jobs: dict[int, Any] = field(default_factory=dict[int, Any])  # payloads that concern jobs
+    key_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
+    heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of ServiceStarted
+    first: Mapping[str, Any] | None = None
+
+    def add(self, seq: int, payload: Any) -> None:
+        """An event whose content is as it was recorded."""
+        kind = payload["kind"]
+        if kind in _OF_JOBS:
+            self.jobs[seq] = payload
+        elif kind == "key_changed":
+            self.key_changes.append((seq, payload))
+        elif kind == "service_started":
+            self.heads_at_start.append((seq, payload["heads"]))
+
+
 def run_faults(
     run_id: str,
     *,
     run_rows: Rows,
     head_rows: Rows,
-    event_rows: Rows,
+    event_rows: Iterable[Mapping[Any, Any]],
     artefact_rows: Rows,
     job_rows: Rows,
-    files: Mapping[str, FileState],
+    files: Mapping[str, FileState] | None,  # None: not read
+    facts: ChainFacts,
 ) -> Iterator[Fault]:
-    """Every fault of one run, in the order of its events, then those of the run as a whole."""
-    payloads: dict[int, Any] = {}
+    """Every fault of one run, in the order of its events, then those of the run as a whole. Fills `facts`."""
     by_seq: dict[int, list[Mapping[str, Any]]] = {}
     for row in artefact_rows:
         by_seq.setdefault(int(row["seq"]), []).append(row)
@@ -71,20 +93,22 @@ def run_faults(
     for row in event_rows:
         yield from _link_faults(run_id, row, seq, previous)
         seq, previous = int(row["seq"]), str(row["sha256"])
+        facts.sha256_at[seq] = previous
+        facts.first = facts.first or row
         mine = by_seq.pop(seq, [])
         payload, problem = _payload_of(row)
         if problem:
             yield Fault(run_id, seq, "", problem)
             continue
-        payloads[seq] = payload
+        facts.add(seq, payload)
         recorded |= {(str(item["sha256"]), int(item["size_bytes"])) for item in mine}
         yield from _artefact_faults(run_id, row, payload, mine, recorded=recorded, files=files)
     for left in by_seq.values():
         for item in left:
             what = f"artefact {item['original_name']} ({item['sha256']}) belongs to an event that is not there"
             yield Fault(run_id, int(item["seq"]), "", what)
-    yield from _end_faults(run_id, run_rows, head_rows, event_rows)
-    yield from _job_faults(run_id, job_rows, payloads)
+    yield from _end_faults(run_id, run_rows, head_rows, facts.first, (seq, previous))
+    yield from _job_faults(run_id, job_rows, facts.jobs)
 
 
 def _link_faults(run_id: str, row: Mapping[str, Any], before: int, previous: str) -> Iterator[Fault]:
@@ -101,11 +125,12 @@ def _payload_of(row: Mapping[str, Any]) -> tuple[Any, str]:
     try:
         payload = parse_canonical(row["payload"])
         PAYLOAD.validate_python(payload)
+        text = canonical(payload)
         fields = {name: row[name] for name in ("seq", "run_id", "at_utc", "monotonic_s", "actor", "previous_sha256")}
-        digest = event_sha256({**fields, "payload": payload})
+        digest = event_sha256_of_text(fields, text)
         if digest != row["sha256"]:
             return None, f"the content was altered: its SHA-256 is {digest}, recorded is {row['sha256']}"
-        if canonical(payload) != row["payload"]:
+        if text != row["payload"]:
             return None, "the payload is not in canonical form: its text was altered"
         if payload["kind"] != row["kind"]:
             return None, f"the column kind says {row['kind']}, the payload {payload['kind']}"
@@ -122,16 +147,19 @@ def _artefact_faults(
     rows: Rows,
     *,
     recorded: set[tuple[str, int]],
-    files: Mapping[str, FileState],
+    files: Mapping[str, FileState] | None,
 ) -> Iterator[Fault]:
     seq = int(event["seq"])
     named = references(payload)
     for row in rows:
-        state = files[row["sha256"]]
+        state = None if files is None else files[row["sha256"]]
+        shown = "" if state is None else state.shown
         if ArtefactRef(**{column: row[column] for column in _REF_COLUMNS}) not in named:
-            yield Fault(run_id, seq, state.shown, "the artefact's row is not what the event refers to")
+            yield Fault(run_id, seq, shown, "the artefact's row is not what the event refers to")
         elif record_sha256(event["sha256"], dict(row)) != row["record_sha256"]:
-            yield Fault(run_id, seq, state.shown, "the artefact's row was altered (device, step, time, who …)")
+            yield Fault(run_id, seq, shown, "the artefact's row was altered (device, step, time, who …)")
+        if state is None:
+            continue
         if state.problem:
             yield Fault(run_id, seq, state.shown, f"{state.problem} ({row['original_name']})")
         elif state.size != row["size_bytes"]:
@@ -145,15 +173,15 @@ def _artefact_faults(
             yield Fault(run_id, seq, "", what)
 
 
-def _end_faults(run_id: str, run_rows: Rows, head_rows: Rows, event_rows: Rows) -> Iterator[Fault]:
-    first, last = (event_rows[0], event_rows[-1]) if event_rows else (None, None)
-    end = (0, ROOT) if last is None else (last["seq"], last["sha256"])
+def _end_faults(
+    run_id: str, run_rows: Rows, head_rows: Rows, first: Mapping[str, Any] | None, end: tuple[int, str]
+) -> Iterator[Fault]:
     for head in head_rows:
         if (head["seq"], head["sha256"]) != end:
             what = (
                 f"the chain ends at event {end[0]} ({end[1]}), it was left at event {head['seq']} ({head['sha256']})"
             )
-            yield Fault(run_id, int(end[0]) + 1, "", what)
+            yield Fault(run_id, end[0] + 1, "", what)
     if not head_rows:
         yield Fault(run_id, None, "", "the record of where the chain ends is missing")
     if not run_rows:

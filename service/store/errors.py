@@ -23,3 +23,7 @@ class StoreVersionError(StoreError):
 
 class SigningKeyError(StoreError):
     """The private key that signs checkpoints is missing, unusable or badly kept; what is recorded stays as it is."""
+
+
+class TimestampError(StoreError):
+    """A time-stamp authority could not be reached, or its answer does not verify; the evidence stands without it."""

@@ -60,7 +60,7 @@ class KeyFolder:
         return key
 
     def load(self, key_id: str) -> Ed25519PrivateKey:
-        """The private key of this fingerprint. Raises SigningKeyError: missing, readable by others, or another key."""
+        """The private key of a fingerprint. Raises SigningKeyError: missing, readable by others, or another key."""
         path = self._path(key_id)
         try:
             for checked in (self._folder, path):

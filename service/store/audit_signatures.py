@@ -1,0 +1,131 @@
+"""The pure part of the audit that concerns signatures: keys, checkpoints and time stamps in, faults and notes out."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from service.store.audit_checks import ChainFacts, Fault
+from service.store.checkpoints import RowsDigest, key_fingerprint, signed_by
+from service.store.records import SITE, Checkpoint
+
+
+@dataclass(frozen=True, slots=True)
+class KeyPeriod:
+    """A public key and the part of the site's chain during which it signed."""
+
+    key_id: str
+    public_key: bytes
+    seq: int  # of its KeyChanged
+    replaced_seq: int | None
+
+
+@dataclass
+class Keys:
+    """The history of keys as the site's chain tells it."""
+
+    periods: dict[str, KeyPeriod] = field(default_factory=dict[str, KeyPeriod])
+    faults: list[Fault] = field(default_factory=list[Fault])
+    notes: list[str] = field(default_factory=list[str])
+
+
+def key_history(site: ChainFacts, checkpoints: Sequence[Checkpoint]) -> Keys:
+    """The keys of the site's chain; `checkpoints` are those of the site.
+
+    A new key counts as introduced when its predecessor signed its KeyChanged. One that is not is a note: it
+    happens when the old key was lost, and only a fingerprint written down elsewhere tells it from an intruder's.
+    """
+    keys = Keys()
+    vouchers = {item.seq: item for item in checkpoints}
+    before: KeyPeriod | None = None
+    for index, (seq, change) in enumerate(site.key_changes):
+        key_id, said_before = str(change["key_id"]), str(change["previous_key_id"])
+        try:
+            raw = base64.b64decode(str(change["public_key"]), validate=True)
+        except (binascii.Error, ValueError):
+            raw = b""
+        if len(raw) != 32 or key_fingerprint(raw) != key_id:
+            keys.faults.append(Fault(SITE, seq, "", f"the fingerprint {key_id} is not that of the public key"))
+        if said_before != (before.key_id if before else ""):
+            keys.faults.append(Fault(SITE, seq, "", f"key {key_id[:16]}… does not follow the key before it"))
+        if key_id in keys.periods:
+            keys.faults.append(Fault(SITE, seq, "", f"key {key_id[:16]}… is introduced twice"))
+        if before is not None and (seq not in vouchers or not signed_by(vouchers[seq], before.public_key)):
+            keys.notes.append(
+                f"site, event {seq}: key {key_id} was not vouched for by the key before it ({change['reason']}): "
+                "compare its fingerprint with one that was written down elsewhere"
+            )
+        after = site.key_changes[index + 1][0] if index + 1 < len(site.key_changes) else None
+        before = KeyPeriod(key_id, raw, seq, after)
+        keys.periods.setdefault(key_id, before)
+    return keys
+
+
+def checkpoint_faults(
+    run_id: str,
+    checkpoints: Sequence[Checkpoint],
+    chain: ChainFacts,
+    site: ChainFacts,
+    keys: Mapping[str, KeyPeriod],
+    artefact_rows: Sequence[Mapping[str, Any]],
+) -> Iterator[Fault]:
+    """Every fault of a run's checkpoints, which come oldest first, as the artefact rows come in their order."""
+    digest, position = RowsDigest(), 0
+    for item in checkpoints:
+        while position < len(artefact_rows) and int(artefact_rows[position]["seq"]) <= item.seq:
+            digest.add(str(artefact_rows[position]["record_sha256"]))
+            position += 1
+        period = keys.get(item.key_id)
+        found = chain.sha256_at.get(item.seq)
+        if period is None:
+            yield _fault(item, f"it is signed by a key that the site's chain does not know ({item.key_id})")
+        elif not signed_by(item, period.public_key):
+            yield _fault(item, "its signature is not valid")
+        elif not _in_use(item, period):
+            yield _fault(
+                item, f"its key {item.key_id[:16]}… was not in use at event {item.site_seq} of the site's chain"
+            )
+        if found is None:
+            yield _fault(item, "it signs an event that is not there")
+        elif found != item.sha256:
+            yield _fault(item, f"it signs an event with hash {item.sha256}, the chain has {found}: it was rewritten")
+        if item.artefacts_sha256 != digest.hexdigest():
+            yield _fault(item, "the rows of the artefacts up to it are not those that it signs")
+        if site.sha256_at.get(item.site_seq) != item.site_sha256:
+            yield _fault(item, f"event {item.site_seq} of the site's chain is not the one that it names")
+
+
+def _in_use(item: Checkpoint, period: KeyPeriod) -> bool:
+    if period.replaced_seq is None or item.site_seq < period.replaced_seq:
+        return item.site_seq >= period.seq
+    return item.run_id == SITE and item.seq == item.site_seq == period.replaced_seq  # vouches for its successor
+
+
+def _fault(item: Checkpoint, what: str) -> Fault:
+    return Fault(item.run_id, item.seq, "", f"checkpoint: {what}")
+
+
+def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[Fault]:
+    """Ends of the run's chain that the site's chain wrote down at each start of the service: all must be there."""
+    for start_seq, heads in site.heads_at_start:
+        if run_id in heads:
+            seq, sha256 = heads[run_id]
+            if chain.sha256_at.get(int(seq)) != sha256:
+                what = (
+                    f"the service saw another event here when it started (event {start_seq} of the site's chain): "
+                    "the chain was cut or rewritten since"
+                )
+                yield Fault(run_id, int(seq), "", what)
+
+
+def unsigned(run_id: str, checkpoints: Sequence[Checkpoint], events: int) -> tuple[int, str]:
+    """How many events come after the last checkpoint, and a note on it, "" when there is none."""
+    last = checkpoints[-1].seq if checkpoints else 0
+    count = max(0, events - last)
+    if count == 0:
+        return 0, ""
+    after = f"after its last checkpoint (event {last})" if checkpoints else "and none of them is signed"
+    return count, f"{run_id}: {count} event{'s' if count != 1 else ''} {after}"

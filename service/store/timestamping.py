@@ -1,0 +1,167 @@
+"""RFC 3161: an authority elsewhere says when a checkpoint existed. Asked when one is configured, never required."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import urllib.request
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from cryptography import x509
+from rfc3161_client import (
+    HashAlgorithm,
+    TimestampRequestBuilder,
+    TimeStampResponse,
+    VerificationError,
+    VerifierBuilder,
+    decode_timestamp_response,
+)
+from sqlalchemy import insert, select
+
+from service.store.audit_checks import Fault
+from service.store.checkpoints import statement
+from service.store.errors import TimestampError
+from service.store.records import Checkpoint, Timestamp
+from service.store.seam import utc_text
+from service.store.store import Store
+from service.store.tables import timestamps
+
+_LARGEST_REPLY = 1 << 20
+_TYPE, _REPLY_TYPE = "application/timestamp-query", "application/timestamp-reply"
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """A time-stamp authority, and the certificates (PEM: its root, those between) that its answers must lead to."""
+
+    url: str
+    certificates: Path
+    timeout_s: float = 10.0
+
+
+def stamped_bytes(checkpoint: Checkpoint) -> bytes:
+    """What the authority is asked about: what was signed, and the signature."""
+    return statement(checkpoint) + b"\n" + checkpoint.signature.encode()
+
+
+def timestamp(store: Store, checkpoint: Checkpoint, authority: Authority) -> Timestamp:
+    """Have a checkpoint stamped, verify the answer and keep it; one that is there already is returned.
+
+    Raises:
+        TimestampError: no answer, or one that does not verify. Nothing was recorded and nothing is lost.
+    """
+    for present in store.timestamps(checkpoint.run_id):
+        if (present.seq, present.authority) == (checkpoint.seq, authority.url):
+            return present
+    asked_utc = utc_text(store.clock.utc_now())
+    message = stamped_bytes(checkpoint)
+    request = TimestampRequestBuilder().data(message).hash_algorithm(HashAlgorithm.SHA256).build()
+    try:
+        reply = _post(authority, request.as_bytes())
+        response = decode_timestamp_response(reply)
+        roots, others = _certificates(authority.certificates)
+        builder = VerifierBuilder.from_request(request)
+        _verify(builder, roots, others, response, message)
+    except (OSError, ValueError, VerificationError) as error:
+        raise TimestampError(
+            f"the time-stamp authority gave no valid answer: {error}",
+            where=authority.url,
+            remedy="Check the network, address and certificates in the rig file; the checkpoint stands by itself",
+        ) from error
+    found = Timestamp(checkpoint.run_id, checkpoint.seq, authority.url, asked_utc, base64.b64encode(reply).decode())
+    with store.database.writing() as connection:
+        taken = select(timestamps.c.seq).where(
+            timestamps.c.run_id == found.run_id,
+            timestamps.c.seq == found.seq,
+            timestamps.c.authority == found.authority,
+        )
+        if connection.execute(taken).first() is None:
+            connection.execute(
+                insert(timestamps).values(
+                    run_id=found.run_id,
+                    seq=found.seq,
+                    authority=found.authority,
+                    at_utc=found.at_utc,
+                    token=found.token,
+                )
+            )
+    return found
+
+
+def timestamp_findings(
+    checkpoints: Sequence[Checkpoint], stamps: Sequence[Timestamp], certificates: Path | None
+) -> tuple[list[Fault], list[str]]:
+    """Faults and notes on the time stamps of a run. Raises TimestampError for certificates that cannot be read."""
+    signed = {item.seq: item for item in checkpoints}
+    faults: list[Fault] = []
+    notes: list[str] = []
+    for stamp in stamps:
+        try:
+            said = _check(signed.get(stamp.seq), stamp, certificates)
+        except (ValueError, VerificationError) as error:
+            faults.append(Fault(stamp.run_id, stamp.seq, "", f"time stamp of {stamp.authority}: {error}"))
+        else:
+            notes.append(f"{stamp.run_id}: {stamp.authority} says that the checkpoint at event {stamp.seq} {said}")
+    return faults, notes
+
+
+def _check(checkpoint: Checkpoint | None, stamp: Timestamp, certificates: Path | None) -> str:
+    if checkpoint is None:
+        raise ValueError("it belongs to a checkpoint that is not there")
+    try:
+        response = decode_timestamp_response(base64.b64decode(stamp.token, validate=True))
+    except binascii.Error as error:
+        raise ValueError(f"it cannot be read: {error}") from error
+    message = stamped_bytes(checkpoint)
+    at = f"existed at {utc_text(response.tst_info.gen_time)}"
+    if certificates is None:
+        if response.tst_info.message_imprint.message != hashlib.sha256(message).digest():
+            raise ValueError("it was given for something else than this checkpoint")
+        return f"{at} (its signature was not checked: no certificates were given)"
+    roots, others = _certificates(certificates)
+    _verify(VerifierBuilder(), roots, others, response, message)
+    return at
+
+
+def _verify(
+    builder: VerifierBuilder,
+    roots: Sequence[x509.Certificate],
+    others: Sequence[x509.Certificate],
+    response: TimeStampResponse,
+    message: bytes,
+) -> None:
+    for certificate in roots:
+        builder = builder.add_root_certificate(certificate)
+    for certificate in others:
+        builder = builder.add_intermediate_certificate(certificate)
+    builder.build().verify_message(response, message)
+
+
+def _certificates(path: Path) -> tuple[list[x509.Certificate], list[x509.Certificate]]:
+    """Self-issued certificates are roots, the others lie between."""
+    try:
+        found = x509.load_pem_x509_certificates(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise TimestampError(
+            f"the certificates of the time-stamp authority cannot be read: {error}",
+            where=str(path),
+            remedy="Name a PEM file that holds the authority's root certificate",
+        ) from error
+    roots = [certificate for certificate in found if certificate.issuer == certificate.subject]
+    return roots, [certificate for certificate in found if certificate not in roots]
+
+
+def _post(authority: Authority, body: bytes) -> bytes:
+    if not authority.url.startswith(("http://", "https://")):
+        raise ValueError("the address must begin with http:// or https://")
+    request = urllib.request.Request(authority.url, data=body, headers={"Content-Type": _TYPE}, method="POST")
+    with urllib.request.urlopen(request, timeout=authority.timeout_s) as reply:
+        if reply.headers.get_content_type() != _REPLY_TYPE:
+            raise ValueError(f"it answered with {reply.headers.get_content_type()}")
+        content: bytes = reply.read(_LARGEST_REPLY + 1)
+    if len(content) > _LARGEST_REPLY:
+        raise ValueError("its answer is too long")
+    return content
