@@ -99,11 +99,6 @@ class Link:
         self._model = model
         self._camera: Gphoto | None = None
 
-    @property
-    def is_open(self) -> bool:
-        """Whether a camera was opened and not closed since."""
-        return self._camera is not None
-
     def open(self) -> None:
         """Connect, with back-off: bodies need a moment after a lost session."""
         check_library_version(library_version())

@@ -76,10 +76,6 @@ class CameraModel:
         out = cv2.undistortPointsIter(points, self.matrix, self.distortion, np.eye(3), np.eye(3), criteria)
         return np.asarray(out, dtype=np.float64).reshape(-1, 2)
 
-    def undistort(self, pixels: Array) -> Array:
-        """Pixels (N, 2) an ideal pinhole with the same K would have seen."""
-        return self.normalise(pixels) * [self.fx, self.fy] + [self.cx, self.cy]
-
     def scaled(self, width: int, height: int) -> CameraModel:
         """The same camera at another image size; centres stay at integers, so c' = (c + ½) s − ½."""
         sx, sy = width / self.width, height / self.height

@@ -46,10 +46,6 @@ class IllegalTransitionError(OrthocaptureError):
     """The lifecycle does not allow this action in this state."""
 
 
-class GateError(OrthocaptureError):
-    """A measured value is outside its limit."""
-
-
 class StoreError(OrthocaptureError):
     """The evidence could not be written or read."""
 

@@ -12,7 +12,6 @@ likelihood (REML; Patterson and Thompson 1971, by Henderson's mixed model equati
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,10 +58,6 @@ class Views:
             self.design[which],
             self.kind,
         )
-
-    def without_arm(self) -> Views:
-        """The same views with the arm's systematic error left in the noise."""
-        return dataclasses.replace(self, design=self.design[:, :, :0], kind=self.kind[:0])
 
 
 @dataclass(frozen=True, slots=True)

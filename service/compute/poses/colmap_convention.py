@@ -73,11 +73,6 @@ def from_colmap_pose(cam_from_world: pycolmap.Rigid3d) -> Transform:
     return inverse(transform(rotation, np.asarray(cam_from_world.translation, dtype=np.float64)))
 
 
-def to_colmap_pixels(pixels: Array) -> Array:
-    """COLMAP's image coordinates (N, 2) of our pixels (N, 2)."""
-    return pixels + HALF_PIXEL
-
-
 def from_colmap_pixels(points: Array) -> Array:
     """Our pixels (N, 2) of COLMAP's image coordinates (N, 2)."""
     return points - HALF_PIXEL

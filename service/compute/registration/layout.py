@@ -200,19 +200,6 @@ def layout_record(report: LayoutReport) -> dict[str, Any]:
     }
 
 
-def visible_counts(centres_m: Array, radius_m: float, cameras_m: Array) -> IntArray:
-    """How many spheres (N, 3) each camera position (K, 3) sees whole, not hidden by a nearer sphere: (K,)."""
-    counts = np.zeros(len(cameras_m), dtype=np.int64)
-    for k, camera in enumerate(cameras_m):
-        ray = centres_m - camera
-        distance = np.linalg.norm(ray, axis=1)
-        half = np.arcsin(np.minimum(radius_m / distance, 1.0))
-        angle = np.arccos(np.clip((ray / distance[:, None]) @ (ray / distance[:, None]).T, -1.0, 1.0))
-        hides = (angle < half[:, None] + half[None]) & (distance[None] < distance[:, None])
-        counts[k] = np.count_nonzero(~hides.any(axis=1))
-    return counts
-
-
 # --- search ---------------------------------------------------------------------------------------------
 
 
