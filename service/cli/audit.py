@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import getpass
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -22,7 +25,8 @@ from service.cli.common import (
 from service.store import audit
 from service.store.audit import AuditReport, EvidenceRecord
 from service.store.records import Artefact
-from service.store.store import resolve_run
+from service.store.signing import PublicKey, checkpoint, public_keys, rotate_key
+from service.store.store import Store, resolve_run
 
 audit_app = typer.Typer(
     name="audit",
@@ -31,6 +35,17 @@ audit_app = typer.Typer(
 )
 
 _RUN_HELP = "Name of the run, its first characters, or `latest`."
+
+RunArgument = Annotated[str, typer.Argument(help=_RUN_HELP)]
+CertificatesOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Certificates of the time-stamp authority (PEM), to check its signatures too.",
+        exists=True,
+        dir_okay=False,
+    ),
+]
 
 
 @audit_app.command("show")
@@ -53,22 +68,81 @@ def show_command(
 def verify_command(
     run: Annotated[str, typer.Argument(help=_RUN_HELP + " `all` checks every run of the folder.")] = "latest",
     data: DataOption = DEFAULT_DATA,
+    certificates: CertificatesOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Check the evidence: read every file again, follow the chain of records, and name the first fault.
+    """Check the evidence: read every file again, follow the chain, check the signatures, and name the first fault.
 
     The exit status is 0 when all is as it was recorded, and 1 when anything differs.
     """
     with reporting_errors(json):
         run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
         with progress_bar(quiet=json) as report_progress:
-            report = audit.verify(data, run_id, report_progress)
+            report = audit.verify(data, run_id, report_progress, certificates=certificates)
     if json:
         print_json(report_json(report))
     else:
         _print_report(report)
     if not report.ok:
         raise typer.Exit(1)
+
+
+@audit_app.command("checkpoint")
+def checkpoint_command(
+    run: RunArgument = "latest", data: DataOption = DEFAULT_DATA, json: JsonOption = False
+) -> None:
+    """Sign the end of a run's chain now, so that everything up to it can no longer be rewritten."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        made = checkpoint(store, store.find_run(run))
+    if json:
+        print_json(asdict(made))
+    else:
+        console.print(f"Run {made.run_id} is signed up to event {made.seq} with key {made.key_id}.")
+
+
+@audit_app.command("keys")
+def keys_command(data: DataOption = DEFAULT_DATA, json: JsonOption = False) -> None:
+    """Show the fingerprints of the keys that sign. Write them down elsewhere: a bundle is checked against them."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        keys = public_keys(store)
+    if json:
+        print_json({"keys": [_key_json(key) for key in keys]})
+        return
+    if not keys:
+        console.print("No key has signed anything in this folder yet.")
+    for key in keys:
+        state = "in use" if key.replaced_seq is None else "replaced"
+        gap = "" if key.introduced or key is keys[0] else ", [yellow]not vouched for by the key before it[/]"
+        console.print(f"{key.key_id}  {state}{gap}  ({escape(key.reason)})")
+
+
+@audit_app.command("rotate-key")
+def rotate_key_command(
+    reason: Annotated[str, typer.Option(help="Why the key is replaced; it is recorded.")],
+    data: DataOption = DEFAULT_DATA,
+    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    lost: Annotated[
+        bool, typer.Option("--lost", help="The old key's file is gone and cannot vouch for the new one.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Replace the signing key. The old one signs the new one as its last act, and its file is destroyed."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        key = rotate_key(store, reason=reason, actor=operator or getpass.getuser(), lost=lost)
+    if json:
+        print_json(_key_json(key))
+    else:
+        console.print(f"The key is now {key.key_id}. Write this fingerprint down elsewhere.")
+
+
+def _key_json(key: PublicKey) -> dict[str, Any]:
+    return {
+        "key_id": key.key_id,
+        "public_key": base64.b64encode(key.public_key).decode(),
+        "in_use": key.replaced_seq is None,
+        "introduced_by_predecessor": key.introduced,
+        "reason": key.reason,
+    }
 
 
 def report_json(report: AuditReport) -> dict[str, Any]:
@@ -118,10 +192,13 @@ def _print_records(run_id: str, records: Sequence[EvidenceRecord]) -> None:
 def _print_report(report: AuditReport) -> None:
     console.print(
         f"Checked {len(report.runs)} run(s) in {escape(report.data_dir)}: {report.events} events, "
-        f"{report.artefacts} recorded files ({report.bytes_hashed / 1e6:.1f} MB read again), {report.jobs} jobs."
+        f"{report.artefacts} recorded files ({report.bytes_hashed / 1e6:.1f} MB read again), {report.jobs} jobs, "
+        f"{report.checkpoints} signatures."
     )
     for run_id, head in report.heads.items():
         console.print(f"  {run_id} ends with {head}")
+    for key_id in report.key_ids:
+        console.print(f"  signed with key {key_id}")
     for note in report.notes:
         console.print(f"  [yellow]note:[/] {escape(note)}")
     if report.first_fault is None:
