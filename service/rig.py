@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import yaml
 from pydantic import Field, ValidationError
 
 from service.core.errors import ConfigurationError
-from service.core.geometry import Transform
 from service.core.model import Record
+
+if TYPE_CHECKING:  # the module brings scipy, for which a web process must not wait when it starts
+    from service.core.geometry import Transform
 
 Vector3 = tuple[float, float, float]
 
