@@ -1,0 +1,285 @@
+"""Accounts: first set-up, invitations, roles, and what an administrator or their owner changes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import Connection, Row, func, insert, select, update
+
+from service.people.errors import AccountError, LinkError
+from service.people.passwords import Passwords, new_token, require_password, require_pin, token_sha256
+from service.people.person import Account, Invitation, Person
+from service.people.roles import ROLES, Role
+from service.people.rows import (
+    SERVICE,
+    end_sessions,
+    find_account,
+    get_account,
+    plain_name,
+    record_change,
+    require_full_name,
+    require_name,
+    require_reason,
+    to_account,
+)
+from service.store.seam import utc_text
+from service.store.store import Store
+from service.store.tables import accounts, invitations
+
+FIRST_LINK_S = 24 * 3600.0
+INVITATION_S = 72 * 3600.0
+
+
+class Accounts:
+    """What administrators do to accounts, and people to their own. Each change is recorded as it is made."""
+
+    def __init__(self, store: Store, passwords: Passwords) -> None:
+        self._store = store
+        self._passwords = passwords
+
+    def _now_s(self) -> float:
+        return self._store.clock.utc_now().timestamp()
+
+    def all(self) -> list[Account]:
+        """Every account, by name."""
+        with self._store.database.reading() as connection:
+            return [to_account(row) for row in connection.execute(select(accounts).order_by(accounts.c.account))]
+
+    # --- one-time links ---
+
+    def first_link(self) -> str | None:
+        """A token to make the first administrator with, or None when there is one already."""
+        with self._store.database.writing() as connection:
+            if self._administrators(connection):
+                return None
+            return self._new_link(connection, "", FIRST_LINK_S, actor=SERVICE)
+
+    def invitation(self, token: str) -> Invitation:
+        """What a link is for. Raises LinkError when it is unknown, used or too old."""
+        with self._store.database.reading() as connection:
+            return self._invitation(connection, token)
+
+    def set_up(self, token: str, account: str, full_name: str, password: str, pin: str) -> str:
+        """Use the first link: make the administrator; the account's name. Raises LinkError, AccountError."""
+        name = plain_name(account)
+        require_name(name)
+        plain = require_full_name(full_name)
+        require_password(password, name)
+        require_pin(pin)
+        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._passwords.hash(pin)}
+        with self._store.database.writing() as connection:
+            if self._invitation(connection, token).account or self._administrators(connection):
+                raise _no_link()
+            if find_account(connection, name) is not None:
+                raise AccountError(f"there is an account {name} already", where="account", remedy="Choose another")
+            self._use(connection, token)
+            self._insert(connection, name, plain, "administrator", "active", secrets)
+            record_change(self._store, connection, name, name, "created", "", "administrator, active")
+        return name
+
+    def accept(self, token: str, password: str, pin: str) -> str:
+        """Use an invitation: the account gets its password and PIN; its name. Raises LinkError, AccountError."""
+        name = self.invitation(token).account
+        require_password(password, name)
+        require_pin(pin)
+        secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._passwords.hash(pin)}
+        with self._store.database.writing() as connection:
+            if not name or self._invitation(connection, token).account != name:
+                raise _no_link()
+            self._use(connection, token)
+            connection.execute(
+                update(accounts)
+                .where(accounts.c.account == name)
+                .values(state="active", failures=0, locked_until_utc_s=0.0, **secrets)
+            )
+            record_change(self._store, connection, name, name, "state", "invited", "active")
+        return name
+
+    def invite(self, by: Person, account: str, full_name: str, role: Role) -> str:
+        """Make an account and the token of its link, which is shown once. Raises AccountError."""
+        name = plain_name(account)
+        require_name(name)
+        plain = require_full_name(full_name)
+        _require_role(role)
+        with self._store.database.writing() as connection:
+            if find_account(connection, name) is not None:
+                raise AccountError(
+                    f"there is an account {name} already", where="account", remedy="Choose another, or reset that one"
+                )
+            self._insert(connection, name, plain, role, "invited", {"password_hash": "", "pin_hash": ""})
+            record_change(self._store, connection, by.account, name, "created", "", f"{role}, invited")
+            return self._new_link(connection, name, INVITATION_S, actor=by.account)
+
+    def reset(self, by: Person, account: str, reason: str) -> str:
+        """Take away password and PIN, end all sign-ins, and make a new link. Raises AccountError."""
+        why = require_reason(reason)
+        with self._store.database.writing() as connection:
+            row = get_account(connection, account)
+            if row.state == "active":
+                self._require_another_administrator(connection, row)
+            values = {
+                "state": "invited",
+                "password_hash": "",
+                "pin_hash": "",
+                "failures": 0,
+                "locked_until_utc_s": 0.0,
+            }
+            connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
+            end_sessions(self._store, connection, account, actor=by.account)
+            record_change(self._store, connection, by.account, account, "state", row.state, "invited", why)
+            return self._new_link(connection, account, INVITATION_S, actor=by.account)
+
+    # --- an administrator's changes ---
+
+    def change_role(self, by: Person, account: str, role: Role, reason: str) -> None:
+        """Give an account another role; its sign-ins end. Raises AccountError."""
+        why = require_reason(reason)
+        _require_role(role)
+        with self._store.database.writing() as connection:
+            row = get_account(connection, account)
+            if row.role == role:
+                raise AccountError(f"{account} is {role} already", where="role", remedy="Nothing has to be done")
+            if row.state == "active":
+                self._require_another_administrator(connection, row)
+            connection.execute(update(accounts).where(accounts.c.account == account).values(role=role))
+            end_sessions(self._store, connection, account, actor=by.account)
+            record_change(self._store, connection, by.account, account, "role", row.role, role, why)
+
+    def disable(self, by: Person, account: str, reason: str) -> None:
+        """Shut an account out; its sign-ins and links end. Raises AccountError for the last administrator."""
+        why = require_reason(reason)
+        with self._store.database.writing() as connection:
+            row = get_account(connection, account)
+            if row.state == "disabled":
+                raise AccountError(f"{account} is disabled already", where="account", remedy="Nothing has to be done")
+            if row.state == "active":
+                self._require_another_administrator(connection, row)
+            connection.execute(update(accounts).where(accounts.c.account == account).values(state="disabled"))
+            end_sessions(self._store, connection, account, actor=by.account)
+            self._void_links(connection, account)
+            record_change(self._store, connection, by.account, account, "state", row.state, "disabled", why)
+
+    def enable(self, by: Person, account: str, reason: str) -> None:
+        """Let a disabled account in again, with the password it had. Raises AccountError."""
+        why = require_reason(reason)
+        with self._store.database.writing() as connection:
+            row = get_account(connection, account)
+            if row.state != "disabled" or not row.password_hash:
+                raise AccountError(
+                    f"{account} is not disabled"
+                    if row.state != "disabled"
+                    else f"{account} has never had a password",
+                    where="account",
+                    remedy="Reset the account for a new link if its owner cannot sign in",
+                )
+            connection.execute(update(accounts).where(accounts.c.account == account).values(state="active"))
+            record_change(self._store, connection, by.account, account, "state", "disabled", "active", why)
+
+    def end_wait(self, by: Person, account: str) -> None:
+        """End an account's wait after wrong passwords. Raises AccountError."""
+        with self._store.database.writing() as connection:
+            row = get_account(connection, account)
+            values = {"failures": 0, "locked_until_utc_s": 0.0}
+            connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
+            record_change(
+                self._store, connection, by.account, account, "lock_out", f"{row.failures} wrong passwords", "ended"
+            )
+
+    # --- one's own ---
+
+    def change_password(self, person: Person, password: str) -> None:
+        """Set a new password; the person's other sign-ins end. The old one has been checked before. AccountError."""
+        require_password(password, person.account)
+        self._change_secret(person, "password", self._passwords.hash(password))
+
+    def change_pin(self, person: Person, pin: str) -> None:
+        """Set a new PIN. The password has been checked before. Raises AccountError."""
+        require_pin(pin)
+        self._change_secret(person, "pin", self._passwords.hash(pin))
+
+    def _change_secret(self, person: Person, which: str, stored: str) -> None:
+        with self._store.database.writing() as connection:
+            connection.execute(
+                update(accounts).where(accounts.c.account == person.account).values(**{f"{which}_hash": stored})
+            )
+            if which == "password":
+                end_sessions(self._store, connection, person.account, actor=person.account, keep=person.screen)
+            record_change(self._store, connection, person.account, person.account, which, "set", "changed")
+
+    # --- within a transaction ---
+
+    def _insert(
+        self, connection: Connection, name: str, full_name: str, role: Role, state: str, secrets: dict[str, str]
+    ) -> None:
+        connection.execute(
+            insert(accounts).values(
+                account=name,
+                full_name=full_name,
+                role=role,
+                state=state,
+                failures=0,
+                locked_until_utc_s=0.0,
+                created_utc=utc_text(self._store.clock.utc_now()),
+                **secrets,
+            )
+        )
+
+    def _new_link(self, connection: Connection, account: str, valid_s: float, *, actor: str) -> str:
+        self._void_links(connection, account)
+        token = new_token()
+        connection.execute(
+            insert(invitations).values(
+                token_sha256=token_sha256(token), account=account, expires_utc_s=self._now_s() + valid_s, used=0
+            )
+        )
+        record_change(self._store, connection, actor, account, "link", "", f"valid for {valid_s / 3600:.0f} h")
+        return token
+
+    def _void_links(self, connection: Connection, account: str) -> None:
+        connection.execute(update(invitations).where(invitations.c.account == account).values(used=1))
+
+    def _invitation(self, connection: Connection, token: str) -> Invitation:
+        row = connection.execute(
+            select(invitations).where(
+                invitations.c.token_sha256 == token_sha256(token),
+                invitations.c.used == 0,
+                invitations.c.expires_utc_s > self._now_s(),
+            )
+        ).one_or_none()
+        if row is None:
+            raise _no_link()
+        if not row.account:
+            return Invitation("", "", "administrator")
+        owner = get_account(connection, row.account)
+        return Invitation(owner.account, owner.full_name, owner.role)
+
+    def _use(self, connection: Connection, token: str) -> None:
+        connection.execute(
+            update(invitations).where(invitations.c.token_sha256 == token_sha256(token)).values(used=1)
+        )
+
+    def _administrators(self, connection: Connection) -> int:
+        return connection.execute(
+            select(func.count()).where(accounts.c.role == "administrator", accounts.c.state == "active")
+        ).scalar_one()
+
+    def _require_another_administrator(self, connection: Connection, row: Row[Any]) -> None:
+        if row.role == "administrator" and self._administrators(connection) < 2:
+            raise AccountError(
+                f"{row.account} is the last active administrator",
+                where="account",
+                remedy="Make another administrator first",
+            )
+
+
+def _require_role(role: str) -> None:
+    if role not in ROLES:
+        raise AccountError(f"there is no role {role!r}", where="role", remedy=f"One of {', '.join(ROLES)}")
+
+
+def _no_link() -> LinkError:
+    return LinkError(
+        "this link is not valid: it was used, is too old, or was replaced by a newer one",
+        where="link",
+        remedy="Ask an administrator for a new one; the first link is printed by `orthocapture serve` as it starts",
+    )

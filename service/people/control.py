@@ -1,0 +1,226 @@
+"""Which screen has control of a run. One acts, the others look on; every change of hands is in the run's chain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sqlalchemy import Connection, select
+from sqlalchemy.dialects.sqlite import insert
+
+from service.core.model import ControlTaken
+from service.people.errors import ControlError, NotAllowedError
+from service.people.person import Person
+from service.people.rows import SESSION_S, require_reason
+from service.store.store import Store
+from service.store.tables import accounts, control, runs, sessions
+
+UNANSWERED_S = 60.0  # after which a question to a locked screen counts as answered
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """Who has control, and who asks for it; "" for nobody. A screen whose sign-in has ended has none."""
+
+    screen: str = ""
+    account: str = ""
+    full_name: str = ""
+    locked: bool = False
+    asked_by_screen: str = ""
+    asked_by_account: str = ""
+    asked_utc_s: float = 0.0
+
+
+class Control:
+    """Control of the runs of a data folder. Methods raise ControlError when the answer is no."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def _now_s(self) -> float:
+        return self._store.clock.utc_now().timestamp()
+
+    def holder(self, run_id: str) -> Holder:
+        """Who has control now."""
+        with self._store.database.reading() as connection:
+            return self._holder(connection, run_id)
+
+    def require(self, run_id: str, person: Person) -> None:
+        """Raises ControlError unless this person's screen has control of the run."""
+        holder = self.holder(run_id)
+        if holder.screen != person.screen:
+            raise ControlError(
+                f"{holder.full_name} has control of this run, on screen {holder.screen}"
+                if holder.screen
+                else "no screen has control of this run",
+                where=run_id,
+                remedy="Ask for control" if holder.screen else "Take control first",
+            )
+
+    def take(self, run_id: str, person: Person) -> None:
+        """Take control that is free, that the person has on another screen, or that a locked screen does not defend."""
+        _require_operator(person)
+        with self._store.database.writing() as connection:
+            holder = self._holder(connection, run_id)
+            if holder.screen == person.screen:
+                return
+            unanswered = (
+                holder.locked
+                and holder.asked_by_screen == person.screen
+                and self._now_s() - holder.asked_utc_s >= UNANSWERED_S
+            )
+            if not holder.screen:
+                self._give(connection, run_id, person, holder, "free", "")
+            elif holder.account == person.account:
+                self._give(connection, run_id, person, holder, "handed_over", "the same person on another screen")
+            elif unanswered:
+                self._give(
+                    connection, run_id, person, holder, "taken_over", "asked; the locked screen did not answer"
+                )
+            else:
+                raise ControlError(
+                    f"{holder.full_name} has control of this run, on screen {holder.screen}",
+                    where=run_id,
+                    remedy="Ask for control, or have a supervisor take over",
+                )
+
+    def take_over(self, run_id: str, person: Person, reason: str) -> None:
+        """A supervisor takes control from whoever has it, with a reason."""
+        if person.role != "supervisor":
+            raise NotAllowedError(
+                "only a supervisor takes over control", where=run_id, remedy="Ask for control, or call a supervisor"
+            )
+        why = require_reason(reason)
+        with self._store.database.writing() as connection:
+            holder = self._holder(connection, run_id)
+            if holder.screen != person.screen:
+                self._give(connection, run_id, person, holder, "taken_over" if holder.screen else "free", why)
+
+    def ask(self, run_id: str, person: Person) -> None:
+        """Ask the screen that has control. A later question replaces one that nobody answered."""
+        _require_operator(person)
+        with self._store.database.writing() as connection:
+            holder = self._holder(connection, run_id)
+            if not holder.screen or holder.screen == person.screen:
+                raise ControlError("there is nobody to ask", where=run_id, remedy="Take control; it is free")
+            recent = self._now_s() - holder.asked_utc_s < UNANSWERED_S
+            if holder.asked_by_screen not in ("", person.screen) and recent:
+                raise ControlError(
+                    f"{holder.asked_by_account} has just asked", where=run_id, remedy="Wait for the answer"
+                )
+            self._write(
+                connection,
+                run_id,
+                asked_by_screen=person.screen,
+                asked_by_account=person.account,
+                # Asking again does not start the waiting anew.
+                asked_utc_s=holder.asked_utc_s if holder.asked_by_screen == person.screen else self._now_s(),
+            )
+
+    def answer(self, run_id: str, person: Person, *, grant: bool) -> None:
+        """The screen in control says yes, which hands over, or no."""
+        with self._store.database.writing() as connection:
+            holder = self._holder(connection, run_id)
+            if holder.screen != person.screen:
+                raise ControlError("this screen does not have control", where=run_id, remedy="Read the page again")
+            if not holder.asked_by_screen:
+                raise ControlError("nobody asks for control any more", where=run_id, remedy="Nothing has to be done")
+            asker = connection.execute(_valid(holder.asked_by_screen, self._now_s())).one_or_none()
+            if grant and asker is not None:
+                reason = f"asked for; granted by {person.account}"
+                self._record(connection, run_id, asker.account, holder.asked_by_screen, holder, "handed_over", reason)
+            else:
+                self._write(connection, run_id, asked_by_screen="", asked_by_account="", asked_utc_s=0.0)
+            if grant and asker is None:
+                ended = ControlError("the screen that asked is signed out", where=run_id, remedy="You keep control")
+            else:
+                ended = None
+        if ended is not None:
+            raise ended
+
+    def release(self, run_id: str, person: Person) -> None:
+        """Give control back, for anybody to take."""
+        with self._store.database.writing() as connection:
+            holder = self._holder(connection, run_id)
+            if holder.screen != person.screen:
+                raise ControlError("this screen does not have control", where=run_id, remedy="Read the page again")
+            self._record(connection, run_id, person.account, "", holder, "free", "given back")
+
+    def _holder(self, connection: Connection, run_id: str) -> Holder:
+        if connection.execute(select(runs.c.run_id).where(runs.c.run_id == run_id)).first() is None:
+            self._store.events(run_id)  # raises UnknownRunError in the store's words
+        row = connection.execute(select(control).where(control.c.run_id == run_id)).one_or_none()
+        if row is None or not row.screen:
+            return Holder()
+        session = connection.execute(_valid(row.screen, self._now_s())).one_or_none()
+        if session is None:
+            return Holder()
+        return Holder(
+            screen=row.screen,
+            account=row.account,
+            full_name=session.full_name,
+            locked=bool(session.locked),
+            asked_by_screen=row.asked_by_screen,
+            asked_by_account=row.asked_by_account,
+            asked_utc_s=row.asked_utc_s,
+        )
+
+    def _give(
+        self,
+        connection: Connection,
+        run_id: str,
+        person: Person,
+        holder: Holder,
+        how: Literal["free", "handed_over", "taken_over"],
+        reason: str,
+    ) -> None:
+        self._record(connection, run_id, person.account, person.screen, holder, how, reason)
+
+    def _record(
+        self,
+        connection: Connection,
+        run_id: str,
+        account: str,
+        screen: str,
+        before: Holder,
+        how: Literal["free", "handed_over", "taken_over"],
+        reason: str,
+    ) -> None:
+        taken = ControlTaken(screen=screen, previous=before.account, how=how, reason=reason)
+        self._store.append(connection, run_id, [taken], actor=account)
+        self._write(
+            connection,
+            run_id,
+            screen=screen,
+            account=account if screen else "",
+            asked_by_screen="",
+            asked_by_account="",
+            asked_utc_s=0.0,
+        )
+
+    def _write(self, connection: Connection, run_id: str, **values: object) -> None:
+        nobody = {"screen": "", "account": "", "asked_by_screen": "", "asked_by_account": "", "asked_utc_s": 0.0}
+        connection.execute(
+            insert(control)
+            .values(run_id=run_id, **{**nobody, **values})
+            .on_conflict_do_update(index_elements=["run_id"], set_=values)
+        )
+
+
+def _valid(screen: str, now_s: float) -> Any:
+    return (
+        select(sessions.c.account, sessions.c.locked, accounts.c.full_name)
+        .join(accounts, sessions.c.account == accounts.c.account)
+        .where(
+            sessions.c.screen == screen,
+            sessions.c.created_utc_s > now_s - SESSION_S,
+            accounts.c.state == "active",
+        )
+    )
+
+
+def _require_operator(person: Person) -> None:
+    if not person.may("operate"):
+        raise NotAllowedError(
+            f"the role {person.role} looks on and does not act", where="control", remedy="Ask a technician"
+        )

@@ -1,0 +1,129 @@
+"""Reading and recording people: rows of accounts and sign-ins, and the site's events that go with every change."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, Literal, cast
+
+from sqlalchemy import Connection, Row, delete, select
+
+from service.core.model import AccountChanged, SignInRecorded
+from service.people.errors import AccountError
+from service.people.person import Account, Person
+from service.people.roles import Role
+from service.store.store import Store
+from service.store.tables import accounts, sessions
+
+SERVICE = "web"  # actor of what happens without anybody signed in
+SESSION_S = 12 * 3600.0
+Outcome = Literal["signed_in", "refused", "locked_out", "signed_out", "screen_locked", "screen_unlocked", "ended"]
+_NAME = re.compile(r"[a-z][a-z0-9._-]{1,31}")
+_RESERVED = frozenset({"web", "runner", "worker", "site", "service", "camera", "robot", "orthocapture", "nobody"})
+
+
+def plain_name(typed: str) -> str:
+    """The account that a typed name means: letters of either case are the same."""
+    return typed.strip().lower()
+
+
+def require_name(name: str) -> None:
+    """Raises AccountError for a name that cannot be an account's."""
+    if not _NAME.fullmatch(name):
+        raise AccountError(
+            "this cannot be the name of an account",
+            where="account",
+            remedy="Use 2 to 32 letters a-z, digits, dots, dashes or underscores, a letter first",
+        )
+    if name in _RESERVED:
+        raise AccountError(f"{name} is a name of the system itself", where="account", remedy="Choose another one")
+
+
+def require_full_name(name: str) -> str:
+    """The name without outer blanks. Raises AccountError for one that cannot stand in a record."""
+    plain = " ".join(name.split())
+    if not 2 <= len(plain) <= 80 or not plain.isprintable():
+        raise AccountError(
+            "this cannot be a person's name",
+            where="full_name",
+            remedy="Give first and last name, up to 80 characters",
+        )
+    return plain
+
+
+def require_reason(reason: str) -> str:
+    """The reason without outer blanks. Raises AccountError when there is none."""
+    plain = reason.strip()
+    if not 3 <= len(plain) <= 500:
+        raise AccountError(
+            "a reason is needed", where="reason", remedy="Say why in a few words, up to 500 characters"
+        )
+    return plain
+
+
+def find_account(connection: Connection, account: str) -> Row[Any] | None:
+    """The row of an account, if there is one."""
+    return connection.execute(select(accounts).where(accounts.c.account == account)).one_or_none()
+
+
+def get_account(connection: Connection, account: str) -> Row[Any]:
+    """The row of an account. Raises AccountError."""
+    row = find_account(connection, account)
+    if row is None:
+        raise AccountError(f"there is no account {account!r}", where="account", remedy="See the list of accounts")
+    return row
+
+
+def to_account(row: Row[Any]) -> Account:
+    """A row without its secrets."""
+    return Account(
+        account=row.account,
+        full_name=row.full_name,
+        role=cast(Role, row.role),
+        state=row.state,
+        failures=row.failures,
+        locked_until_utc_s=row.locked_until_utc_s,
+        created_utc=row.created_utc,
+    )
+
+
+def to_person(row: Row[Any]) -> Person:
+    """Who a row of sessions joined with accounts stands for."""
+    return Person(
+        account=row.account,
+        full_name=row.full_name,
+        role=cast(Role, row.role),
+        screen=row.screen,
+        csrf=row.csrf,
+        locked=bool(row.locked),
+    )
+
+
+def record_change(
+    store: Store, connection: Connection, actor: str, account: str, field: str, old: str, new: str, reason: str = ""
+) -> None:
+    """Append that an account changed, in the transaction that changes it."""
+    change = AccountChanged(account=account, field=field, old=old, new=new, reason=reason)
+    store.append_site(connection, [change], actor=actor)
+
+
+def record_sign_in(
+    store: Store,
+    connection: Connection,
+    outcome: Outcome,
+    *,
+    account: str,
+    screen: str = "",
+    address: str = "",
+    actor: str = SERVICE,
+) -> None:
+    """Append what happened to a sign-in, in the transaction in which it happens."""
+    event = SignInRecorded(account=account, outcome=outcome, screen=screen, address=address)
+    store.append_site(connection, [event], actor=actor)
+
+
+def end_sessions(store: Store, connection: Connection, account: str, *, actor: str, keep: str = "") -> None:
+    """End all sign-ins of an account, but the screen `keep`; each is recorded."""
+    chosen = (sessions.c.account == account) & (sessions.c.screen != keep)
+    for row in connection.execute(select(sessions.c.screen).where(chosen)).all():
+        record_sign_in(store, connection, "ended", account=account, screen=row.screen, actor=actor)
+    connection.execute(delete(sessions).where(chosen))
