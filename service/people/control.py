@@ -58,7 +58,7 @@ class Control:
             )
 
     def take(self, run_id: str, person: Person) -> None:
-        """Take control that is free, that the person has on another screen, or that a locked screen does not defend."""
+        """Take control that is free, one's own on another screen, or not defended by a locked screen."""
         _require_operator(person)
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)

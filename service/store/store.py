@@ -152,9 +152,7 @@ class Store:
             self._begin_chain(connection, SITE, SiteOpened(software=dict(software or {})), actor, ())
         return append(connection, self._clock, SITE, payloads, actor)
 
-    def append(
-        self, connection: Connection, run_id: str, payloads: Sequence[Payload], *, actor: str
-    ) -> list[Event]:
+    def append(self, connection: Connection, run_id: str, payloads: Sequence[Payload], *, actor: str) -> list[Event]:
         """Append to a run's chain within a transaction of `database.writing()`, as `append_site` does."""
         self._require_run(connection, run_id)
         return append(connection, self._clock, run_id, payloads, actor)
