@@ -144,7 +144,7 @@ def _walk(out: _Collector, a: Any, b: Any, path: str, group: str) -> None:
     out.compared += 1
     if _is_number(a) and _is_number(b):
         if a != b:
-            out.add(group, _scalar(float(a), float(b), path))
+            out.add(group, _scalar(float(cast("float", a)), float(cast("float", b)), path))
     elif type(a) is not type(b) or (a != b and out.renamed.get(str(a)) != b):
         out.add(group, Difference(path, _brief(a), _brief(b), None, None, ""))
 
@@ -158,26 +158,31 @@ def _arrays(out: _Collector, a: Array, b: Array, path: str, group: str) -> None:
             ((..., slice(0, 3), slice(3, 4)), "translation", "mm", 1e3),
             ((..., slice(0, 3), slice(0, 3)), "rotation", "°", 180 / math.pi),
         ):
-            _one_array(out, a[rows], b[rows], f"{path} {name}", f"{group} {name}", (unit, factor))
+            _one_array(out, a[rows], b[rows], f"{path} {name}", f"{group} {name}", (unit, factor), least_scale=1.0)
         _one_array(out, a[..., 3, :], b[..., 3, :], f"{path} last row", f"{group} last row", ("", 1.0))
         return
     _one_array(out, a, b, path, group, unit_of(path))
 
 
-def _one_array(out: _Collector, a: Array, b: Array, path: str, group: str, unit: tuple[str, float]) -> None:
+def _one_array(
+    out: _Collector, a: Array, b: Array, path: str, group: str, unit: tuple[str, float], least_scale: float = 0.0
+) -> None:
+    """`least_scale`: a pose at the origin is still of a world of metres."""
     apart = (a != b) & ~(np.isnan(a) & np.isnan(b))
     if not apart.any():
         return
     off = np.where(apart, np.abs(b - a), 0.0)
     off[np.isnan(off)] = np.inf
     at = np.unravel_index(int(np.argmax(off)), a.shape)
-    scale = float(np.nanmax(np.abs(np.where(np.isfinite(a), a, 0.0))))
+    scale = max(least_scale, float(np.abs(np.where(np.isfinite(a), a, 0.0)).max()))
     worst = float(off[at])
     relative = worst / scale if scale > 0 else math.inf
     index = "".join(f"[{n}]" for n in at)
     out.add(
         group,
-        Difference(f"{path}{index}", float(a[at]), float(b[at]), worst * unit[1], relative, unit[0], int(apart.sum())),
+        Difference(
+            f"{path}{index}", float(a[at]), float(b[at]), worst * unit[1], relative, unit[0], int(apart.sum())
+        ),
     )
 
 
@@ -262,8 +267,8 @@ def _compare_archives(name: str, recorded: Path, recomputed: Path) -> Comparison
     for key in {**old, **new}:
         path = f"{name}: {key}"
         if key not in old or key not in new or old[key].shape != new[key].shape:
-            shapes = (f"shape {found[key].shape}" if key in found else "nothing" for found in (old, new))
-            out.add(path, Difference(path, *shapes, None, None, ""))
+            before, after = (f"shape {found[key].shape}" if key in found else "nothing" for found in (old, new))
+            out.add(path, Difference(path, before, after, None, None, ""))
         elif old[key].dtype.kind in "fiub":
             pair = old[key].astype(np.float64), new[key].astype(np.float64)
             out.compared += pair[0].size
@@ -282,13 +287,17 @@ def _arrays_of(path: Path) -> Iterator[tuple[str, Any]]:
 def _compare_pictures(name: str, recorded: Path, recomputed: Path) -> Comparison:
     old, new = (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in (recorded, recomputed))
     if old is None or new is None or old.shape != new.shape:
-        shown = ("unreadable" if p is None else "×".join(map(str, p.shape[1::-1])) + " px" for p in (old, new))
-        return Comparison(1, (Difference(f"{name} size", *shown, None, None, ""),))
+        before, after = (
+            "unreadable" if p is None else "×".join(map(str, p.shape[1::-1])) + " px" for p in (old, new)
+        )
+        return Comparison(1, (Difference(f"{name} size", before, after, None, None, ""),))
     off = np.abs(old.astype(np.float64) - new.astype(np.float64))
     worst = float(off.max())
     if worst == 0:
         return Comparison(off.size, ())
     path = f"{name}: pixels, mean difference {off.mean():.3g}"
     at = np.unravel_index(int(off.argmax()), off.shape)
-    entry = Difference(path, float(old[at]), float(new[at]), worst, worst / 255, "levels of 255", int((off > 0).sum()))
+    entry = Difference(
+        path, float(old[at]), float(new[at]), worst, worst / 255, "levels of 255", int((off > 0).sum())
+    )
     return Comparison(off.size, (entry,))

@@ -112,12 +112,12 @@ def drifts(summary: RunSummary, recomputed: Recomputed) -> Iterator[Drift]:
             continue
         before, after = old["result"], new["result"]
         shared = sorted(before["T_scan_camera"].keys() & after["T_scan_camera"].keys())
-        cameras = [np.array([each["T_scan_camera"][name] for name in shared]) for each in (after, before)]
+        moved, given = (np.array([each["T_scan_camera"][name] for name in shared]) for each in (after, before))
         in_world: float | None = None
         if before["poses"] in ("robot", "robot_corrected"):  # the world is the base of the first station
             places = [apply(np.array(each["T_world_scan"]), centre_m) for each in (before, after)]
             in_world = 1e3 * float(np.linalg.norm(places[1] - places[0]))
-        yield Drift(str(before["poses"]), in_world, 1e3 * true_error_m(*cameras, centre_m))
+        yield Drift(str(before["poses"]), in_world, 1e3 * true_error_m(moved, given, centre_m))
 
 
 def _key(value: Any) -> str:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import re
 import tempfile
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,7 +40,6 @@ DEFAULT_KINDS = (
     "register",
     "evaluate",
 )
-_SHA256 = re.compile(r"[0-9a-f]{64}")
 _FAILURES = (ValueError, ArithmeticError, LookupError, OSError, MemoryError, np.linalg.LinAlgError)
 
 
@@ -123,11 +121,12 @@ class ReplayReport:
     @property
     def verdict(self) -> Verdict:
         """The worst of all jobs; a gate that comes out otherwise is a difference."""
-        found = {job.verdict for job in self.jobs}
+        found: set[Verdict] = {job.verdict for job in self.jobs}
         if any(gate.changed for gate in self.gates):
             found.add("different")
         order: tuple[Verdict, ...] = ("not_replayed", "different", "within_tolerance")
-        return next((verdict for verdict in order if verdict in found), "identical")
+        worst: Verdict = next((verdict for verdict in order if verdict in found), "identical")
+        return worst
 
 
 class ScratchStore:
@@ -203,7 +202,7 @@ def replay(
             replays.append(_replay_job(run, store, step_id, job, arguments, recomputed, show))
             if out is not None:
                 _keep(store, replays[-1], out / step_id / f"{number:02d}_{job.kind}")
-        report = ReplayReport(
+        return ReplayReport(
             run_id=run.run_id,
             head_sha256=run.events[-1].sha256,
             end_to_end=end_to_end,
@@ -215,7 +214,6 @@ def replay(
             jobs=tuple(replays),
             drifts=tuple(drifts(run.summary(), recomputed)) if end_to_end else (),
         )
-    return report
 
 
 def _chosen(run: RecordedRun, kinds: Collection[str], step: str | None) -> list[tuple[str, JobState]]:
@@ -225,9 +223,7 @@ def _chosen(run: RecordedRun, kinds: Collection[str], step: str | None) -> list[
             f"no worker computes {', '.join(unknown)}", remedy=f"Jobs are of the kinds {', '.join(HANDLERS)}"
         )
     if step is not None and step not in run.state.steps:
-        raise ConfigurationError(
-            f"the protocol has no step {step!r}", remedy=f"Steps: {', '.join(run.state.steps)}"
-        )
+        raise ConfigurationError(f"the protocol has no step {step!r}", remedy=f"Steps: {', '.join(run.state.steps)}")
     jobs = [
         (name, job)
         for name, state in run.state.steps.items()
@@ -348,20 +344,9 @@ def _keep(store: ScratchStore, job: JobReplay, folder: Path) -> None:
 
 def changed_versions(run: RecordedRun) -> tuple[VersionChange, ...]:
     """Distributions that differ between the run's last session and this process."""
-    sessions: Sequence[SessionStarted] = [
-        cast(SessionStarted, e.payload) for e in run.events if e.payload.kind == "session_started"
-    ]
+    sessions = [e.payload for e in run.events if isinstance(e.payload, SessionStarted)]
     recorded = sessions[-1].software if sessions else run.root.software
     now = software_versions()
     names = sorted({**recorded, **now}, key=str.lower)
     changes = (VersionChange(name, recorded.get(name, ""), now.get(name, "")) for name in names)
     return tuple(change for change in changes if change.recorded != change.now)
-
-
-def input_hashes(arguments: Any) -> frozenset[str]:
-    """Every SHA-256 within a job's arguments."""
-    if isinstance(arguments, Mapping):
-        return frozenset[str]().union(*map(input_hashes, cast("Mapping[str, Any]", arguments).values()))
-    if isinstance(arguments, list | tuple):
-        return frozenset[str]().union(*map(input_hashes, cast("Sequence[Any]", arguments)))
-    return frozenset({arguments} if isinstance(arguments, str) and _SHA256.fullmatch(arguments) else ())

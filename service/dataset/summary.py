@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
+from typing import Protocol as Interface
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from service.core.run_state import RunState
 from service.store.store import Store
 
 
-class ArtefactReader(Protocol):
+class ArtefactReader(Interface):
     """Where the files of the evidence are."""
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:

@@ -51,7 +51,9 @@ class SfmOptions:
         filter_error_px: observations beyond this are dropped before the final bundle adjustment.
         min_track: views a point needs to take part in the final bundle adjustment.
         loss_px: scale of the final bundle adjustment's robust (Cauchy) loss.
-        threads: of extraction, matching and bundle adjustment.
+        threads: of extraction and matching.
+        mapping_threads: of mapping and bundle adjustment. With one, the same features give the same model bit for
+            bit; with more, sums are added up in the order in which threads finish.
         refine: what the final bundle adjustment may change in the calibrated camera.
         seed: of every random choice.
         timeout_s: after which one stage is given up.
@@ -67,6 +69,7 @@ class SfmOptions:
     min_track: int = 3
     loss_px: float = 0.5
     threads: int = 2
+    mapping_threads: int = 1
     refine: Refine = "nothing"
     seed: int = 1
     timeout_s: float = 3600.0

@@ -56,6 +56,15 @@ def _extract(job: dict[str, Any], _pipe: Connection) -> dict[str, Any]:
     reader.camera_model = camera.model_name
     reader.camera_params = ",".join(repr(float(p)) for p in camera.params)
     workspace = Path(job["workspace"])
+    pycolmap.Database.open(workspace / "database.db").close()  # makes it
+    # The extractor's threads would number the images as they finish, and the mapper goes by these numbers.
+    pycolmap.import_images(
+        database_path=workspace / "database.db",
+        image_path=workspace / "images",
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        image_names=job["internal"],
+        options=reader,
+    )
     pycolmap.extract_features(
         database_path=workspace / "database.db",
         image_path=workspace / "images",
@@ -160,7 +169,7 @@ def _tracks(model: pycolmap.Reconstruction, index: dict[str, int]) -> dict[str, 
 
 def _incremental(job: dict[str, Any], raw: Path, pipe: Connection) -> dict[int, pycolmap.Reconstruction]:
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = job["options"]["threads"]
+    options.num_threads = job["options"]["mapping_threads"]
     options.random_seed = job["options"]["seed"]
     options.min_model_size = 3
     options.extract_colors = False
@@ -189,10 +198,10 @@ def _incremental(job: dict[str, Any], raw: Path, pipe: Connection) -> dict[int, 
 
 def _global(job: dict[str, Any], raw: Path, _pipe: Connection) -> dict[int, pycolmap.Reconstruction]:
     options = pycolmap.GlobalPipelineOptions()
-    options.num_threads = job["options"]["threads"]
+    options.num_threads = job["options"]["mapping_threads"]
     options.random_seed = job["options"]["seed"]
     mapper = options.mapper
-    mapper.num_threads = job["options"]["threads"]
+    mapper.num_threads = job["options"]["mapping_threads"]
     mapper.random_seed = job["options"]["seed"]
     # Global positioning starts at random and is slow on many tracks; retriangulation brings the others back.
     mapper.keep_max_num_tracks = max(1500, 100 * len(job["names"]))
@@ -219,7 +228,7 @@ def _refine(model: pycolmap.Reconstruction, job: dict[str, Any]) -> None:
     options.min_track_length = settings["min_track"]
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = settings["loss_px"] * scale
-    options.ceres.solver_options.num_threads = settings["threads"]
+    options.ceres.solver_options.num_threads = settings["mapping_threads"]
     options.ceres.solver_options.max_num_iterations = 50
     options.ceres.solver_options.function_tolerance = 1e-8
     options.ceres.solver_options.gradient_tolerance = 1e-10
