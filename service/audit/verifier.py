@@ -1,0 +1,919 @@
+"""Tell whether an evidence bundle of orthocapture is whole and unaltered, on a machine without orthocapture.
+
+    python verify.py BUNDLE.zip [--key FINGERPRINT] [--certificates FILE] [--json]
+    python verify.py FOLDER        the same for an unpacked bundle; nothing is unpacked here
+
+Needs Python 3.9 or newer and the package `cryptography`, nothing else and no network. Nothing is written.
+Exit status: 0 whole and unaltered; 1 something differs, and every difference is named; 2 this is not a bundle.
+
+Every signature here is checked against keys that the bundle itself brings. That the bundle comes from whom it says
+it comes from, only a key's fingerprint tells that was obtained in another way: give it with --key.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import datetime
+import hashlib
+import json
+import math
+import re
+import stat
+import sys
+import zipfile
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+try:
+    from cryptography import x509
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+    from cryptography.x509.oid import ExtendedKeyUsageOID
+except ImportError:
+    raise SystemExit("The package `cryptography` is needed: python -m pip install cryptography") from None
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+FORMAT = "orthocapture bundle v1"
+CHECKPOINT = "orthocapture checkpoint v1"
+MANIFEST_PREFIX = b"orthocapture bundle manifest v1\n"
+MANIFEST, SIGNATURE = "manifest.json", "manifest.sig"
+SITE = "site"
+ROOT = "0" * 64
+CHUNK = 1 << 20
+LARGEST_MANIFEST = 64 << 20
+LARGEST_LINE = 64 << 20
+LARGEST_EXPANSION = 200  # of a compressed file; records compress twentyfold at most
+SAFE_INTEGER = 2**53 - 1
+REFERENCE = frozenset({"sha256", "kind", "media_type", "size_bytes", "original_name"})
+JOB_FIELDS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
+
+
+class NotABundleError(Exception):
+    """Nothing can be said of this: exit status 2."""
+
+
+# --- RFC 8785 canonical JSON ------------------------------------------------------------------------------------
+
+_ESCAPES = {"\b": "\\b", "\t": "\\t", "\n": "\\n", "\f": "\\f", "\r": "\\r", '"': '\\"', "\\": "\\\\"}
+_ESCAPED = re.compile(r'[\x00-\x1f"\\]')
+
+
+def canonical(value: Any) -> bytes:
+    """RFC 8785 canonical JSON. Raises ValueError for what has none."""
+    parts: list[str] = []
+    _write(value, parts)
+    return "".join(parts).encode("utf-8")  # a lone surrogate raises UnicodeEncodeError, which is a ValueError
+
+
+def _write(value: Any, parts: list[str]) -> None:
+    if value is None or value is True or value is False:
+        parts.append({None: "null", True: "true", False: "false"}[value])
+    elif isinstance(value, str):
+        parts.append(_string(value))
+    elif isinstance(value, int):
+        if not -SAFE_INTEGER <= value <= SAFE_INTEGER:
+            raise ValueError(f"{value} is beyond 2^53")
+        parts.append(str(value))
+    elif isinstance(value, float):
+        parts.append(number(value))
+    elif isinstance(value, (list, tuple)):
+        parts.append("[")
+        for index, item in enumerate(value):
+            parts.append("," if index else "")
+            _write(item, parts)
+        parts.append("]")
+    elif isinstance(value, dict):
+        parts.append("{")
+        for index, name in enumerate(sorted(value, key=lambda text: text.encode("utf-16-be", "surrogatepass"))):
+            parts.append("," if index else "")
+            parts.append(_string(name) + ":")
+            _write(value[name], parts)
+        parts.append("}")
+    else:
+        raise ValueError(f"{type(value).__name__} has no JSON form")  # one kind of error for callers
+
+
+def _string(text: str) -> str:
+    return '"' + _ESCAPED.sub(lambda found: _ESCAPES.get(found[0]) or f"\\u{ord(found[0]):04x}", text) + '"'
+
+
+def number(value: float) -> str:
+    """A double as ECMAScript writes it (Number::toString): the shortest digits that read back as the same."""
+    if not math.isfinite(value):
+        raise ValueError(f"{value} has no JSON form")
+    if value == 0:
+        return "0"
+    sign = "-" if value < 0 else ""
+    mantissa, _, exponent = repr(abs(value)).partition("e")  # repr gives the shortest digits too
+    whole, _, fraction = mantissa.partition(".")
+    fraction = "" if fraction == "0" else fraction
+    digits = (whole + fraction).lstrip("0")
+    point = len(whole) + int(exponent or 0)  # digits before the decimal point, counted from the first of `whole`
+    point -= len(whole + fraction) - len((whole + fraction).lstrip("0"))
+    digits = digits.rstrip("0")
+    count = len(digits)
+    if count <= point <= 21:
+        text = digits + "0" * (point - count)
+    elif 0 < point <= 21:
+        text = digits[:point] + "." + digits[point:]
+    elif -6 < point <= 0:
+        text = "0." + "0" * -point + digits
+    else:
+        power = point - 1
+        text = (
+            digits[0] + ("." + digits[1:] if count > 1 else "") + "e" + ("-" if power < 0 else "+") + str(abs(power))
+        )
+    return sign + text
+
+
+def parse(text: bytes) -> Any:
+    """JSON without duplicate names, NaN and infinity. Raises ValueError."""
+    try:
+        return json.loads(
+            text.decode("utf-8"), object_pairs_hook=_pairs, parse_int=_integer, parse_constant=_constant
+        )
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def _pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a name appears twice")
+    return found
+
+
+def _integer(digits: str) -> Any:
+    # The canonical form of 1e20 has no exponent: beyond the safe range the number can only have been a double.
+    if len(digits) > 400:
+        raise ValueError("a number is too long")
+    value = int(digits)
+    return value if -SAFE_INTEGER <= value <= SAFE_INTEGER else float(digits)
+
+
+def _constant(name: str) -> Any:
+    raise ValueError(f"{name} is no JSON")
+
+
+# --- the container ----------------------------------------------------------------------------------------------
+
+
+class Bundle:
+    """The files of a bundle: names and sizes, and a stream of each."""
+
+    sizes: dict[str, int]
+
+    def open(self, name: str) -> IO[bytes]:
+        """A stream of one file."""
+        raise NotImplementedError
+
+    def read(self, name: str, limit: int) -> bytes:
+        """A small file as a whole. Raises ValueError when it is longer than it may be."""
+        with self.open(name) as stream:
+            content = stream.read(limit + 1)
+        if len(content) > limit:
+            raise ValueError("the file is too long")
+        return content
+
+    def lines(self, name: str) -> Iterator[bytes]:
+        """The lines of a file without their ends. Raises ValueError for one that is too long or not ended."""
+        with self.open(name) as stream:
+            while line := stream.readline(LARGEST_LINE):
+                if not line.endswith(b"\n"):
+                    raise ValueError("a line is too long or has no end")
+                yield line[:-1]
+
+
+class ZipBundle(Bundle):
+    """A zip file, read where it is."""
+
+    def __init__(self, path: Path, fault: Callable[[str, str], None]) -> None:
+        try:
+            self._zip = zipfile.ZipFile(path)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise NotABundleError(f"{path} cannot be read as a zip file: {error}") from error
+        self._infos: dict[str, zipfile.ZipInfo] = {}
+        self.sizes = {}
+        compressed = 0
+        for info in self._zip.infolist():
+            compressed += info.compress_size
+            problem = name_problem(info.orig_filename) or _entry_problem(info)
+            if problem:
+                fault(repr(info.orig_filename), problem)
+            elif info.filename in self._infos:
+                fault(info.filename, "the zip file holds this name twice")
+            elif info.file_size > LARGEST_EXPANSION * info.compress_size + CHUNK:
+                fault(info.filename, f"it would expand from {info.compress_size} to {info.file_size} bytes: not read")
+            else:
+                self._infos[info.filename] = info
+                self.sizes[info.filename] = info.file_size
+        if compressed > path.stat().st_size:
+            raise NotABundleError("the entries of the zip file overlap: nothing in it was read")
+
+    def open(self, name: str) -> IO[bytes]:
+        """See Bundle."""
+        return self._zip.open(self._infos[name])
+
+
+class FolderBundle(Bundle):
+    """An unpacked bundle."""
+
+    def __init__(self, folder: Path, fault: Callable[[str, str], None]) -> None:
+        self._folder = folder
+        self.sizes = {}
+        for path in sorted(folder.rglob("*")):
+            name = path.relative_to(folder).as_posix()
+            if path.is_symlink():
+                fault(name, "it is a link, not a file")
+            elif path.is_file():
+                self.sizes[name] = path.stat().st_size
+
+    def open(self, name: str) -> IO[bytes]:
+        """See Bundle."""
+        return (self._folder / name).open("rb")
+
+
+def name_problem(name: str) -> str:
+    """Why a name must not be in a bundle (it could lead out of the folder it is unpacked to); "" for a good one."""
+    if not name or "\\" in name or "\x00" in name or name.startswith("/") or re.match(r"[A-Za-z]:", name):
+        return "the name leads out of the bundle, or is none"
+    if any(part in ("", ".", "..") for part in name.rstrip("/").split("/")):
+        return "the name leads out of the bundle, or is none"
+    return ""
+
+
+def _entry_problem(info: zipfile.ZipInfo) -> str:
+    mode = info.external_attr >> 16
+    if info.is_dir() or (mode and not stat.S_ISREG(mode) and stat.S_IFMT(mode)):
+        return "it is a folder, a link or a device, not a file"
+    if info.flag_bits & 1:
+        return "it is encrypted"
+    return ""
+
+
+# --- the checks -------------------------------------------------------------------------------------------------
+
+
+class Check:
+    """One pass over a bundle: faults and notes, in the order in which they were found."""
+
+    files: dict[str, tuple[str, int]]  # as the manifest lists them
+
+    def __init__(self) -> None:
+        self.faults: list[dict[str, str]] = []
+        self.notes: list[str] = []
+        self.manifest: dict[str, Any] = {}
+        self.keys: dict[str, dict[str, Any]] = {}  # key_id → seq, replaced_seq, raw, vouched
+        self.counts: dict[str, int] = {}
+
+    def fault(self, where: str, what: str) -> None:
+        """Something that is not as it should be."""
+        self.faults.append({"where": where, "what": what})
+
+    def run(self, path: Path, key: str | None, certificates: Path | None) -> None:
+        """Everything. Raises NotABundleError."""
+        if not path.exists():
+            raise NotABundleError(f"{path} is not there")
+        bundle = FolderBundle(path, self.fault) if path.is_dir() else ZipBundle(path, self.fault)
+        signed = self._read_manifest(bundle)
+        whole = self._check_files(bundle)
+        run_id = str(self.manifest["run_id"])
+        site = Chain(self, bundle, "site_events.jsonl", SITE, whole)
+        run = Chain(self, bundle, "events.jsonl", run_id, whole)
+        self._check_heads(run, site)
+        rows = self._check_artefacts(bundle, run, whole)
+        checkpoints = {chain.run_id: chain for chain in (run, site)}
+        signatures = list(self.records(bundle, "checkpoints.jsonl", whole))
+        self._check_keys(site, signatures)
+        self._check_checkpoints(signatures, checkpoints, site, rows)
+        self._check_key_file(bundle, whole)
+        self._check_signature(bundle, signed)
+        self._check_jobs(bundle, run, whole)
+        self._check_copies(bundle, run)
+        self._check_crate(bundle, whole)
+        stamps = list(self.records(bundle, "timestamps.jsonl", whole))
+        self._check_stamps(stamps, signatures, certificates)
+        self._check_expected_key(key)
+
+    # --- manifest and files ---
+
+    def _read_manifest(self, bundle: Bundle) -> bytes:
+        if MANIFEST not in bundle.sizes:
+            raise NotABundleError("there is no manifest.json: this is not a bundle of orthocapture")
+        try:
+            content = bundle.read(MANIFEST, LARGEST_MANIFEST)
+            manifest = parse(content)
+            files = {str(item["path"]): (str(item["sha256"]), int(item["size_bytes"])) for item in manifest["files"]}
+            if manifest["format"] != FORMAT:
+                raise NotABundleError(f"this verifier does not know the format {manifest['format']!r}")
+            for name in ("run_id", "simulated", "hashes_only", "head", "site_head", "made_by_key"):
+                manifest[name]
+        except (ValueError, KeyError, TypeError, OSError, zipfile.BadZipFile) as error:
+            raise NotABundleError(f"manifest.json cannot be read: {error!r}") from error
+        if len(files) != len(manifest["files"]):
+            self.fault(MANIFEST, "it lists a file twice")
+        self.manifest = manifest
+        self.files = files
+        return content
+
+    def _check_files(self, bundle: Bundle) -> frozenset[str]:
+        """Both ways: every listed file is there as listed, and nothing else is. The names of those that are."""
+        whole: list[str] = []
+        for name, (sha256, size) in self.files.items():
+            if name not in bundle.sizes:
+                self.fault(name, "it is missing from the bundle")
+            elif bundle.sizes[name] != size:
+                self.fault(name, f"it has {bundle.sizes[name]} bytes, the manifest lists {size}")
+            else:
+                found = self._hash(bundle, name)
+                if found != sha256:
+                    self.fault(name, f"its content was altered: its SHA-256 is {found}, the manifest lists {sha256}")
+                whole.append(name)  # altered records are read too, to say what was altered
+        for name in sorted(set(bundle.sizes) - set(self.files) - {MANIFEST, SIGNATURE}):
+            self.fault(name, "it is in the bundle, but not in the manifest")
+        for name in ("events.jsonl", "site_events.jsonl", "artefacts.jsonl", "jobs.jsonl", "checkpoints.jsonl"):
+            if name not in self.files:
+                self.fault(name, "a bundle must have it; the manifest does not list it")
+        self.counts["files"] = len(self.files)
+        return frozenset(whole)
+
+    def _hash(self, bundle: Bundle, name: str) -> str:
+        digest = hashlib.sha256()
+        try:
+            with bundle.open(name) as stream:
+                while chunk := stream.read(CHUNK):
+                    digest.update(chunk)
+        except (OSError, zipfile.BadZipFile, ValueError, EOFError, NotImplementedError) as error:
+            return f"unreadable ({error})"
+        return digest.hexdigest()
+
+    def records(self, bundle: Bundle, name: str, whole: frozenset[str]) -> Iterator[dict[str, Any]]:
+        """The lines of a file of records, each canonical JSON."""
+        if name not in whole:
+            return
+        try:
+            for index, line in enumerate(bundle.lines(name), 1):
+                try:
+                    record = parse(line)
+                    if not isinstance(record, dict) or canonical(record) != line:
+                        raise ValueError("it is not canonical JSON: its text was altered")  # noqa: TRY301
+                except ValueError as error:
+                    self.fault(f"{name}, line {index}", str(error))
+                else:
+                    yield record
+        except (OSError, zipfile.BadZipFile, ValueError, EOFError, NotImplementedError) as error:
+            self.fault(name, f"it cannot be read to its end: {error}")
+
+    def _check_heads(self, run: Chain, site: Chain) -> None:
+        for chain, name in ((run, "head"), (site, "site_head")):
+            head = self.manifest[name]
+            if (head.get("seq"), head.get("sha256")) != chain.end:
+                said = f"event {head.get('seq')} ({head.get('sha256')})"
+                self.fault(
+                    chain.file, f"the chain ends at event {chain.end[0]} ({chain.end[1]}), it was left at {said}"
+                )
+        first = run.first or {}
+        if first.get("kind") != "run_started":
+            self.fault(run.file, "the chain does not begin with run_started")
+        elif bool(first.get("simulated")) != self.manifest["simulated"]:
+            self.fault(MANIFEST, "the manifest and the run's first event disagree on whether it was simulated")
+        for start, heads in site.starts:
+            seq, sha256 = heads.get(run.run_id, (0, ""))
+            if seq and run.hashes.get(seq) != sha256:
+                what = f"the service saw another event {seq} when it started (event {start} of the site's chain)"
+                self.fault(run.file, what)
+
+    # --- artefacts ---
+
+    def _check_artefacts(self, bundle: Bundle, run: Chain, whole: frozenset[str]) -> list[dict[str, Any]]:
+        rows = list(self.records(bundle, "artefacts.jsonl", whole))
+        present = frozenset(name for name in whole if name.startswith("artefacts/"))
+        wanted: dict[str, int] = {}
+        for row in rows:
+            seq, sha256 = row.get("seq"), str(row.get("sha256"))
+            shown = f"artefacts.jsonl, {row.get('original_name')} of event {seq}"
+            event = run.hashes.get(seq)
+            reference = canonical({name: row.get(name) for name in REFERENCE})
+            if event is None:
+                self.fault(shown, "it belongs to an event that is not there")
+                continue
+            named = {name: value for name, value in row.items() if name != "record_sha256"}
+            if hashlib.sha256(canonical(dict(named, event_sha256=event))).hexdigest() != row.get("record_sha256"):
+                self.fault(shown, "the row was altered (device, step, time, who …)")
+            elif reference not in run.references.get(int(row["seq"]), ()):
+                self.fault(shown, "the row is not what the event refers to")
+            wanted[sha256] = int(row.get("size_bytes", -1))
+        recorded = {canonical({name: row.get(name) for name in ("sha256", "size_bytes")}) for row in rows}
+        for seq, found in run.references.items():
+            for text in found:
+                reference = parse(text)
+                if canonical({name: reference[name] for name in ("sha256", "size_bytes")}) not in recorded:
+                    self.fault(run.file, f"event {seq} refers to {reference['original_name']}, which has no row")
+        self._check_artefact_files(wanted, present)
+        self.counts["artefacts"] = len(rows)
+        return rows
+
+    def _check_artefact_files(self, wanted: Mapping[str, int], present: frozenset[str]) -> None:
+        for sha256, size in wanted.items():
+            name = f"artefacts/{sha256[:2]}/{sha256}"
+            if self.manifest["hashes_only"]:
+                continue
+            if name not in self.files:
+                self.fault(name, "an artefact of the record is not among the files of the bundle")
+            elif self.files[name] != (sha256, size):
+                self.fault(name, "the manifest lists another content than the record")
+        for name in sorted(present):
+            if name.rsplit("/", 1)[-1] not in wanted:
+                self.fault(name, "no record refers to this file")
+        if self.manifest["hashes_only"]:
+            self.notes.append("The recorded files are not in this bundle, only their hashes.")
+
+    # --- keys and signatures ---
+
+    def _check_keys(self, site: Chain, signatures: Sequence[Mapping[str, Any]]) -> None:
+        vouchers = {item.get("seq"): item for item in signatures if item.get("run_id") == SITE}
+        before = ""
+        for seq, change in site.key_changes:
+            key_id = str(change.get("key_id"))
+            shown = f"site_events.jsonl, event {seq}"
+            try:
+                raw = base64.b64decode(str(change.get("public_key")), validate=True)
+            except ValueError:
+                raw = b""
+            if len(raw) != 32 or hashlib.sha256(raw).hexdigest() != key_id:
+                self.fault(shown, f"the fingerprint {key_id} is not that of the public key")
+            if change.get("previous_key_id") != before:
+                self.fault(shown, f"key {key_id} does not follow the key before it")
+            if key_id in self.keys:
+                self.fault(shown, f"key {key_id} is introduced twice")
+                continue
+            vouched = not before
+            if before:
+                self.keys[before]["replaced_seq"] = seq
+                voucher = vouchers.get(seq)
+                vouched = voucher is not None and signature_fits(voucher, self.keys[before]["raw"])
+                if not vouched:
+                    self.notes.append(
+                        f"Key {key_id} was not vouched for by the key before it ({change.get('reason')}): "
+                        "compare its fingerprint with one obtained in another way."
+                    )
+            self.keys[key_id] = {"seq": seq, "replaced_seq": None, "raw": raw, "vouched": vouched}
+            before = key_id
+        if not self.keys:
+            self.fault("site_events.jsonl", "it brings no public key: nothing can be proved")
+
+    def _check_checkpoints(
+        self,
+        signatures: Sequence[Mapping[str, Any]],
+        chains: Mapping[str, Chain],
+        site: Chain,
+        rows: Sequence[Mapping[str, Any]],
+    ) -> None:
+        last = dict.fromkeys(chains, 0)
+        for item in signatures:
+            run_id, seq = str(item.get("run_id")), item.get("seq")
+            shown = f"checkpoints.jsonl, {run_id} at event {seq}"
+            chain, key = chains.get(run_id), self.keys.get(str(item.get("key_id")))
+            if chain is None or not isinstance(seq, int):
+                self.fault(shown, "it belongs to no chain of this bundle")
+                continue
+            if key is None:
+                self.fault(shown, f"its key {item.get('key_id')} is not in the site's chain")
+            elif not signature_fits(item, key["raw"]):
+                self.fault(shown, "its signature is not valid")
+            elif not in_use(item, key):
+                self.fault(shown, "its key was not in use at that time")
+            if chain.hashes.get(seq) != item.get("sha256"):
+                self.fault(shown, "it signs another event than the chain has: the chain was cut or rewritten")
+            digest = hashlib.sha256()
+            for row in rows if run_id != SITE else ():
+                if row.get("seq", 0) <= seq:
+                    digest.update(str(row.get("record_sha256")).encode() + b"\n")
+            if digest.hexdigest() != item.get("artefacts_sha256"):
+                self.fault(shown, "the rows of the artefacts up to it are not those that it signs")
+            if site.hashes.get(item.get("site_seq")) != item.get("site_sha256"):
+                self.fault(shown, "the site's chain is not the one that it names")
+            last[run_id] = max(last[run_id], seq)
+        self.counts["checkpoints"] = len(signatures)
+        for run_id, chain in chains.items():
+            if chain.end[0] > last[run_id]:
+                self.notes.append(
+                    f"{run_id}: {chain.end[0] - last[run_id]} events after the last checkpoint; "
+                    "the signature of the bundle covers them."
+                )
+
+    def _check_key_file(self, bundle: Bundle, whole: frozenset[str]) -> None:
+        listed = [record.get("key_id") for record in self.records(bundle, "keys.jsonl", whole)]
+        if listed != list(self.keys):
+            self.fault("keys.jsonl", "it does not list the keys of the site's chain")
+
+    def _check_signature(self, bundle: Bundle, signed: bytes) -> None:
+        key_id = str(self.manifest["made_by_key"])
+        key = self.keys.get(key_id)
+        if SIGNATURE not in bundle.sizes:
+            self.fault(SIGNATURE, "it is missing from the bundle")
+            return
+        try:
+            signature = base64.b64decode(bundle.read(SIGNATURE, 4096).strip(), validate=True)
+        except (ValueError, OSError, zipfile.BadZipFile) as error:
+            self.fault(SIGNATURE, f"it cannot be read: {error}")
+            return
+        if key is None or key["replaced_seq"] is not None:
+            self.fault(MANIFEST, f"its key {key_id} is not the one in use at the end of the site's chain")
+        elif not ed25519_fits(key["raw"], signature, MANIFEST_PREFIX + signed):
+            self.fault(SIGNATURE, "the signature of the manifest is not valid: the manifest was altered")
+
+    def _check_expected_key(self, key: str | None) -> None:
+        made_by = str(self.manifest["made_by_key"])
+        if key is None:
+            self.notes.append(f"Compare this fingerprint with one obtained in another way (or use --key): {made_by}")
+            return
+        wanted = key.replace(":", "").replace(" ", "").lower()
+        order = list(self.keys)
+        if wanted not in self.keys:
+            self.fault("--key", f"the bundle knows no key with the fingerprint {wanted}; it is signed with {made_by}")
+        elif not all(self.keys[key_id]["vouched"] for key_id in order[order.index(wanted) + 1 :]):
+            self.fault("--key", f"no unbroken line of signatures leads from {wanted} to the key in use")
+
+    # --- the rest ---
+
+    def _check_jobs(self, bundle: Bundle, run: Chain, whole: frozenset[str]) -> None:
+        rows = {row.get("job_id"): row for row in self.records(bundle, "jobs.jsonl", whole)}
+        known = set()
+        for seq, payload in run.jobs:
+            job = payload.get("job")
+            known.add(job)
+            row = rows.get(job)
+            if row is None:
+                self.fault("jobs.jsonl", f"job {job} of event {seq} has no row")
+            elif payload["kind"] == "job_enqueued":
+                same = all(payload.get(name) == row.get(column) for name, column in JOB_FIELDS.items())
+                if not same or row.get("enqueued_seq") != seq or row.get("arguments") != payload.get("arguments"):
+                    self.fault("jobs.jsonl", f"job {job} differs from its event {seq}")
+            elif (row.get("state"), row.get("ended_seq")) != (payload["kind"][4:], seq):
+                self.fault("jobs.jsonl", f"job {job} is {row.get('state')}, but event {seq} is {payload['kind']}")
+        for job in sorted(set(map(str, rows)) - set(map(str, known))):
+            self.fault("jobs.jsonl", f"job {job} has no event")
+
+    def _check_copies(self, bundle: Bundle, run: Chain) -> None:
+        for field in ("protocol", "rig"):
+            reference = (run.first or {}).get(field) or {}
+            name = f"{field}.yaml"
+            if self.files.get(name, ("", 0))[0] != reference.get("sha256"):
+                self.fault(name, f"it is not the {field} file with which the run began")
+
+    def _check_crate(self, bundle: Bundle, whole: frozenset[str]) -> None:
+        name = "ro-crate-metadata.json"
+        if name not in whole:
+            return
+        try:
+            graph = parse(bundle.read(name, LARGEST_MANIFEST))["@graph"]
+            listed = {str(item["@id"]): str(item.get("sha256", "")) for item in graph if "File" in str(item["@type"])}
+        except (ValueError, KeyError, TypeError) as error:
+            self.fault(name, f"it cannot be read: {error!r}")
+            return
+        for path, sha256 in listed.items():
+            if path in (MANIFEST, SIGNATURE) or path.startswith("#"):
+                continue
+            if path not in self.files or (sha256 and self.files[path][0] != sha256):
+                self.fault(name, f"it describes {path} otherwise than the manifest")
+
+    def _check_stamps(
+        self,
+        stamps: Sequence[Mapping[str, Any]],
+        signatures: Sequence[Mapping[str, Any]],
+        certificates: Path | None,
+    ) -> None:
+        signed = {(item.get("run_id"), item.get("seq")): item for item in signatures}
+        roots = load_certificates(certificates)
+        for stamp in stamps:
+            shown = f"timestamps.jsonl, {stamp.get('authority')} at event {stamp.get('seq')}"
+            item = signed.get((stamp.get("run_id"), stamp.get("seq")))
+            try:
+                if item is None:
+                    raise ValueError("it belongs to a checkpoint that is not there")  # noqa: TRY301
+                message = statement(item) + b"\n" + str(item.get("signature")).encode()
+                token = Token(base64.b64decode(str(stamp.get("token")), validate=True))
+                token.check_message(message)
+                if roots:
+                    token.check_signature(roots)
+            except (ValueError, IndexError, InvalidSignature, TypeError) as error:
+                self.fault(shown, f"the time stamp does not hold: {error or 'its signature is not valid'}")
+            else:
+                checked = "" if roots else " (its signature was not checked: give the authority's --certificates)"
+                self.notes.append(f"{shown}: it existed at {token.at.isoformat()}{checked}")
+        self.counts["timestamps"] = len(stamps)
+
+
+class Chain:
+    """A chain of events, checked while its lines pass by once; what other checks need of it is kept."""
+
+    def __init__(self, check: Check, bundle: Bundle, file: str, run_id: str, whole: frozenset[str]) -> None:
+        self.file, self.run_id = file, run_id
+        self.hashes: dict[Any, str] = {}
+        self.references: dict[int, list[bytes]] = {}
+        self.key_changes: list[tuple[int, dict[str, Any]]] = []
+        self.starts: list[tuple[int, dict[str, Any]]] = []
+        self.jobs: list[tuple[int, dict[str, Any]]] = []
+        self.first: dict[str, Any] | None = None
+        self.end: tuple[Any, str] = (0, ROOT)
+        for event in check.records(bundle, file, whole):  # both belong to this file
+            self._add(check, event)
+        check.counts[file] = len(self.hashes)
+
+    def _add(self, check: Check, event: dict[str, Any]) -> None:
+        seq, payload, sha256 = event.get("seq"), event.get("payload"), str(event.get("sha256"))
+        shown = f"{self.file}, event {seq}"
+        before, previous = self.end
+        if event.get("run_id") != self.run_id:
+            check.fault(shown, f"it belongs to another chain ({event.get('run_id')})")
+        if seq != before + 1:
+            check.fault(self.file, f"after event {before} comes event {seq}: events are missing or out of order")
+        elif event.get("previous_sha256") != previous:
+            check.fault(shown, "it does not follow the event before it: previous_sha256 differs")
+        named = {name: value for name, value in event.items() if name != "sha256"}
+        found = hashlib.sha256(canonical(named)).hexdigest()
+        if found != sha256:
+            check.fault(shown, f"its content was altered: its SHA-256 is {found}, recorded is {sha256}")
+        if not isinstance(seq, int) or not isinstance(payload, dict):
+            check.fault(shown, "it is no event")
+            return
+        self.end = (seq, sha256)
+        self.hashes[seq] = sha256
+        self.first = self.first or payload
+        kind = payload.get("kind")
+        if kind == "key_changed" and self.run_id == SITE:
+            self.key_changes.append((seq, payload))
+        elif kind == "service_started":
+            self.starts.append((seq, payload.get("heads") or {}))
+        elif kind in ("job_enqueued", "job_finished", "job_failed"):
+            self.jobs.append((seq, payload))
+        references = [canonical(reference) for reference in references_in(payload)]
+        if references:
+            self.references[seq] = references
+
+
+def references_in(value: Any) -> Iterator[dict[str, Any]]:
+    """Every reference to a file anywhere within a payload."""
+    if isinstance(value, dict):
+        if value.keys() == REFERENCE:
+            yield value
+        else:
+            for item in value.values():
+                yield from references_in(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from references_in(item)
+
+
+def statement(item: Mapping[str, Any]) -> bytes:
+    """What a checkpoint signs."""
+    named = {name: value for name, value in item.items() if name != "signature"}
+    return canonical(dict(named, purpose=CHECKPOINT))
+
+
+def signature_fits(item: Mapping[str, Any], raw: bytes) -> bool:
+    """Whether a checkpoint is signed by this key."""
+    try:
+        signature = base64.b64decode(str(item.get("signature")), validate=True)
+    except ValueError:
+        return False
+    return ed25519_fits(raw, signature, statement(item))
+
+
+def ed25519_fits(raw: bytes, signature: bytes, message: bytes) -> bool:
+    """Whether a signature is this key's over this message."""
+    try:
+        Ed25519PublicKey.from_public_bytes(raw).verify(signature, message)
+    except (InvalidSignature, ValueError):
+        return False
+    return True
+
+
+def in_use(item: Mapping[str, Any], key: Mapping[str, Any]) -> bool:
+    """Whether a key was the one in use where the site's chain was; a replaced one still vouches for its successor."""
+    at, replaced = item.get("site_seq"), key["replaced_seq"]
+    if not isinstance(at, int):
+        return False
+    if replaced is None or at < replaced:
+        return bool(at >= key["seq"])
+    return bool(item.get("run_id") == SITE and item.get("seq") == at == replaced)
+
+
+# --- RFC 3161 time stamps: as much of DER and CMS as they need ------------------------------------------------------
+
+_DIGESTS = {
+    "2.16.840.1.101.3.4.2.1": hashes.SHA256(),
+    "2.16.840.1.101.3.4.2.2": hashes.SHA384(),
+    "2.16.840.1.101.3.4.2.3": hashes.SHA512(),
+}
+_CONTENT_TYPE, _MESSAGE_DIGEST, _TST_INFO = (
+    "1.2.840.113549.1.9.3",
+    "1.2.840.113549.1.9.4",
+    "1.2.840.113549.1.9.16.1.4",
+)
+
+
+class Node:
+    """One DER value: its tag, its content, and its bytes as a whole."""
+
+    def __init__(self, data: bytes, start: int = 0) -> None:
+        self.tag = data[start]
+        length, at = data[start + 1], start + 2
+        if length & 0x80:
+            count = length & 0x7F
+            length, at = int.from_bytes(data[at : at + count], "big"), at + count
+            if not 0 < count <= 4:
+                raise ValueError("it is not DER")
+        if at + length > len(data):
+            raise ValueError("it ends too early")
+        self.content = data[at : at + length]
+        self.end = at + length
+        self.whole = data[start : self.end]
+
+    def children(self) -> list[Node]:
+        """The values within."""
+        found: list[Node] = []
+        at = 0
+        while at < len(self.content):
+            found.append(Node(self.content, at))
+            at = found[-1].end
+        return found
+
+    def oid(self) -> str:
+        """An object identifier as text."""
+        numbers = [self.content[0] // 40, self.content[0] % 40]
+        value = 0
+        for byte in self.content[1:]:
+            value = value << 7 | byte & 0x7F
+            if not byte & 0x80:
+                numbers.append(value)
+                value = 0
+        return ".".join(map(str, numbers))
+
+
+class Token:
+    """A TimeStampResp: what it was given for, when, and by whom. Raises ValueError, IndexError for what is none."""
+
+    def __init__(self, data: bytes) -> None:
+        status, content = Node(data).children()[:2]
+        if status.children()[0].content != b"\x00":
+            raise ValueError("the authority did not grant it")
+        signed = content.children()[1].children()[0].children()
+        encapsulated = signed[2].children()
+        if encapsulated[0].oid() != _TST_INFO:
+            raise ValueError("it holds no time stamp")
+        self._info = encapsulated[1].children()[0].content
+        info = Node(self._info).children()
+        imprint = info[2].children()
+        self._imprint = (imprint[0].children()[0].oid(), imprint[1].content)
+        text = info[4].content.decode("ascii")
+        form = "%Y%m%d%H%M%S.%fZ" if "." in text else "%Y%m%d%H%M%SZ"
+        self.at = datetime.datetime.strptime(text, form).replace(tzinfo=datetime.timezone.utc)  # noqa: UP017  # Python 3.9
+        self._certificates = [node.whole for part in signed[3:] if part.tag == 0xA0 for node in part.children()]
+        self._signers = signed[-1].children()
+
+    def check_message(self, message: bytes) -> None:
+        """Raises ValueError when it was given for something else."""
+        algorithm, imprint = self._imprint
+        if algorithm not in _DIGESTS or _digest(algorithm, message) != imprint:
+            raise ValueError("it was given for something else than this checkpoint")
+
+    def check_signature(self, trusted: Sequence[x509.Certificate]) -> None:
+        """Raises ValueError, InvalidSignature when no line of certificates leads to one of the trusted."""
+        if len(self._signers) != 1:
+            raise ValueError("it has not one signature but several or none")
+        signer = self._signers[0].children()
+        issuer, serial = signer[1].children()
+        algorithm, attributes, signature = signer[2].children()[0].oid(), signer[3], signer[5].content
+        if attributes.tag != 0xA0 or algorithm not in _DIGESTS:
+            raise ValueError("it is signed in a way that this verifier does not know")
+        values = {node.children()[0].oid(): node.children()[1].children()[0] for node in attributes.children()}
+        if values[_CONTENT_TYPE].oid() != _TST_INFO or values[_MESSAGE_DIGEST].content != _digest(
+            algorithm, self._info
+        ):
+            raise ValueError("its signature is for another content")
+        brought = [x509.load_der_x509_certificate(data) for data in self._certificates] + list(trusted)
+        wanted = int.from_bytes(serial.content, "big", signed=True)
+        leaf = next(
+            (c for c in brought if c.serial_number == wanted and c.issuer.public_bytes() == issuer.whole), None
+        )
+        if leaf is None:
+            raise ValueError("the certificate of its signature is missing")
+        key, content = leaf.public_key(), b"\x31" + attributes.whole[1:]
+        if isinstance(key, rsa.RSAPublicKey):
+            key.verify(signature, content, padding.PKCS1v15(), _DIGESTS[algorithm])
+        elif isinstance(key, ec.EllipticCurvePublicKey):
+            key.verify(signature, content, ec.ECDSA(_DIGESTS[algorithm]))
+        else:
+            raise ValueError("its key is of a kind that this verifier does not know")  # noqa: TRY004  # as all faults
+        usage = leaf.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+        if ExtendedKeyUsageOID.TIME_STAMPING not in usage:
+            raise ValueError("its certificate is not one for time stamps")
+        self._check_line(leaf, brought, trusted)
+
+    def _check_line(
+        self, leaf: x509.Certificate, brought: Sequence[x509.Certificate], trusted: Sequence[x509.Certificate]
+    ) -> None:
+        at = leaf
+        for _ in range(8):
+            moment = self.at.replace(tzinfo=None)
+            begins, ends = at.not_valid_before_utc, at.not_valid_after_utc
+            if not begins.replace(tzinfo=None) <= moment <= ends.replace(tzinfo=None):
+                raise ValueError(f"the certificate of {at.subject.rfc4514_string()} was not valid at that time")
+            if at in trusted:
+                return
+            at = next((above for above in brought if above != at and _issued(above, at)), at)
+        raise ValueError("no line of certificates leads from it to one that was given")
+
+
+def _issued(above: x509.Certificate, below: x509.Certificate) -> bool:
+    try:
+        if not above.extensions.get_extension_for_class(x509.BasicConstraints).value.ca:
+            return False
+        below.verify_directly_issued_by(above)
+    except (ValueError, TypeError, InvalidSignature, x509.ExtensionNotFound):
+        return False
+    return True
+
+
+def _digest(algorithm: str, message: bytes) -> bytes:
+    return hashlib.new(_DIGESTS[algorithm].name, message).digest()
+
+
+def load_certificates(path: Path | None) -> list[x509.Certificate]:
+    """The certificates of a PEM file. Raises NotABundleError."""
+    if path is None:
+        return []
+    try:
+        return x509.load_pem_x509_certificates(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise NotABundleError(f"{path} cannot be read as certificates: {error}") from error
+
+
+# --- what people see ------------------------------------------------------------------------------------------------
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Check a bundle and say what was found. The exit status."""
+    parser = argparse.ArgumentParser(description="Tell whether an evidence bundle is whole and unaltered.")
+    parser.add_argument("bundle", type=Path, help="the bundle, or the folder into which it was unpacked")
+    parser.add_argument("--key", metavar="FINGERPRINT", help="fingerprint of the site's key, as you were told it")
+    parser.add_argument(
+        "--certificates", metavar="FILE", type=Path, help="PEM certificates of the time-stamp authority"
+    )
+    parser.add_argument("--json", action="store_true", help="write the result as JSON")
+    options = parser.parse_args(arguments)
+    check = Check()
+    try:
+        check.run(options.bundle, options.key, options.certificates)
+    except NotABundleError as error:
+        sys.stderr.write(f"{error}\n")
+        for fault in check.faults:
+            sys.stderr.write(f"  {fault['where']}: {fault['what']}\n")
+        return 2
+    if options.json:
+        result = {
+            "ok": not check.faults,
+            "run_id": check.manifest["run_id"],
+            "simulated": check.manifest["simulated"],
+            "head": check.manifest["head"],
+            "signed_by": check.manifest["made_by_key"],
+            "keys": list(check.keys),
+            "counts": check.counts,
+            "faults": check.faults,
+            "notes": check.notes,
+        }
+        sys.stdout.write(json.dumps(result, indent=1) + "\n")
+    else:
+        sys.stdout.write(report(check))
+    return 1 if check.faults else 0
+
+
+def report(check: Check) -> str:
+    """The result in words."""
+    counts = check.counts
+    simulated = " SIMULATED: no real device took part." if check.manifest["simulated"] else ""
+    lines = [
+        f"Run {check.manifest['run_id']}.{simulated}",
+        f"Read {counts.get('files', 0)} files, {counts.get('events.jsonl', 0)} events of the run, "
+        f"{counts.get('site_events.jsonl', 0)} of the site, {counts.get('artefacts', 0)} artefacts, "
+        f"{counts.get('checkpoints', 0)} checkpoints, {counts.get('timestamps', 0)} time stamps.",
+        f"The run's chain ends with {check.manifest['head'].get('sha256')}.",
+        *(f"note: {note}" for note in check.notes),
+    ]
+    if check.faults:
+        lines.append(f"NOT AS IT WAS RECORDED: {len(check.faults)} differences.")
+        lines += [f"  {fault['where']}: {fault['what']}" for fault in check.faults]
+    else:
+        lines.append("WHOLE AND UNALTERED: every file, record, link and signature is as it was recorded.")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
