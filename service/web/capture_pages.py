@@ -2,6 +2,128 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from typing import Annotated, Any, Literal
 
-router = APIRouter()
+from fastapi import APIRouter, Depends, Path, Query, Request
+from fastapi.responses import HTMLResponse
+
+from service.people.control import Control
+from service.people.person import Person
+from service.web.pages import render
+from service.web.run_frame import run_frame
+from service.web.security import Signed, requires
+from service.web.site import Here, Site
+from service.web.viewpoints import captures_of
+
+router = APIRouter(tags=["capture"])
+
+RunId = Annotated[str, Path(max_length=64)]
+Name = Annotated[str, Query(max_length=64)]
+Page = Annotated[int, Query(ge=1, le=100_000)]
+Seq = Annotated[int, Query(ge=0, le=2**53)]
+SHEET = 60  # images on one page of the contact sheet
+
+
+@router.get("/runs/{run_id}/capture", name="capture", dependencies=[Depends(requires("read"))])
+def capture(
+    request: Request,
+    site: Here,
+    person: Signed,
+    run_id: RunId,
+    step: Name = "",
+    viewpoint: Name = "",
+    seq: Seq = 0,
+    page: Page = 1,
+    replaced: bool = False,
+    plain: bool = False,
+) -> HTMLResponse:
+    """Everything about the images of one step."""
+    shown = _shown(site, person, run_id, step, viewpoint, seq, page, replaced=replaced, plain=plain)
+    return render(request, "capture.html.j2", frame=run_frame(site, run_id), **shown)
+
+
+@router.get("/runs/{run_id}/capture/parts/{name}", name="capture_part", dependencies=[Depends(requires("read"))])
+def capture_part(
+    request: Request,
+    site: Here,
+    person: Signed,
+    run_id: RunId,
+    name: Literal["image", "plan", "sheet"],
+    step: Name = "",
+    viewpoint: Name = "",
+    seq: Seq = 0,
+    page: Page = 1,
+    replaced: bool = False,
+    plain: bool = False,
+) -> HTMLResponse:
+    """One part of the page, for the script that keeps it up to date."""
+    shown = _shown(site, person, run_id, step, viewpoint, seq, page, replaced=replaced, plain=plain)
+    return render(request, "capture_part.html.j2", part=name, **shown)
+
+
+def _shown(
+    site: Site,
+    person: Person,
+    run_id: str,
+    wanted: str,
+    viewpoint: str,
+    seq: int,
+    page: int,
+    *,
+    replaced: bool,
+    plain: bool,
+) -> dict[str, Any]:
+    # The planning of viewpoints brings scipy, which the start of the service does not wait for.
+    from service.web import capture_view, plan_drawing, planned  # noqa: PLC0415
+
+    log = site.run(run_id)
+    common = {"run_id": run_id, "steps": capture_view.capture_steps(log.protocol), "log": log}
+    step = capture_view.step_to_show(log, wanted)
+    if step is None:
+        return {**common, "step": None}
+    views = capture_view.views_of(log, step)
+    everything = captures_of(log, step.id)
+    valid = [c for c in everything if c.replaced is None]
+    chosen = next((c for c in everything if seq and c.seq == seq), None)
+    if chosen is None:
+        named = [c for c in valid if c.payload.viewpoint == viewpoint]
+        chosen = (named or ([] if viewpoint else valid) or [None])[-1]
+    name = viewpoint or ("" if chosen is None else chosen.payload.viewpoint)
+    view = next((v for v in views if v.name == name), None)
+    listed = everything if replaced else valid
+    pages = max(1, -(-len(listed) // SHEET))
+    page = min(page, pages)
+    stations = list(dict.fromkeys(v.station for v in views if v.station))
+    there = {station: planned.station_of(log, station) for station in stations}
+    drawings = [
+        plan_drawing.plan_drawing(known, [v for v in views if v.station == station])
+        for station, known in there.items()
+        if known is not None
+    ]
+    advice, suggestions = capture_view.suggestions_of(log, step)
+    counts = {state: sum(v.state == state for v in views) for state in capture_view.WORDS}
+    holder = Control(site.store).holder(run_id)
+    return {
+        **common,
+        "step": step,
+        "state": log.state.steps[step.id],
+        "views": views,
+        "counts": {state: count for state, count in counts.items() if count},
+        "words": capture_view.WORDS,
+        "tones": capture_view.TONES,
+        "drawings": [drawing for drawing in drawings if drawing is not None],
+        "capture": chosen,
+        "view": view,
+        "verdicts": [] if chosen is None else capture_view.verdicts_of(log, step, chosen, valid),
+        "sums": [] if chosen is None else capture_view.summary_of(step, chosen),
+        "redo": None if view is None else capture_view.redo_of(log, step, view, person.account),
+        "in_control": person.may("operate") and holder.screen == person.screen,
+        "captures": listed[::-1][(page - 1) * SHEET : page * SHEET],  # newest first
+        "replaced_count": len(everything) - len(valid),
+        "page": page,
+        "pages": pages,
+        "advice": advice,
+        "suggestions": suggestions,
+        "following": not viewpoint and not seq,
+        "query": {"step": step.id, "viewpoint": viewpoint, "seq": seq, "replaced": replaced, "plain": plain},
+    }

@@ -1,0 +1,93 @@
+"""Where the plan puts the camera, and the station that it stands in, without a device and without moving anything."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import yaml
+
+from service.core.geometry import Transform
+from service.core.model import RunStarted
+from service.core.protocol import Step
+from service.evidence import RunLog
+from service.rig import RigSection
+from service.steps.context import StationLayout
+from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A camera pose in the base frame of its station: where it is and where it looks."""
+
+    name: str
+    station: str
+    position_m: Vector
+    looks: Vector  # unit vector of the optical axis
+
+
+@dataclass(frozen=True, slots=True)
+class Station:
+    """A station as a plan of it is drawn."""
+
+    layout: StationLayout
+    specimen_m: tuple[float, float]  # along the approach, across it
+
+
+def station_of(log: RunLog, name: str) -> Station | None:
+    """Of the rig as it was when the run began; None when it has no such station."""
+    section = _recorded_rig(log)
+    there = section.stations.get(name)
+    if there is None:
+        return None
+    azimuth = math.radians(there.approach_azimuth_deg)
+    layout = StationLayout(name, there.robot, there.scene_centre_m, (math.cos(azimuth), math.sin(azimuth), 0.0))
+    size = section.collision.specimen_size_m
+    return Station(layout, (size[0], size[1]))
+
+
+def planned_viewpoints(log: RunLog, step: Step) -> tuple[Planned, ...]:
+    """Those of the protocol, then those that an attempt of the step has suggested."""
+    sets: tuple[ViewpointSet, ...] = getattr(step.params, "viewpoints", ())
+    out: list[Viewpoint] = []
+    for viewpoint_set in sets:
+        station = station_of(log, viewpoint_set.station)
+        if station is not None:
+            out += plan_viewpoints(viewpoint_set, station.layout)
+    notes = [note for note in log.state.steps[step.id].notes if note.note == "suggested_viewpoints"]
+    wanted = {str(view["viewpoint"]) for note in notes for view in note.data["viewpoints"]}
+    for viewpoint_set in sets[-1:]:
+        last = station_of(log, viewpoint_set.station)
+        if wanted and last is not None:
+            out += [v for v in denser_viewpoints(viewpoint_set, last.layout) if v.name in wanted]
+    return tuple(Planned(v.name, v.station, *place(v.T_base_camera)) for v in out)
+
+
+def place(T_base_camera: Transform) -> tuple[Vector, Vector]:
+    """Position and optical axis of a camera pose."""
+    return _vector(T_base_camera[:3, 3]), _vector(T_base_camera[:3, 2])
+
+
+def nominal_T_flange_camera(log: RunLog) -> tuple[tuple[float, float, float, float], ...] | None:
+    """The drawing of the camera's mount."""
+    return _recorded_rig(log).T_flange_camera_nominal
+
+
+def _vector(values: Transform) -> Vector:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def _recorded_rig(log: RunLog) -> RigSection:
+    root = log.events[0].payload
+    assert isinstance(root, RunStarted)  # the log was read the same way
+    return _rig_section(log.store.artefact_path(root.rig.sha256))
+
+
+@lru_cache(maxsize=8)
+def _rig_section(path: Path) -> RigSection:
+    return RigSection.model_validate(yaml.safe_load(path.read_bytes()))
