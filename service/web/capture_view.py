@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -171,11 +171,32 @@ def _place(log: RunLog, capture: Capture) -> tuple[Vector, Vector] | tuple[None,
 
 def verdicts_of(log: RunLog, step: Step, capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
     """Sharp, exposed, spheres, pose, settings: in words, with the figures behind them."""
-    payload, live = capture.payload, capture.live
+    of_board = capture.payload.artefacts[0].kind == "board_image"
+    found = [_board(log, step, capture)] if of_board else _found(capture, others)
+    return [*found, *_taken(log.protocol, capture)]
+
+
+def _board(log: RunLog, step: Step, capture: Capture) -> Verdict:
+    """Whether the calibration uses an image of the board."""
+    details: Any = log.state.steps[step.id].result.get("details", {})
+    intrinsics = details.get("intrinsics", {})
+    why = {entry["image"]: entry["reason"] for entry in intrinsics.get("excluded", ())}
+    why = dict.fromkeys(details.get("views_without_board", ()), "no board was found in it") | why
+    name = capture.payload.viewpoint
+    if name in why:
+        return Verdict("Board", False, "Not used", why[name])
+    if name not in intrinsics.get("images", ()):
+        return Verdict("Board", None, "not looked at yet", "the board is searched for once all images are taken")
+    rms = dict(zip(intrinsics["images"], intrinsics["per_view_rms_px"], strict=True))[name]
+    return Verdict("Board", True, "Found", f"corners {rms:.3f} px rms against the calibration")
+
+
+def _found(capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
+    """What the live numbers say."""
+    live = capture.live
     measures = {} if live is None else dict(live.measures)
     waiting = live is not None and live.status == "enqueued"
     unknown = "being looked at" if waiting else "not measured"
-    protocol = log.protocol
     out: list[Verdict] = []
 
     edge = measures.get("edge_width_px")
@@ -201,6 +222,13 @@ def verdicts_of(log: RunLog, step: Step, capture: Capture, others: Sequence[Capt
     reason = "" if live is None else str(live.result.get("reason", "")) or live.message
     out.append(Verdict("Spheres", seen, words[seen], f"{figures}; {reason}".strip("; ") if reason else figures))
 
+    return out
+
+
+def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
+    """What was judged when the image was taken."""
+    payload = capture.payload
+    out: list[Verdict] = []
     still = payload.verdicts.get("still")
     words = {None: "not judged", True: "Still", False: "Moved"}
     figures = (

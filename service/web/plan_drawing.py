@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ from service.web.capture_view import View, ViewState
 from service.web.planned import Station, Vector
 
 WIDTH = 640.0  # of the drawing; its height follows from what is on it
-_MARGIN = 46.0
+_MARGIN = 62.0
 _TICK = 30.0  # length of the line that tells where a camera looks
 _MOST_LABELS = 40
 
@@ -71,7 +72,7 @@ def plan_drawing(station: Station, views: Sequence[View]) -> PlanDrawing | None:
         dx, dy = _above(looks, (0.0, 0.0, 0.0), layout.approach)
         length = math.hypot(dx, dy)
         reach = 0.0 if length < 0.05 else _TICK / length * min(1.0, length / 0.3)
-        label = view.name.rsplit("_", 1)[-1].lstrip("0") if len(placed) <= _MOST_LABELS else ""
+        label = _short(view.name) if len(placed) <= _MOST_LABELS else ""
         symbols.append(Symbol(view.name, label, view.state, x, y, round(x + reach * dx, 1), round(y + reach * dy, 1)))
     corner, far = at(-across / 2, -deep / 2), at(across / 2, deep / 2)
     base = at(*_above((0.0, 0.0, 0.0), layout.scene_centre_m, layout.approach))
@@ -85,6 +86,12 @@ def plan_drawing(station: Station, views: Sequence[View]) -> PlanDrawing | None:
         bar=round(0.1 * scale, 1),
         robot=base if inside else None,
     )
+
+
+def _short(name: str) -> str:
+    """v1_003 → 3; a name without a number stays."""
+    number = re.search(r"(\d+)$", name)
+    return number.group(1).lstrip("0") if number and not re.search(r"t\d+[+-]\d+$", name) else name
 
 
 def _above(point: Vector, origin: Vector, approach: Vector) -> tuple[float, float]:
