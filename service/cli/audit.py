@@ -13,6 +13,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from service.audit.bundle import export_bundle
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -133,6 +134,41 @@ def rotate_key_command(
         print_json(_key_json(key))
     else:
         console.print(f"The key is now {key.key_id}. Write this fingerprint down elsewhere.")
+
+
+@audit_app.command("export")
+def export_command(
+    run: RunArgument,
+    bundle: Annotated[
+        Path, typer.Argument(help="The zip file to write; a simulated run's gets SIMULATED in its name.")
+    ],
+    data: DataOption = DEFAULT_DATA,
+    hashes_only: Annotated[
+        bool, typer.Option("--hashes-only", help="Leave the recorded files out; the records hold their hashes.")
+    ] = False,
+    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    json: JsonOption = False,
+) -> None:
+    """Write a run's evidence into one file that anybody can verify elsewhere, with the verifier inside.
+
+    Refused when the evidence does not verify, and when the protocol asks for a release that was not given.
+    """
+    with reporting_errors(json):
+        with Store.open(data, create=False) as store, progress_bar(quiet=json) as report_progress:
+            made = export_bundle(
+                store,
+                store.find_run(run),
+                bundle,
+                actor=operator or getpass.getuser(),
+                hashes_only=hashes_only,
+                progress=report_progress,
+            )
+    if json:
+        print_json({**asdict(made), "path": str(made.path)})
+        return
+    console.print(f"{escape(str(made.path))}: {made.size_bytes / 1e6:.1f} MB, SHA-256 {made.sha256}")
+    console.print(f"  signed with key {made.key_id}")
+    console.print(f"  To verify it anywhere: python verify.py {escape(made.path.name)} --key {made.key_id}")
 
 
 def _key_json(key: PublicKey) -> dict[str, Any]:

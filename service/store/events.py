@@ -56,11 +56,15 @@ def event_sha256(fields: Mapping[str, Any]) -> str:
 
 def event_sha256_of_text(fields: Mapping[str, Any], payload: str) -> str:
     """The same for a payload that is canonical JSON already: it is not written out a second time."""
+    return sha256_text(event_text({name: value for name, value in fields.items() if name != "sha256"}, payload))
+
+
+def event_text(fields: Mapping[str, Any], payload: str) -> str:
+    """Canonical JSON of an event from its other fields and its payload's canonical JSON."""
     # In canonical JSON the members are sorted by name, and `payload` stands alone between two groups of others.
-    named = {name: value for name, value in fields.items() if name not in ("sha256", "payload")}
-    before = canonical({name: value for name, value in named.items() if name < "payload"})
-    after = canonical({name: value for name, value in named.items() if name > "payload"})
-    return sha256_text(f'{before[:-1]},"payload":{payload},{after[1:]}')
+    before = canonical({name: value for name, value in fields.items() if name < "payload"})
+    after = canonical({name: value for name, value in fields.items() if name > "payload"})
+    return f'{before[:-1]},"payload":{payload},{after[1:]}'
 
 
 def payload_text(payload: Payload) -> str:

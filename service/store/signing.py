@@ -87,6 +87,16 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
     return public_keys(store)[-1]
 
 
+def sign(store: Store, message: bytes) -> tuple[str, str]:
+    """Fingerprint of the key in use, and its signature over a message in base64. Raises SigningKeyError.
+
+    The message begins with what it is for, so that no signature can be taken for one of another kind.
+    """
+    with store.database.writing() as connection:
+        key = _present_key(store, connection)
+    return key_fingerprint(public_bytes(key)), base64.b64encode(key.sign(message)).decode()
+
+
 def public_keys(store: Store) -> list[PublicKey]:
     """Every key that ever signed here, oldest first; the last one is in use."""
     with store.database.reading() as connection:

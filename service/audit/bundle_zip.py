@@ -1,0 +1,89 @@
+"""Writing a bundle's zip file: streamed, hashed on the way, the same bytes for the same content."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+import zipfile
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.core.errors import DataError, StoreError
+
+ZipTime = tuple[int, int, int, int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Listed:
+    """A file of the bundle, as the manifest lists it."""
+
+    path: str
+    sha256: str
+    size_bytes: int
+
+
+class BundleZip:
+    """A zip file under way; every entry is hashed while it is written."""
+
+    def __init__(self, archive: zipfile.ZipFile, at: ZipTime) -> None:
+        self._archive = archive
+        self._at = at
+        self.listed: list[Listed] = []
+
+    def add(self, path: str, chunks: Iterable[bytes], *, compress: bool = True) -> Listed:
+        """Write one file. What is stored as it came (images) is not compressed."""
+        info = zipfile.ZipInfo(path, date_time=self._at)
+        info.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+        info.create_system = 3  # Unix, wherever it is written: the permissions below mean something
+        info.external_attr = (stat.S_IFREG | 0o644) << 16
+        digest, size = hashlib.sha256(), 0
+        with self._archive.open(info, "w", force_zip64=True) as entry:
+            for chunk in chunks:
+                digest.update(chunk)
+                size += len(chunk)
+                entry.write(chunk)
+        listed = Listed(path, digest.hexdigest(), size)
+        self.listed.append(listed)
+        return listed
+
+
+@contextmanager
+def writing_bundle(target: Path, at: ZipTime) -> Generator[BundleZip]:
+    """A zip file that appears under its name only when it is complete and durable; nothing is left of it otherwise.
+
+    Raises:
+        DataError: a file of this name exists.
+        StoreError: the disk refused.
+    """
+    if target.exists():
+        raise DataError("the file exists already", where=str(target), remedy="Name a new one; nothing is overwritten")
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with part.open("xb") as handle:
+            with zipfile.ZipFile(handle, "w", allowZip64=True) as archive:
+                yield BundleZip(archive, at)
+            handle.flush()
+            os.fsync(handle.fileno())
+        os.link(part, target)  # unlike a rename, never replaces what another process has put there meanwhile
+        _sync(target.parent)
+    except FileExistsError as error:
+        raise DataError("the file exists already", where=str(target), remedy="Name a new one") from error
+    except OSError as error:
+        raise StoreError(
+            f"the bundle cannot be written: {error.strerror or error}",
+            where=str(error.filename or target),
+            remedy="Check free space and permissions; the evidence itself is as it was",
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
