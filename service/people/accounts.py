@@ -45,6 +45,11 @@ class Accounts:
         with self._store.database.reading() as connection:
             return [to_account(row) for row in connection.execute(select(accounts).order_by(accounts.c.account))]
 
+    def get(self, account: str) -> Account:
+        """One account. Raises AccountError."""
+        with self._store.database.reading() as connection:
+            return to_account(get_account(connection, account))
+
     # --- one-time links ---
 
     def first_link(self) -> str | None:

@@ -95,6 +95,11 @@ class People:
                     self._require_unchanged(connection, row)
                     self._reset_failures(connection, row, password)
 
+    def refuse_address(self, address: str) -> None:
+        """Record that an address has failed too often and is not listened to for a while."""
+        with self._store.database.writing() as connection:
+            record_sign_in(self._store, connection, "locked_out", account="", address=address)
+
     def _checked(self, typed: str, password: str, address: str) -> Row[Any]:
         name = plain_name(typed)
         with self._store.database.reading() as connection:

@@ -157,10 +157,12 @@ class Limiter:
         error.wait_s = wait_s
         raise error
 
-    def failed(self, address: str) -> None:
-        """Count one."""
+    def failed(self, address: str) -> bool:
+        """Count one; whether it was the one too many."""
         with self._lock:
-            self._failed.setdefault(address, deque(maxlen=self._tries)).append(self._clock.monotonic_s())
+            failed = self._failed.setdefault(address, deque(maxlen=self._tries))
+            failed.append(self._clock.monotonic_s())
             self._failed.move_to_end(address)
             while len(self._failed) > self._addresses:
                 self._failed.popitem(last=False)
+            return len(failed) == self._tries
