@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from typing import Any
 
-from service.audit.findings import value_at
+from service.audit.findings import value_at, value_text
 from service.audit.queries import one_event
 from service.core.errors import DataError
 from service.core.model import Event, RecordCorrected
 from service.store.store import Store
 
 _UNCORRECTABLE = frozenset({"sha256", "size_bytes", "kind", "signed_sha256", "protocol_sha256"})
+_FIELDS = 300  # offered for choice
 _REMEDY = "Open the event in the timeline and copy the name of the field"
 
 
@@ -50,6 +52,27 @@ def correct(store: Store, run_id: str, *, of_seq: int, field: str, new: str, rea
     payload = RecordCorrected(of_seq=of_seq, field=field, old=old, new=value, reason=reason)
     (appended,) = store.record(run_id, [payload], actor=actor)
     return appended
+
+
+def correctable(payload: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Fields whose value can be corrected, each with its value as text; up to a few hundred."""
+    found: list[tuple[str, str]] = []
+
+    def walk(value: Any, path: tuple[str, ...]) -> None:
+        if len(found) >= _FIELDS or (path and path[-1] in _UNCORRECTABLE):
+            return
+        if isinstance(value, dict):
+            for name, item in value.items():
+                if "." not in name:
+                    walk(item, (*path, name))
+        elif isinstance(value, list):
+            for index, item in enumerate(value):
+                walk(item, (*path, str(index)))
+        else:
+            found.append((".".join(path), value_text(value)))
+
+    walk(dict(payload), ())
+    return found
 
 
 def _typed(old: Any, new: str, where: str) -> Any:

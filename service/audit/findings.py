@@ -107,6 +107,16 @@ class CorrectedValue:
     original: Any  # what the event really holds: equals `old`
     latest: bool  # no later correction of the same value
 
+    @property
+    def old_text(self) -> str:
+        """The original for people."""
+        return value_text(self.old)
+
+    @property
+    def new_text(self) -> str:
+        """The new value for people."""
+        return value_text(self.new)
+
 
 def corrected_values(connection: Connection, run_id: str) -> list[CorrectedValue]:
     """All corrections of a run, in order."""
@@ -134,6 +144,11 @@ def corrected_values(connection: Connection, run_id: str) -> list[CorrectedValue
             )
         )
     return found
+
+
+def value_text(value: Any) -> str:
+    """A value for people: text as it is, anything else as JSON."""
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
 def value_at(payload: Mapping[str, Any], path: str) -> Any:
@@ -287,3 +302,30 @@ def events_of(connection: Connection, run_id: str, *kinds: str, newest: bool = F
     """All events of some kinds, up to LISTED of them, with their payloads."""
     seqs = seqs_of_kind(connection, run_id, kinds, limit=LISTED, newest=newest)
     return read_rows(connection, run_id, seqs, whole=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One start of the runner's process."""
+
+    row: EventRow
+    software: Mapping[str, str]
+    changed: Mapping[str, tuple[str, str]]  # against the session before it: distribution → before, now
+
+
+def sessions(rows: Sequence[EventRow]) -> list[Session]:
+    """The starts of a runner, each compared with the one before."""
+    found: list[Session] = []
+    before: dict[str, str] | None = None
+    for row in rows:
+        software = {str(name): str(version) for name, version in dict(row.payload.get("software") or {}).items()}
+        names = sorted({*software, *before}) if before is not None else []
+        earlier = before or {}
+        changed = {
+            name: (earlier.get(name, ""), software.get(name, ""))
+            for name in names
+            if earlier.get(name) != software.get(name)
+        }
+        found.append(Session(row, software, changed))
+        before = software
+    return found

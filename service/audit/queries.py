@@ -43,8 +43,8 @@ class RunBasics:
     head_sha256: str
 
 
-def runs(connection: Connection) -> list[RunBasics]:
-    """All runs, newest first."""
+def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
+    """All runs, newest first; or the one of this name, if there is one."""
     rows = connection.execute(
         text(
             "SELECT r.run_id, r.created_utc, r.simulated, h.seq, h.sha256, "
@@ -53,9 +53,9 @@ def runs(connection: Connection) -> list[RunBasics]:
             "json_extract(e.payload, '$.operator') AS operator "
             "FROM runs AS r LEFT JOIN heads AS h ON h.run_id = r.run_id "
             "LEFT JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 AND json_valid(e.payload) "
-            "WHERE r.run_id <> :site ORDER BY r.created_utc DESC, r.run_id DESC"
+            "WHERE r.run_id <> :site AND (:run IS NULL OR r.run_id = :run) ORDER BY r.created_utc DESC, r.run_id DESC"
         ),
-        {"site": SITE},
+        {"site": SITE, "run": None if run_id is None else plain(run_id)},
     )
     return [
         RunBasics(

@@ -1,7 +1,445 @@
-"""The auditor's view: runs, first page of a run, timeline, artefacts, provenance."""
+"""The auditor's view: runs, first page of a run, timeline, artefacts, provenance, corrections, the site's chain."""
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from typing import Annotated
 
-router = APIRouter()
+from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+
+from service.audit import artefact_queries, findings, first_page, queries
+from service.audit.computed import Progress
+from service.audit.correcting import correct, correctable
+from service.audit.first_page import GROUPS, ListedRun, RunFilter
+from service.audit.provenance import origin
+from service.audit.provenance_drawing import draw
+from service.audit.queries import EventFilter
+from service.store.records import SITE
+from service.web.audit_view import Audit, Auditing, audit_frame, cut, link
+from service.web.pages import render
+from service.web.security import Signed, requires
+
+router = APIRouter(tags=["audit"])
+_RUNS_A_PAGE = 25
+_FIRST = 25  # of a list on the first page
+_READ = [Depends(requires("read"))]
+
+Text = Annotated[str, Query(description="as shown; cut after 200 characters")]
+Number = Annotated[int, Query()]
+
+
+@router.get("/audit", name="audit", dependencies=_READ, response_class=HTMLResponse)
+def runs_page(
+    request: Request,
+    audit: Auditing,
+    since: Text = "",
+    until: Text = "",
+    protocol: Text = "",
+    person: Text = "",
+    status: Text = "",
+    simulated: Text = "",
+    deviations: Text = "",
+    unverified: Text = "",
+    q: Text = "",
+    page: Number = 1,
+) -> Response:
+    """The runs, newest first."""
+    wanted = RunFilter(
+        since=cut(since),
+        until=cut(until),
+        protocol=cut(protocol),
+        person=cut(person),
+        status=cut(status),
+        simulated=cut(simulated),
+        deviations=bool(deviations),
+        unverified=bool(unverified),
+        q=cut(q),
+    )
+    with audit.site.store.database.reading() as connection:
+        every = queries.runs(connection)
+    listed = [_listed(audit, basics) for basics in every]
+    found = [run for run in listed if first_page.matches(run, wanted)]
+    pages = max(1, -(-len(found) // _RUNS_A_PAGE))
+    page = min(max(page, 1), pages)
+    return render(
+        request,
+        "audit_runs.html.j2",
+        runs=found[(page - 1) * _RUNS_A_PAGE : page * _RUNS_A_PAGE],
+        count=len(found),
+        every=len(every),
+        unknown=sum(run.digest is None for run in found),
+        protocols=sorted({run.protocol for run in every if run.protocol}),
+        people=first_page.people_of(listed),
+        wanted=wanted,
+        page=page,
+        pages=pages,
+        href=lambda number: link("/audit", {**wanted.query(), "page": number}),
+    )
+
+
+def _listed(audit: Audit, basics: queries.RunBasics) -> ListedRun:
+    digest = audit.digests.at(basics.run_id, basics.head_seq, basics.head_sha256)
+    if isinstance(digest, Progress):
+        audit.digests.warm(basics.run_id)
+    return ListedRun(basics, first_page.known(digest), audit.verifications.last(basics.run_id))
+
+
+@router.get("/audit/runs/{run_id}", name="audit_run", dependencies=_READ, response_class=HTMLResponse)
+def run_page(request: Request, audit: Auditing, run_id: str) -> Response:
+    """The first page of a run: deviations first."""
+    frame = audit_frame(audit, run_id, "")
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    with audit.site.store.database.reading() as connection:
+        root = queries.read_rows(connection, run_id, [1], whole=True)
+        corrected = queries.count_of_kind(connection, run_id, "record_corrected")
+        devices = findings.events_of(connection, run_id, "device_opened", newest=True)
+        sessions = findings.events_of(connection, run_id, "session_started", newest=True)
+        exports = findings.events_of(connection, run_id, "evidence_exported", newest=True)
+        signatures = findings.signatures(connection, run_id, known)
+    listed = first_page.findings(known) if known else []
+    return render(
+        request,
+        "audit_run.html.j2",
+        audit=frame,
+        digest=known,
+        progress=digest if isinstance(digest, Progress) else None,
+        counts=first_page.counts(known) if known else {},
+        groups=GROUPS,
+        listed=listed[:_FIRST],
+        more=len(listed) - _FIRST,
+        root=root[0] if root else None,
+        corrected=corrected,
+        devices={row.payload.get("device"): row for row in devices},
+        session=sessions[-1] if sessions else None,
+        sessions=len(sessions),
+        exports=exports,
+        releases=[s for s in signatures if not s.step],
+        signatures=signatures,
+    )
+
+
+@router.get(
+    "/audit/runs/{run_id}/deviations", name="audit_deviations", dependencies=_READ, response_class=HTMLResponse
+)
+def deviations_page(request: Request, audit: Auditing, run_id: str, group: Text = "", page: Number = 1) -> Response:
+    """All deviations, or those of one group."""
+    frame = audit_frame(audit, run_id, "")
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    group = group if group in GROUPS else ""
+    listed = first_page.findings(known, group) if known else []
+    pages = max(1, -(-len(listed) // queries.PAGE))
+    page = min(max(page, 1), pages)
+    return render(
+        request,
+        "audit_deviations.html.j2",
+        audit=frame,
+        progress=digest if isinstance(digest, Progress) else None,
+        groups=GROUPS,
+        counts=first_page.counts(known) if known else {},
+        group=group,
+        listed=listed[(page - 1) * queries.PAGE : page * queries.PAGE],
+        count=len(listed),
+        page=page,
+        pages=pages,
+        href=lambda number: link(f"{frame.base}/deviations", {"group": group, "page": number}),
+    )
+
+
+# --- events ---------------------------------------------------------------------------------------------------
+
+
+@router.get("/audit/runs/{run_id}/timeline", name="audit_timeline", dependencies=_READ, response_class=HTMLResponse)
+def timeline_page(
+    request: Request,
+    audit: Auditing,
+    run_id: str,
+    step: Text = "",
+    device: Text = "",
+    person: Text = "",
+    kind: Text = "",
+    q: Text = "",
+    after: Number = 0,
+    before: Number = 0,
+) -> Response:
+    """The events of a run in order, filtered and searched."""
+    frame = audit_frame(audit, run_id, "/timeline")
+    wanted = EventFilter(cut(step), cut(device), cut(person), cut(kind), cut(q))
+    return _events(request, audit, run_id, wanted, after, before, "audit_timeline.html.j2", audit=frame)
+
+
+def _events(
+    request: Request,
+    here: Audit,
+    chain: str,
+    wanted: EventFilter,
+    after: int,
+    before: int,
+    template: str,
+    **context: object,
+) -> Response:
+    digest = here.digests.get(chain) if chain != SITE else None
+    with here.site.store.database.reading() as connection:
+        page = queries.events_page(connection, chain, wanted, after=after, before=before)
+        last, _ = queries.head(connection, chain)
+        facets = digest.facets if digest is not None and not isinstance(digest, Progress) else queries.Facets()
+        if chain == SITE:
+            facets.add(connection, SITE, 0, last)
+        devices = artefact_queries.artefact_facets(connection, chain)["device"]
+    address = request.url.path
+    return render(
+        request,
+        template,
+        events=page,
+        wanted=wanted,
+        facets=facets,
+        devices=sorted({*facets.devices, *devices}),
+        progress=digest if isinstance(digest, Progress) else None,
+        last=last,
+        earlier=link(address, {**wanted.query(), "before": page.before}) if page.before else "",
+        later=link(address, {**wanted.query(), "after": page.after}) if page.after else "",
+        **context,
+    )
+
+
+@router.get("/audit/runs/{run_id}/events/{seq}", name="audit_event", dependencies=_READ, response_class=HTMLResponse)
+def event_page(request: Request, audit: Auditing, person: Signed, run_id: str, seq: int) -> Response:
+    """One event with everything that is recorded of it."""
+    frame = audit_frame(audit, run_id, "/timeline")
+    return _event(request, audit, run_id, seq, may_correct=person.may("correct"), audit=frame)
+
+
+def _event(request: Request, here: Audit, chain: str, seq: int, *, may_correct: bool, **context: object) -> Response:
+    with here.site.store.database.reading() as connection:
+        row = queries.one_event(connection, chain, seq)
+        last, _ = queries.head(connection, chain)
+        brought = artefact_queries.artefacts_of_events(connection, chain, [row.seq])
+    return render(
+        request,
+        "audit_event.html.j2",
+        event=row,
+        last=last,
+        computed_sha256=queries.computed_sha256(chain, row),
+        brought=brought,
+        fields=correctable(row.payload) if may_correct and row.kind != "record_corrected" else [],
+        events_at=f"/audit/runs/{chain}/events" if chain != SITE else "/audit/site/events",
+        **context,
+    )
+
+
+# --- artefacts -------------------------------------------------------------------------------------------------
+
+
+@router.get("/audit/runs/{run_id}/artefacts", name="audit_artefacts", dependencies=_READ, response_class=HTMLResponse)
+def artefacts_page(
+    request: Request,
+    audit: Auditing,
+    run_id: str,
+    kind: Text = "",
+    step: Text = "",
+    device: Text = "",
+    viewpoint: Text = "",
+    q: Text = "",
+    page: Number = 1,
+) -> Response:
+    """Every file of a run."""
+    frame = audit_frame(audit, run_id, "/artefacts")
+    wanted = artefact_queries.ArtefactFilter(cut(kind), cut(step), cut(device), cut(viewpoint), cut(q))
+    with audit.site.store.database.reading() as connection:
+        found = artefact_queries.artefacts_page(connection, run_id, wanted, page=page)
+        facets = artefact_queries.artefact_facets(connection, run_id)
+    return render(
+        request,
+        "audit_artefacts.html.j2",
+        audit=frame,
+        found=found,
+        wanted=wanted,
+        facets=facets,
+        href=lambda number: link(f"{frame.base}/artefacts", {**wanted.query(), "page": number}),
+    )
+
+
+@router.get(
+    "/audit/runs/{run_id}/artefacts/{sha256}", name="audit_artefact", dependencies=_READ, response_class=HTMLResponse
+)
+def artefact_page(request: Request, audit: Auditing, run_id: str, sha256: str) -> Response:
+    """One file: what it is, where it came from, what was made of it."""
+    frame = audit_frame(audit, run_id, "/artefacts")
+    with audit.site.store.database.reading() as connection:
+        found = origin(connection, run_id, sha256)
+    return render(request, "audit_artefact.html.j2", audit=frame, origin=found, artefact=found.records[0])
+
+
+@router.get(
+    "/audit/runs/{run_id}/provenance", name="audit_provenance", dependencies=_READ, response_class=HTMLResponse
+)
+def provenance_page(request: Request, audit: Auditing, run_id: str) -> Response:
+    """What came from what."""
+    frame = audit_frame(audit, run_id, "/provenance")
+    graph = audit.graphs.get(run_id)
+    known = None if isinstance(graph, Progress) else graph
+    return render(
+        request,
+        "audit_provenance.html.j2",
+        audit=frame,
+        progress=graph if isinstance(graph, Progress) else None,
+        graph=known,
+        drawing=draw(known) if known else None,
+    )
+
+
+# --- findings --------------------------------------------------------------------------------------------------
+
+
+@router.get(
+    "/audit/runs/{run_id}/corrections", name="audit_corrections", dependencies=_READ, response_class=HTMLResponse
+)
+def corrections_page(request: Request, audit: Auditing, run_id: str, page: Number = 1) -> Response:
+    """Old and new: corrected values, steps done again, views taken again."""
+    frame = audit_frame(audit, run_id, "/corrections")
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    views = findings.replaced_viewpoints(known) if known else []
+    pages = max(1, -(-len(views) // queries.PAGE))
+    page = min(max(page, 1), pages)
+    shown = views[(page - 1) * queries.PAGE : page * queries.PAGE]
+    with audit.site.store.database.reading() as connection:
+        values = findings.corrected_values(connection, run_id)
+        steps = findings.replaced_steps(connection, run_id, known) if known else []
+        seqs = sorted({seq for view in shown for seq in (view.old_seq, view.new_seq) if seq})
+        pictures = {
+            row.seq: row
+            for row in reversed(artefact_queries.artefacts_of_events(connection, run_id, seqs))
+            if row.is_picture
+        }
+        corrected = queries.count_of_kind(connection, run_id, "record_corrected")
+    return render(
+        request,
+        "audit_corrections.html.j2",
+        audit=frame,
+        progress=digest if isinstance(digest, Progress) else None,
+        values=values,
+        corrected=corrected,
+        steps=steps,
+        views=shown,
+        view_count=len(views),
+        pictures=pictures,
+        page=page,
+        pages=pages,
+        href=lambda number: link(f"{frame.base}/corrections", {"page": number}),
+    )
+
+
+@router.post("/audit/runs/{run_id}/corrections", name="correct", dependencies=[Depends(requires("correct"))])
+def correct_value(
+    audit: Auditing,
+    person: Signed,
+    run_id: str,
+    of_seq: Annotated[int, Form(ge=1, le=2**53)],
+    field: Annotated[str, Form(min_length=1, max_length=400)],
+    new: Annotated[str, Form(max_length=4000)],
+    reason: Annotated[str, Form(min_length=1, max_length=2000)],
+) -> Response:
+    """Record a correction; the original stays."""
+    audit_frame(audit, run_id, "/corrections")
+    correct(audit.site.store, run_id, of_seq=of_seq, field=field, new=new, reason=reason, actor=person.account)
+    return RedirectResponse(f"/audit/runs/{run_id}/corrections", status_code=303)
+
+
+@router.get(
+    "/audit/runs/{run_id}/signatures", name="audit_signatures", dependencies=_READ, response_class=HTMLResponse
+)
+def signatures_page(request: Request, audit: Auditing, run_id: str) -> Response:
+    """Who signed what, and whether it still stands."""
+    frame = audit_frame(audit, run_id, "/signatures")
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    with audit.site.store.database.reading() as connection:
+        found = findings.signatures(connection, run_id, known)
+    return render(
+        request,
+        "audit_signatures.html.j2",
+        audit=frame,
+        signatures=found,
+        digest=known,
+        progress=digest if isinstance(digest, Progress) else None,
+    )
+
+
+@router.get("/audit/runs/{run_id}/devices", name="audit_devices", dependencies=_READ, response_class=HTMLResponse)
+def devices_page(request: Request, audit: Auditing, run_id: str) -> Response:
+    """Devices with versions, clocks, troubles; sessions and software."""
+    frame = audit_frame(audit, run_id, "/devices")
+    with audit.site.store.database.reading() as connection:
+        opened = findings.events_of(connection, run_id, "device_opened", newest=True)
+        sessions = findings.events_of(connection, run_id, "session_started", newest=True)
+        troubles = findings.events_of(connection, run_id, "device_trouble", newest=True)
+        trouble_count = queries.count_of_kind(connection, run_id, "device_trouble")
+        clocks = findings.clock_offsets(connection, run_id)
+    return render(
+        request,
+        "audit_devices.html.j2",
+        audit=frame,
+        opened=opened,
+        sessions=findings.sessions(sessions),
+        troubles=troubles[-50:],
+        trouble_count=trouble_count,
+        clocks=clocks,
+    )
+
+
+# --- verification -----------------------------------------------------------------------------------------------
+
+
+@router.get(
+    "/audit/runs/{run_id}/verification", name="audit_verification", dependencies=_READ, response_class=HTMLResponse
+)
+def verification_page(request: Request, audit: Auditing, run_id: str) -> Response:
+    """What the last verification found, or how far the present one is."""
+    return render(request, "audit_verification.html.j2", audit=audit_frame(audit, run_id, "/verification"))
+
+
+@router.post("/audit/runs/{run_id}/verification", name="verify", dependencies=_READ)
+def verify_now(audit: Auditing, person: Signed, run_id: str) -> Response:
+    """Verify the run; it only reads, so whoever may read may ask for it."""
+    audit_frame(audit, run_id, "/verification")
+    audit.verifications.start(run_id, person.account)
+    return RedirectResponse(f"/audit/runs/{run_id}/verification", status_code=303)
+
+
+# --- the site -----------------------------------------------------------------------------------------------------
+
+
+@router.get("/audit/site", name="audit_site", dependencies=_READ, response_class=HTMLResponse)
+def site_page(
+    request: Request,
+    audit: Auditing,
+    person: Text = "",
+    kind: Text = "",
+    q: Text = "",
+    after: Number = 0,
+    before: Number = 0,
+) -> Response:
+    """The site's chain: starts of the service, people, keys."""
+    wanted = EventFilter(person=cut(person), kind=cut(kind), q=cut(q))
+    with audit.site.store.database.reading() as connection:
+        starts = findings.events_of(connection, SITE, "service_started", newest=True)[-5:]
+        keys = findings.events_of(connection, SITE, "key_changed", newest=True)
+    return _events(
+        request,
+        audit,
+        SITE,
+        wanted,
+        after,
+        before,
+        "audit_site.html.j2",
+        starts=list(reversed(starts)),
+        keys=keys,
+    )
+
+
+@router.get("/audit/site/events/{seq}", name="audit_site_event", dependencies=_READ, response_class=HTMLResponse)
+def site_event_page(request: Request, audit: Auditing, seq: int) -> Response:
+    """One event of the site's chain."""
+    return _event(request, audit, SITE, seq, may_correct=False)

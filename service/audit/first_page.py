@@ -1,0 +1,189 @@
+"""What an auditor reads first: every deviation in plain words, counted and listed; and the list of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from service.audit.computed import Progress
+from service.audit.digest import Digest
+from service.audit.queries import RunBasics
+from service.audit.verifying import Verification
+from service.core.gates import limits
+from service.core.run_state import DeviationKind
+
+# Group on the page → its name, and the kinds of deviations in it.
+GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
+    "redone": ("Re-dos", frozenset({"redo", "redo_viewpoint", "reset_by_redo"})),
+    "skipped_views": ("Skipped views", frozenset({"viewpoint_skipped"})),
+    "skipped_steps": ("Skipped steps", frozenset({"skip"})),
+    "overridden": ("Gates overridden", frozenset({"gate_overridden"})),
+    "refused": ("Refused actions", frozenset({"refused"})),
+    "failed_gates": ("Failed gates", frozenset()),
+    "automatic": ("Automatic confirmations", frozenset({"automatic"})),
+}
+_NAMES: Mapping[str, str] = {
+    "skip": "Step skipped",
+    "gate_overridden": "Gate overridden",
+    "redo": "Step done again",
+    "redo_viewpoint": "View taken again",
+    "reset_by_redo": "Reset by a re-do",
+    "viewpoint_skipped": "View skipped",
+    "refused": "Refused",
+    "automatic": "Automatic (note)",
+    "failed_gate": "Gate failed",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the list."""
+
+    seq: int
+    at_utc: str
+    kind: str
+    step: str
+    person: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        """The kind in words."""
+        return _NAMES[self.kind]
+
+    @property
+    def is_note(self) -> bool:
+        """For the record only."""
+        return self.kind == "automatic"
+
+
+def findings(digest: Digest, group: str = "") -> list[Finding]:
+    """Deviations and failed gates in the order of their events; of one group, or all without the notes."""
+    kinds = GROUPS[group][1] if group in GROUPS else None
+    found = [
+        Finding(d.seq, digest.times.get(d.seq, ""), d.kind, d.step or "", d.actor, d.text)
+        for d in digest.deviations
+        if (d.kind in kinds if kinds is not None else not d.is_note)
+    ]
+    if kinds is None or group == "failed_gates":
+        found += [
+            Finding(
+                gate.seq,
+                gate.at_utc,
+                "failed_gate",
+                gate.step,
+                "",
+                f"{gate.measure} {_value(gate.value, gate.unit)}, allowed {limits(gate.minimum, gate.maximum)}"
+                f"{' ' + gate.unit if gate.unit else ''} (attempt {gate.attempt})",
+            )
+            for gate in digest.failed_gates
+        ]
+        found.sort(key=lambda finding: finding.seq)
+    return found
+
+
+def _value(value: float | None, unit: str) -> str:
+    return "was not measured" if value is None else f"{value:.4g} {unit}".rstrip()
+
+
+def counts(digest: Digest) -> dict[str, int]:
+    """How many of each group."""
+    by_kind: dict[str, int] = {}
+    for deviation in digest.deviations:
+        by_kind[deviation.kind] = by_kind.get(deviation.kind, 0) + 1
+    found = {group: sum(by_kind.get(kind, 0) for kind in kinds) for group, (_, kinds) in GROUPS.items()}
+    return found | {"failed_gates": len(digest.failed_gates)}
+
+
+# --- the list of runs -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RunFilter:
+    """Which runs are wanted; an empty field wants all."""
+
+    since: str = ""  # 2026-11-21
+    until: str = ""
+    protocol: str = ""
+    person: str = ""
+    status: str = ""
+    simulated: str = ""  # yes, no
+    deviations: bool = False  # only those with some
+    unverified: bool = False  # only those that do not verify as they are now
+    q: str = ""
+
+    def query(self) -> dict[str, str]:
+        """For a link that keeps it."""
+        names = ("since", "until", "protocol", "person", "status", "simulated", "q")
+        fields = {name: getattr(self, name) for name in names}
+        fields |= {"deviations": "1" if self.deviations else "", "unverified": "1" if self.unverified else ""}
+        return {name: value for name, value in fields.items() if value}
+
+
+@dataclass(frozen=True, slots=True)
+class ListedRun:
+    """One line of the list of runs."""
+
+    basics: RunBasics
+    digest: Digest | None  # None: being computed
+    verification: Verification | None
+
+    @property
+    def status(self) -> str:
+        """As the digest says; "" while it is being computed."""
+        return self.digest.status if self.digest else ""
+
+    @property
+    def deviations(self) -> int | None:
+        """How many, without the notes."""
+        if self.digest is None or self.digest.state is None:
+            return None
+        return self.digest.state.deviation_count
+
+    @property
+    def verified(self) -> str:
+        """See verified."""
+        return verified(self.verification, self.basics.head_sha256)
+
+
+def verified(verification: Verification | None, head_sha256: str) -> str:
+    """never, faults, outdated (events came since), or current."""
+    if verification is None:
+        return "never"
+    if not verification.ok:
+        return "faults"
+    return "current" if verification.head_sha256 == head_sha256 else "outdated"
+
+
+def matches(run: ListedRun, wanted: RunFilter) -> bool:
+    """Whether a run is wanted. What is not known yet does not hide a run."""
+    basics, digest = run.basics, run.digest
+    words = f"{basics.run_id} {basics.protocol} {basics.version} {basics.operator}".lower()
+    day = basics.created_utc[:10]
+    fits = (
+        all(word in words for word in wanted.q.lower().split())
+        and (not wanted.since or wanted.since <= day)
+        and (not wanted.until or day <= wanted.until)
+        and wanted.protocol in ("", basics.protocol)
+        and (not wanted.simulated or basics.simulated == (wanted.simulated == "yes"))
+        and not (wanted.unverified and run.verified == "current")
+    )
+    if digest is None or not fits:
+        return fits
+    return (
+        wanted.person in ("", basics.operator, *digest.people)
+        and wanted.status in ("", run.status)
+        and not (wanted.deviations and run.deviations == 0)
+    )
+
+
+def known(value: Digest | Progress) -> Digest | None:
+    """The digest, when there is one."""
+    return None if isinstance(value, Progress) else value
+
+
+def people_of(runs: Sequence[ListedRun]) -> list[str]:
+    """Everybody who took part in any of them."""
+    return sorted(
+        {name for run in runs for name in (run.basics.operator, *(run.digest.people if run.digest else ()))}
+    )

@@ -1,0 +1,33 @@
+// Places that are still being computed ([data-pending] with an id) are fetched again until they are there.
+"use strict";
+
+const WAIT_MS = 700;
+
+async function refill() {
+  const pending = [...document.querySelectorAll("[data-pending][id]")];
+  if (!pending.length) return;
+  let again = true;
+  try {
+    const answer = await fetch(location.href, { headers: { Accept: "text/html" } });
+    if (answer.ok) {
+      const page = new DOMParser().parseFromString(await answer.text(), "text/html");
+      for (const place of pending) {
+        const fresh = page.getElementById(place.id);
+        if (!fresh) continue;
+        const focused = place.contains(document.activeElement);
+        place.replaceWith(document.adoptNode(fresh));
+        if (focused) fresh.querySelector("a, button, summary")?.focus();
+      }
+      again = document.querySelector("[data-pending][id]") !== null;
+      if (!again) {
+        const news = document.getElementById("news");
+        if (news) news.textContent = "The page is complete now.";
+      }
+    }
+  } catch {
+    // The connection is away; the next try comes by itself.
+  }
+  if (again) setTimeout(refill, WAIT_MS);
+}
+
+setTimeout(refill, WAIT_MS);
