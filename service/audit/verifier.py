@@ -526,7 +526,7 @@ class Check:
         if key is None or key["replaced_seq"] is not None:
             self.fault(MANIFEST, f"its key {key_id} is not the one in use at the end of the site's chain")
         elif not ed25519_fits(key["raw"], signature, MANIFEST_PREFIX + signed):
-            self.fault(SIGNATURE, "the signature of the manifest is not valid: the manifest was altered")
+            self.fault(f"{MANIFEST}, {SIGNATURE}", "the signature is not valid: the manifest was altered")
 
     def _check_expected_key(self, key: str | None) -> None:
         made_by = str(self.manifest["made_by_key"])

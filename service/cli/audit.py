@@ -13,7 +13,6 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.audit.bundle import export_bundle
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -140,7 +139,7 @@ def rotate_key_command(
 def export_command(
     run: RunArgument,
     bundle: Annotated[
-        Path, typer.Argument(help="The zip file to write; a simulated run's gets SIMULATED in its name.")
+        Path, typer.Argument(help="The zip file to write; that of a simulated run gets SIMULATED in its name.")
     ],
     data: DataOption = DEFAULT_DATA,
     hashes_only: Annotated[
@@ -153,16 +152,21 @@ def export_command(
 
     Refused when the evidence does not verify, and when the protocol asks for a release that was not given.
     """
-    with reporting_errors(json):
-        with Store.open(data, create=False) as store, progress_bar(quiet=json) as report_progress:
-            made = export_bundle(
-                store,
-                store.find_run(run),
-                bundle,
-                actor=operator or getpass.getuser(),
-                hashes_only=hashes_only,
-                progress=report_progress,
-            )
+    from service.audit.bundle import export_bundle  # noqa: PLC0415  # loads the numerics, which `verify` does without
+
+    with (
+        reporting_errors(json),
+        Store.open(data, create=False) as store,
+        progress_bar(quiet=json) as report_progress,
+    ):
+        made = export_bundle(
+            store,
+            store.find_run(run),
+            bundle,
+            actor=operator or getpass.getuser(),
+            hashes_only=hashes_only,
+            progress=report_progress,
+        )
     if json:
         print_json({**asdict(made), "path": str(made.path)})
         return
