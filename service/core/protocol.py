@@ -149,6 +149,7 @@ class StepFields(Record):
     title: Text
     why: str = ""
     instructions: str = ""
+    drawing: str = ""  # of service/web/static/drawings, shown beside the instructions; "": as the step's kind suggests
     checklist: tuple[Text, ...] = ()
     gates: tuple[Gate, ...] = ()
     sign: bool = False

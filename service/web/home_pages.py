@@ -2,6 +2,125 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-router = APIRouter()
+from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
+
+from service.core.errors import OrthocaptureError
+from service.core.protocol import LoadedProtocol, load_protocol
+from service.steps import params_models
+from service.store.records import RunRow
+from service.web.pages import render
+from service.web.run_frame import robot_banner
+from service.web.security import Signed, requires
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["home"])
+_PAGE = 12
+
+
+@dataclass(frozen=True, slots=True)
+class RunLine:
+    """A run in a list."""
+
+    run_id: str
+    title: str
+    created_utc: str
+    operator: str
+    simulated: bool
+    status: str
+    step: str
+    passed: int
+    steps: int
+    deviations: int
+    robot: str
+    fault: str = ""  # what is wrong with its record
+
+
+@dataclass(frozen=True, slots=True)
+class Startable:
+    """A protocol file."""
+
+    file: str
+    loaded: LoadedProtocol | None
+    fault: str = ""
+
+
+@router.get("/", name="home", dependencies=[Depends(requires("read"))])
+def home(
+    request: Request, site: Here, person: Signed, page: Annotated[int, Query(ge=1, le=100_000)] = 1
+) -> HTMLResponse:
+    """Runs under way first, then those that have ended, newest first."""
+    rows = sorted(site.store.runs(), key=lambda row: row.created_utc, reverse=True)
+    pages = max(1, -(-len(rows) // _PAGE))
+    page = min(page, pages)
+    lines = [_line(site, row) for row in rows[_PAGE * (page - 1) : _PAGE * page]]
+    startable = [_startable(path.name, site) for path in site.protocol_files()] if person.may("operate") else []
+    return render(
+        request,
+        "home.html.j2",
+        under_way=[line for line in lines if line.status in ("active", "paused")],
+        ended=[line for line in lines if line.status not in ("active", "paused")],
+        page=page,
+        pages=pages,
+        protocols=startable,
+        rig=site.rig.section,
+    )
+
+
+@router.post(
+    "/theme",
+    name="theme",
+    dependencies=[Depends(requires("read", while_locked=True))],
+    response_class=RedirectResponse,
+)
+def theme(
+    site: Here,
+    theme: Annotated[Literal["light", "dark", "auto"], Form()],
+    back: Annotated[str, Form(max_length=400)] = "/",
+) -> RedirectResponse:
+    """Light or dark on this screen, remembered by its browser."""
+    # Only pages of this site: neither //elsewhere nor /\elsewhere.
+    inside = back.startswith("/") and not back.startswith(("//", "/\\"))
+    response = RedirectResponse(back if inside else "/", status_code=303)
+    response.set_cookie("theme", theme, max_age=365 * 24 * 3600, samesite="lax", secure=site.secure, httponly=True)
+    return response
+
+
+def _line(site: Site, row: RunRow) -> RunLine:
+    try:
+        log = site.run(row.run_id)
+    except OrthocaptureError as error:
+        return RunLine(
+            row.run_id, row.run_id, row.created_utc, "", row.simulated, "unreadable", "", 0, 0, 0, "", str(error)
+        )
+    state = log.state
+    # Imported here: one small file a run is read for those under way only.
+    from service.monitor.snapshot import read_snapshot  # noqa: PLC0415
+
+    robot = ""
+    if not state.terminal:
+        snapshot = read_snapshot(site.data, row.run_id)
+        robot = robot_banner(state, snapshot, driven=site.launcher.driven(row.run_id)).title
+    return RunLine(
+        run_id=row.run_id,
+        title=log.protocol.title,
+        created_utc=row.created_utc,
+        operator=state.operator,
+        simulated=state.simulated,
+        status=state.status,
+        step=log.protocol.step(state.current).title,
+        passed=sum(step.phase == "passed" for step in state.steps.values()),
+        steps=len(log.protocol.steps),
+        deviations=state.deviation_count,
+        robot=robot,
+    )
+
+
+def _startable(name: str, site: Site) -> Startable:
+    try:
+        return Startable(name, load_protocol(site.protocols / name, params_models()))
+    except OrthocaptureError as error:
+        return Startable(name, None, str(error))

@@ -2,6 +2,93 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path as FilePath
+from typing import Annotated, Any, Literal
 
-router = APIRouter()
+from fastapi import APIRouter, Depends, Path, Query, Request
+from fastapi.responses import HTMLResponse
+from markupsafe import Markup
+
+from service.monitor.snapshot import read_snapshot
+from service.people.control import Control
+from service.people.person import Person
+from service.web.pages import render
+from service.web.run_frame import robot_banner, run_frame
+from service.web.run_view import Looker, run_view
+from service.web.security import Signed, requires
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["run"])
+
+RunId = Annotated[str, Path(max_length=64)]
+Name = Annotated[str, Query(max_length=64)]
+Part = Literal["banner", "control", "vitals", "step", "actions", "dialogs", "side"]
+_DRAWINGS = FilePath(__file__).with_name("static") / "drawings"
+
+
+@router.get("/runs/{run_id}", name="run", dependencies=[Depends(requires("read"))])
+def run(
+    request: Request, site: Here, person: Signed, run_id: RunId, step: Name = "", dialog: Name = ""
+) -> HTMLResponse:
+    """The current step, or another one to look at."""
+    return render(request, "run.html.j2", frame=run_frame(site, run_id), **_shown(site, person, run_id, step, dialog))
+
+
+@router.get("/runs/{run_id}/parts/{name}", name="run_part", dependencies=[Depends(requires("read"))])
+def run_part(
+    request: Request, site: Here, person: Signed, run_id: RunId, name: Part, step: Name = ""
+) -> HTMLResponse:
+    """One part of the page, for the script that keeps it up to date."""
+    if name == "banner":
+        log = site.run(run_id)
+        snapshot, driven = read_snapshot(site.data, run_id), site.launcher.driven(run_id)
+        return render(request, "banner.html.j2", b=robot_banner(log.state, snapshot, driven=driven))
+    return render(request, f"run_{name}.html.j2", **_shown(site, person, run_id, step))
+
+
+def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "") -> dict[str, Any]:
+    log = site.run(run_id)
+    view = run_view(
+        log,
+        read_snapshot(site.data, run_id),
+        _looker(site, person, run_id),
+        driven=site.launcher.driven(run_id),
+        show=step,
+    )
+    results = [log.state.steps[s.id].result for s in log.protocol.steps if s.kind == "evaluation"]
+    return {
+        "view": view,
+        "looking_back": bool(step) and view.shown.id != view.current,
+        "dialog": dialog,
+        "drawing": drawing(view.shown.drawing),
+        "now_utc": datetime.now(UTC).isoformat(),
+        "result_table": next((result["table"] for result in reversed(results) if result.get("table")), ()),
+    }
+
+
+def _looker(site: Site, person: Person, run_id: str) -> Looker:
+    holder = Control(site.store).holder(run_id)
+    mine = holder.screen == person.screen and bool(holder.screen)
+    return Looker(
+        may_operate=person.may("operate"),
+        may_take_over=person.role == "supervisor",
+        in_control=mine and person.may("operate"),
+        holder=holder.full_name,
+        holder_screen=holder.screen,
+        mine_elsewhere=not mine and bool(holder.screen) and holder.account == person.account,
+        asked_by=holder.asked_by_account,
+        asked_by_me=bool(holder.asked_by_screen) and holder.asked_by_screen == person.screen,
+    )
+
+
+@cache
+def _drawings() -> dict[str, Markup]:
+    # Our own files; they stand inside the page so that they take its colours.
+    return {path.stem: Markup(path.read_text("utf-8")) for path in sorted(_DRAWINGS.glob("*.svg"))}
+
+
+def drawing(name: str) -> Markup:
+    """A drawing by its name, to stand in a page; empty when there is none of this name."""
+    return _drawings().get(name, Markup(""))

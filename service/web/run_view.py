@@ -1,0 +1,359 @@
+"""What the run page shows, as plain data: a pure function of the record, the runner's last word and who looks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from typing import Protocol as Interface
+
+from service.core.actions import needs_signature_now, record_to_sign, redoable_steps
+from service.core.decide import AskOperator, decide
+from service.core.model import Event, OperatorVerb
+from service.core.protocol import Protocol, Step
+from service.core.run_state import Deviation, RunState
+from service.monitor.snapshot import Snapshot
+from service.web.run_figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
+from service.web.run_words import (
+    count,
+    drawing_of,
+    figure_line,
+    irreversible_warning,
+    moves_robot,
+    phase_words,
+    planned_views,
+    station_of,
+    will_happen,
+)
+
+
+class Recorded(Interface):
+    """A run's record: service.evidence.RunLog."""
+
+    @property
+    def protocol(self) -> Protocol: ...
+    @property
+    def events(self) -> Sequence[Event]: ...
+    @property
+    def state(self) -> RunState: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Looker:
+    """Who looks, and how they stand to the control of this run."""
+
+    may_operate: bool = False
+    may_take_over: bool = False
+    in_control: bool = False  # this screen
+    holder: str = ""  # name of whoever has control; "" for nobody
+    holder_screen: str = ""
+    mine_elsewhere: bool = False  # the same person, on another screen
+    asked_by: str = ""  # who asks for control
+    asked_by_me: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StepLine:
+    """A step in the list at the side."""
+
+    id: str
+    title: str
+    word: str
+    tone: str
+    icon: str
+    shown: bool
+    reachable: bool  # something of it can be looked at
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """An item of the checklist."""
+
+    text: str
+    ticked: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """The step on the screen."""
+
+    id: str
+    title: str
+    number: int
+    attempt: int
+    kind: str
+    why: str
+    instructions: str
+    drawing: str
+    station: str
+    status: str
+    current: bool
+    checklist: tuple[Check, ...]
+    open_items: int
+    gates: tuple[GateLine, ...]
+    warning: str  # of an irreversible step that has not been done
+    requires: tuple[tuple[str, bool], ...]
+    captured: int
+    planned: int
+    signed_by: str
+    skipped: bool
+    started_utc: str
+    ended_utc: str
+    table: Sequence[Mapping[str, Any]]  # of an evaluation
+
+
+@dataclass(frozen=True, slots=True)
+class Main:
+    """The one large target."""
+
+    verb: str  # an operator's verb, or go-on
+    text: str
+    note: str = ""
+    hold: bool = False
+    enabled: bool = True
+    why_not: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Redo:
+    """A step that can be done again, and what that resets."""
+
+    step: str
+    title: str
+    resets: tuple[str, ...]
+    images: int  # whose evidence stays, but which no longer count
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """What a signature binds."""
+
+    sha256: str
+    title: str
+    figures: tuple[str, ...]
+    meaning: str  # offered; the person may change it
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """A step that needs a decision."""
+
+    title: str
+    what: str
+    safe: str
+    advice: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunView:
+    """The run page."""
+
+    run_id: str
+    title: str
+    seq: int
+    status: str  # active, paused, completed, aborted
+    mode: str  # ask, sign, recover, work, paused, died, ended
+    headline: str  # news for screen readers when it changes
+    current: str
+    attempt: int
+    steps: tuple[StepLine, ...]
+    passed: int
+    shown: Shown
+    main: Main | None
+    options: tuple[OperatorVerb, ...]  # besides the main one
+    can_pause: bool
+    standing: bool  # paused, and the robot stands still
+    looker: Looker
+    trouble: Trouble | None
+    signature: Signature | None
+    redos: tuple[Redo, ...]
+    skip_overrides: bool  # a skip now would set aside figures outside of their limits
+    progress: Progress
+    readings: tuple[Reading, ...]
+    working: tuple[str, int, int]
+    deviations: tuple[Deviation, ...]
+    news: tuple[tuple[str, str], ...]
+    pedal_armed: bool
+    stop_reason: str
+    operator: str
+    released_by: str
+
+
+def run_view(log: Recorded, snapshot: Snapshot, looker: Looker, *, driven: bool, show: str = "") -> RunView:
+    """The page of a run that has begun.
+
+    Args:
+        driven: whether a living process drives the run.
+        show: step to look at; the current one when it is "" or unknown.
+    """
+    protocol, state = log.protocol, log.state
+    shown = show if show in state.steps else state.current
+    decision = decide(protocol, state)
+    mode = _mode(state, decision, driven=driven)
+    return RunView(
+        run_id=state.run_id,
+        title=protocol.title,
+        seq=state.seq,
+        status=state.status,
+        mode=mode,
+        headline=_headline(protocol, state, mode),
+        current=state.current,
+        attempt=state.step.attempt,
+        steps=tuple(_line(protocol, state, step, shown) for step in protocol.steps),
+        passed=sum(step.phase == "passed" for step in state.steps.values()),
+        shown=_shown(protocol, state, protocol.step(shown)),
+        main=_main(protocol, state, decision, mode),
+        options=_options(decision, state),
+        can_pause=not state.terminal and not state.paused and looker.may_operate,
+        standing=snapshot.doing == "paused" and snapshot.robot != "moving",
+        looker=looker,
+        trouble=_trouble(protocol, state, decision),
+        signature=_signature(protocol, state),
+        redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
+        skip_overrides=bool(state.step.verdicts) and not state.step.gates_passed,
+        progress=capture_progress(protocol, state, log.events),
+        readings=readings(snapshot),
+        working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
+        deviations=tuple(reversed(state.deviations)),
+        news=tuple((m.at_utc, m.text) for m in reversed(snapshot.messages)),
+        pedal_armed=snapshot.pedal_armed,
+        stop_reason=state.stop_reason,
+        operator=state.operator,
+        released_by=state.released_by,
+    )
+
+
+def _mode(state: RunState, decision: object, *, driven: bool) -> str:
+    if state.terminal:
+        return "ended"
+    if not driven:
+        return "died"
+    if state.paused:
+        return "paused"
+    if isinstance(decision, AskOperator):
+        return {"confirm": "ask", "sign": "sign", "recovery": "recover"}[decision.for_]
+    return "work"
+
+
+def _headline(protocol: Protocol, state: RunState, mode: str) -> str:
+    title = protocol.step(state.current).title
+    return {
+        "ended": f"The run is {state.status}.",
+        "died": "The program that drives the robot has stopped. Everything captured is safe.",
+        "paused": f"Paused at: {title}.",
+        "ask": f"Now: {title}. Your confirmation is awaited.",
+        "sign": f"{title}: a signature is due.",
+        "recover": f"{title}: a decision is needed.",
+        "work": f"Working: {title}.",
+    }[mode]
+
+
+def _line(protocol: Protocol, state: RunState, step: Step, shown: str) -> StepLine:
+    there = state.steps[step.id]
+    word, tone, icon = phase_words(state, there)
+    again = any(past.step == step.id and past.viewpoint is None for past in state.superseded)
+    if again and tone in ("passed", "current"):
+        word = f"{word}, attempt {there.attempt}"
+    return StepLine(step.id, step.title, word, tone, icon, step.id == shown, there.phase != "pending")
+
+
+def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
+    now = state.steps[step.id]
+    checks = tuple(Check(item, item in now.ticked) for item in step.checklist)
+    undone = step.irreversible and now.phase != "passed"
+    return Shown(
+        id=step.id,
+        title=step.title,
+        number=protocol.index(step.id) + 1,
+        attempt=now.attempt,
+        kind=step.kind,
+        why=step.why,
+        instructions=step.instructions.strip(),
+        drawing=drawing_of(step),
+        station=station_of(step),
+        status=phase_words(state, now)[0],
+        current=step.id == state.current and not state.terminal,
+        checklist=checks,
+        open_items=sum(not check.ticked for check in checks),
+        gates=gate_lines(step, now.verdicts, state.skipped),
+        warning=irreversible_warning(protocol, step) if undone else "",
+        requires=tuple((protocol.step(name).title, state.steps[name].passed_its_gates) for name in step.requires),
+        captured=len(now.captured),
+        planned=planned_views(step),
+        signed_by=now.signed_by,
+        skipped=now.skipped,
+        started_utc=now.started_utc,
+        ended_utc=now.ended_utc,
+        table=now.result.get("table", ()) if step.kind == "evaluation" else (),
+    )
+
+
+def _main(protocol: Protocol, state: RunState, decision: object, mode: str) -> Main | None:
+    step, now = protocol.step(state.current), state.step
+    moves = moves_robot(step)
+    if mode == "died":
+        note = "The run goes on where it stopped." + (" The robot may move." if moves else " Nothing moves.")
+        return Main("go-on", "Go on", note, hold=moves)
+    if mode == "paused":
+        under_way = now.phase == "running"
+        note = "The robot goes on with its viewpoints." if moves and under_way else "The run goes on where it paused."
+        return Main("resume", "Resume", note, hold=moves)
+    if mode == "ask":
+        text, note = will_happen(step, now)
+        left = sum(item not in now.ticked for item in step.checklist)
+        why_not = f"{count(left, 'item is', 'items are')} not ticked yet." if left else ""
+        return Main("confirm", text, note, hold=moves, enabled=not left, why_not=why_not)
+    if mode == "sign":
+        return Main("sign", f"Sign: {step.title[:1].lower()}{step.title[1:]}", "Your password is asked for.")
+    if mode == "recover" and isinstance(decision, AskOperator) and "confirm" in decision.options:
+        note = "What was captured is kept; only what is missing is done."
+        return Main("confirm", "Try again", note + (" The robot moves." if moves else ""), hold=moves)
+    return None
+
+
+def _options(decision: object, state: RunState) -> tuple[OperatorVerb, ...]:
+    if state.terminal:
+        return ()
+    asked = decision.options if isinstance(decision, AskOperator) else ()
+    others: tuple[OperatorVerb, ...] = ("skip",) if "skip" in asked else ()
+    return (*others, "redo", "abort")
+
+
+def _trouble(protocol: Protocol, state: RunState, decision: object) -> Trouble | None:
+    if not isinstance(decision, AskOperator) or decision.for_ != "recovery":
+        return None
+    step, now = protocol.step(state.current), state.step
+    images = sum(len(there.captured) for there in state.steps.values())
+    safe = f"Yes. {count(images, 'image is', 'images are')} recorded, and every result so far."
+    advice = next((str(note.data["advice"]) for note in reversed(now.notes) if "advice" in note.data), "")
+    if now.failure is not None:
+        return Trouble(f"{step.title} did not work", now.failure.message, safe, advice)
+    failed = [figure_line(verdict) for verdict in now.verdicts if not verdict.passed]
+    if failed:
+        return Trouble(f"{step.title}: outside its limits", "; ".join(failed), safe, advice)
+    return Trouble(f"{step.title} cannot begin yet", decision.text, safe, advice)
+
+
+def _signature(protocol: Protocol, state: RunState) -> Signature | None:
+    if state.terminal or not needs_signature_now(protocol, state):
+        return None
+    step = protocol.step(state.current)
+    if step.irreversible:
+        figures = tuple(
+            f"{protocol.step(name).title}: {figure_line(verdict)}"
+            for name in step.requires
+            for verdict in state.steps[name].verdicts
+        )
+        meaning = f"I release this step, which cannot be undone: {step.title}"
+    else:
+        figures = tuple(figure_line(verdict) for verdict in state.step.verdicts)
+        meaning = f"I have checked these figures and accept them: {step.title}"
+    sha256 = record_to_sign(protocol, state)
+    return Signature(sha256, step.title, figures, meaning) if sha256 else None
+
+
+def _redo(protocol: Protocol, state: RunState, target: str) -> Redo:
+    steps = protocol.steps[protocol.index(target) :]
+    begun = [s for s in steps if state.steps[s.id].started_utc or state.steps[s.id].skipped]
+    images = sum(len(state.steps[s.id].captured) for s in begun)
+    return Redo(target, protocol.step(target).title, tuple(s.title for s in begun if s.id != target), images)

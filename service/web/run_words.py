@@ -1,0 +1,141 @@
+"""The words of the run page: what a confirmation does, what a step shows, names of measured numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from service.core.model import GateVerdict
+from service.core.protocol import Protocol, Step
+from service.core.run_state import RunState, StepState
+
+#: Step kinds that move the robot, so that a confirmation must be held. service.steps says it too; importing all step
+#: kinds to ask would load their numerics.
+MOVES_ROBOT = frozenset({"viewpoint_capture", "calibration"})
+_DRAWINGS_BY_ID = {
+    "fixation": "fixation",
+    "ct_hand_over_out": "transport",
+    "ct_hand_over_back": "transport",
+    "camera_set_up": "camera",
+    "board_removal": "board",
+    "station_change": "stations",
+    "control_sphere_removal": "control_spheres",
+    "specimen_release": "fixation",
+}
+_DRAWINGS_BY_KIND = {
+    "layout_check": "layout_photo",
+    "calibration": "board",
+    "viewpoint_capture": "stations",
+    "scan_import": "scan_path",
+    "timed_application": "spray",
+    "ct_import": "transport",
+}
+_ACRONYMS = {"rms": "RMS", "ct": "CT", "colmap": "COLMAP", "five": "Five", "px": "px"}
+_UNITS = frozenset({"px", "mm", "deg", "min", "m", "s", "rad"})
+
+
+def drawing_of(step: Step) -> str:
+    """Name of the drawing that shows the step, "" for none: the protocol's own choice, else by what the step is."""
+    return step.drawing or _DRAWINGS_BY_ID.get(step.id) or _DRAWINGS_BY_KIND.get(step.kind, "")
+
+
+def moves_robot(step: Step) -> bool:
+    """Whether the robot moves while this step works."""
+    return step.kind in MOVES_ROBOT
+
+
+def measure_name(measure: str) -> str:
+    """`five_fold_rms_px` → `Five fold RMS`: the unit stands beside the number."""
+    parts = measure.split("_")
+    while len(parts) > 1 and parts[-1] in _UNITS:
+        parts.pop()
+    words = " ".join(_ACRONYMS.get(part, part) for part in parts)
+    return words[:1].upper() + words[1:]
+
+
+def number(value: float | None, unit: str = "") -> str:
+    """A number as people read it, with its unit."""
+    if value is None:
+        return "not measured"
+    text = f"{value:.0f}" if value == int(value) and abs(value) < 1e7 else f"{value:.3g}"
+    return f"{text} {unit}".rstrip()
+
+
+def limit(minimum: float | None, maximum: float | None, unit: str = "") -> str:
+    """`at least 0.2 and at most 1 mm`."""
+    low = "" if minimum is None else f"at least {minimum:g}"
+    high = "" if maximum is None else f"at most {maximum:g}"
+    return f"{' and '.join(text for text in (low, high) if text) or 'no limit'} {unit}".rstrip()
+
+
+def planned_views(step: Step) -> int:
+    """How many images the protocol plans in a step."""
+    sets: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
+    return sum(int(one.count) for one in sets)
+
+
+def station_of(step: Step) -> str:
+    """`station 1` of a capture step; "" for others."""
+    sets: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
+    return " and ".join(dict.fromkeys(str(one.station).replace("_", " ") for one in sets))
+
+
+def count(amount: int, one: str, many: str = "") -> str:
+    """`1 image`, `8 images`."""
+    return f"{amount} {one if amount == 1 else many or one + 's'}"
+
+
+def will_happen(step: Step, now: StepState) -> tuple[str, str]:
+    """What a confirmation of this step does: the large words of its button, and a line below."""
+    left = max(planned_views(step) - len(now.captured), 0)
+    match step.kind:
+        case "viewpoint_capture" | "calibration":
+            what = count(left, "image") + (" of the board" if step.kind == "calibration" else "")
+            where = f" at {station_of(step)}" if station_of(step) else ""
+            return f"Confirm: the robot takes {what}{where}", "The robot moves. Everybody stays outside of its reach."
+        case "layout_check":
+            photographs = int(getattr(step.params, "photographs", 1))
+            return f"Confirm: the camera takes {count(photographs, 'photograph')}", "Nothing moves."
+        case "ct_import":
+            return "Confirm: import the CT series", "Nothing moves. The software waits for the series."
+        case "scan_import":
+            return "Confirm: import the scan", "Nothing moves. The software waits for the export."
+        case "timed_application":
+            product = str(getattr(step.params, "product", "the coat"))
+            return f"Confirm: {product} is on, the clock starts", "Nothing moves."
+        case "checklist":
+            return "Confirm: all of this is done", "Nothing moves."
+        case _:
+            return f"Confirm: begin {step.title[:1].lower()}{step.title[1:]}", "Nothing moves."
+
+
+def irreversible_warning(protocol: Protocol, step: Step) -> str:
+    """In plain words what cannot be undone after this step."""
+    before = [s.title for s in protocol.steps[: protocol.index(step.id)] if s.kind == "viewpoint_capture"]
+    words = {
+        "control_sphere_removal": "Once the control spheres are off, they can never be put back in the same place.",
+        "spraying": "Once the spray is on, the bare anatomy can never be photographed again in this run.",
+        "specimen_release": "Once the K-wires are out, nothing can be measured again in this frame.",
+    }.get(step.id, "This step changes the scene for good.")
+    tail = f" None of these can be done again: {', '.join(before)}." if before else ""
+    return f"{words}{tail} Read the figures before you go on."
+
+
+def figure_line(verdict: GateVerdict) -> str:
+    """One figure of what is signed."""
+    return (
+        f"{measure_name(verdict.measure)} {number(verdict.value, verdict.unit)} "
+        f"({limit(verdict.minimum, verdict.maximum, verdict.unit)})"
+    )
+
+
+def phase_words(state: RunState, step: StepState) -> tuple[str, str, str]:
+    """A step's status in the list of steps: word, tone, icon."""
+    if step.skipped:
+        return "skipped", "skipped", "skip"
+    if step.phase == "passed":
+        return "passed", "passed", "ok"
+    if step.step == state.current and not state.terminal:
+        return "now", "current", "now"
+    if state.terminal and step.step == state.current:
+        return "stopped here", "current", "fail"
+    return "to come", "pending", "open"

@@ -1,0 +1,307 @@
+"use strict";
+/* Keeps a page up to date, lets dangerous buttons be held, sends forms without leaving the page. It never acts by
+ * itself: every POST follows a person's press. Without it every form works as plain HTML. */
+
+(() => {
+  const LOST_AFTER_MS = 3500;
+  const body = document.body;
+  const by = (id) => document.getElementById(id);
+  let offline = false;
+
+  // --- news for screen readers --------------------------------------------------------------------------------
+
+  const told = { news: collected("news"), alarm: "" };
+  function collected(kind) {
+    return [...document.querySelectorAll(`[data-${kind}]`)].map((e) => e.dataset[kind].trim()).filter(Boolean).join(" ");
+  }
+  function announce() {
+    for (const kind of ["news", "alarm"]) {
+      const text = collected(kind);
+      if (text !== told[kind]) by(kind).textContent = text;
+      told[kind] = text;
+    }
+  }
+
+  // --- parts: fetched anew when something changed, merged so that focus, caret, typed text and opened details stay --
+
+  const KEPT = { DETAILS: ["open"], DIALOG: ["open"] };
+  const MARKS = new Set(["data-offline", "style"]);
+  function sameKind(a, b) {
+    return a.nodeType === b.nodeType && a.nodeName === b.nodeName
+      && (a.nodeType !== 1 || (a.id === b.id && (a.getAttribute("name") || "") === (b.getAttribute("name") || "")
+        && a.hasAttribute("data-hold") === b.hasAttribute("data-hold")));
+  }
+  function merge(old, fresh) {
+    if (old.nodeType !== 1) {
+      if (old.nodeValue !== fresh.nodeValue) old.nodeValue = fresh.nodeValue;
+      return;
+    }
+    if (old.nodeName === "DIALOG" && old.open) return; // somebody is writing in it
+    const kept = KEPT[old.nodeName] || [];
+    for (const { name } of [...old.attributes]) {
+      if (!fresh.hasAttribute(name) && !kept.includes(name) && !MARKS.has(name)) old.removeAttribute(name);
+    }
+    for (const { name, value } of fresh.attributes) {
+      if (!kept.includes(name) && old.getAttribute(name) !== value) old.setAttribute(name, value);
+    }
+    if (old.nodeName === "TEXTAREA") return;
+    mergeChildren(old, fresh);
+  }
+  function mergeChildren(old, fresh) {
+    const wanted = [...fresh.childNodes];
+    let here = old.firstChild;
+    for (const node of wanted) {
+      let match = here;
+      // Something may have been put in or taken away before: look a little further.
+      for (let i = 0; match && i < 8 && !sameKind(match, node); i += 1) match = match.nextSibling;
+      if (match && sameKind(match, node)) {
+        while (here !== match) { const next = here.nextSibling; here.remove(); here = next; }
+        merge(match, node);
+        here = match.nextSibling;
+      } else {
+        old.insertBefore(node.cloneNode(true), here);
+      }
+    }
+    while (here) { const next = here.nextSibling; here.remove(); here = next; }
+  }
+
+  let fetching = false;
+  let again = false;
+  async function refresh() {
+    if (fetching) { again = true; return; }
+    fetching = true;
+    do {
+      again = false;
+      try {
+        await Promise.all([...document.querySelectorAll("[data-part]")].map(refreshPart));
+      } catch { /* the stream tells that the connection is lost */ }
+    } while (again);
+    fetching = false;
+    announce();
+    followLock();
+    if (offline) setControls(true);
+  }
+  async function refreshPart(part) {
+    const answer = await fetch(part.dataset.part, { headers: { Accept: "text/html" }, cache: "no-store" });
+    if (answer.redirected && new URL(answer.url).pathname === "/sign-in") { location.reload(); return; }
+    if (!answer.ok) return;
+    const fresh = document.createElement("template");
+    fresh.innerHTML = await answer.text();
+    if (!part.isConnected) return;
+    mergeChildren(part, fresh.content);
+    part.dispatchEvent(new CustomEvent("part-changed", { bubbles: true }));
+  }
+
+  // --- connection ------------------------------------------------------------------------------------------------
+
+  let stream = null;
+  let heardAt = Date.now();
+  let known = "";
+  let opening = 0;
+  function connect() {
+    opening = Date.now();
+    stream?.close();
+    stream = new EventSource(body.dataset.stream);
+    const heard = () => { heardAt = Date.now(); if (offline) backOnline(); };
+    stream.addEventListener("changed", (event) => {
+      const fresh = event.data !== known;
+      known = event.data;
+      const wasOffline = offline;
+      heard();
+      if (fresh && !wasOffline) refresh();
+    });
+    stream.addEventListener("beat", heard);
+    stream.addEventListener("signed_out", () => location.reload());
+  }
+  function watch() {
+    const now = Date.now();
+    if (now - heardAt > LOST_AFTER_MS && !offline) goOffline();
+    if (now - heardAt > 1500 && now - opening > 2500) connect();
+  }
+  function goOffline() {
+    offline = true;
+    cancelHold();
+    body.classList.add("offline");
+    by("connection-lost").hidden = false;
+    setControls(true);
+  }
+  function backOnline() {
+    offline = false;
+    body.classList.remove("offline");
+    by("connection-lost").hidden = true;
+    setControls(false);
+    refresh();
+  }
+  function setControls(off) {
+    const which = off ? "button:not(:disabled), input:not(:disabled), select:not(:disabled), textarea:not(:disabled)" : "[data-offline]";
+    for (const control of document.querySelectorAll(`:is(main, aside, dialog) :is(${which})`)) {
+      control.disabled = off;
+      control.toggleAttribute("data-offline", off);
+    }
+  }
+
+  // --- hold to confirm -------------------------------------------------------------------------------------------
+
+  let held = null; // {button, from, need, frame, key}
+  const still = matchMedia("(prefers-reduced-motion: reduce)");
+  function startHold(button, key) {
+    if (offline || held || button.disabled || button.form?.dataset.busy) return;
+    held = { button, from: performance.now(), need: Number(button.dataset.hold), key, frame: 0 };
+    button.classList.add("held");
+    by("news").textContent = "Keep holding.";
+    turn();
+  }
+  function turn() {
+    if (!held) return;
+    const { button, from, need } = held;
+    const share = Math.min((performance.now() - from) / need, 1);
+    if (!button.isConnected || button.disabled) { cancelHold(); return; }
+    button.style.setProperty("--held", String(still.matches ? Math.floor(share * 3) * 100 / 3 : share * 100));
+    if (share < 1) { held.frame = requestAnimationFrame(turn); return; }
+    cancelHold();
+    button.dataset.done = "yes";
+    button.form.requestSubmit(button);
+    delete button.dataset.done;
+  }
+  function cancelHold() {
+    if (!held) return;
+    cancelAnimationFrame(held.frame);
+    held.button.classList.remove("held");
+    held.button.style.removeProperty("--held");
+    held = null;
+  }
+  const holdable = (event) => (event.target instanceof Element ? event.target.closest("button[data-hold]") : null);
+  document.addEventListener("pointerdown", (event) => {
+    const button = holdable(event);
+    if (!button || event.button !== 0 || !event.isPrimary) { cancelHold(); return; }
+    if (button.hasPointerCapture(event.pointerId)) button.releasePointerCapture(event.pointerId);
+    startHold(button, null);
+  });
+  for (const kind of ["pointerup", "pointercancel"]) document.addEventListener(kind, () => { if (held?.key === null) cancelHold(); });
+  document.addEventListener("pointermove", (event) => {
+    if (held?.key === null && !held.button.contains(document.elementFromPoint(event.clientX, event.clientY))) cancelHold();
+  });
+  document.addEventListener("keydown", (event) => {
+    const button = holdable(event);
+    if (!button || !["Enter", " "].includes(event.key)) { if (held) cancelHold(); return; }
+    event.preventDefault();
+    if (!event.repeat) startHold(button, event.key);
+  });
+  document.addEventListener("keyup", (event) => { if (held && held.key === event.key) cancelHold(); });
+  document.addEventListener("focusout", (event) => { if (held?.button === event.target) cancelHold(); });
+  document.addEventListener("contextmenu", (event) => { if (holdable(event)) event.preventDefault(); });
+  document.addEventListener("visibilitychange", cancelHold);
+  window.addEventListener("blur", cancelHold);
+
+  // --- forms -------------------------------------------------------------------------------------------------------
+
+  document.addEventListener("submit", (event) => {
+    const form = event.target;
+    const button = event.submitter;
+    if (button?.matches("[data-hold]") && !button.dataset.done) { event.preventDefault(); return; }
+    if (form.method !== "post" || form.hasAttribute("data-plain")) return;
+    event.preventDefault();
+    if (form.dataset.busy || (offline && !form.matches(".theme-form"))) return;
+    send(form, button);
+  });
+  async function send(form, button) {
+    const fields = new URLSearchParams(new FormData(form, button));
+    const action = new URL(button?.getAttribute("formaction") || form.getAttribute("action") || location.href, location.href);
+    if (action.pathname === "/theme") document.documentElement.dataset.theme = fields.get("theme");
+    form.dataset.busy = "yes";
+    button?.setAttribute("aria-disabled", "true");
+    say(form, "");
+    try {
+      const answer = await fetch(action, { method: "POST", body: fields, headers: { Accept: "application/json", "X-CSRF-Token": body.dataset.csrf || "" } });
+      if (answer.ok) await succeed(form, action, answer);
+      else await fail(form, answer);
+    } catch {
+      say(form, "This did not reach the service. Whether it had an effect shows when the connection is back.");
+    }
+    delete form.dataset.busy;
+    button?.removeAttribute("aria-disabled");
+  }
+  async function succeed(form, action, answer) {
+    if (action.pathname === "/theme") return;
+    if (action.pathname === "/lock") { showLock(true); return; }
+    if (action.pathname === "/unlock") { form.reset(); showLock(false); await refresh(); return; }
+    const target = new URL(answer.url);
+    const here = document.querySelector("[data-part]") && target.pathname === location.pathname;
+    form.closest("dialog")?.close();
+    if (!here || !answer.redirected) { location.assign(answer.redirected ? answer.url : location.href); return; }
+    if (location.search) history.replaceState(null, "", location.pathname);
+    form.reset();
+    await refresh();
+  }
+  async function fail(form, answer) {
+    let problem = {};
+    try { problem = await answer.json(); } catch { /* no words came with it */ }
+    if (answer.status === 401 && !form.closest("dialog") && !form.querySelector("[type=password]")) { location.reload(); return; }
+    if (answer.status === 423) { showLock(true); return; }
+    const words = [problem.what || "The service could not do this", problem.remedy, problem.safe].filter(Boolean);
+    say(form, words.map((line) => line[0].toUpperCase() + line.slice(1).replace(/[.]?$/, ".")).join(" "));
+    for (const secret of form.querySelectorAll("[type=password]")) { secret.value = ""; secret.setAttribute("aria-invalid", "true"); secret.focus(); }
+    refresh();
+  }
+  function say(form, words) {
+    const own = form.querySelector(".form-problem");
+    const place = own || by("problem");
+    place.textContent = words;
+    place.hidden = !words;
+    if (words && !own) {
+      by("alarm").textContent = words;
+      place.scrollIntoView({ block: "nearest" });
+    }
+  }
+
+  // --- dialogs and lock --------------------------------------------------------------------------------------------
+
+  document.addEventListener("click", (event) => {
+    const at = event.target instanceof Element ? event.target : null;
+    const opener = at?.closest("[data-dialog]");
+    if (opener && by(opener.dataset.dialog)) {
+      event.preventDefault();
+      if (!offline) by(opener.dataset.dialog).showModal();
+      return;
+    }
+    if (at?.closest("[data-close]")) {
+      event.preventDefault();
+      at.closest("dialog").close();
+      return;
+    }
+    const digit = at?.closest("[data-digit]")?.dataset.digit;
+    if (digit) {
+      const pin = at.closest("form").querySelector("[name=pin]");
+      pin.value = digit === "clear" ? "" : pin.value + digit;
+    }
+  });
+  document.addEventListener("keydown", (event) => { // links that act as buttons answer to the space bar as well
+    if (event.key === " " && event.target.matches?.('a[role="button"]')) { event.preventDefault(); event.target.click(); }
+  });
+  document.addEventListener("close", (event) => { if (event.target.id !== "lock-screen") refresh(); }, true);
+  function showLock(locked) {
+    const dialog = by("lock-screen");
+    if (!dialog) return;
+    body.classList.toggle("locked-behind", locked);
+    if (!locked) { dialog.close(); return; }
+    cancelHold();
+    if (dialog.matches(":modal")) return;
+    if (dialog.open) dialog.close(); // as it came with the page, before the script
+    dialog.showModal();
+    dialog.querySelector("[name=pin]").focus();
+  }
+  by("lock-screen")?.addEventListener("cancel", (event) => event.preventDefault());
+  function followLock() {
+    const screen = document.querySelector("[data-screen]");
+    if (screen) showLock(screen.dataset.screen === "locked");
+  }
+
+  for (const dialog of document.querySelectorAll("dialog[open]:not(#lock-screen)")) { dialog.close(); dialog.showModal(); }
+  if (body.hasAttribute("data-locked")) showLock(true);
+  if (body.dataset.stream) {
+    told.alarm = "";
+    announce();
+    connect();
+    setInterval(watch, 500);
+  }
+})();
