@@ -12,8 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 
 from service.compute.budget.closure import Alignment
 from service.core.gates import describe
-from service.core.geometry import Array
-from service.dataset.scene_view import scene_figure
+from service.dataset.scene_view import Scene, SceneMesh, SceneSphere, decimated, scene_html
 from service.dataset.summary import RunSummary
 from service.store.audit import AuditReport
 
@@ -91,18 +90,19 @@ def _scene(summary: RunSummary) -> str | None:
     best, registrations = summary.best(), summary.result("registration").get("registrations", {})
     if best is None or best not in registrations:
         return None
-    vertices_m, faces = summary.scan_mesh()
-    cameras = {name: np.array(T) for name, T in registrations[best]["T_scan_camera"].items()}
-    stations = {capture.viewpoint: capture.station for capture in summary.captures()}
-    spheres = np.array(summary.result("scan_import")["spheres_m"])
-    placed = Alignment(
-        np.array(registrations[best]["T_world_scan"]), np.array(registrations[best]["covariance"])[:6, :6]
+    registered = registrations[best]
+    points, triangles = decimated(*summary.scan_mesh())
+    placed = Alignment(np.array(registered["T_world_scan"]), np.array(registered["covariance"])[:6, :6])
+    error_mm = 1e3 * np.sqrt(np.trace(placed.covariance_at_m2(points), axis1=1, axis2=2))
+    centres: list[tuple[float, float, float]] = summary.result("scan_import")["spheres_m"]
+    scene = Scene(
+        cameras={name: np.array(T) for name, T in registered["T_scan_camera"].items()},
+        stations={c.viewpoint: c.station for c in summary.captures() if c.viewpoint in registered["T_scan_camera"]},
+        spheres=[SceneSphere(str(i), "registration", centre) for i, centre in enumerate(centres)],
+        radius_m=summary.protocol.spheres.radius_mm / 1000,
+        mesh=SceneMesh(points, triangles, error_mm),
     )
-
-    def predicted_error_mm(points_m: Array) -> Array:
-        return 1e3 * np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2))
-
-    return scene_figure(vertices_m, faces, spheres, cameras, stations, predicted_error_mm)
+    return scene_html(scene)
 
 
 def _data_url(summary: RunSummary, sha256: str) -> str:

@@ -1,95 +1,350 @@
-"""The scene in 3D for a report: cameras, spheres and the decimated mesh, as one self-contained plotly figure."""
+"""The scene in 3D as a plotly figure, for report and screen: cameras, spheres, decimated mesh, robot bases."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+import base64
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import fast_simplification
 import numpy as np
-import plotly.graph_objects as go
+from numpy.typing import NDArray
 
-from service.core.geometry import Array, apply
+from service.core.geometry import Array, Transform, apply, inverse, transform
 
-_FACES_SHOWN = 40_000
-_FRUSTUM_M = 0.05
+FACES_SHOWN = 60_000
+_FRUSTUM_MM = 50.0
+_STYLES = (("#2f86d6", "circle"), ("#d9772b", "diamond"), ("#9a58d1", "square"))  # of cameras, by station
+_KINDS = {"registration": "#2f9e57", "sphere": "#2f9e57", "control": "#d05fa0"}
+_NAMES = {"registration": "registration spheres", "control": "control spheres", "sphere": "spheres"}
+_PROUD = 1.07  # times its radius: a sphere is drawn over the scanned one
+_BAR_MM = 100.0
+_ROOM_MM = 60.0
+_EYE_MM, _TOWARDS_MM = (280.0, -1150.0, 850.0), (0.0, 0.0, 210.0)  # of the first view
+_ROUND, _FLAT = 10, 6  # meridians and parallels of a sphere
 
 
-def scene_figure(
-    vertices_m: Array,
-    faces: Any,
-    spheres_m: Array,
-    cameras: Mapping[str, Array],
-    stations: Mapping[str, str],
-    predicted_error_mm: Callable[[Array], Array] | None = None,
-) -> str:
-    """HTML (a div with its script) of the scene in the scan frame.
+@dataclass(frozen=True, slots=True)
+class SceneSphere:
+    """A sphere with the label that it has on every page."""
 
-    Args:
-        vertices_m: (V, 3).
-        faces: (F, 3).
-        spheres_m: (M, 3) registration spheres.
-        cameras: T_scan_camera (4, 4) by viewpoint.
-        stations: station of each viewpoint.
-        predicted_error_mm: predicted target registration error (N,) of points (N, 3) of the scan; colours the mesh.
+    label: str
+    kind: Literal["registration", "control", "sphere"]
+    centre_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class SceneMesh:
+    """A surface light enough for a screen.
+
+    Attributes:
+        points_m: (V, 3).
+        triangles: (F, 3).
+        error_mm: (V,) predicted target registration error; None: not known.
     """
-    share = 1.0 - min(1.0, _FACES_SHOWN / max(len(faces), 1))
-    points, triangles = vertices_m, faces.astype(np.int64)
+
+    points_m: Array = field(repr=False)
+    triangles: NDArray[np.int64] = field(repr=False)
+    error_mm: Array | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Everything in one frame, metres.
+
+    Attributes:
+        cameras: T_frame_camera by viewpoint.
+        planned: the same of viewpoints still to be taken.
+        stations: station of every viewpoint.
+        bases: T_frame_base by station, where it is known.
+        up: unit vector (3,).
+    """
+
+    cameras: Mapping[str, Transform]
+    stations: Mapping[str, str]
+    spheres: Sequence[SceneSphere] = ()
+    radius_m: float = 0.015
+    mesh: SceneMesh | None = None
+    planned: Mapping[str, Transform] = field(default_factory=dict[str, Transform])
+    bases: Mapping[str, Transform] = field(default_factory=dict[str, Transform])
+    up: tuple[float, float, float] | None = None
+
+
+def decimated(vertices_m: Array, faces: Any, most: int = FACES_SHOWN) -> tuple[Array, NDArray[np.int64]]:
+    """Points (V, 3) and triangles (F, 3) of at most about `most` faces."""
+    share = 1.0 - min(1.0, most / max(len(faces), 1))
+    points, triangles = np.asarray(vertices_m, dtype=np.float64), np.asarray(faces).astype(np.int64)
     if share > 0:
-        points, triangles = fast_simplification.simplify(points, triangles, target_reduction=share)[:2]
-    figure = go.Figure()
-    figure.add_mesh3d(
-        x=points[:, 0], y=points[:, 1], z=points[:, 2], i=triangles[:, 0], j=triangles[:, 1], k=triangles[:, 2],
-        lighting={"ambient": 0.5, "diffuse": 0.8}, name="scan", **_colouring(points, predicted_error_mm),
-    )  # fmt: skip
-    figure.add_scatter3d(
-        x=spheres_m[:, 0], y=spheres_m[:, 1], z=spheres_m[:, 2], mode="markers+text", name="registration spheres",
-        text=[str(i) for i in range(len(spheres_m))], marker={"size": 5, "color": "#1b7f3b"},
-    )  # fmt: skip
-    colours = ["#1f5fbf", "#bf5f1f", "#7f1fbf"]
-    for colour, station in zip(colours, sorted(set(stations.values())), strict=False):
-        names = [name for name in cameras if stations.get(name) == station]
-        lines = _frusta([cameras[name] for name in names])
-        figure.add_scatter3d(
-            x=lines[:, 0], y=lines[:, 1], z=lines[:, 2], mode="lines", name=f"cameras of {station}",
-            line={"color": colour, "width": 3}, hoverinfo="skip",
-        )  # fmt: skip
-        centres = np.array([cameras[name][:3, 3] for name in names])
-        figure.add_scatter3d(
-            x=centres[:, 0], y=centres[:, 1], z=centres[:, 2], mode="markers", text=names, hoverinfo="text",
-            marker={"size": 3, "color": colour}, showlegend=False,
-        )  # fmt: skip
-    # The scan's frame is arbitrary: the cameras tell where up is.
-    up = np.mean([T[:3, 3] for T in cameras.values()], axis=0) - spheres_m.mean(axis=0)
-    up /= np.linalg.norm(up)
-    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
-    eye = 0.9 * up + 1.5 * side / np.linalg.norm(side)
-    view = {axis: dict(zip("xyz", map(float, v), strict=True)) for axis, v in (("up", up), ("eye", eye))}
-    figure.update_layout(
-        scene_camera=view,
-        scene={"aspectmode": "data", "xaxis_title": "x (m)", "yaxis_title": "y (m)", "zaxis_title": "z (m)"},
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-        height=620,
-        legend={"orientation": "h"},
-    )
-    return str(figure.to_html(full_html=False, include_plotlyjs=True))
+        points, triangles = fast_simplification.simplify(points, triangles.astype(np.int32), target_reduction=share)[
+            :2
+        ]
+    return np.asarray(points, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
 
 
-def _colouring(points: Array, predicted_error_mm: Callable[[Array], Array] | None) -> dict[str, Any]:
-    if predicted_error_mm is None:
-        return {"color": "#c9a58f", "hoverinfo": "skip"}
-    return {
-        "intensity": predicted_error_mm(points),
+def viewing_frame(scene: Scene) -> Transform:
+    """T_view_frame: origin amid the spheres, z up, −y towards the first station.
+
+    A scan's frame is arbitrary: the cameras tell where up is, unless the scene says so.
+    """
+    centre = _centre(scene)
+    eyes = np.array([T[:3, 3] for T in (*scene.cameras.values(), *scene.planned.values())]).reshape(-1, 3)
+    up = np.array(scene.up if scene.up is not None else _mean(eyes) - centre, dtype=np.float64)
+    up = _unit(up, np.array([0.0, 0.0, 1.0]))
+    first = min([*scene.stations.values(), *scene.bases], default="")
+    near = scene.bases[first][:3, 3] if first in scene.bases else _mean(_eyes_of(scene, first), default=eyes)
+    front = near - centre
+    front = _unit(front - up * float(front @ up), np.eye(3)[int(np.argmin(np.abs(up)))])
+    front = _unit(front - up * float(front @ up), front)
+    rotation = np.column_stack([np.cross(front, up) * -1.0, -front, up])  # axes of the view in the frame
+    return inverse(transform(rotation, centre))
+
+
+def scene_figure(scene: Scene) -> dict[str, Any]:
+    """The figure as plotly's plain data, in millimetres of the viewing frame.
+
+    plotly's camera moves in a box that its axes fill: the box is made to have one unit for a metre.
+    """
+    to_view = viewing_frame(scene)
+    extent = _Extent()
+
+    def mm(points_m: Array) -> Array:
+        points = 1e3 * apply(to_view, np.asarray(points_m, dtype=np.float64).reshape(-1, 3))
+        extent.add(points)
+        return points
+
+    data: list[dict[str, Any]] = []
+    if scene.mesh is not None:
+        data.append(_mesh(mm(scene.mesh.points_m), scene.mesh))
+    for kind in _NAMES:
+        mine = [s for s in scene.spheres if s.kind == kind]
+        if mine:
+            data += _spheres(mm(np.array([s.centre_m for s in mine])), mine, 1e3 * scene.radius_m)
+    data.append(_scale_bar(mm(_centre(scene))))
+    names = sorted({*scene.stations.values(), *scene.bases})
+    for i, station in enumerate(names):
+        colour, symbol = _STYLES[i % len(_STYLES)]
+        data += _cameras(scene, station, to_view, colour, symbol)
+        mine = [T for name, T in (*scene.cameras.items(), *scene.planned.items()) if scene.stations[name] == station]
+        mm(np.array([T[:3, 3] for T in mine]))
+        if station in scene.bases:
+            data.append(_base(mm(scene.bases[station][None, :3, 3]), station, colour))
+    return {"data": data, "layout": _layout(extent)}
+
+
+def scene_html(scene: Scene) -> str:
+    """HTML (a div with its script, plotly's included) of the scene, for a report."""
+    import plotly.io  # noqa: PLC0415 - half a second, and the screens never need it
+
+    figure = scene_figure(scene)
+    figure["layout"] |= {"height": 620}
+    return str(plotly.io.to_html(figure, full_html=False, include_plotlyjs=True, validate=False))
+
+
+def figure_json(figure: Mapping[str, Any]) -> str:
+    """A figure for a script element of type application/json: nothing in it can end that element."""
+    text = json.dumps(figure, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+class _Extent:
+    """The box around everything, mm."""
+
+    def __init__(self) -> None:
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
+
+    def add(self, points: Array) -> None:
+        if len(points):
+            self._low, self._high = (
+                np.minimum(self._low, points.min(axis=0)),
+                np.maximum(self._high, points.max(axis=0)),
+            )
+
+    def ranges(self) -> list[list[float]]:
+        """Low and high end of each axis, with room for what is drawn around a point."""
+        if not np.all(np.isfinite(self._low)):
+            return [[-500.0, 500.0]] * 3
+        return [[float(a) - _ROOM_MM, float(b) + _ROOM_MM] for a, b in zip(self._low, self._high, strict=True)]
+
+
+# --- pieces -----------------------------------------------------------------------------------------------------
+
+
+def _mesh(points: Array, mesh: SceneMesh) -> dict[str, Any]:
+    trace: dict[str, Any] = {
+        "type": "mesh3d",
+        "name": "surface",
+        **_xyz(points),
+        **{axis: _packed(mesh.triangles[:, k]) for k, axis in enumerate("ijk")},
+        "lighting": {"ambient": 0.55, "diffuse": 0.8, "specular": 0.05},
+    }
+    if mesh.error_mm is None:
+        return trace | {"color": "#c9a58f", "hoverinfo": "skip"}
+    return trace | {
+        "intensity": _packed(mesh.error_mm.astype(np.float32)),
         "colorscale": "Viridis",
-        "colorbar": {"title": "predicted error (mm)", "len": 0.6},
+        "colorbar": {"title": {"text": "predicted error (mm)", "side": "right"}, "len": 0.6, "thickness": 14, "x": 1},
         "hovertemplate": "%{intensity:.4f} mm<extra></extra>",
     }
 
 
-def _frusta(cameras: Sequence[Array]) -> Array:
-    """Line segments (N, 3), broken by NaN rows, of a small pyramid for each camera."""
-    w, h, z = 0.36 * _FRUSTUM_M, 0.24 * _FRUSTUM_M, _FRUSTUM_M
+def _spheres(centres: Array, spheres: Sequence[SceneSphere], radius: float) -> list[dict[str, Any]]:
+    ball, faces = _ball()
+    points = (centres[:, None] + _PROUD * radius * ball[None]).reshape(-1, 3)
+    triangles = (np.arange(len(centres))[:, None, None] * len(ball) + faces[None]).reshape(-1, 3)
+    kind = spheres[0].kind
+    # A control sphere is told by its label, C0, C1 …, not by its colour alone.
+    return [
+        {
+            "type": "mesh3d",
+            "name": _NAMES[kind],
+            "showlegend": True,
+            **_xyz(points),
+            **{axis: _packed(triangles[:, k]) for k, axis in enumerate("ijk")},
+            "color": _KINDS[kind],
+            "hoverinfo": "skip",
+            "lighting": {"ambient": 0.6, "diffuse": 0.7},
+        },
+        {
+            "type": "scatter3d",
+            "mode": "text",
+            **_xyz(centres + np.array([0.0, 0.0, 1.6 * radius])),
+            "text": [s.label for s in spheres],
+            "textfont": {"size": 15},
+            "hoverinfo": "skip",
+            "showlegend": False,
+        },
+    ]
+
+
+def _cameras(scene: Scene, station: str, to_view: Transform, colour: str, symbol: str) -> list[dict[str, Any]]:
+    out: list[dict[str, Any]] = []
+    for poses, what, opacity, filled in (
+        (scene.cameras, "cameras", 1.0, symbol),
+        (scene.planned, "planned", 0.45, f"{symbol}-open"),
+    ):
+        mine = {name: to_view @ T for name, T in poses.items() if scene.stations.get(name) == station}
+        if not mine:
+            continue
+        title = f"{what} of {station}" if what == "cameras" else f"still to be taken at {station}"
+        line = {"color": colour, "width": 3}
+        frusta = {"mode": "lines", "name": title, "line": line, "hoverinfo": "skip", "opacity": opacity}
+        out.append({"type": "scatter3d", **frusta, **_xyz(_frusta(list(mine.values())))})
+        eyes = 1e3 * np.array([T[:3, 3] for T in mine.values()])
+        marker = {"size": 5, "color": colour, "symbol": filled}
+        points = {"mode": "markers", "text": list(mine), "hoverinfo": "text", "marker": marker, "showlegend": False}
+        out.append({"type": "scatter3d", **points, **_xyz(eyes)})
+    return out
+
+
+def _base(at: Array, station: str, colour: str) -> dict[str, Any]:
+    return {
+        "type": "scatter3d",
+        "mode": "markers+text",
+        "name": f"robot base, {station}",
+        **_xyz(at),
+        "text": [f"robot, {station}"],
+        "textposition": "bottom center",
+        "marker": {"size": 9, "color": colour, "symbol": "square"},
+        "hoverinfo": "text",
+    }
+
+
+def _scale_bar(centre: Array) -> dict[str, Any]:
+    x, y, z = (float(v) for v in centre[0])
+    ends = [[x - 0.5 * _BAR_MM, y - 300, z - 60], [x + 0.5 * _BAR_MM, y - 300, z - 60]]
+    return {
+        "type": "scatter3d",
+        "mode": "lines+text",
+        **_xyz(np.array(ends)),
+        "text": ["", f"  {_BAR_MM:.0f} mm"],
+        "textposition": "middle right",
+        "line": {"color": "#8a97a0", "width": 5},
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
+
+
+def _layout(extent: _Extent) -> dict[str, Any]:
+    ranges = dict(zip("xyz", extent.ranges(), strict=True))
+    axes = {f"{a}axis": {"visible": False, "showspikes": False, "range": ends} for a, ends in ranges.items()}
+    return {
+        "scene": {
+            "aspectmode": "manual",
+            "aspectratio": {a: 1e-3 * (high - low) for a, (low, high) in ranges.items()},
+            "dragmode": "turntable",
+            "camera": {"eye": _in_box(ranges, _EYE_MM), "center": _in_box(ranges, _TOWARDS_MM)},
+            **axes,
+        },
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 70},
+        "legend": {"orientation": "h", "x": 0, "y": 0, "yanchor": "top", "itemsizing": "constant"},
+    }
+
+
+def _in_box(ranges: Mapping[str, Sequence[float]], point_mm: Sequence[float]) -> dict[str, float]:
+    """Where a point of the viewing frame is for plotly's camera."""
+    return {a: 1e-3 * (p - sum(ends) / 2) for (a, ends), p in zip(ranges.items(), point_mm, strict=True)}
+
+
+def _frusta(cameras: Sequence[Transform]) -> Array:
+    """Line segments (N, 3) in mm, broken by NaN rows, of a small pyramid for each camera."""
+    w, h, z = 0.36 * _FRUSTUM_MM, 0.24 * _FRUSTUM_MM, _FRUSTUM_MM
     o, a, b, c, d = [0, 0, 0], [-w, -h, z], [w, -h, z], [w, h, z], [-w, h, z]
-    path = np.array([o, a, b, c, d, a, o, b, o, c, o, d], dtype=np.float64)
+    path = 1e-3 * np.array([o, a, b, c, d, a, o, b, o, c, o, d], dtype=np.float64)
     gap = np.full((1, 3), np.nan)
-    return np.vstack([np.vstack([apply(T, path), gap]) for T in cameras]) if cameras else gap
+    return np.vstack([np.vstack([1e3 * apply(T, path), gap]) for T in cameras]) if cameras else gap
+
+
+def _ball() -> tuple[Array, NDArray[np.int64]]:
+    """A unit sphere: points (V, 3), triangles (F, 3)."""
+    polar = np.linspace(0, np.pi, _FLAT + 1)[1:-1]
+    around = np.linspace(0, 2 * np.pi, _ROUND, endpoint=False)
+    rings = [[np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)] for p in polar for a in around]
+    points = np.array([[0.0, 0.0, 1.0], *rings, [0.0, 0.0, -1.0]])
+    last = len(points) - 1
+    faces: list[list[int]] = []
+    for k in range(_ROUND):
+        nxt = (k + 1) % _ROUND
+        faces += [[0, 1 + k, 1 + nxt], [last, last - _ROUND + nxt, last - _ROUND + k]]
+        for ring in range(_FLAT - 2):
+            a, b = 1 + ring * _ROUND + k, 1 + ring * _ROUND + nxt
+            faces += [[a, a + _ROUND, b], [b, a + _ROUND, b + _ROUND]]
+    return points, np.array(faces)
+
+
+def _xyz(points: Array) -> dict[str, Any]:
+    return {axis: _packed(points[:, k].astype(np.float32)) for k, axis in enumerate("xyz")}
+
+
+def _packed(values: NDArray[Any]) -> dict[str, str]:
+    """A typed array in base64, as plotly reads it."""
+    kind = "f4" if values.dtype.kind == "f" else "u4"
+    little = values.astype(np.dtype(f"<{kind}"))
+    return {"dtype": kind, "bdata": base64.b64encode(little.tobytes()).decode()}
+
+
+def _centre(scene: Scene) -> Array:
+    if scene.spheres:
+        return np.array([s.centre_m for s in scene.spheres], dtype=np.float64).mean(axis=0)
+    if scene.mesh is not None:
+        return scene.mesh.points_m.mean(axis=0)
+    poses = [*scene.cameras.values(), *scene.planned.values()]
+    # Nothing but cameras: what they look at, about.
+    return _mean(np.array([T[:3, 3] + 0.6 * T[:3, 2] for T in poses]).reshape(-1, 3))
+
+
+def _eyes_of(scene: Scene, station: str) -> Array:
+    poses = {**scene.planned, **scene.cameras}
+    return np.array([T[:3, 3] for name, T in poses.items() if scene.stations.get(name) == station]).reshape(-1, 3)
+
+
+def _mean(points: Array, default: Array | None = None) -> Array:
+    if len(points):
+        return points.mean(axis=0)
+    return np.zeros(3) if default is None else _mean(default)
+
+
+def _unit(vector: Array, otherwise: Array) -> Array:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-9 else otherwise / float(np.linalg.norm(otherwise))

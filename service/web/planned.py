@@ -50,7 +50,7 @@ def station_of(log: RunLog, name: str) -> Station | None:
     return Station(layout, (size[0], size[1]))
 
 
-def planned_viewpoints(log: RunLog, step: Step) -> tuple[Planned, ...]:
+def planned_poses(log: RunLog, step: Step) -> tuple[Viewpoint, ...]:
     """Those of the protocol, then those that an attempt of the step has suggested."""
     sets: tuple[ViewpointSet, ...] = getattr(step.params, "viewpoints", ())
     out: list[Viewpoint] = []
@@ -64,7 +64,12 @@ def planned_viewpoints(log: RunLog, step: Step) -> tuple[Planned, ...]:
         last = station_of(log, viewpoint_set.station)
         if wanted and last is not None:
             out += [v for v in denser_viewpoints(viewpoint_set, last.layout) if v.name in wanted]
-    return tuple(Planned(v.name, v.station, *place(v.T_base_camera)) for v in out)
+    return tuple(out)
+
+
+def planned_viewpoints(log: RunLog, step: Step) -> tuple[Planned, ...]:
+    """The same as places and directions."""
+    return tuple(Planned(v.name, v.station, *place(v.T_base_camera)) for v in planned_poses(log, step))
 
 
 def place(T_base_camera: Transform) -> tuple[Vector, Vector]:
