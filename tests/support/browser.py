@@ -76,7 +76,12 @@ class Served:
         words = ["serve", "--rig", str(self.rig), "--data", str(self.data), "--port", port, "--json", *self.options]
         with (self.data.parent / "serve.log").open("a") as log:
             self._process = subprocess.Popen(
-                command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True
+                command(*words),
+                cwd=REPOSITORY,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
             )
         assert self._process.stdout is not None
         line = self._process.stdout.readline()
@@ -185,7 +190,9 @@ def screen(
     complaints: list[str] = []
     page = context.new_page()
     page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.on("console", lambda message: complaints.append(message.text) if "Content Security" in message.text else None)
+    page.on(
+        "console", lambda message: complaints.append(message.text) if "Content Security" in message.text else None
+    )
     try:
         yield Screen(context, page, url)
     finally:
