@@ -13,7 +13,7 @@ from service.people.accounts import Accounts
 from service.people.errors import NotSignedInError, PinRefusedError, SignInRefusedError
 from service.people.passwords import Passwords, new_token, token_sha256
 from service.people.person import Person, Screen
-from service.people.rows import SERVICE, SESSION_S, find_account, plain_name, record_sign_in, to_person
+from service.people.rows import SERVICE, SESSION_S, find_account, get_account, plain_name, record_sign_in, to_person
 from service.store.store import Store
 from service.store.tables import accounts, sessions
 
@@ -111,7 +111,7 @@ class People:
             return row
         with self._store.database.writing() as connection:
             if row is not None and usable:
-                failures = row.failures + 1
+                failures = get_account(connection, name).failures + 1  # another process may count too
                 wait_s = wait_after_s(failures)
                 connection.execute(
                     update(accounts)

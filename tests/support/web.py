@@ -47,7 +47,7 @@ _ACCOUNTS: dict[Role, str] = {role: name.split()[0].lower() for role, name in NA
 
 def password_of(account: str) -> str:
     """Every account's password in tests."""
-    return f"correct horse {account}"
+    return f"correct horse {account.lower()}"
 
 
 class NoLauncher(Launcher):
