@@ -14,13 +14,16 @@ from pathlib import Path
 import pytest
 import rfc8785
 from alembic.autogenerate import compare_metadata
+from alembic.config import Config
 from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sqlalchemy import create_engine
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.model import ActionRefused, JobEnqueued, StepNote
+from service.store import database
 from service.store.audit import verify
 from service.store.database import database_path
 from service.store.errors import StoreVersionError, UnknownRunError
@@ -142,6 +145,14 @@ def test_opening_prints_nothing_and_needs_no_ini(tmp_path: Path, capfd: pytest.C
     Store.open(tmp_path / "new" / "deep").close()
     Store.open(tmp_path / "new" / "deep").close()
     assert capfd.readouterr() == ("", "")
+
+
+def test_the_known_revisions_are_those_of_the_migrations() -> None:
+    config = Config()
+    config.set_main_option("script_location", str(Path(database.__file__).with_name("migrations")))
+    config.set_main_option("path_separator", "os")
+    scripts = ScriptDirectory.from_config(config).walk_revisions()
+    assert tuple(reversed([script.revision for script in scripts])) == database.REVISIONS
 
 
 def test_newer_database_is_refused_unchanged(tmp_path: Path) -> None:

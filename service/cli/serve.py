@@ -85,9 +85,6 @@ def serve_command(
             record_start(store, rig_file, site.protocol_files(), address)
             checkpoint(store, SITE)
             link = people.first_link()
-            _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
-            # The numerics behind steps and protocols take seconds to load: while the first page is being read.
-            threading.Thread(target=params_models, daemon=True).start()
             config = uvicorn.Config(
                 create_app(site),
                 log_level="warning",
@@ -97,10 +94,24 @@ def serve_command(
                 ssl_certfile=tls and str(tls[0]),
                 ssl_keyfile=tls and str(tls[1]),
             )
-            server = uvicorn.Server(config)
-            signal.signal(signal.SIGTERM, server.handle_exit)
-            server.run(sockets=[listener])
+            server = _Server(config)
+            with server.capture_signals():
+                _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
+                # The numerics behind steps and protocols take seconds to load: while the first page is being read.
+                threading.Thread(target=params_models, daemon=True).start()
+                server.run(sockets=[listener])
             checkpoint(store, SITE)
+
+
+class _Server(uvicorn.Server):
+    """Ends in order when told to; uvicorn's own would raise the signal again, past what is left to do here."""
+
+    @contextmanager
+    def capture_signals(self) -> Generator[None]:
+        """Ctrl-C and SIGTERM end the server."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self.handle_exit)
+        yield
 
 
 def _announce(address: str, set_up: str, *, json: bool) -> None:

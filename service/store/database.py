@@ -9,9 +9,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from alembic import command
-from alembic.config import Config
-from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.pool import ConnectionPoolEntry
@@ -22,6 +19,7 @@ from service.store.seam import Files
 
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0
+REVISIONS = ("0001", "0002", "0003")  # of migrations/versions, in order
 _MIGRATIONS = Path(__file__).with_name("migrations")
 
 
@@ -65,7 +63,7 @@ def open_database(data_dir: Path, files: Files) -> Database:
     database = Database(engine, path, files)
     try:
         with database.reading() as connection:
-            is_current = _revision(connection) == _head()
+            is_current = _revision(connection) == REVISIONS[-1]
         if not is_current:
             with database.writing() as connection:
                 _upgrade(connection, path)
@@ -133,20 +131,6 @@ def _engine(address: str, *, writable: bool) -> Engine:
     return engine
 
 
-def _alembic() -> Config:
-    config = Config()
-    config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
-    config.set_main_option("path_separator", "os")
-    return config
-
-
-def _head() -> str:
-    head = ScriptDirectory.from_config(_alembic()).get_current_head()
-    if head is None:
-        raise StoreError("the installation has no database migrations", where=str(_MIGRATIONS), remedy="Reinstall it")
-    return head
-
-
 def _revision(connection: Connection) -> str | None:
     if not inspect(connection).has_table("alembic_version"):
         return None
@@ -155,8 +139,7 @@ def _revision(connection: Connection) -> str | None:
 
 
 def _refuse_unknown(present: str | None, path: Path) -> None:
-    known = {script.revision for script in ScriptDirectory.from_config(_alembic()).walk_revisions()}
-    if present is not None and present not in known:
+    if present is not None and present not in REVISIONS:
         raise StoreVersionError(
             f"this database was written by a newer version of orthocapture (its revision {present} is unknown here)",
             where=str(path),
@@ -165,7 +148,7 @@ def _refuse_unknown(present: str | None, path: Path) -> None:
 
 
 def _refuse_old(present: str | None, path: Path) -> None:
-    if present != _head():
+    if present != REVISIONS[-1]:
         raise StoreVersionError(
             "this database was written by an older version of orthocapture and has not been upgraded"
             if present
@@ -182,8 +165,14 @@ def _upgrade(connection: Connection, path: Path) -> None:
         raise StoreVersionError(
             "this is not a database of orthocapture", where=str(path), remedy="Choose another data folder"
         )
-    if present != _head():
-        config = _alembic()
+    if present != REVISIONS[-1]:
+        # Half a second to import, for what happens once in the life of a database.
+        from alembic import command  # noqa: PLC0415
+        from alembic.config import Config  # noqa: PLC0415
+
+        config = Config()
+        config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
+        config.set_main_option("path_separator", "os")
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
 
