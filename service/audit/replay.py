@@ -40,6 +40,7 @@ DEFAULT_KINDS = (
     "register",
     "evaluate",
 )
+_WORST_FIRST: tuple[Verdict, ...] = ("not_replayed", "different", "within_tolerance")
 _FAILURES = (ValueError, ArithmeticError, LookupError, OSError, MemoryError, np.linalg.LinAlgError)
 
 
@@ -124,9 +125,10 @@ class ReplayReport:
         found: set[Verdict] = {job.verdict for job in self.jobs}
         if any(gate.changed for gate in self.gates):
             found.add("different")
-        order: tuple[Verdict, ...] = ("not_replayed", "different", "within_tolerance")
-        worst: Verdict = next((verdict for verdict in order if verdict in found), "identical")
-        return worst
+        for verdict in _WORST_FIRST:
+            if verdict in found:
+                return verdict
+        return "identical"
 
 
 class ScratchStore:

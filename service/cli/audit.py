@@ -13,6 +13,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from service.cli.audit_report import report_command
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -248,3 +249,6 @@ def _print_report(report: AuditReport) -> None:
     if len(report.faults) > 1:
         console.print(f"  and {len(report.faults) - 1} more; all of them with --json")
     console.print("  Keep this folder as it is, and compare it with a copy made earlier.")
+
+
+audit_app.command("report")(report_command)

@@ -16,6 +16,9 @@ import numpy as np
 import typer
 from rich.table import Table
 
+from service.audit.recorded import read_run
+from service.audit.report_content import report_content
+from service.audit.report_html import write_html
 from service.cli.common import JsonOption, console, error_console, print_json, progress_bar, reporting_errors
 from service.cli.run import drive
 from service.compute.registration.evaluation import true_error_m
@@ -23,7 +26,6 @@ from service.core.errors import OrthocaptureError
 from service.core.geometry import inverse
 from service.core.protocol import load_protocol
 from service.dataset.export import export_dataset
-from service.dataset.report import write_report
 from service.dataset.summary import RunSummary, summarise
 from service.rig import load_rig
 from service.runs import start_run
@@ -60,7 +62,7 @@ def demo_command(
             audit = verify(data, run_id, progress)
             truth = true_errors_mm(summary, Path(ready["truth"]))
             report = folder / "report.html"
-            write_report(summary, audit, report, true_error_mm=truth)
+            write_html(report_content(read_run(data, run_id), audit, true_error_mm=truth), report)
             dataset = folder / "dataset"
             export_dataset(summary, dataset)
             table = [{**row, "true_error_mm": truth[row["poses"]]} for row in summary.table()]

@@ -1,0 +1,105 @@
+"""What a report says, put together from a run's evidence; how it looks is report_html's and report_pdf's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+from service.audit.recorded import RecordedRun
+from service.audit.report_accuracy import accuracy_section, budget_section, result_sentence
+from service.audit.report_blocks import Cell, Facts, Report
+from service.audit.report_certificates import certificate_sections
+from service.audit.report_course import deviations, deviations_section, people_section, steps_section
+from service.audit.report_origin import devices_section, pictures_section, scene_section, software_section
+from service.audit.report_verification import verification_section
+from service.audit.report_words import duration, utc
+from service.dataset.summary import RunSummary
+from service.store.audit import AuditReport
+
+
+def report_content(
+    run: RecordedRun,
+    audit: AuditReport,
+    *,
+    made_at: datetime | None = None,
+    true_error_mm: Mapping[str, float] | None = None,
+    with_scene: bool = True,
+) -> Report:
+    """The report of a run.
+
+    Args:
+        run: the run.
+        audit: what verifying it gave, before anything else; the first page says so.
+        made_at: the time stamp of the report; now unless given. With the same one the same evidence gives the same.
+        true_error_mm: by source of poses, on a simulated rig where the truth is known; marked as such.
+        with_scene: the 3D scene as well, which only HTML can show.
+    """
+    summary = run.summary()
+    listed = deviations(run)
+    result = result_sentence(summary)
+    sections = [
+        deviations_section(run, listed),
+        accuracy_section(summary, true_error_mm),
+        budget_section(summary),
+        steps_section(run),
+        people_section(run),
+        *certificate_sections(run),
+        devices_section(run),
+        pictures_section(run),
+        scene_section(summary) if with_scene else None,
+        verification_section(run, audit),
+        software_section(run),
+    ]
+    return Report(
+        title=run.protocol.title,
+        simulated=run.root.simulated,
+        verification=_verification(audit),
+        result=result,
+        deviations=Cell(f"{len(listed)} deviations, listed first", "attention")
+        if listed
+        else Cell("No deviation: every step was done as the protocol says", "ok"),
+        facts=_facts(summary),
+        sections=tuple(section for section in sections if section is not None),
+        run_id=run.run_id,
+        head_sha256=run.events[-1].sha256,
+        made_utc=utc((made_at or datetime.now(UTC)).isoformat()),
+    )
+
+
+def _verification(audit: AuditReport) -> Cell:
+    if audit.first_fault is None:
+        return Cell("The evidence verifies: every file and every record is as it was recorded", "ok")
+    more = f", and {len(audit.faults) - 1} more faults" if len(audit.faults) > 1 else ""
+    return Cell(
+        f"THE EVIDENCE DOES NOT VERIFY: {audit.first_fault}{more}. Nothing in this report can be relied on.", "stop"
+    )
+
+
+def _facts(summary: RunSummary) -> Facts:
+    root, state, events = summary.root, summary.state, summary.events
+    views = sum(len(step.captured) for step in state.steps.values())
+    others = sorted(state.people - {root.operator})
+    status = {"active": "not finished"}.get(state.status, state.status)
+    return Facts(
+        (
+            ("Run", summary.run_id),
+            ("Begun", utc(events[0].at_utc)),
+            ("Last record", f"{utc(events[-1].at_utc)}, after {duration(events[0].at_utc, events[-1].at_utc)}"),
+            (
+                "State",
+                Cell(
+                    status + (f": {state.stop_reason}" if state.stop_reason else ""),
+                    "ok" if status == "completed" else "attention",
+                ),
+            ),
+            ("Begun by", root.operator),
+            ("Others who took part", ", ".join(others) or "none"),
+            ("Released by", state.released_by or "nobody"),
+            ("Protocol", f"{root.protocol_id}, version {root.protocol_version}"),
+            ("SHA-256 of the protocol", root.protocol_sha256),
+            ("SHA-256 of the rig's description", root.rig.sha256),
+            ("Photographs that count", str(views)),
+            ("Records", str(len(events))),
+            ("Chain head", events[-1].sha256),
+        )
+    )

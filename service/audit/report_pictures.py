@@ -1,0 +1,42 @@
+"""Pictures of a report: small copies of what the evidence holds, each file verified by its hash first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from service.audit.recorded import RecordedRun
+from service.audit.report_blocks import Picture
+from service.core.errors import IntegrityError
+
+THUMBNAIL_PX = 300
+LARGE_PX = 1400
+
+
+def picture(run: RecordedRun, sha256: str, caption: str, width_px: int) -> Picture:
+    """A JPEG copy no wider than this, without the camera's own data; empty where the file is missing or altered."""
+    try:
+        path = run.files.artefact_path(sha256, verify=True)
+    except IntegrityError:
+        return Picture(f"{caption}: the file is missing or was altered", None)
+    pixels = _read(path, width_px)
+    if pixels is None:
+        return Picture(f"{caption}: the file cannot be read as a picture", None)
+    height, width = pixels.shape[:2]
+    if width > width_px:
+        size = (width_px, round(height * width_px / width))
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+    jpeg = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, 82])[1].tobytes()
+    return Picture(caption, jpeg, pixels.shape[1], pixels.shape[0])
+
+
+def _read(path: Path, width_px: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None:
+    """Thumbnails are decoded at an eighth where the photograph is large enough: 60 MP take long otherwise."""
+    if width_px <= THUMBNAIL_PX:
+        small = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_4 | cv2.IMREAD_IGNORE_ORIENTATION)
+        if small is not None and small.shape[1] >= width_px:
+            return np.asarray(small, dtype=np.uint8)
+    found = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return None if found is None else np.asarray(found, dtype=np.uint8)

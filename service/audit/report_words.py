@@ -1,0 +1,63 @@
+"""How a report writes times, names and numbers."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from service.audit.report_blocks import Cell
+from service.core.gates import limits
+from service.core.model import GateVerdict
+
+
+def utc(text: str) -> str:
+    """2026-11-21 10:12:03 UTC, from ISO 8601."""
+    moment = datetime.fromisoformat(text)
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def clock(text: str) -> str:
+    """The same without the date."""
+    return utc(text).split()[1]
+
+
+def duration(start: str, end: str) -> str:
+    """3 min 5 s, between two times."""
+    seconds = round((datetime.fromisoformat(end) - datetime.fromisoformat(start)).total_seconds())
+    hours, rest = divmod(max(seconds, 0), 3600)
+    minutes, seconds = divmod(rest, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
+
+
+def words(name: str) -> str:
+    """A name of the records as words: viewpoint_skipped → viewpoint skipped."""
+    return name.replace("_", " ")
+
+
+def limit(verdict: GateVerdict) -> str:
+    """What a gate allows: ≥ 0.2 and ≤ 1."""
+    if verdict.minimum is not None and verdict.minimum == verdict.maximum:
+        return f"= {verdict.minimum:g}"
+    return limits(verdict.minimum, verdict.maximum)
+
+
+def measured(verdict: GateVerdict) -> tuple[str, str]:
+    """Name of what a gate judges without its unit, and the value with it."""
+    name = verdict.measure
+    for ending, unit in (("_mm", "mm"), ("_px", "px"), ("_deg", "°"), ("_min", "min")):
+        if verdict.unit == unit:
+            name = name.removesuffix(ending)
+    value = "not measured" if verdict.value is None else f"{verdict.value:.4g} {verdict.unit}".strip()
+    return words(name), value
+
+
+def judged(verdict: GateVerdict) -> Cell:
+    """A word, a sign and a colour."""
+    return Cell("✓ passed", "ok") if verdict.passed else Cell("✗ failed", "stop")
+
+
+def mm(value: float | None, digits: int = 3) -> str:
+    """Millimetres without the unit; – for none."""
+    return "–" if value is None else f"{value:.{digits}f}"
