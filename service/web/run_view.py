@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from typing import Protocol as Interface
 
@@ -22,6 +22,7 @@ from service.web.run_words import (
     moves_robot,
     phase_words,
     planned_views,
+    sentence,
     station_of,
     will_happen,
 )
@@ -31,11 +32,22 @@ class Recorded(Interface):
     """A run's record: service.evidence.RunLog."""
 
     @property
-    def protocol(self) -> Protocol: ...
+    def protocol(self) -> Protocol:
+        """As it was when the run began."""
+        ...
+
     @property
-    def events(self) -> Sequence[Event]: ...
+    def events(self) -> Sequence[Event]:
+        """All of them, in order."""
+        ...
+
     @property
-    def state(self) -> RunState: ...
+    def state(self) -> RunState:
+        """Their fold."""
+        ...
+
+
+_STOPPED = frozenset({"protective_stop", "safeguard_stop", "emergency_stop", "fault"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +214,7 @@ def run_view(log: Recorded, snapshot: Snapshot, looker: Looker, *, driven: bool,
         steps=tuple(_line(protocol, state, step, shown) for step in protocol.steps),
         passed=sum(step.phase == "passed" for step in state.steps.values()),
         shown=_shown(protocol, state, protocol.step(shown)),
-        main=_main(protocol, state, decision, mode),
+        main=_main(protocol, state, decision, mode, stopped=snapshot.robot in _STOPPED),
         options=_options(decision, state),
         can_pause=not state.terminal and not state.paused and looker.may_operate,
         standing=snapshot.doing == "paused" and snapshot.robot != "moving",
@@ -268,7 +280,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
         attempt=now.attempt,
         kind=step.kind,
         why=step.why,
-        instructions=step.instructions.strip(),
+        instructions="\n".join(" ".join(part.split()) for part in step.instructions.split("\n\n")),
         drawing=drawing_of(step),
         station=station_of(step),
         status=phase_words(state, now)[0],
@@ -288,7 +300,14 @@ def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
     )
 
 
-def _main(protocol: Protocol, state: RunState, decision: object, mode: str) -> Main | None:
+def _main(protocol: Protocol, state: RunState, decision: object, mode: str, *, stopped: bool) -> Main | None:
+    main = _wanted(protocol, state, decision, mode)
+    if main is not None and main.hold and stopped:
+        return replace(main, enabled=False, why_not="The robot is stopped. Clear the stop at the robot first.")
+    return main
+
+
+def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) -> Main | None:
     step, now = protocol.step(state.current), state.step
     moves = moves_robot(step)
     if mode == "died":
@@ -327,7 +346,7 @@ def _trouble(protocol: Protocol, state: RunState, decision: object) -> Trouble |
     safe = f"Yes. {count(images, 'image is', 'images are')} recorded, and every result so far."
     advice = next((str(note.data["advice"]) for note in reversed(now.notes) if "advice" in note.data), "")
     if now.failure is not None:
-        return Trouble(f"{step.title} did not work", now.failure.message, safe, advice)
+        return Trouble(f"{step.title} did not work", sentence(now.failure.message), safe, advice)
     failed = [figure_line(verdict) for verdict in now.verdicts if not verdict.passed]
     if failed:
         return Trouble(f"{step.title}: outside its limits", "; ".join(failed), safe, advice)

@@ -67,6 +67,12 @@ def limit(minimum: float | None, maximum: float | None, unit: str = "") -> str:
     return f"{' and '.join(text for text in (low, high) if text) or 'no limit'} {unit}".rstrip()
 
 
+def sentence(text: str) -> str:
+    """With a capital letter and a full stop."""
+    text = text.strip()
+    return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
+
+
 def planned_views(step: Step) -> int:
     """How many images the protocol plans in a step."""
     sets: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
@@ -84,7 +90,7 @@ def count(amount: int, one: str, many: str = "") -> str:
     return f"{amount} {one if amount == 1 else many or one + 's'}"
 
 
-def will_happen(step: Step, now: StepState) -> tuple[str, str]:
+def will_happen(step: Step, now: StepState) -> tuple[str, str]:  # noqa: PLR0911 - one return a kind
     """What a confirmation of this step does: the large words of its button, and a line below."""
     left = max(planned_views(step) - len(now.captured), 0)
     match step.kind:
