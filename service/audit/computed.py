@@ -9,16 +9,28 @@ from concurrent.futures import TimeoutError as FutureTimeoutError
 from contextlib import suppress
 from dataclasses import dataclass, field
 from threading import Lock
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, Self, TypeVar
 
 from sqlalchemy import text
 
 from service.audit.queries import head
 from service.store.store import Store
 
-T = TypeVar("T")
 WAIT_S = 0.08  # that a page waits before it says "being computed"
-_REST_S = 0.002  # between two chunks, so that pages come first
+_LARGE = 2000  # events; a larger run is not waited for the first time
+_GRACE_S = 0.25  # before a long computation begins: the page that asked is answered first
+_REST_S = 0.001  # between two chunks, so that pages come first
+
+
+class Copied(Protocol):
+    """What can be computed."""
+
+    def copy(self) -> Self:
+        """Another one, to go on with while pages read this one."""
+        ...
+
+
+T = TypeVar("T", bound=Copied)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,15 +72,18 @@ class Computed(Generic[T]):
         self._ahead = ThreadPoolExecutor(max_workers=1, thread_name_prefix=f"{name}-ahead")
         self._entries: dict[str, _Entry[T]] = {}
         self._lock = Lock()
+        self._warm = False
 
     def get(self, run_id: str, wait_s: float = WAIT_S) -> T | Progress:
         """The value of the run as it is now, or how far it is. Raises UnknownRunError and what `advance` raises."""
         ready = self.ready(run_id)
         if not isinstance(ready, Progress):
             return ready
-        future = self._submit(run_id, somebody_waits=True)
+        # What is computed first in a process also loads what it needs, which takes a second.
+        long = ready.total - ready.done > _LARGE or not self._warm
+        future = self._submit(run_id, somebody_waits=True, grace_s=_GRACE_S if long and wait_s <= WAIT_S else 0.0)
         with suppress(FutureTimeoutError):
-            future.result(wait_s)
+            future.result(0 if long and wait_s <= WAIT_S else wait_s)
         return self.ready(run_id)
 
     def ready(self, run_id: str) -> T | Progress:
@@ -99,25 +114,30 @@ class Computed(Generic[T]):
         with self._lock:
             return self._entries.setdefault(run_id, _Entry())
 
-    def _submit(self, run_id: str, *, somebody_waits: bool) -> Future[None]:
+    def _submit(self, run_id: str, *, somebody_waits: bool, grace_s: float = _GRACE_S) -> Future[None]:
         entry = self._entry(run_id)
         with self._lock:
             future = entry.future
             under_way = future is not None and not future.done()
             if future is None or not under_way or (somebody_waits and not entry.somebody_waits):
                 executor = self._asked if somebody_waits else self._ahead
-                entry.future = future = executor.submit(self._compute, run_id, entry)
+                entry.future = future = executor.submit(self._compute, run_id, entry, grace_s)
                 entry.somebody_waits = somebody_waits
             return future
 
-    def _compute(self, run_id: str, entry: _Entry[T]) -> None:
+    def _compute(self, run_id: str, entry: _Entry[T], grace_s: float) -> None:
+        if not self._warm:
+            time.sleep(grace_s)
         with entry.lock:
             if entry.step is not None and not self._still_holds(run_id, entry.step):
                 entry.step = None
             with self._store.database.reading() as connection:
                 last, _ = head(connection, run_id)
+            value = entry.step.value.copy() if entry.step is not None else None
             while entry.step is None or entry.step.seq < max(last, entry.step.last):
-                entry.step = self._advance(run_id, entry.step.value if entry.step else None)
+                entry.step = self._advance(run_id, value)
+                value = entry.step.value
+                self._warm = True
                 time.sleep(_REST_S)
 
     def _still_holds(self, run_id: str, step: Step[T]) -> bool:

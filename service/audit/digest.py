@@ -18,7 +18,7 @@ from service.core.protocol import Protocol, parse_protocol
 from service.core.run_state import Deviation, RunState
 from service.store.store import Store
 
-CHUNK = 2000  # events between two looks at who waits
+CHUNK = 300  # events between two looks at who waits
 
 # The others change neither the lifecycle nor the deviations; a run of 100 000 events consists mostly of them.
 FOLDED = (
@@ -105,8 +105,7 @@ def digests(store: Store) -> Computed[Digest]:
 
 def step(store: Store, run_id: str, before: Digest | None) -> Step[Digest]:
     """One chunk further. Raises UnknownRunError, StoreError."""
-    # A copy, because a page may be reading the one before.
-    digest = before.copy() if before else Digest(run_id)
+    digest = before or Digest(run_id)
     with store.database.reading() as connection:
         last, sha256 = head(connection, run_id)
         if before is None:

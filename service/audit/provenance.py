@@ -15,7 +15,7 @@ from service.audit.computed import Computed, Step
 from service.audit.queries import EventRow, head, plain, read_rows
 from service.store.store import Store
 
-CHUNK = 4000  # events between two looks at who waits
+CHUNK = 500  # events between two looks at who waits
 _HASH = re.compile(r'"([0-9a-f]{64})"')
 # Later jobs hold earlier results by value too (a camera, centres of spheres): so many digits nobody typed.
 _NUMBER = re.compile(r"-?\d+\.\d{12,}(?:e-?\d+)?")
@@ -77,7 +77,7 @@ def graphs(store: Store) -> Computed[Graph]:
 
 
 def _step(store: Store, run_id: str, before: Graph | None) -> Step[Graph]:
-    graph = before.copy() if before else Graph(run_id)
+    graph = before or Graph(run_id)
     with store.database.reading() as connection:
         last, sha256 = head(connection, run_id)
         upto = min(graph.seq + CHUNK, last)

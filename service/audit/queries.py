@@ -284,7 +284,7 @@ def _event_row(row: Any, *, whole: bool) -> EventRow:
     try:
         payload: dict[str, Any] = parse_canonical(row.payload or "null") or {}
         shown = json.dumps(payload, indent=1, ensure_ascii=False, sort_keys=True) if whole else ""
-        line = summary({name: value for name, value in payload.items() if name not in ("step", "attempt")})
+        line = headline(payload)
     except (ValueError, AttributeError):  # altered: shown as it is
         payload, shown, line = {}, str(row.payload)[:_INLINE_CHARACTERS], "this payload cannot be read"
     step, attempt = payload.get("step"), payload.get("attempt")
@@ -304,6 +304,37 @@ def _event_row(row: Any, *, whole: bool) -> EventRow:
         sha256=row.sha256,
         artefacts=row.artefacts,
     )
+
+
+_TELLING = (
+    "viewpoint",
+    "station",
+    "action",
+    "item",
+    "device",
+    "job_kind",
+    "what",
+    "account",
+    "outcome",
+    "field",
+    "measure",
+    "error",
+    "message",
+    "note",
+    "why",
+    "reason",
+    "meaning",
+)  # fmt: skip - one line of names reads better
+
+
+def headline(payload: Mapping[str, Any]) -> str:
+    """One line on an event: what tells most comes first, without names of fields where the value speaks."""
+    told = [str(payload[name]) for name in _TELLING if isinstance(payload.get(name), str) and payload[name]]
+    if "passed" in payload:
+        told.append("passed" if payload["passed"] else "not passed")
+    told = [text if len(text) <= 80 else text[:79] + "…" for text in told]
+    rest = {name: value for name, value in payload.items() if name not in ("step", "attempt")}
+    return " · ".join(told) or summary(rest)
 
 
 def computed_sha256(run_id: str, row: EventRow) -> str:

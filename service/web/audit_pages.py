@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
@@ -177,7 +177,7 @@ def _events(
     after: int,
     before: int,
     template: str,
-    **context: object,
+    **context: Any,
 ) -> Response:
     digest = here.digests.get(chain) if chain != SITE else None
     with here.site.store.database.reading() as connection:
@@ -210,7 +210,7 @@ def event_page(request: Request, audit: Auditing, person: Signed, run_id: str, s
     return _event(request, audit, run_id, seq, may_correct=person.may("correct"), audit=frame)
 
 
-def _event(request: Request, here: Audit, chain: str, seq: int, *, may_correct: bool, **context: object) -> Response:
+def _event(request: Request, here: Audit, chain: str, seq: int, *, may_correct: bool, **context: Any) -> Response:
     with here.site.store.database.reading() as connection:
         row = queries.one_event(connection, chain, seq)
         last, _ = queries.head(connection, chain)

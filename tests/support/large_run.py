@@ -116,7 +116,9 @@ class LargeRun:
         """Signature and confirmation where the protocol wants them, then the step's start."""
         self.flush()
         if step.irreversible and step.sign:
-            self.act("sign", step=step.id, meaning="released", signed_sha256=record_to_sign(self.protocol, self.state))
+            self.act(
+                "sign", step=step.id, meaning="released", signed_sha256=record_to_sign(self.protocol, self.state)
+            )
         if step.confirm:
             self.act("confirm", step=step.id, checklist=step.checklist)
         self.flush()
@@ -201,7 +203,11 @@ def _captures(run: LargeRun, step: Step, sizes: Sizes) -> tuple[ArtefactRef, ...
             _job(run, step, images)
         if number < sizes.failures:
             failed = ViewpointFailed(
-                step=step.id, attempt=1, viewpoint=f"w{number:05d}", error="StillnessError", message="the arm moved",
+                step=step.id,
+                attempt=1,
+                viewpoint=f"w{number:05d}",
+                error="StillnessError",
+                message="the arm moved",
                 skipped=number % 6 == 0,
             )
             run.add(failed)
@@ -226,7 +232,9 @@ def _notes(run: LargeRun, step: Step, count: int) -> None:
     words: Sequence[str] = ("station", "entered", "timer", "light", "temperature", "waiting", "moving", "settled")
     for number in range(max(count, 0)):
         note = " ".join(run.draw.sample(words, 3))
-        run.add(StepNote(step=step.id, attempt=1, note=note, data={"number": number, "where": f"station_{number % 4}"}))
+        run.add(
+            StepNote(step=step.id, attempt=1, note=note, data={"number": number, "where": f"station_{number % 4}"})
+        )
     run.flush()
 
 
