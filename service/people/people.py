@@ -10,7 +10,7 @@ from argon2 import PasswordHasher
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from service.people.accounts import Accounts
-from service.people.errors import NotSignedInError, PinRefusedError, SignInRefusedError
+from service.people.errors import AccountError, NotSignedInError, PinRefusedError, SignInRefusedError
 from service.people.passwords import Passwords, new_token, token_sha256
 from service.people.person import Person, Screen
 from service.people.rows import SERVICE, SESSION_S, find_account, get_account, plain_name, record_sign_in, to_person
@@ -251,7 +251,7 @@ class People:
         with self._store.database.writing() as connection:
             chosen = (sessions.c.screen == screen) & (sessions.c.account == person.account)
             if connection.execute(select(sessions.c.screen).where(chosen)).one_or_none() is None:
-                raise NotSignedInError(f"there is no sign-in {screen!r}", where="screen", remedy="It may have ended")
+                raise AccountError(f"you have no sign-in {screen!r}", where="screen", remedy="It may have ended")
             record_sign_in(
                 self._store, connection, "ended", account=person.account, screen=screen, actor=person.account
             )
