@@ -53,7 +53,7 @@ def devices_section(run: RecordedRun) -> Section:
         sigma_m = max(capture.pose_sigma_m for capture in captures)
         text = (
             f"Over {len(captures)} captures the robot's clock stayed within {1e3 * float(np.ptp(offsets)):.1f} ms of "
-            f"its distance from the host's monotonic clock; the flange stood still within {1e6 * sigma_m:.2g} µm "
+            f"its distance from the host's monotonic clock; the flange stood still within {1e6 * sigma_m:.2f} µm "
             "(1σ) during every exposure."
         )
         blocks.append(Paragraph(text + _environment(captures)))

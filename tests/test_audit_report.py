@@ -1,0 +1,237 @@
+"""The report of a run: what it says, in HTML and in PDF, and that it never hides what is wrong."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import zlib
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from service.audit import report_pdf
+from service.audit.recorded import read_run
+from service.audit.report_blocks import Report
+from service.audit.report_content import report_content
+from service.audit.report_html import render_html
+from service.audit.report_pdf import render_pdf
+from service.cli.main import app
+from service.store.audit import verify
+from service.store.signing import checkpoint
+from service.store.store import Store
+from tests.support.reported_run import record_reported_run
+
+AT = datetime(2026, 11, 21, 11, 30, tzinfo=UTC)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with deviations, signed, in the folder data."""
+    made = tmp_path_factory.mktemp("reported")
+    run_id = record_reported_run(made)
+    with Store.open(made / "data") as store:
+        checkpoint(store, run_id)
+    return made
+
+
+def report_of(data: Path, **options: Any) -> Report:
+    run_id = read_run(data, "latest").run_id
+    return report_content(read_run(data, run_id), verify(data, run_id), made_at=AT, **options)
+
+
+@pytest.fixture(scope="module")
+def report(folder: Path) -> Report:
+    return report_of(folder / "data")
+
+
+class _Words(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def handle_data(self, data: str) -> None:
+        self.found.append(data)
+
+
+def words_of(html: str) -> str:
+    """The text between the tags, in order, white space made one blank."""
+    parser = _Words()
+    parser.feed(html)
+    return " ".join(" ".join(parser.found).split())
+
+
+def pages_of(pdf: bytes) -> list[str]:
+    """The text of each page of a PDF in the fonts that every reader has, in order."""
+    return [" ".join(_strings(stream)) for stream in _streams(pdf) if b" Tj" in stream]
+
+
+def _streams(pdf: bytes) -> Iterator[bytes]:
+    for found in re.finditer(rb"/ASCII85Decode /FlateDecode[^>]*>>\s*stream\r?\n(.*?)endstream", pdf, re.DOTALL):
+        yield zlib.decompress(base64.a85decode(b"<~" + found[1].strip(), adobe=True))
+
+
+def _strings(stream: bytes) -> Iterator[str]:
+    for found in re.finditer(rb"\(((?:\\.|[^\\()])*)\) Tj", stream, re.DOTALL):
+        plain = re.sub(rb"\\([0-7]{3})", lambda octal: bytes([int(octal[1], 8)]), found[1])
+        yield re.sub(rb"\\(.)", rb"\1", plain).decode("cp1252", errors="replace")
+
+
+@pytest.fixture
+def standard_fonts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a machine without DejaVu; text can then be read from the PDF as it stands."""
+    monkeypatch.setattr(report_pdf, "_FONT_FOLDERS", ())
+
+
+# --- what it says -----------------------------------------------------------------------------------------
+
+
+def test_first_page_says_what_nobody_may_miss(report: Report) -> None:
+    html = words_of(render_html(report))
+    first = html[: html.index("1 Deviations")]
+    for text in (
+        "SIMULATED",
+        "The evidence verifies",
+        "deviations, listed first",
+        "0.213 mm, within the limit of 0.35 mm (the protocol's gate)",
+        "predicted uncertainty of the registration of 0.040 mm (1σ, 3D), 0.061 mm with the scan's own error",
+        "Ada Λ. Müller",
+        "reported, version 3",
+        report.head_sha256,
+    ):
+        assert text in first, text
+
+
+def test_deviations_come_before_everything_else(report: Report) -> None:
+    assert report.sections[0].title == "Deviations"
+    html = words_of(render_html(report))
+    section = html[html.index("1 Deviations") : html.index("2 Registration error")]
+    for text in (
+        "attempt 1: viewpoints_captured 1 views, allowed ≥ 2",
+        "v002 given up: no file arrived",
+        "the cable was loose",
+        "camera: the camera does not answer",
+        "environment.light_lux: 0 → 800",
+        "the meter was covered",
+        "1 attempts at steps and 0 single views were replaced",
+    ):
+        assert text in section, text
+
+
+def test_signature_certificate_devices_and_verification(folder: Path, report: Report) -> None:
+    html = words_of(render_html(report))
+    run = read_run(folder / "data", "latest")
+    certificate = next(a.ref.sha256 for a in run.artefacts if a.ref.kind == "calibration")
+    (key,) = verify(folder / "data", run.run_id).key_ids
+    for text in (
+        f"Evaluate: reviewed and accepted (cli) {run.state.steps['evaluation'].gates_sha256}",
+        f"Certificate number (SHA-256 of calibration.json) {certificate}",
+        "0.0300 px rms, which is 0.0120 mm at 0.70 m (5 folds)",
+        "0.040 mm (median over the views, each predicted by the others)",
+        "Any of these makes a new one necessary",
+        "95% of the 96 cells hold a corner, 1 none",
+        "1.10 / 11.53 (1920)",
+        "UR10e 20231 5.12",
+        "stayed within 0.0 ms",
+        "light 800 to 800 lx, temperature 21.5 to 21.5 °C",
+        "Signed checkpoints (Ed25519) 1",
+        key,
+        "Part 11-style controls",
+    ):
+        assert text in html, text
+    assert "complian" not in html.lower()
+
+
+def test_outside_its_limit_it_says_so(tmp_path: Path) -> None:
+    record_reported_run(tmp_path, error_mm=0.3499999)
+    assert report_of(tmp_path / "data").result.tone == "ok"
+    shutil.rmtree(tmp_path / "data")
+    record_reported_run(tmp_path, error_mm=0.41)
+    report = report_of(tmp_path / "data")
+    assert "OUTSIDE the limit" in report.result.text
+    assert report.result.tone == "stop"
+    html = words_of(render_html(report))
+    assert "best_mean_radial_error_mm 0.41 mm, allowed ≤ 0.35" in html
+    assert "the step is recovering" in html
+
+
+def test_evidence_that_does_not_verify_is_said_first_and_loudest(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder / "data", tmp_path / "data")
+    run = read_run(tmp_path / "data", "latest")
+    photograph = next(a for a in run.artefacts if a.ref.kind == "image" and a.attempt == 2)
+    path = run.files.artefact_path(photograph.ref.sha256)
+    path.chmod(0o644)
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    report = report_of(tmp_path / "data")
+    assert report.verification.tone == "stop"
+    html = words_of(render_html(report))
+    assert html.index("THE EVIDENCE DOES NOT VERIFY") < html.index("Deviations")
+    assert f"{photograph.viewpoint}: the file is missing or was altered" in html
+    answer = CliRunner().invoke(
+        app, ["audit", "report", "--data", str(tmp_path / "data"), "--pdf", str(tmp_path / "r.pdf"), "--json"]
+    )
+    assert answer.exit_code == 1
+    assert json.loads(answer.stdout)["verified"] is False
+    assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
+
+
+# --- how it is written -----------------------------------------------------------------------------------
+
+
+def test_html_needs_nothing_from_elsewhere_and_lets_nothing_in(tmp_path: Path) -> None:
+    record_reported_run(tmp_path, person="<script>alert(1)</script>")
+    html = render_html(report_of(tmp_path / "data"))
+    assert "&lt;script&gt;alert(1)" in html
+    assert "<script" not in html, "no scene in this run, so no script at all"
+    assert not re.search(r'(src|href)="(?!data:)', html)
+    assert html.count("data:image/jpeg;base64,") == 2
+
+
+@pytest.mark.usefixtures("standard_fonts")
+def test_pdf_says_the_same_on_numbered_pages(report: Report) -> None:
+    pages = pages_of(render_pdf(report))
+    for number, page in enumerate(pages, 1):
+        assert f"{number} of {len(pages)}" in page
+        assert f"Run {report.run_id}" in page
+        assert report.head_sha256 in page
+    assert "SIMULATED" in pages[0]
+    whole = " ".join(" ".join(pages).split())
+    for text in ("The evidence verifies", "the cable was loose", "reviewed and accepted", "Part 11-style controls"):
+        assert text in whole, text
+    for section in report.sections:
+        assert section.title in whole
+
+
+@pytest.mark.usefixtures("standard_fonts")
+def test_greek_and_signs_have_glyphs_without_dejavu(report: Report) -> None:
+    pdf = render_pdf(report)
+    assert b"/Symbol" in pdf, "Greek and ≤ come from the symbol font"
+    assert "\ufffd" not in "".join(pages_of(pdf))
+
+
+def test_the_same_evidence_gives_the_same_bytes(folder: Path, report: Report) -> None:
+    assert render_pdf(report_of(folder / "data")) == render_pdf(report)
+    assert render_html(report_of(folder / "data")) == render_html(report)
+
+
+def test_command_writes_both(folder: Path, tmp_path: Path) -> None:
+    pdf, html = tmp_path / "new" / "r.pdf", tmp_path / "new" / "r.html"
+    words = ["audit", "report", "latest", "--data", str(folder / "data"), "--pdf", str(pdf), "--html", str(html)]
+    before = sorted((p, p.stat().st_mtime_ns) for p in (folder / "data" / "artefacts").rglob("*"))
+    answer = CliRunner().invoke(app, words)
+    assert answer.exit_code == 0, answer.output
+    assert pdf.read_bytes().startswith(b"%PDF-")
+    assert html.read_text().startswith("<!doctype html>")
+    assert sorted((p, p.stat().st_mtime_ns) for p in (folder / "data" / "artefacts").rglob("*")) == before
+
+
+def test_command_without_a_file_says_what_to_say(folder: Path) -> None:
+    answer = CliRunner().invoke(app, ["audit", "report", "--data", str(folder / "data"), "--json"])
+    assert answer.exit_code == 1
+    assert "--pdf FILE" in json.loads(answer.stdout)["error"]["remedy"]
