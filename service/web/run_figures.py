@@ -25,7 +25,7 @@ class GateLine:
     value: str
     limit: str
     why: str
-    status: str  # Within, Outside, Not measured yet, Not judged
+    status: str  # Within, Outside, Not yet, Not judged
     tone: str
     percent: float | None  # length of its bar; None where a bar would say nothing
     limit_percent: float
@@ -67,7 +67,7 @@ def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str])
         if gate.unless_skipped is not None and gate.unless_skipped in skipped:
             why = f"{gate.unless_skipped} was skipped; without it there is no such number"
             return GateLine(name, "–", limits, why, "Not judged", "attention", None, _BAR_LIMIT)
-        return GateLine(name, "–", limits, gate.why, "Not measured yet", "open", None, _BAR_LIMIT)
+        return GateLine(name, "–", limits, gate.why, "Not yet", "open", None, _BAR_LIMIT)
     percent = None
     bound = gate.max if gate.max is not None else gate.min
     if verdict.value is not None and bound is not None and bound > 0 and verdict.value >= 0:

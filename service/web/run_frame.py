@@ -77,7 +77,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
     )
 
 
-def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner:
+def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner:  # noqa: PLR0911 - one return a case
     """What to say of the robot. What is not known for certain is said to be unknown."""
     if state.terminal:
         return Banner("ended", "standing", "end", "The run has ended.", "It drives no robot any more.")
@@ -90,9 +90,7 @@ def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner
         return _moving(state, snapshot)
     if snapshot.robot == "not_connected":
         title = "Paused. The robot is not connected." if state.paused else "Robot not connected."
-        text = (
-            "No connection to it is open: so far nothing has needed it. It may still be moved from its own pendant."
-        )
+        text = "Nothing has needed it so far. Its own pendant can still move it."
         return Banner("not_connected", "paused" if state.paused else "standing", "open", title, text)
     if state.paused:
         if snapshot.doing == "paused":
@@ -142,8 +140,8 @@ _STOPS: dict[str, Banner] = {
         "stop",
         "Protective stop.",
         "The robot stopped itself: it touched something, or a limit was near. What was captured is safe.",
-        "Look at what it touched and clear its path. Check that specimen, spheres and camera have not moved. Then, on "
-        "the teach pendant: wait 5 s and choose Enable robot. " + _AT_THE_ROBOT,
+        "Look at what it touched and clear its path. Check that specimen, spheres and camera have not moved. Then, "
+        "on the teach pendant: wait 5 s and choose Enable robot. " + _AT_THE_ROBOT,
         assertive=True,
     ),
     "safeguard_stop": Banner(

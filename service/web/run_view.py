@@ -142,7 +142,7 @@ class Signature:
 
     sha256: str
     title: str
-    figures: tuple[str, ...]
+    figures: tuple[tuple[str, tuple[str, ...]], ...]  # by step
     meaning: str  # offered; the person may change it
 
 
@@ -216,7 +216,7 @@ def run_view(log: Recorded, snapshot: Snapshot, looker: Looker, *, driven: bool,
         shown=_shown(protocol, state, protocol.step(shown)),
         main=_main(protocol, state, decision, mode, stopped=snapshot.robot in _STOPPED),
         options=_options(decision, state),
-        can_pause=not state.terminal and not state.paused and looker.may_operate,
+        can_pause=mode not in ("ended", "died", "paused") and looker.may_operate,
         standing=snapshot.doing == "paused" and snapshot.robot != "moving",
         looker=looker,
         trouble=_trouble(protocol, state, decision),
@@ -358,15 +358,16 @@ def _signature(protocol: Protocol, state: RunState) -> Signature | None:
         return None
     step = protocol.step(state.current)
     if step.irreversible:
-        figures = tuple(
-            f"{protocol.step(name).title}: {figure_line(verdict)}"
-            for name in step.requires
-            for verdict in state.steps[name].verdicts
-        )
+        steps: tuple[str, ...] = step.requires
         meaning = f"I release this step, which cannot be undone: {step.title}"
     else:
-        figures = tuple(figure_line(verdict) for verdict in state.step.verdicts)
+        steps = (step.id,)
         meaning = f"I have checked these figures and accept them: {step.title}"
+    figures = tuple(
+        (protocol.step(name).title, tuple(figure_line(verdict) for verdict in state.steps[name].verdicts))
+        for name in steps
+        if state.steps[name].verdicts
+    )
     sha256 = record_to_sign(protocol, state)
     return Signature(sha256, step.title, figures, meaning) if sha256 else None
 
