@@ -119,7 +119,7 @@ def test_deviations_come_before_everything_else(report: Report) -> None:
         "camera: the camera does not answer",
         "environment.light_lux: 0 → 800",
         "the meter was covered",
-        "1 attempts at steps and 0 single views were replaced",
+        "Replaced by later ones: attempts at steps 1, single views 0.",
     ):
         assert text in section, text
 

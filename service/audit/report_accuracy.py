@@ -26,8 +26,8 @@ _PAPER = {
 _SOURCES = {
     "robot": "the robot's poses as reported",
     "robot_corrected": "the robot's poses, its errors corrected",
-    "colmap": "structure from motion, incremental (COLMAP)",
-    "glomap": "structure from motion, global (GLOMAP)",
+    "colmap": "incremental structure from motion, COLMAP",
+    "glomap": "global structure from motion, GLOMAP",
     "hybrid": "structure from motion, robot and spheres adjusted together",
 }
 

@@ -10,7 +10,7 @@ from service.audit.report_accuracy import accuracy_section, budget_section, resu
 from service.audit.report_blocks import Cell, Facts, Report
 from service.audit.report_certificates import certificate_sections
 from service.audit.report_course import deviations, deviations_section, people_section, steps_section
-from service.audit.report_origin import devices_section, pictures_section, scene_section, software_section
+from service.audit.report_origin import devices_section, pictures_section, software_section
 from service.audit.report_verification import verification_section
 from service.audit.report_words import duration, utc
 from service.dataset.summary import RunSummary
@@ -45,8 +45,7 @@ def report_content(
         people_section(run),
         *certificate_sections(run),
         devices_section(run),
-        pictures_section(run),
-        scene_section(summary) if with_scene else None,
+        pictures_section(run, with_scene=with_scene),
         verification_section(run, audit),
         software_section(run),
     ]

@@ -97,7 +97,7 @@ def deviations_section(run: RecordedRun, listed: Sequence[Departure]) -> Section
     retaken = [past for past in run.state.superseded if past.viewpoint is not None]
     redone = [past for past in run.state.superseded if past.viewpoint is None]
     if retaken or redone:
-        counted = f"{len(redone)} attempts at steps and {len(retaken)} single views were replaced by later ones."
+        counted = f"Replaced by later ones: attempts at steps {len(redone)}, single views {len(retaken)}."
         blocks.append(Paragraph(f"{counted} Their evidence was kept and is part of what was verified."))
     return Section("Deviations", tuple(blocks))
 

@@ -12,6 +12,7 @@ from service.audit.report_blocks import Block, Cell, Column, Heading, Paragraph,
 from service.audit.report_pictures import LARGE_PX, THUMBNAIL_PX, picture
 from service.audit.report_words import clock
 from service.compute.budget.closure import Alignment
+from service.core.errors import IntegrityError
 from service.core.model import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
 from service.dataset.summary import RunSummary
 
@@ -69,8 +70,8 @@ def _environment(captures: list[ViewpointCaptured]) -> str:
     return f" Meanwhile: {', '.join(parts)}." if parts else ""
 
 
-def pictures_section(run: RecordedRun) -> Section:
-    """Overlays of the evaluation, then a contact sheet of every capture that counts."""
+def pictures_section(run: RecordedRun, *, with_scene: bool) -> Section:
+    """Overlays of the evaluation, the scene in 3D, then a contact sheet of every capture that counts."""
     blocks: list[Block] = []
     overlays = run.summary().artefacts("overlay")
     if overlays:
@@ -82,6 +83,9 @@ def pictures_section(run: RecordedRun) -> Section:
             ),
             Pictures(tuple(picture(run, ref.sha256, ref.original_name, LARGE_PX) for ref in overlays), 2),
         ]
+    scene = _scene(run.summary()) if with_scene else None
+    if scene is not None:
+        blocks += [Heading("Cameras and mesh in one frame"), scene]
     for step in run.protocol.steps:
         seqs = sorted(run.state.steps[step.id].captured.values())
         captures = [run.events[seq - 1].payload for seq in seqs]
@@ -100,7 +104,7 @@ def _caption(capture: ViewpointCaptured) -> str:
     return capture.viewpoint + (f" ✗ {', '.join(failed)}" if failed else "")
 
 
-def scene_section(summary: RunSummary) -> Section | None:
+def _scene(summary: RunSummary) -> Scene | None:
     """Cameras, spheres and mesh in one frame; None where there is no registration."""
     # plotly and the decimation are only for this: the PDF need not wait for them.
     from service.dataset import scene_view  # noqa: PLC0415
@@ -109,6 +113,10 @@ def scene_section(summary: RunSummary) -> Section | None:
     spheres = summary.result("scan_import").get("spheres_m")
     if best not in registrations or spheres is None or not summary.artefacts("scan_mesh"):
         return None
+    try:
+        summary.store.artefact_path(summary.artefacts("scan_mesh")[-1].sha256, verify=True)
+    except IntegrityError:
+        return None  # the first page says which file it is
     registered = registrations[best]
     points_m, triangles = scene_view.decimated(*summary.scan_mesh())
     placed = Alignment(np.array(registered["T_world_scan"]), np.array(registered["covariance"])[:6, :6])
@@ -122,7 +130,7 @@ def scene_section(summary: RunSummary) -> Section | None:
         mesh=scene_view.SceneMesh(points_m, triangles, error_mm),
     )
     text = f"{len(cameras)} cameras, {len(spheres)} spheres and the scan's mesh, coloured by the predicted error."
-    return Section("Cameras and mesh in one frame", (Scene(scene_view.scene_html(scene), text),))
+    return Scene(scene_view.scene_html(scene), text)
 
 
 def software_section(run: RecordedRun) -> Section:

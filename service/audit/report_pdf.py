@@ -180,8 +180,6 @@ def _front(report: Report, styles: _Styles) -> Iterator[Flowable]:
 
 
 def _section(section: Section, number: int, styles: _Styles) -> Iterator[Flowable]:
-    if all(isinstance(block, Scene) for block in section.blocks):
-        return
     yield CondPageBreak(45 * mm)
     yield Spacer(1, 6 * mm)
     yield Text(f"{number}&nbsp;&nbsp;{escape(section.title)}", styles.style(13, "bold", keepWithNext=1))

@@ -80,16 +80,26 @@ def record_reported_run(folder: Path, *, error_mm: float = 0.213, person: str = 
         run.add(StepPassed(step="calibration", attempt=1), StepStarted(step="capture", attempt=1))
         run.capture(1, "v001")
         run.add(DeviceTrouble(device="camera", error="TransportError", message="the camera does not answer"))
-        failed = {"viewpoint": "v002", "error": "CameraError", "message": "no file arrived"}
-        run.add(ViewpointFailed(step="capture", attempt=1, skipped=True, **failed))
+        run.add(
+            ViewpointFailed(
+                step="capture",
+                attempt=1,
+                viewpoint="v002",
+                error="CameraError",
+                message="no file arrived",
+                skipped=True,
+            )
+        )
         run.measure("capture", 1, {"viewpoints_captured": 1.0, "optics_departures": 0.0}, {})
         run.act("redo", step="capture", reason="the cable was loose")
         run.add(StepStarted(step="capture", attempt=2))
         for viewpoint in ("v001", "v002"):
             run.capture(2, viewpoint)
         run.measure("capture", 2, {"viewpoints_captured": 2.0, "optics_departures": 0.0}, {})
-        correction = {"field": "environment.light_lux", "old": 0.0, "new": 800.0, "reason": "the meter was covered"}
-        run.add(RecordCorrected(of_seq=8, **correction), actor=person)
+        correction = RecordCorrected(
+            of_seq=8, field="environment.light_lux", old=0.0, new=800.0, reason="the meter was covered"
+        )
+        run.add(correction, actor=person)
         run.add(StepPassed(step="capture", attempt=2), StepStarted(step="evaluation", attempt=1))
         judged = run.measure("evaluation", 1, {"best_mean_radial_error_mm": error_mm}, evaluation(error_mm))
         if error_mm > 0.35:  # the gate has failed: nobody can sign, and the run waits
