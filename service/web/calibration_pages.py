@@ -2,6 +2,95 @@
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from typing import Annotated, Any
 
-router = APIRouter()
+from fastapi import APIRouter, Depends, Path, Request
+from fastapi.responses import HTMLResponse
+
+from service.core.errors import IllegalTransitionError
+from service.evidence import RunLog
+from service.web.calibration_view import (
+    Calibration,
+    calibration_of,
+    certificate_of,
+    charts_of,
+    hand_eye_chart,
+    held_out_mm,
+    image_rows,
+)
+from service.web.pages import render
+from service.web.run_frame import run_frame
+from service.web.run_words import limit, measure_name, number
+from service.web.security import requires
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["calibration"])
+
+_WORDS: dict[str, Any] = {"measure_name": measure_name, "number": number, "limit": limit}
+RunId = Annotated[str, Path(max_length=64)]
+
+
+@router.get("/runs/{run_id}/calibration", name="calibration", dependencies=[Depends(requires("read"))])
+def calibration(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
+    """Whether the calibration is good, in pixels and in millimetres, and what would make it better."""
+    log = site.run(run_id)
+    found = calibration_of(log)
+    context: dict[str, Any] = {**_WORDS, "run_id": run_id, "found": found, "frame": run_frame(site, run_id)}
+    if found is not None:
+        context |= {
+            "charts": charts_of(found),
+            "hand_eye_chart": hand_eye_chart(found),
+            "images": image_rows(found),
+            "held_out": held_out_mm(found),
+            **_advice(site, log, found),
+        }
+    return render(request, "calibration.html.j2", **context)
+
+
+@router.get(
+    "/runs/{run_id}/calibration/certificate",
+    name="calibration_certificate",
+    dependencies=[Depends(requires("read"))],
+)
+def certificate(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
+    """The calibration on a page to print."""
+    log = site.run(run_id)
+    found = calibration_of(log)
+    if found is None:
+        raise IllegalTransitionError(
+            "there is no calibration to certify yet", where=run_id, remedy="Finish the calibration step first"
+        )
+    return render(
+        request,
+        "certificate.html.j2",
+        frame=run_frame(site, run_id),
+        run_id=run_id,
+        found=found,
+        held_out=held_out_mm(found),
+        certificate=certificate_of(log, found),
+        simulated=log.state.simulated,
+        head=log.events[-1],
+        **_WORDS,
+    )
+
+
+def _advice(site: Site, log: RunLog, found: Calibration) -> dict[str, object]:
+    # The planning of poses brings scipy, which the start of the service does not wait for.
+    from service.web.board_advice import advised_poses, empty_regions  # noqa: PLC0415
+    from service.web.planned import recorded_rig  # noqa: PLC0415
+
+    regions = [] if found.intrinsics is None else empty_regions(found.intrinsics["coverage"]["corners"])
+    board = log.protocol.board
+    if found.hand_eye is None or found.best is None or board is None or found.artefact is None:
+        return {"regions": regions, "poses": ()}
+    used = set(found.best["residuals"]["mm"])
+    poses = advised_poses(
+        found.hand_eye,
+        found.camera,
+        [capture for capture in found.captures if capture.viewpoint in used],
+        board,
+        recorded_rig(log).collision.arm or "",
+        site.data,
+        found.artefact.sha256,
+    )
+    return {"regions": regions, "poses": poses}

@@ -40,7 +40,7 @@ class Station:
 
 def station_of(log: RunLog, name: str) -> Station | None:
     """Of the rig as it was when the run began; None when it has no such station."""
-    section = _recorded_rig(log)
+    section = recorded_rig(log)
     there = section.stations.get(name)
     if there is None:
         return None
@@ -79,7 +79,7 @@ def place(T_base_camera: Transform) -> tuple[Vector, Vector]:
 
 def nominal_T_flange_camera(log: RunLog) -> tuple[tuple[float, float, float, float], ...] | None:
     """The drawing of the camera's mount."""
-    return _recorded_rig(log).T_flange_camera_nominal
+    return recorded_rig(log).T_flange_camera_nominal
 
 
 def _vector(values: Transform) -> Vector:
@@ -87,7 +87,8 @@ def _vector(values: Transform) -> Vector:
     return x, y, z
 
 
-def _recorded_rig(log: RunLog) -> RigSection:
+def recorded_rig(log: RunLog) -> RigSection:
+    """The rig file as it was when the run began."""
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # the log was read the same way
     return _rig_section(log.store.artefact_path(root.rig.sha256))
