@@ -88,6 +88,7 @@
     const fresh = document.createElement("template");
     fresh.innerHTML = await answer.text();
     if (!part.isConnected) return;
+    for (const without of fresh.content.querySelectorAll("noscript")) without.replaceChildren(); // a template shows it
     mergeChildren(part, fresh.content);
     part.dispatchEvent(new CustomEvent("part-changed", { bubbles: true }));
   }
