@@ -1,0 +1,104 @@
+"""Exports one thing in a process of its own, so that pages stay quick: `python -m service.audit.export_process`.
+
+Its progress goes out line by line, its result last, as JSON. It ends the export whether or not anybody listens.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from service.audit.bundle import export_bundle, marked_name, record_export, require_exportable
+from service.audit.bundle_zip import writing_bundle
+from service.audit.recorded import RecordedRun, read_run
+from service.core.errors import ConfigurationError, OrthocaptureError
+from service.store.artefacts import chunks_of
+from service.store.audit import verify
+from service.store.store import Store
+
+Progress = Callable[[str, int, int], None]
+_OLDEST = (1980, 1, 1, 0, 0, 0)  # zip knows no earlier time; the files say themselves what they are of
+
+
+def export(data: Path, run_id: str, what: str, target: Path, actor: str, progress: Progress) -> Path:
+    """Make a bundle, a data set or a report, and record that it was exported. The file as it was named.
+
+    Raises OrthocaptureError: the evidence does not verify, nothing was released, there is nothing to export …
+    """
+    with Store.open(data, create=False) as store:
+        if what in ("bundle", "hashes"):
+            made = export_bundle(store, run_id, target, actor=actor, hashes_only=what == "hashes", progress=progress)
+            return made.path
+        require_exportable(store, run_id, progress)
+        run = read_run(data, run_id)
+        path = target.with_name(marked_name(target.name, simulated=run.root.simulated))
+        progress("writing", 0, 0)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
+            part = Path(folder) / "part"
+            if what == "dataset":
+                _write_dataset(run, part, path)
+            elif what in ("report", "report_pdf"):
+                _write_report(run, part, pdf=what == "report_pdf")
+                part.replace(path)
+            else:
+                raise ConfigurationError(f"nothing is called {what!r}", where="what")
+        kind = "dataset" if what == "dataset" else "report"
+        record_export(store, run_id, path, what=kind, head_sha256=run.events[-1].sha256, actor=actor)
+        return path
+
+
+def _write_dataset(run: RecordedRun, folder: Path, target: Path) -> None:
+    from service.dataset.export import export_dataset  # noqa: PLC0415  # loads the numerics; a bundle needs none
+
+    export_dataset(run.summary(), folder)
+    with writing_bundle(target, _OLDEST) as archive:
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+            compress = path.suffix.lower() not in (".jpg", ".jpeg", ".png", ".npz")
+            archive.add(path.relative_to(folder).as_posix(), chunks_of(path), compress=compress)
+
+
+def _write_report(run: RecordedRun, path: Path, *, pdf: bool) -> None:
+    # These load the numerics and the typesetting, which a bundle does without.
+    from service.audit.report_content import report_content  # noqa: PLC0415
+    from service.audit.report_html import write_html  # noqa: PLC0415
+    from service.audit.report_pdf import write_pdf  # noqa: PLC0415
+
+    (write_pdf if pdf else write_html)(report_content(run, verify(run.data_dir, run.run_id)), path)
+
+
+def main(arguments: list[str]) -> None:
+    """Write the lines."""
+    data, run_id, what, target, actor = arguments
+    listening = True
+    last = 0.0
+
+    def say(**line: Any) -> None:
+        nonlocal listening
+        try:
+            if listening:
+                sys.stdout.write(json.dumps(line) + "\n")
+                sys.stdout.flush()
+        except BrokenPipeError:  # the web process was restarted: the export goes on
+            listening = False
+
+    def progress(doing: str, done: int, total: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > 0.2:
+            last = time.monotonic()
+            say(what=doing, done=done, total=total)
+
+    try:
+        made = export(Path(data), run_id, what, Path(target), actor, progress)
+    except OrthocaptureError as error:
+        say(problem={"what": error.what, "where": error.where, "remedy": error.remedy})
+    else:
+        say(result=made.name)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
