@@ -371,7 +371,7 @@ def seqs_of_kind(
     found = connection.execute(
         text(
             "SELECT seq FROM event_index WHERE run_id = :run AND kind IN (SELECT value FROM json_each(:kinds)) "
-            f"ORDER BY seq {order} LIMIT :limit"
+            f"ORDER BY +seq {order} LIMIT :limit"  # by kind first: those are few
         ),
         {"run": plain(run_id), "kinds": json.dumps(list(kinds)), "limit": limit},
     ).scalars()
