@@ -187,6 +187,14 @@ def test_a_sign_in_ends_after_twelve_hours_however_busy(office: Office) -> None:
     assert office.outcomes("grace")[-1] == "ended"
 
 
+def test_sign_ins_that_nobody_came_back_to_end_in_the_record_too(office: Office) -> None:
+    office.enter("grace")
+    office.clock.passed_s = 12 * 3600
+    office.enter("emmy")
+    assert office.people.screens("grace") == []
+    assert office.outcomes("grace") == ["signed_in", "ended"]
+
+
 def test_refusals_are_the_same_words_whatever_the_cause(office: Office) -> None:
     _, administrator = office.enter("ada")
     office.people.accounts.disable(administrator, "lise", "left the house")

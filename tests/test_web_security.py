@@ -161,10 +161,10 @@ def test_nobody_is_sent_elsewhere_after_signing_in(site: WebSite, elsewhere: str
 
 def test_after_signing_in_the_page_that_was_asked_for(site: WebSite, run_id: str) -> None:
     browser = site.browser()
-    asked = browser.get(f"/runs/{run_id}", follow_redirects=False).headers["location"]
+    asked = browser.get(f"/runs/{run_id}?step=capture", follow_redirects=False).headers["location"]
     page = browser.get(asked).text
     (following,) = re.findall(r'name="next" value="([^"]*)"', page)
-    assert browser.sign_in("grace", next=following).headers["location"] == f"/runs/{run_id}"
+    assert browser.sign_in("grace", next=following).headers["location"] == f"/runs/{run_id}?step=capture"
 
 
 # --- one-time links ------------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def test_after_signing_in_the_page_that_was_asked_for(site: WebSite, run_id: str
 def test_an_invitation_is_shown_once_and_works_once(site: WebSite) -> None:
     administrator, newcomer = site.browser("administrator"), site.browser()
     page = administrator.send_form("/accounts", account="mary", full_name="Mary <b>Shelley", role="auditor")
-    (link,) = re.findall(r'value="(https://testserver/set-up/[^"]+)"', page.text)
+    (link,) = re.findall(r">(https://testserver/set-up/[^<]+)<", page.text)
     assert "<b>" not in page.text
     assert link.rsplit("/", 1)[1] not in administrator.get("/accounts/mary").text
     assert "Mary" in newcomer.get(link).text
@@ -361,7 +361,7 @@ def test_generated_requests_never_break_the_server(
 
             @seed(7)
             @settings(
-                max_examples=4,
+                max_examples=3,
                 deadline=None,
                 database=None,
                 phases=[Phase.generate],

@@ -61,6 +61,7 @@ class People:
             with self._store.database.writing() as connection:
                 self._require_unchanged(connection, row)
                 self._end(connection, replaces)
+                self._end_expired(connection, now)
                 screen = "".join(secrets.choice(_SCREEN_LETTERS) for _ in range(6))
                 connection.execute(
                     insert(sessions).values(
@@ -270,6 +271,12 @@ class People:
         )
         if changed.rowcount:
             record_sign_in(self._store, connection, "screen_locked", account=account, screen=screen, actor=actor)
+
+    def _end_expired(self, connection: Connection, now: float) -> None:
+        expired = sessions.c.created_utc_s <= now - SESSION_S
+        for row in connection.execute(select(sessions.c.account, sessions.c.screen).where(expired)).all():
+            record_sign_in(self._store, connection, "ended", account=row.account, screen=row.screen)
+        connection.execute(delete(sessions).where(expired))
 
     def _end(self, connection: Connection, token: str) -> None:
         row = self._session(connection, token) if token else None

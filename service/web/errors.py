@@ -91,7 +91,7 @@ def _expected(request: Request, error: Exception) -> Response:
     if not isinstance(error, OrthocaptureError):
         raise error
     if isinstance(error, people.NotSignedInError) and request.method == "GET" and not wants_json(request):
-        return RedirectResponse(f"/sign-in?next={quote(request.url.path, safe='/')}", status_code=303)
+        return RedirectResponse(f"/sign-in?next={quote(_asked_for(request), safe='/')}", status_code=303)
     safe = (
         "Do not go on before this is understood: evidence does not verify. Nothing was changed."
         if isinstance(error, IntegrityError)
@@ -100,6 +100,11 @@ def _expected(request: Request, error: Exception) -> Response:
     problem = Problem(status_of(error), error.what, error.where, error.remedy, safe)
     headers = {"Retry-After": f"{error.wait_s:.0f}"} if isinstance(error, people.TooManyTriesError) else None
     return respond(request, problem, headers)
+
+
+def _asked_for(request: Request) -> str:
+    address = f"{request.url.path}?{request.url.query}" if request.url.query else request.url.path
+    return address if len(address) <= 400 else "/"
 
 
 def _invalid(request: Request, error: Exception) -> Response:
