@@ -11,15 +11,17 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.audit.bundle import export_bundle, marked_name, record_export, require_exportable
 from service.audit.bundle_zip import writing_bundle
-from service.audit.recorded import RecordedRun, read_run
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.store.artefacts import chunks_of
 from service.store.audit import verify
 from service.store.store import Store
+
+if TYPE_CHECKING:
+    from service.audit.recorded import RecordedRun
 
 Progress = Callable[[str, int, int], None]
 _OLDEST = (1980, 1, 1, 0, 0, 0)  # zip knows no earlier time; the files say themselves what they are of
@@ -35,6 +37,9 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
             made = export_bundle(store, run_id, target, actor=actor, hashes_only=what == "hashes", progress=progress)
             return made.path
         require_exportable(store, run_id, progress)
+        # These load the numerics and the typesetting, which a bundle does without.
+        from service.audit.recorded import read_run  # noqa: PLC0415
+
         run = read_run(data, run_id)
         path = target.with_name(marked_name(target.name, simulated=run.root.simulated))
         progress("writing", 0, 0)
@@ -53,7 +58,7 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
 
 
 def _write_dataset(run: RecordedRun, folder: Path, target: Path) -> None:
-    from service.dataset.export import export_dataset  # noqa: PLC0415  # loads the numerics; a bundle needs none
+    from service.dataset.export import export_dataset  # noqa: PLC0415
 
     export_dataset(run.summary(), folder)
     with writing_bundle(target, _OLDEST) as archive:
@@ -63,7 +68,6 @@ def _write_dataset(run: RecordedRun, folder: Path, target: Path) -> None:
 
 
 def _write_report(run: RecordedRun, path: Path, *, pdf: bool) -> None:
-    # These load the numerics and the typesetting, which a bundle does without.
     from service.audit.report_content import report_content  # noqa: PLC0415
     from service.audit.report_html import write_html  # noqa: PLC0415
     from service.audit.report_pdf import write_pdf  # noqa: PLC0415
