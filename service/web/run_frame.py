@@ -48,6 +48,7 @@ class RunFrame:
     protocol_sha256: str
     simulated: bool
     live: bool  # not ended: news may come
+    pausable: bool
     banner: Banner
     tabs: tuple[Tab, ...]
 
@@ -58,6 +59,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # site.run has read it the same way
     here = f"/runs/{run_id}"
+    driven = site.launcher.driven(run_id)
     return RunFrame(
         run_id=run_id,
         name=run_id,
@@ -66,7 +68,8 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
         protocol_sha256=root.protocol_sha256,
         simulated=root.simulated,
         live=not log.state.terminal,
-        banner=robot_banner(log.state, read_snapshot(site.data, run_id), driven=site.launcher.driven(run_id)),
+        pausable=log.state.status == "active" and driven,
+        banner=robot_banner(log.state, read_snapshot(site.data, run_id), driven=driven),
         tabs=(
             Tab(here, "Step"),
             Tab(f"{here}/capture", "Capture"),

@@ -15,7 +15,7 @@ from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Person
 from service.web.pages import render
-from service.web.run_frame import robot_banner, run_frame
+from service.web.run_frame import run_frame
 from service.web.run_view import Looker, run_view
 from service.web.security import Signed, requires
 from service.web.site import Here, Site
@@ -42,9 +42,7 @@ def run_part(
 ) -> HTMLResponse:
     """One part of the page, for the script that keeps it up to date."""
     if name == "banner":
-        log = site.run(run_id)
-        snapshot, driven = read_snapshot(site.data, run_id), site.launcher.driven(run_id)
-        return render(request, "banner.html.j2", b=robot_banner(log.state, snapshot, driven=driven))
+        return render(request, "banner.html.j2", of_run=run_frame(site, run_id))
     return render(request, f"run_{name}.html.j2", **_shown(site, person, run_id, step))
 
 

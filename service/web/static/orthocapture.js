@@ -226,6 +226,7 @@
     if (action.pathname === "/theme") return;
     if (action.pathname === "/lock") { showLock(true); return; }
     if (action.pathname === "/unlock") { form.reset(); showLock(false); await refresh(); return; }
+    if (form.hasAttribute("data-stay")) { await refresh(); return; } // pausing: wherever it was asked for
     const target = new URL(answer.url);
     const here = document.querySelector("[data-part]") && target.pathname === location.pathname;
     form.closest("dialog")?.close();
