@@ -61,6 +61,14 @@ class OpticsSection(Record):
     blur_um: Annotated[float, Field(gt=0)] = 45.0  # circle of confusion on the sensor, 12 px of 3.76 µm
 
 
+class TimestampSection(Record):
+    """A time-stamp authority (RFC 3161) asked at the end of every run; without its answer the run ends too."""
+
+    url: Annotated[str, Field(pattern=r"^https?://")]
+    certificates: str  # PEM file beside the rig file: the authority's root, and those between
+    timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0
+
+
 class RigSection(Record):
     """The rig file."""
 
@@ -73,6 +81,7 @@ class RigSection(Record):
     payload: PayloadSection | None = None
     collision: CollisionSection = CollisionSection()
     optics: OpticsSection | None = None  # None: depth of field is not judged
+    timestamp: TimestampSection | None = None  # None: nobody outside is asked
 
 
 @dataclass(frozen=True, slots=True)

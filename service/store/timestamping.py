@@ -21,14 +21,17 @@ from rfc3161_client import (
 )
 from sqlalchemy import insert, select
 
+from service.core.model import DeviceTrouble
 from service.store.audit_checks import Fault
 from service.store.checkpoints import statement
 from service.store.errors import TimestampError
 from service.store.records import Checkpoint, Timestamp
 from service.store.seam import utc_text
+from service.store.signing import checkpoint
 from service.store.store import Store
 from service.store.tables import timestamps
 
+_DEVICE = "time-stamp authority"
 _LARGEST_REPLY = 1 << 20
 _TYPE, _REPLY_TYPE = "application/timestamp-query", "application/timestamp-reply"
 
@@ -89,6 +92,23 @@ def timestamp(store: Store, checkpoint: Checkpoint, authority: Authority) -> Tim
                 )
             )
     return found
+
+
+def stamp_end(store: Store, run_id: str, authority: Authority | None) -> None:
+    """Sign the end of a run, and have that stamped where an authority is configured.
+
+    An authority that does not answer is recorded as a trouble, and that is signed too; nothing is raised for it.
+    Raises StoreError when the checkpoint itself cannot be made.
+    """
+    signed = checkpoint(store, run_id)
+    if authority is None:
+        return
+    try:
+        timestamp(store, signed, authority)
+    except TimestampError as error:
+        trouble = DeviceTrouble(device=_DEVICE, error=type(error).__name__, message=str(error))
+        store.record(run_id, [trouble], actor="service")
+        checkpoint(store, run_id)
 
 
 def timestamp_findings(
