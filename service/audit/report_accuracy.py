@@ -89,7 +89,7 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
         named = row["poses"] + (" (best)" if best else "")
         texts: list[Cell | str] = [
             f"{named}: {_SOURCES.get(row['source'], words(row['source']))}",
-            str(row["resolution"]),
+            str(row["resolution"]).replace(" ", "\N{NO-BREAK SPACE}"),
             f"{row['mean_radial_error_mm']:.3f}",
             f"{row['mean_reprojection_error_px']:.2f}",
             f"{row['predicted_error_mm']:.3f}",

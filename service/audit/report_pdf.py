@@ -26,7 +26,6 @@ from reportlab.platypus import Paragraph as Text
 from reportlab.platypus import Table as Grid
 
 from service.audit.report_blocks import (
-    Block,
     Box,
     Cell,
     Drawing,
@@ -45,6 +44,7 @@ from service.audit.report_blocks import (
     Tone,
 )
 
+_Body = Paragraph | Facts | Table | Pictures | Drawings | Scene  # a block that is no heading
 _MARGIN = 18 * mm
 _WIDTH = A4[0] - 2 * _MARGIN
 _INK, _QUIET, _HAIR, _STRONG = HexColor("#1a1f24"), HexColor("#52606d"), HexColor("#d5dbe1"), HexColor("#f3f6f9")
@@ -180,15 +180,23 @@ def _front(report: Report, styles: _Styles) -> Iterator[Flowable]:
 
 
 def _section(section: Section, number: int, styles: _Styles) -> Iterator[Flowable]:
-    yield CondPageBreak(45 * mm)
-    yield Spacer(1, 6 * mm)
-    yield Text(f"{number}&nbsp;&nbsp;{escape(section.title)}", styles.style(13, "bold", keepWithNext=1))
-    yield Spacer(1, 2.5 * mm)
+    title = Text(f"{number}&nbsp;&nbsp;{escape(section.title)}", styles.style(13, "bold"))
+    headed: list[Flowable] = [Spacer(1, 6 * mm), title, Spacer(1, 2.5 * mm)]
     for block in section.blocks:
-        yield from _block(block, styles)
+        if isinstance(block, Heading):
+            headed += [Spacer(1, 2.5 * mm), Text(escape(block.text), styles.style(9.5, "bold")), Spacer(1, 1.5 * mm)]
+            continue
+        first, *others = _block(block, styles)
+        # A heading stays with what follows it; a long table begins where there is room for some of it.
+        if isinstance(block, Table) and len(block.rows) > _KEPT_ROWS:
+            yield from (CondPageBreak(50 * mm), *headed, first)
+        else:
+            yield KeepTogether([*headed, first]) if headed or isinstance(block, Table) else first
+        yield from others
+        headed = []
 
 
-def _block(block: Block, styles: _Styles) -> Iterator[Flowable]:
+def _block(block: _Body, styles: _Styles) -> Iterator[Flowable]:
     match block:
         case Paragraph(text, "plain"):
             yield Text(escape(text), styles.style(8.5))
@@ -196,17 +204,11 @@ def _block(block: Block, styles: _Styles) -> Iterator[Flowable]:
         case Paragraph(text, tone):
             yield _statement(Cell(text, tone), styles, 8.5)
             yield Spacer(1, 2 * mm)
-        case Heading(text):
-            yield CondPageBreak(50 * mm)
-            yield Spacer(1, 2.5 * mm)
-            yield Text(escape(text), styles.style(9.5, "bold", keepWithNext=1))
-            yield Spacer(1, 1.5 * mm)
         case Facts():
             yield _facts(block, styles)
             yield Spacer(1, 2 * mm)
         case Table():
-            grid = _table(block, styles)
-            yield KeepTogether([grid]) if len(block.rows) <= _KEPT_ROWS else grid
+            yield _table(block, styles)
             yield Spacer(1, 3 * mm)
         case Pictures():
             yield from _pictures(block, styles)
