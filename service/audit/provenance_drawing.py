@@ -12,6 +12,8 @@ _COLUMN = 262
 _ROW = 62
 _MARGIN = 8
 DRAWN = 70  # nodes; a larger graph is read in the list
+# What helps during the capture and leads to no result: among all else it would hide what does.
+_ASIDE = frozenset({"live_view", "live_summary", "coverage_points"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +49,7 @@ class Drawing:
 def draw(graph: Graph) -> Drawing:
     """Columns by the longest way from a source; within a column in the order that keeps the arrows short."""
     ordered = graph.ordered()
-    connected = {key for edge in graph.edges for key in edge}
+    connected = {key for edge in graph.edges for key in edge if graph.nodes[key].kind not in _ASIDE}
     shown = [node for node in ordered if node.key in connected][:DRAWN]
     names = {node.key for node in shown}
     place = {node.key: index for index, node in enumerate(shown)}
