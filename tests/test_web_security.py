@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import httpx
@@ -14,6 +15,8 @@ import schemathesis
 from fastapi.routing import iter_route_contexts
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from schemathesis.checks import not_a_server_error
+from schemathesis.core.result import Ok
+from schemathesis.schemas import APIOperation
 
 from service.people.roles import ROLES, Role, may
 from service.store.records import SITE
@@ -103,7 +106,12 @@ def test_the_policy_of_pages_allows_no_inline_script() -> None:
 
 
 def test_pages_have_no_inline_script_or_style(site: WebSite, run_id: str) -> None:
-    for role, address in (("technician", f"/runs/{run_id}"), ("administrator", "/accounts"), ("auditor", "/account")):
+    pages: tuple[tuple[Role, str], ...] = (
+        ("technician", f"/runs/{run_id}"),
+        ("administrator", "/accounts"),
+        ("auditor", "/account"),
+    )
+    for role, address in pages:
         page = site.browser(role).get(address).text
         assert re.findall(r"<script(?![^>]*\bsrc=)[^>]*>", page) == []
         assert re.findall(r"\s(?:style|on[a-z]+)=\"", page) == []
@@ -355,7 +363,9 @@ def test_generated_requests_never_break_the_server(
     with web_site(tmp_path_factory.mktemp("generated")) as site:
         run_id = site.begin_run().run_id
         schema = schemathesis.openapi.from_dict(site.app.openapi())
-        operations = [result.ok() for result in schema.get_all_operations()]
+        operations: list[APIOperation[Any, Any, Any, Any]] = [
+            result.ok() for result in schema.get_all_operations() if isinstance(result, Ok)
+        ]
         assert len(operations) > 40
         for operation in operations:
 
@@ -365,10 +375,10 @@ def test_generated_requests_never_break_the_server(
                 deadline=None,
                 database=None,
                 phases=[Phase.generate],
-                suppress_health_check=list(HealthCheck),
+                suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],
             )
             @given(case=operation.as_strategy())
-            def one(case: schemathesis.Case) -> None:
+            def one(case: schemathesis.Case[Any]) -> None:
                 if "run_id" in case.path_parameters and case.path not in ("/runs/{run_id}/stream",):
                     case.path_parameters["run_id"] = run_id
                 answer = _send(site, run_id, role, case)
@@ -378,7 +388,7 @@ def test_generated_requests_never_break_the_server(
             one()
 
 
-def _send(site: WebSite, run_id: str, role: Role | None, case: schemathesis.Case) -> httpx.Response:
+def _send(site: WebSite, run_id: str, role: Role | None, case: schemathesis.Case[Any]) -> httpx.Response:
     browser = _screen(site, run_id, role)
     sent = case.as_transport_kwargs(base_url=HOST)
     headers = {**(sent.get("headers") or {})}
