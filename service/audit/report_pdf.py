@@ -343,7 +343,8 @@ def _drawings(drawings: Drawings, styles: _Styles) -> Iterator[Flowable]:
                 ("RIGHTPADDING", (0, 0), (-1, -1), 12),
             ]
         )
-        yield KeepTogether([grid, Spacer(1, 3 * mm)])
+        yield grid
+        yield Spacer(1, 3 * mm)
 
 
 def _sheet(drawing: Drawing, width: float, styles: _Styles) -> Sheet:

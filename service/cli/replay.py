@@ -123,16 +123,16 @@ def _print(report: ReplayReport) -> None:
             console.print(f"  {escape(change.name)} {change.recorded or 'none'} → {change.now or 'none'}")
     else:
         console.print("Every installed distribution has the version that was recorded.")
-    table = Table(title="Computed again", title_justify="left")
-    for heading in ("step", "job", "", "files", "took"):
-        table.add_column(heading, justify="right" if heading == "took" else "left")
+    table = Table(box=None, pad_edge=False)
+    for heading in ("step", "computed again", "comes out", "files the same", "took"):
+        table.add_column(heading, justify="right" if heading == "took" else "left", overflow="fold")
     for job in report.jobs:
         same = sum(artefact.recorded_sha256 == artefact.recomputed_sha256 for artefact in job.artefacts)
         table.add_row(
             job.step,
-            f"{job.kind} {job.label}".strip(),
+            " ".join(filter(None, (job.kind.replace("_", " "), job.label))),
             _WORDS[job.verdict],
-            f"{same} of {len(job.artefacts)} the same" if job.artefacts else "",
+            f"{same} of {len(job.artefacts)}" if job.artefacts else "",
             f"{job.duration_s:.1f} s",
         )
     console.print(table)
