@@ -126,7 +126,9 @@ def scene_figure(scene: Scene) -> dict[str, Any]:
     for i, station in enumerate(names):
         colour, symbol = _STYLES[i % len(_STYLES)]
         data += _cameras(scene, station, to_view, colour, symbol)
-        mine = [T for name, T in (*scene.cameras.items(), *scene.planned.items()) if scene.stations[name] == station]
+        mine = [
+            T for name, T in (*scene.cameras.items(), *scene.planned.items()) if scene.stations.get(name) == station
+        ]
         mm(np.array([T[:3, 3] for T in mine]))
         if station in scene.bases:
             data.append(_base(mm(scene.bases[station][None, :3, 3]), station, colour))
@@ -228,6 +230,7 @@ def _cameras(scene: Scene, station: str, to_view: Transform, colour: str, symbol
         if not mine:
             continue
         title = f"{what} of {station}" if what == "cameras" else f"still to be taken at {station}"
+        title = title if station else what
         line = {"color": colour, "width": 3}
         frusta = {"mode": "lines", "name": title, "line": line, "hoverinfo": "skip", "opacity": opacity}
         out.append({"type": "scatter3d", **frusta, **_xyz(_frusta(list(mine.values())))})

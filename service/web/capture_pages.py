@@ -75,6 +75,7 @@ def _shown(
 ) -> dict[str, Any]:
     # The planning of viewpoints brings scipy, which the start of the service does not wait for.
     from service.web import capture_view, plan_drawing, planned  # noqa: PLC0415
+    from service.web.spheres import best_registration  # noqa: PLC0415
 
     log = site.run(run_id)
     common = {"run_id": run_id, "steps": capture_view.capture_steps(log.protocol), "log": log}
@@ -124,6 +125,7 @@ def _shown(
         "pages": pages,
         "advice": advice,
         "suggestions": suggestions,
+        "registered": best_registration(log) is not None and (chosen is None or chosen.replaced is None),
         "following": not viewpoint and not seq,
         "query": {"step": step.id, "viewpoint": viewpoint, "seq": seq, "replaced": replaced, "plain": plain},
     }

@@ -79,7 +79,8 @@ def _registered(log: RunLog, registered: Registered) -> SceneNow:
     seen = {label: int(row[2]) for label, row in left_out.get("spheres", {}).items()}
     scene = Scene(
         cameras=cameras,
-        stations={c.viewpoint: c.station for c in _all_captures(log) if c.viewpoint in cameras},
+        stations=dict.fromkeys(cameras, "")
+        | {c.viewpoint: c.station for c in _all_captures(log) if c.viewpoint in cameras},
         spheres=[SceneSphere(s.label, s.kind, s.centre_m) for s in spheres],
         radius_m=log.protocol.spheres.radius_mm / 1000,
         bases=bases,

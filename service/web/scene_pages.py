@@ -40,7 +40,14 @@ def scene(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
 
     log = site.run(run_id)
     tables = scene_tables(log, site.data)
-    return render(request, "scene.html.j2", frame=run_frame(site, run_id), run_id=run_id, tables=tables)
+    return render(
+        request,
+        "scene.html.j2",
+        frame=run_frame(site, run_id),
+        run_id=run_id,
+        tables=tables,
+        live=not log.state.terminal,
+    )
 
 
 @router.get("/runs/{run_id}/scene/frame", name="scene_frame", dependencies=[Depends(requires("read"))])
@@ -52,7 +59,7 @@ def scene_frame(request: Request, site: Here, run_id: RunId, theme: Theme = "aut
     log = site.run(run_id)
     now = scene_of(log)
     figure = scene_figure(with_mesh(now, log, site.data))
-    views = sorted({*now.scene.stations.values(), *now.scene.bases})
+    views = sorted(now.scene.bases)
     response = render(
         request, "scene_frame.html.j2", figure=figure_json(figure), theme=theme, stations=views, title="Scene in 3D"
     )

@@ -1,0 +1,149 @@
+"""A run that has calibrated camera and hand-eye on board corners with noise, computed as the worker does."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import cv2
+import numpy as np
+
+from service.compute.calibration.board import BoardView
+from service.compute.calibration.hand_eye import calibrate_hand_eye
+from service.compute.calibration.hand_eye_record import hand_eye_record
+from service.compute.calibration.intrinsics import calibrate_intrinsics
+from service.compute.calibration.intrinsics_record import intrinsics_record
+from service.compute.calibration.uncertainty import board_distance_m, projection_uncertainty
+from service.compute.calibration.validation import calibration_warnings, cross_validate
+from service.core.gates import evaluate_gates
+from service.core.model import ArtefactRef, DeviceOpened, StepMeasured, StepPassed, StepStarted, ViewpointCaptured
+from service.core.protocol import parse_protocol
+from service.rig import load_rig
+from service.runs import start_run
+from service.steps import params_models
+from service.store.records import NewArtefact
+from tests.support.board_sessions import BOARD, noisy_session
+from tests.support.web import WebSite
+
+RIG = """\
+name: small
+simulated: true
+devices: {robot: {driver: ur, host: 127.0.0.1}}
+stations:
+  station_1: {robot: robot, scene_centre_m: [0.5, 0.1, 0.0], approach_azimuth_deg: 180}
+T_flange_camera_nominal: [[1, 0, 0, 0], [0, 1, 0, -0.06], [0, 0, 1, 0.09], [0, 0, 0, 1]]
+"""
+PROTOCOL = f"""\
+id: calibrated
+version: "1"
+title: A calibration and what comes after it
+spheres: {{radius_mm: 15, registration: 10}}
+board: {{columns: {BOARD.columns}, rows: {BOARD.rows}, square_mm: {1000 * BOARD.square_m:g}}}
+camera: {{aperture_f: 22, exposure_s: 1/50, iso: 100}}
+steps:
+  - id: calibration
+    kind: calibration
+    title: Calibrate camera and hand-eye
+    confirm: false
+    params: {{solve: [intrinsics, hand_eye]}}
+    gates:
+      - {{measure: rms_px, max: 0.5, unit: px}}
+      - {{measure: hand_eye_held_out_mm, max: 5, unit: mm}}
+  - id: capture
+    kind: viewpoint_capture
+    title: Capture
+    confirm: false
+    params:
+      purpose: dataset
+      viewpoints:
+        - station: station_1
+          prefix: v1_
+          arcs: [{{tilt_deg: 20, azimuth_from_deg: -50, azimuth_to_deg: 50, count: 4, distance_m: 0.6}}]
+"""
+VIEWS = 10
+
+
+def begin_calibrated_run(site: WebSite) -> str:
+    """Calibrated, and the step after it under way with no image yet; the run's name."""
+    rig = site.folder / "small.yaml"
+    rig.write_text(RIG)
+    loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="calibrated.yaml")
+    store = site.store
+    run_id = start_run(store, loaded, load_rig(rig), operator="grace", auto_confirm=False)
+    identity = {"kind": "robot", "model": "UR10e", "serial": "20231"}
+    store.record(run_id, [DeviceOpened(device="robot", report={"identity": identity})], actor="runner")
+    store.record(run_id, [StepStarted(step="calibration", attempt=1)], actor="runner")
+    session = noisy_session(VIEWS, 0.05, 0.01, 3)
+    names = [f"b{i:03d}" for i in range(VIEWS)]
+    for i, name in enumerate(names):
+        capture(site, run_id, "calibration", name, session.T_base_flange[i].tolist(), kind="board_image", shade=i)
+    every = np.arange(len(session.corners.points_m))
+    views = [BoardView(every, pixels) for pixels in session.corners.corners_px]
+    camera = session.corners.camera
+    solved = calibrate_intrinsics(views, BOARD, (camera.width, camera.height))
+    validation = cross_validate(solved)
+    uncertainty = projection_uncertainty(solved, board_distance_m(solved))
+    warnings = calibration_warnings(solved, validation, uncertainty)
+    hands = calibrate_hand_eye(session.T_base_flange, session.T_camera_board, corners=session.corners, bootstrap=10)
+    hand_eye = hand_eye_record(hands, names)
+    result: dict[str, Any] = {
+        "camera": solved.camera.record(),
+        "T_flange_camera": hand_eye["T_flange_camera"],
+        "T_base_board": hand_eye["T_base_board"],
+        "hand_eye": hand_eye,
+        "robots": ["robot"],
+        "details": {"intrinsics": intrinsics_record(solved, validation, uncertainty, warnings, names, {})},
+    }
+    measures = {"rms_px": solved.rms_px, "hand_eye_held_out_mm": float(np.median(hands.held_out_mm))}
+    ref = _put(site, json.dumps(result).encode(), "calibration", "application/json", "calibration.json")
+    measured = StepMeasured(step="calibration", attempt=1, measures=measures, artefacts=(ref,), result=result)
+    store.record(run_id, [measured], actor="runner", artefacts=[NewArtefact(ref, "worker", "calibration", 1)])
+    gates = evaluate_gates(loaded.protocol.step("calibration"), 1, measures)
+    store.record(run_id, [gates, StepPassed(step="calibration", attempt=1)], actor="runner")
+    store.record(run_id, [StepStarted(step="capture", attempt=1)], actor="runner")
+    return run_id
+
+
+def capture(
+    site: WebSite,
+    run_id: str,
+    step: str,
+    viewpoint: str,
+    T_base_flange: Any,
+    *,
+    kind: str = "image",
+    shade: int = 0,
+    name: str = "DSC00001.JPG",
+) -> str:
+    """One exposure in the record; the photograph's hash."""
+    pixels = np.full((600, 900, 3), 40 + 5 * shade, np.uint8)
+    cv2.putText(pixels, viewpoint, (40, 300), cv2.FONT_HERSHEY_SIMPLEX, 4, (255, 255, 255), 8)
+    ref = _put(site, cv2.imencode(".jpg", pixels)[1].tobytes(), kind, "image/jpeg", name)
+    payload = ViewpointCaptured(
+        step=step,
+        attempt=1,
+        viewpoint=viewpoint,
+        station="station_1",
+        artefacts=(ref,),
+        T_base_flange=tuple(map(tuple, T_base_flange)),
+        pose_sigma_m=2e-6,
+        pose_sigma_rad=1e-6,
+        joints_rad=(0.0,) * 6,
+        pose_samples=10,
+        trigger_monotonic_s=1.0,
+        arrival_monotonic_s=2.0,
+        controller_time_s=3.0,
+        clock_offset_s=0.0,
+        camera={"lens": "FE 50mm", "aperture_f": 22.0, "exposure_s": 0.02, "iso": 100, "width": 900, "height": 600,
+                "focus_mode": "Manual", "focal_length_mm": 50.0, "focus_distance_m": 0.7, "lens_serial": "L-17",
+                "body_serial": "B-4"},
+        environment={"light_lux": 800.0, "temperature_c": 21.5},
+        verdicts={"still": True, "settings": True},
+    )  # fmt: skip
+    row = NewArtefact(ref, "camera", step, 1, viewpoint)
+    site.store.record(run_id, [payload], actor="runner", artefacts=[row])
+    return ref.sha256
+
+
+def _put(site: WebSite, data: bytes, kind: str, media_type: str, name: str) -> ArtefactRef:
+    return site.store.put_bytes(data, kind=kind, media_type=media_type, original_name=name)
