@@ -23,8 +23,8 @@ router = APIRouter(tags=["exports"])
 
 RunId = Annotated[str, Path(max_length=64)]
 MEANINGS = (
-    "I have read this run, its deviations and its verification, and release it",
-    "I have read this run and release it with the deviations that it lists",
+    "I have read this run and release it",
+    "I have read it and release it with its deviations",
 )
 _READ = [Depends(requires("read"))]
 _LOCK = Lock()
