@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sqlite3
+import unicodedata
 from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass
@@ -390,6 +391,12 @@ def test_a_new_password_signs_out_the_other_screens(office: Office) -> None:
     assert office.person(token) is not None
     with pytest.raises(SignInRefusedError):
         office.people.sign_in("grace", password_of("grace"))
+
+
+def test_a_password_is_the_same_from_every_keyboard(office: Office) -> None:
+    _, person = office.enter("grace")
+    office.people.accounts.change_password(person, "un café très noir")
+    office.people.sign_in("grace", unicodedata.normalize("NFD", "un café très noir"))
 
 
 def test_roles_as_the_house_has_them() -> None:

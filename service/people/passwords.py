@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import secrets
+import unicodedata
 from functools import cached_property
 
 from argon2 import PasswordHasher
@@ -25,13 +26,13 @@ class Passwords:
 
     def hash(self, secret: str) -> str:
         """The hash to store, salt and parameters included."""
-        return self._hasher.hash(secret)
+        return self._hasher.hash(_same_form(secret))
 
     def matches(self, stored: str, secret: str) -> bool:
         """Whether a secret belongs to a stored hash; takes as long when there is none ("")."""
         decoy = self._decoy
         try:
-            self._hasher.verify(stored or decoy, secret)
+            self._hasher.verify(stored or decoy, _same_form(secret))
         except VerifyMismatchError:
             return False
         return bool(stored)
@@ -43,6 +44,11 @@ class Passwords:
     @cached_property
     def _decoy(self) -> str:
         return self._hasher.hash(secrets.token_urlsafe(16))
+
+
+def _same_form(secret: str) -> str:
+    # Keyboards differ in how they send the same letter: é as one character or as two.
+    return unicodedata.normalize("NFKC", secret)
 
 
 def require_password(password: str, account: str) -> None:
