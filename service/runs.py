@@ -67,6 +67,23 @@ def recorded_rig(store: Store, root: RunStarted) -> Rig:
     return rig
 
 
+def require_rig_free(store: Store, rig: Path, *, run_id: str = "") -> None:
+    """Refuse to drive a run (`run_id`, or a new one) while a living process drives another with the same rig file.
+
+    Raises ConfigurationError, naming the other run.
+    """
+    for other in store.runs():
+        if other.run_id == run_id or not store.driven(other.run_id):
+            continue
+        theirs = store.events(other.run_id)[0].payload
+        if isinstance(theirs, RunStarted) and theirs.rig.original_name == str(rig):
+            raise ConfigurationError(
+                f"the rig is in use: run {other.run_id} is driven with it",
+                where=str(rig),
+                remedy="End that run, or let it come to its end; both are recorded",
+            )
+
+
 def require_simulated(rig: Rig) -> None:
     """Refuse automatic confirmation unless the rig says that it is simulated and every address is this machine's."""
     remedy = "Leave --auto-confirm out: on a real rig a person confirms every motion"

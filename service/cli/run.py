@@ -38,7 +38,7 @@ from service.core.run_state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import Rig, load_rig
 from service.runner import Runner
-from service.runs import recorded_rig, recorded_run, require_simulated, start_run
+from service.runs import recorded_rig, recorded_run, require_rig_free, require_simulated, start_run
 from service.station import Station, layout_of
 from service.steps import params_models
 from service.steps.live import describe_view
@@ -210,6 +210,7 @@ def drive(
 ) -> RunState:
     """Run the runner in this process, with a worker beside it, until the run ends. `screens`: people answer there."""
     protocol, root = recorded_run(store, run_id)
+    require_rig_free(store, rig.path, run_id=run_id)
     station = Station(rig)
     reporter = Reporter(data, run_id, partial(open_devices, station), station.camera)
     display = Display(error_console, reporter)

@@ -30,7 +30,7 @@ from service.evidence import RunLog
 from service.people.control import Control
 from service.people.errors import NotAllowedError
 from service.rig import load_rig
-from service.runs import start_run
+from service.runs import require_rig_free, start_run
 from service.steps import params_models
 from service.web.security import Signed, requires
 from service.web.site import Here, Site
@@ -66,6 +66,7 @@ def start(site: Here, person: Signed, protocol: Short) -> RedirectResponse:
             f"there is no protocol file {protocol!r}", where=str(site.protocols), remedy="Reload the page"
         )
     loaded = load_protocol(known[protocol], params_models())
+    require_rig_free(site.store, site.rig.path)
     run_id = start_run(site.store, loaded, load_rig(site.rig.path), operator=person.account, auto_confirm=False)
     Control(site.store).take(run_id, person)
     site.launcher.start(run_id)

@@ -10,6 +10,7 @@ from threading import Lock
 
 from service.core.errors import ConfigurationError
 from service.monitor.snapshot import log_path
+from service.runs import recorded_run, require_rig_free
 from service.store.store import Store
 
 
@@ -34,6 +35,8 @@ class Launcher:
         """Start a runner. Raises ConfigurationError when the run has one, or it cannot be started."""
         if self.driven(run_id):
             raise ConfigurationError("a process drives this run already", where=run_id, remedy="Reload the page")
+        _, root = recorded_run(self.store, run_id)
+        require_rig_free(self.store, Path(root.rig.original_name), run_id=run_id)
         log = log_path(self.data, run_id)
         command = [sys.executable, "-m", "service.cli.main", "resume", run_id, "--data", str(self.data), "--screens"]
         try:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
+import threading
 import time
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -27,6 +30,7 @@ TABLET = (1024, 768)
 DESKTOP = (1920, 1080)
 PASSWORD = "correct horse battery"
 PIN = "246810"
+_FAILURES = REPOSITORY / "build" / "browser-failures"  # what the screens showed when a test failed
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # Without the last ones a browser looks up its maker's hosts at every start. SwiftShader draws the 3D view.
 _OPTIONS = (
@@ -118,6 +122,51 @@ class Served:
                 time.sleep(0.1)
 
 
+class Cable:
+    """The way from one screen to the server, which can be cut: nothing comes through any more, nothing is closed."""
+
+    def __init__(self, url: str) -> None:
+        self._target = ("127.0.0.1", int(url.rpartition(":")[2]))
+        self._plugged = threading.Event()
+        self._plugged.set()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """From now on every byte waits."""
+        self._plugged.clear()
+
+    def plug(self) -> None:
+        """What has waited goes on its way."""
+        self._plugged.set()
+
+    def close(self) -> None:
+        """No further connection."""
+        self.plug()
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # closed
+            while True:
+                near, _ = self._listener.accept()
+                threading.Thread(target=self._join, args=(near,), daemon=True).start()
+
+    def _join(self, near: socket.socket) -> None:
+        with near, contextlib.suppress(OSError), socket.create_connection(self._target) as far:
+            back = threading.Thread(target=self._copy, args=(far, near), daemon=True)
+            back.start()
+            self._copy(near, far)
+            back.join()
+
+    def _copy(self, source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(1 << 16):
+                self._plugged.wait()
+                target.sendall(data)
+            target.shutdown(socket.SHUT_WR)
+
+
 @contextmanager
 def served(rig: Path, data: Path, *options: str) -> Generator[Served]:
     """The pages over a data folder, until the block ends."""
@@ -134,7 +183,8 @@ def add_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
     """Accounts with PASSWORD and PIN, made as the pages make them: an administrator invites, people accept."""
     with Store.open(data) as store:
         desk = People(store)
-        token = desk.accounts.set_up(desk.first_link() or "", "admin", "Ada Administrator", PASSWORD, PIN)
+        desk.accounts.set_up(desk.first_link() or "", "ada", "Ada Example", PASSWORD, PIN)
+        token = desk.sign_in("ada", PASSWORD)
         administrator = desk.person(token, idle_lock_s=600, deliberate=True)
         assert administrator is not None
         for account, role in people:
@@ -189,12 +239,17 @@ def screen(
     )
     complaints: list[str] = []
     page = context.new_page()
+    page.set_default_timeout(15_000)
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on(
         "console", lambda message: complaints.append(message.text) if "Content Security" in message.text else None
     )
     try:
         yield Screen(context, page, url)
+    except BaseException:
+        _FAILURES.mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=_FAILURES / f"{time.time():.1f}.png", full_page=True)
+        raise
     finally:
         context.close()
     assert not complaints, complaints
