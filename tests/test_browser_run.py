@@ -171,7 +171,8 @@ def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
 
         # A viewpoint is taken again, with a reason; the earlier image stays in the record.
         tablet.go(f"/runs/{run}/capture")
-        page.get_by_role("link", name="v1_001", exact=True).first.click()
+        page.locator("#sheet, .sheet, main").last.get_by_role("link", name=re.compile("v1_001")).last.click()
+        page.get_by_text("Redo v1_001…").click()
         page.get_by_label("Reason").first.fill("a hand was in the picture")
         redo = page.get_by_role("button", name="Redo v1_001")
         if redo.get_attribute("data-hold"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Form, Path
 from fastapi.responses import RedirectResponse
@@ -125,6 +125,7 @@ def act(
     password: Annotated[str, Form(max_length=1000)] = "",
     signed_sha256: Short = "",
     seen_seq: Number = 0,
+    back: Annotated[Literal["", "capture"], Form()] = "",
 ) -> RedirectResponse:
     """Append what the person does if it is allowed now; otherwise append the refusal and say why.
 
@@ -150,7 +151,7 @@ def act(
         via="web",
     )
     _append(site, log, action, person.account)
-    return _back(run_id)
+    return _back(run_id, back)
 
 
 def _append(site: Site, log: RunLog, action: OperatorAction, actor: str) -> None:
@@ -213,5 +214,5 @@ def release_control(site: Here, person: Signed, run_id: RunId) -> RedirectRespon
     return _back(run_id)
 
 
-def _back(run_id: str) -> RedirectResponse:
-    return RedirectResponse(f"/runs/{run_id}", status_code=303)
+def _back(run_id: str, page: str = "") -> RedirectResponse:
+    return RedirectResponse(f"/runs/{run_id}/{page}".rstrip("/"), status_code=303)

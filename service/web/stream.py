@@ -13,6 +13,7 @@ from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from service.monitor.snapshot import read_snapshot
+from service.people.person import Person
 from service.web.security import requires, token_of
 from service.web.site import Here, Site
 
@@ -20,13 +21,13 @@ router = APIRouter(tags=["stream"])
 
 _LOOK_S = 0.3
 _BEAT_S = 1.5  # a page that hears nothing for twice this says that the connection is lost
-_CHECK_S = 10.0
+_CHECK_S = 5.0
 RunId = Annotated[str, Path(max_length=64)]
 
 
 @router.get("/runs/{run_id}/stream", name="stream", dependencies=[Depends(requires("read"))])
 async def stream(request: Request, site: Here, run_id: RunId) -> StreamingResponse:
-    """`changed` with {"seq", "monitor"} whenever events were appended or the runner told something new."""
+    """`changed` with {"seq", "monitor", "locked"} whenever one of them is another than before."""
     await run_in_threadpool(site.store.head, run_id)  # an unknown run is refused before the stream begins
     return StreamingResponse(
         _news(request, site, run_id),
@@ -36,27 +37,31 @@ async def stream(request: Request, site: Here, run_id: RunId) -> StreamingRespon
 
 
 async def _news(request: Request, site: Site, run_id: str) -> AsyncGenerator[str]:
-    told: tuple[int, float] | None = None
+    told: tuple[int, float, bool] | None = None
     beat_s = checked_s = time.monotonic()
+    token, locked = token_of(request, site), False
     while not await request.is_disconnected():
         now_s = time.monotonic()
-        news = await run_in_threadpool(_newest, site, run_id)
+        if now_s - checked_s > _CHECK_S:
+            checked_s = now_s
+            person = await run_in_threadpool(_signed_in, site, token)
+            if person is None:
+                yield "event: signed_out\ndata: {}\n\n"
+                return
+            locked = person.locked
+        news = (*await run_in_threadpool(_newest, site, run_id), locked)
         if news != told:
             told, beat_s = news, now_s
-            yield f"event: changed\ndata: {json.dumps({'seq': news[0], 'monitor': news[1]})}\n\n"
+            yield f"event: changed\ndata: {json.dumps({'seq': news[0], 'monitor': news[1], 'locked': locked})}\n\n"
         elif now_s - beat_s > _BEAT_S:
             beat_s = now_s
             yield "event: beat\ndata: {}\n\n"
-        if now_s - checked_s > _CHECK_S:
-            checked_s = now_s
-            if not await run_in_threadpool(_signed_in, site, token_of(request, site)):
-                yield "event: signed_out\ndata: {}\n\n"
-                return
         await asyncio.sleep(_LOOK_S)
 
 
-def _signed_in(site: Site, token: str) -> bool:
-    return site.people.person(token, idle_lock_s=site.idle_lock_s, deliberate=False) is not None
+def _signed_in(site: Site, token: str) -> Person | None:
+    """Who sits there; a screen that was left alone is locked by this look."""
+    return site.people.person(token, idle_lock_s=site.idle_lock_s, deliberate=False)
 
 
 def _newest(site: Site, run_id: str) -> tuple[int, float]:
