@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from typing import Any
 
 import cv2
@@ -22,7 +23,7 @@ from service.rig import load_rig
 from service.runs import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
-from tests.support.board_sessions import BOARD, noisy_session
+from tests.support.board_sessions import BOARD, Session, noisy_session
 from tests.support.web import WebSite
 
 RIG = """\
@@ -45,7 +46,12 @@ steps:
     kind: calibration
     title: Calibrate camera and hand-eye
     confirm: false
-    params: {{solve: [intrinsics, hand_eye]}}
+    params:
+      solve: [intrinsics, hand_eye]
+      viewpoints:
+        - station: station_1
+          prefix: b
+          arcs: [{{tilt_deg: 20, azimuth_from_deg: -60, azimuth_to_deg: 60, count: 10, distance_m: 0.7}}]
     gates:
       - {{measure: rms_px, max: 0.5, unit: px}}
       - {{measure: hand_eye_held_out_mm, max: 5, unit: mm}}
@@ -61,6 +67,7 @@ steps:
           arcs: [{{tilt_deg: 20, azimuth_from_deg: -50, azimuth_to_deg: 50, count: 4, distance_m: 0.6}}]
 """
 VIEWS = 10
+_NAMES = [f"b{i:03d}" for i in range(VIEWS)]
 
 
 def begin_calibrated_run(site: WebSite) -> str:
@@ -73,28 +80,9 @@ def begin_calibrated_run(site: WebSite) -> str:
     identity = {"kind": "robot", "model": "UR10e", "serial": "20231"}
     store.record(run_id, [DeviceOpened(device="robot", report={"identity": identity})], actor="runner")
     store.record(run_id, [StepStarted(step="calibration", attempt=1)], actor="runner")
-    session = noisy_session(VIEWS, 0.05, 0.01, 3)
-    names = [f"b{i:03d}" for i in range(VIEWS)]
-    for i, name in enumerate(names):
+    session, result, measures = _calibrated()
+    for i, name in enumerate(_NAMES):
         capture(site, run_id, "calibration", name, session.T_base_flange[i].tolist(), kind="board_image", shade=i)
-    every = np.arange(len(session.corners.points_m))
-    views = [BoardView(every, pixels) for pixels in session.corners.corners_px]
-    camera = session.corners.camera
-    solved = calibrate_intrinsics(views, BOARD, (camera.width, camera.height))
-    validation = cross_validate(solved)
-    uncertainty = projection_uncertainty(solved, board_distance_m(solved))
-    warnings = calibration_warnings(solved, validation, uncertainty)
-    hands = calibrate_hand_eye(session.T_base_flange, session.T_camera_board, corners=session.corners, bootstrap=10)
-    hand_eye = hand_eye_record(hands, names)
-    result: dict[str, Any] = {
-        "camera": solved.camera.record(),
-        "T_flange_camera": hand_eye["T_flange_camera"],
-        "T_base_board": hand_eye["T_base_board"],
-        "hand_eye": hand_eye,
-        "robots": ["robot"],
-        "details": {"intrinsics": intrinsics_record(solved, validation, uncertainty, warnings, names, {})},
-    }
-    measures = {"rms_px": solved.rms_px, "hand_eye_held_out_mm": float(np.median(hands.held_out_mm))}
     ref = _put(site, json.dumps(result).encode(), "calibration", "application/json", "calibration.json")
     measured = StepMeasured(step="calibration", attempt=1, measures=measures, artefacts=(ref,), result=result)
     store.record(run_id, [measured], actor="runner", artefacts=[NewArtefact(ref, "worker", "calibration", 1)])
@@ -102,6 +90,32 @@ def begin_calibrated_run(site: WebSite) -> str:
     store.record(run_id, [gates, StepPassed(step="calibration", attempt=1)], actor="runner")
     store.record(run_id, [StepStarted(step="capture", attempt=1)], actor="runner")
     return run_id
+
+
+@cache
+def _calibrated() -> tuple[Session, dict[str, Any], dict[str, float]]:
+    """The board views, and the step's result and measures."""
+    session = noisy_session(VIEWS, 0.05, 0.01, 3)
+    every = np.arange(len(session.corners.points_m))
+    views = [BoardView(every, pixels) for pixels in session.corners.corners_px]
+    camera = session.corners.camera
+    solved = calibrate_intrinsics(views, BOARD, (camera.width, camera.height))
+    validation = cross_validate(solved)
+    uncertainty = projection_uncertainty(solved, board_distance_m(solved))
+    warnings = calibration_warnings(solved, validation, uncertainty)
+    used = [_NAMES[k] for k in map(int, solved.views)]
+    excluded = {_NAMES[view.index]: view.reason for view in solved.excluded}
+    hands = calibrate_hand_eye(session.T_base_flange, session.T_camera_board, corners=session.corners, bootstrap=10)
+    hand_eye = hand_eye_record(hands, _NAMES)
+    result: dict[str, Any] = {
+        "camera": solved.camera.record(),
+        "T_flange_camera": hand_eye["T_flange_camera"],
+        "T_base_board": hand_eye["T_base_board"],
+        "hand_eye": hand_eye,
+        "robots": ["robot"],
+        "details": {"intrinsics": intrinsics_record(solved, validation, uncertainty, warnings, used, excluded)},
+    }
+    return session, result, {"rms_px": solved.rms_px, "hand_eye_held_out_mm": float(np.median(hands.held_out_mm))}
 
 
 def capture(
