@@ -106,9 +106,9 @@ def test_a_stop_is_told_at_once_and_with_what_to_do(web: WebSite, run_id: str) -
     banner = web.browser("auditor").get(f"/runs/{run_id}/parts/banner").text
     assert "data-alarm" in banner
     assert "cannot clear a stop" in banner
-    assert (
-        "not the emergency stop" in web.browser("auditor").get(f"/runs/{run_id}").text or "Emergency stop" in banner
-    )
+    assert "Emergency stop." in banner
+    tell(web, run_id, doing="working", robot="moving")
+    assert "This screen is not the emergency stop." in web.browser("auditor").get(f"/runs/{run_id}").text
 
 
 def test_a_dead_runner_and_a_silent_one(web: WebSite) -> None:
