@@ -6,12 +6,13 @@ import ast
 import base64
 import hashlib
 import json
+import random
 import shutil
 import struct
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -370,6 +371,40 @@ def test_another_spelling_of_a_record_is_named(unpacked: Path) -> None:
     path.write_bytes(first.replace(b'":', b'": ', 1) + b"\n" + rest)
     seal(unpacked)
     assert any("events.jsonl, line 1: it is not canonical JSON" in fault for fault in check(unpacked))
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """Where something stands within a record."""
+    if path:
+        yield path
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from places(item, (*path, key))
+
+
+def test_any_value_of_any_kind_in_any_place_is_named_and_breaks_nothing(unpacked: Path) -> None:
+    chance = random.Random(4)
+    other = [None, True, -1, 1.5, "", "x", "\0", [], {}, [1], {"a": 1}, "0" * 64]
+    for _ in range(120):
+        path = unpacked / chance.choice(RECORDS)
+        before = {
+            kept: (unpacked / kept).read_bytes() for kept in (path.name, "manifest.json", "ro-crate-metadata.json")
+        }
+        lines = before[path.name].splitlines()
+        number = chance.randrange(len(lines))
+        changed = verifier.parse(lines[number])
+        *way, last = chance.choice(list(places(changed)))
+        within = changed
+        for key in way:
+            within = within[key]
+        within[last] = chance.choice([value for value in other if value != within[last]])
+        lines[number] = verifier.canonical(changed)
+        path.write_bytes(b"".join(line + b"\n" for line in lines))
+        seal(unpacked)
+        found = check(unpacked)
+        assert len(found) > (path.name != "keys.jsonl"), (path.name, number, way, last, found)
+        for name, content in before.items():
+            (unpacked / name).write_bytes(content)
 
 
 def test_a_protocol_of_another_run_and_a_real_looking_manifest_are_named(unpacked: Path) -> None:

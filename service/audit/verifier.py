@@ -50,6 +50,16 @@ LARGEST_LINE = 64 << 20
 LARGEST_EXPANSION = 200  # of a compressed file; records compress twentyfold at most
 SAFE_INTEGER = 2**53 - 1
 REFERENCE = frozenset({"sha256", "kind", "media_type", "size_bytes", "original_name"})
+# What a record must have, and of which kind; everything else is compared, not used.
+KINDS: dict[str, dict[str, type]] = {
+    "events.jsonl": {"run_id": str, "seq": int, "previous_sha256": str, "sha256": str, "payload": dict},
+    "site_events.jsonl": {"run_id": str, "seq": int, "previous_sha256": str, "sha256": str, "payload": dict},
+    "artefacts.jsonl": {"seq": int, "sha256": str, "size_bytes": int, "original_name": str, "record_sha256": str},
+    "jobs.jsonl": {"job_id": str},
+    "checkpoints.jsonl": {"run_id": str, "seq": int, "site_seq": int, "key_id": str, "signature": str},
+    "timestamps.jsonl": {"run_id": str, "seq": int, "token": str},
+    "keys.jsonl": {"key_id": str},
+}
 JOB_FIELDS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
 
 
@@ -311,8 +321,11 @@ class Check:
             files = {str(item["path"]): (str(item["sha256"]), int(item["size_bytes"])) for item in manifest["files"]}
             if manifest["format"] != FORMAT:
                 raise NotABundleError(f"this verifier does not know the format {manifest['format']!r}")
-            for name in ("run_id", "simulated", "hashes_only", "head", "site_head", "made_by_key"):
+            for name in ("run_id", "simulated", "hashes_only", "made_by_key"):
                 manifest[name]
+            for name in ("head", "site_head"):
+                if not isinstance(manifest[name], dict):
+                    raise TypeError(f"{name} is no object")  # noqa: TRY301
         except (ValueError, KeyError, TypeError, OSError, zipfile.BadZipFile) as error:
             raise NotABundleError(f"manifest.json cannot be read: {error!r}") from error
         if len(files) != len(manifest["files"]):
@@ -362,6 +375,9 @@ class Check:
                     record = parse(line)
                     if not isinstance(record, dict) or canonical(record) != line:
                         raise ValueError("it is not canonical JSON: its text was altered")  # noqa: TRY301
+                    for field, kind in KINDS[name].items():
+                        if type(record.get(field)) is not kind:
+                            raise ValueError(f"its field {field} is missing or of another kind")  # noqa: TRY301
                 except ValueError as error:
                     self.fault(f"{name}, line {index}", str(error))
                 else:
@@ -546,7 +562,7 @@ class Check:
         rows = {row.get("job_id"): row for row in self.records(bundle, "jobs.jsonl", whole)}
         known = set()
         for seq, payload in run.jobs:
-            job = payload.get("job")
+            job = str(payload.get("job"))
             known.add(job)
             row = rows.get(job)
             if row is None:
@@ -562,9 +578,9 @@ class Check:
 
     def _check_copies(self, bundle: Bundle, run: Chain) -> None:
         for field in ("protocol", "rig"):
-            reference = (run.first or {}).get(field) or {}
+            reference = (run.first or {}).get(field)
             name = f"{field}.yaml"
-            if self.files.get(name, ("", 0))[0] != reference.get("sha256"):
+            if not isinstance(reference, dict) or self.files.get(name, ("", 0))[0] != reference.get("sha256"):
                 self.fault(name, f"it is not the {field} file with which the run began")
 
     def _check_crate(self, bundle: Bundle, whole: frozenset[str]) -> None:
@@ -618,7 +634,7 @@ class Chain:
         self.hashes: dict[Any, str] = {}
         self.references: dict[int, list[bytes]] = {}
         self.key_changes: list[tuple[int, dict[str, Any]]] = []
-        self.starts: list[tuple[int, dict[str, Any]]] = []
+        self.starts: list[tuple[int, dict[str, tuple[int, str]]]] = []
         self.jobs: list[tuple[int, dict[str, Any]]] = []
         self.first: dict[str, Any] | None = None
         self.end: tuple[Any, str] = (0, ROOT)
@@ -650,12 +666,19 @@ class Chain:
         if kind == "key_changed" and self.run_id == SITE:
             self.key_changes.append((seq, payload))
         elif kind == "service_started":
-            self.starts.append((seq, payload.get("heads") or {}))
+            self.starts.append((seq, _heads(payload.get("heads"))))
         elif kind in ("job_enqueued", "job_finished", "job_failed"):
             self.jobs.append((seq, payload))
         references = [canonical(reference) for reference in references_in(payload)]
         if references:
             self.references[seq] = references
+
+
+def _heads(value: Any) -> dict[str, tuple[int, str]]:
+    """Ends of chains as a start of the service wrote them down; what is none is left out: the hash tells it."""
+    found = value.items() if isinstance(value, dict) else ()
+    pairs = {run: end for run, end in found if isinstance(end, list) and len(end) == 2}
+    return {run: (end[0], end[1]) for run, end in pairs.items() if isinstance(end[0], int)}
 
 
 def references_in(value: Any) -> Iterator[dict[str, Any]]:
