@@ -159,9 +159,20 @@ def search_expression(q: str) -> str | None:
 
 
 def events_page(
-    connection: Connection, run_id: str, wanted: EventFilter, *, after: int = 0, before: int = 0, size: int = PAGE
+    connection: Connection,
+    run_id: str,
+    wanted: EventFilter,
+    *,
+    after: int = 0,
+    before: int = 0,
+    size: int = PAGE,
+    counted: int | None = None,
 ) -> EventPage:
-    """The first events after `after`, or with `before` the last ones before it. Raises UnknownRunError."""
+    """The first events after `after`, or with `before` the last ones before it. Raises UnknownRunError.
+
+    Args:
+        counted: how many match, when that is known; they are counted otherwise.
+    """
     last, _ = head(connection, run_id)
     after, before = (min(max(value, 0), _LARGEST_SEQ) for value in (after, before))
     backwards = before > 0
@@ -175,7 +186,7 @@ def events_page(
         ends = (seqs[0], seqs[-1]) if seqs else (last + 1, 0)
         earlier = more if backwards else after > 0 and _any(connection, run_id, wanted, ends[0], backwards=True)
         later = more if not backwards else _any(connection, run_id, wanted, ends[1], backwards=False)
-        count = _count(connection, run_id, wanted)
+        count = _count(connection, run_id, wanted) if counted is None else counted
     rows = read_rows(connection, run_id, seqs)
     return EventPage(
         rows=rows,
@@ -392,6 +403,15 @@ class Facets:
     steps: dict[str, int] = field(default_factory=dict[str, int])
     people: dict[str, int] = field(default_factory=dict[str, int])
     devices: dict[str, int] = field(default_factory=dict[str, int])
+
+    def matching(self, wanted: EventFilter) -> int | None:
+        """How many events match a filter of one property; None for any other."""
+        counts = {"kind": self.kinds, "step": self.steps, "person": self.people}
+        fields = wanted.query()
+        if len(fields) != 1 or not counts.keys() & fields.keys():
+            return None
+        ((name, value),) = fields.items()
+        return counts[name].get(value, 0)
 
     def copy(self) -> Facets:
         """Another one, to go on with."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi import APIRouter, Depends, FastAPI, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
 from service.audit import artefact_queries, findings, first_page, queries
@@ -15,11 +17,21 @@ from service.audit.provenance import origin
 from service.audit.provenance_drawing import draw
 from service.audit.queries import EventFilter
 from service.store.records import SITE
-from service.web.audit_view import Audit, Auditing, audit_frame, cut, link
-from service.web.pages import render
+from service.web.audit_view import Audit, Auditing, audit_frame, close_audit, cut, link
+from service.web.pages import TEMPLATES, render
 from service.web.security import Signed, requires
 
-router = APIRouter(tags=["audit"])
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncGenerator[None]:
+    """Templates are read before anybody asks: the first page of a run answers at once too."""
+    for name in TEMPLATES.list_templates(filter_func=lambda name: name.startswith("audit_")):
+        TEMPLATES.get_template(name)
+    yield
+    close_audit(app)
+
+
+router = APIRouter(tags=["audit"], lifespan=_lifespan)
 _RUNS_A_PAGE = 25
 _FIRST = 25  # of a list on the first page
 _READ = [Depends(requires("read"))]
@@ -181,11 +193,12 @@ def _events(
 ) -> Response:
     digest = here.digests.get(chain) if chain != SITE else None
     with here.site.store.database.reading() as connection:
-        page = queries.events_page(connection, chain, wanted, after=after, before=before)
-        last, _ = queries.head(connection, chain)
         facets = digest.facets if digest is not None and not isinstance(digest, Progress) else queries.Facets()
+        last, _ = queries.head(connection, chain)
         if chain == SITE:
             facets.add(connection, SITE, 0, last)
+        counted = facets.matching(wanted) if facets.kinds else None
+        page = queries.events_page(connection, chain, wanted, after=after, before=before, counted=counted)
         devices = artefact_queries.artefact_facets(connection, chain)["device"]
     address = request.url.path
     return render(

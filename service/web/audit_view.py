@@ -8,7 +8,7 @@ from threading import Lock
 from typing import Annotated
 from urllib.parse import urlencode
 
-from fastapi import Depends, Request
+from fastapi import Depends, FastAPI, Request
 
 from service.audit import queries
 from service.audit.computed import Computed
@@ -53,6 +53,14 @@ def _audit(request: Request, site: Here) -> Audit:
             )
         found: Audit = state.audit
     return found
+
+
+def close_audit(app: FastAPI) -> None:
+    """End what is still being computed."""
+    found: Audit | None = getattr(app.state, "audit", None)
+    if found is not None:
+        found.digests.close()
+        found.graphs.close()
 
 
 Auditing = Annotated[Audit, Depends(_audit)]
