@@ -402,7 +402,9 @@ def test_any_value_of_any_kind_in_any_place_is_named_and_breaks_nothing(unpacked
         path.write_bytes(b"".join(line + b"\n" for line in lines))
         seal(unpacked)
         found = check(unpacked)
-        assert len(found) > (path.name != "keys.jsonl"), (path.name, number, way, last, found)
+        said = [fault for fault in found if not fault.startswith("manifest.json, manifest.sig")]
+        assert len(said) < len(found)  # the manifest could not be signed again
+        assert said or path.name == "keys.jsonl", (path.name, number, way, last)  # it repeats what the chain says
         for name, content in before.items():
             (unpacked / name).write_bytes(content)
 
