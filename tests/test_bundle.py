@@ -303,14 +303,14 @@ def test_every_missing_file_is_named_and_every_other_too(unpacked: Path) -> None
 
 def seal(folder: Path) -> None:
     """Make the manifest fit again, without the key: everything but its signature then holds."""
-    manifest = json.loads((folder / "manifest.json").read_text())
-    for item in manifest["files"]:
-        item["sha256"], item["size_bytes"] = hash_file(folder / item["path"])
     crate = json.loads((folder / "ro-crate-metadata.json").read_text())
     for entity in crate["@graph"]:
         if "sha256" in entity and (folder / entity["@id"]).is_file():
             entity["sha256"], _ = hash_file(folder / entity["@id"])
     (folder / "ro-crate-metadata.json").write_bytes(rfc8785.dumps(crate))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for item in manifest["files"]:
+        item["sha256"], item["size_bytes"] = hash_file(folder / item["path"])
     (folder / "manifest.json").write_bytes(rfc8785.dumps(manifest))
 
 
@@ -403,8 +403,9 @@ def test_any_value_of_any_kind_in_any_place_is_named_and_breaks_nothing(unpacked
         seal(unpacked)
         found = check(unpacked)
         said = [fault for fault in found if not fault.startswith("manifest.json, manifest.sig")]
-        assert len(said) < len(found)  # the manifest could not be signed again
-        assert said or path.name == "keys.jsonl", (path.name, number, way, last)  # it repeats what the chain says
+        assert found, (path.name, number, way, last)
+        # Of jobs and keys the chain says the most; the rest of their rows only the manifest covers.
+        assert said or path.name in ("jobs.jsonl", "keys.jsonl"), (path.name, number, way, last)
         for name, content in before.items():
             (unpacked / name).write_bytes(content)
 
