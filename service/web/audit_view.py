@@ -90,7 +90,7 @@ def audit_frame(audit: Audit, run_id: str, tab: str) -> AuditFrame:
     return AuditFrame(
         run=found[0],
         base=base,
-        tabs=tuple((base + path, text) for path, text in _TABS),
+        tabs=(*((base + path, text) for path, text in _TABS), (f"/runs/{run_id}/exports", "Exports")),
         here=base + tab,
         verification=last,
         verified=verified(last, found[0].head_sha256),

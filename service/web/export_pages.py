@@ -56,7 +56,7 @@ def exports_page(
     return render(
         request,
         "exports.html.j2",
-        audit=replace(audit_frame(audit, run_id, ""), here=""),
+        audit=replace(audit_frame(audit, run_id, ""), here=f"/runs/{run_id}/exports"),
         state=log.state,
         needs_release=log.protocol.release == "second_person",
         released=released,

@@ -8,9 +8,6 @@ from service.core.model import GateVerdict
 from service.core.protocol import Protocol, Step
 from service.core.run_state import RunState, StepState
 
-#: Step kinds that move the robot, so that a confirmation must be held. service.steps says it too; importing all step
-#: kinds to ask would load their numerics.
-MOVES_ROBOT = frozenset({"viewpoint_capture", "calibration"})
 _DRAWINGS_BY_ID = {
     "fixation": "fixation",
     "ct_hand_over_out": "transport",
@@ -40,7 +37,10 @@ def drawing_of(step: Step) -> str:
 
 def moves_robot(step: Step) -> bool:
     """Whether the robot moves while this step works."""
-    return step.kind in MOVES_ROBOT
+    # Imported here: the step kinds load their numerics, which the start of the service does not wait for.
+    from service.steps import step_kinds  # noqa: PLC0415
+
+    return step_kinds()[step.kind].moves_robot
 
 
 def measure_name(measure: str) -> str:
