@@ -52,8 +52,8 @@ from service.monitor.snapshot import Doing
 from service.steps import step_kinds
 from service.steps.context import Devices, StepContext, StepInterruptedError, StepOutcome
 from service.store.leases import RunLease
-from service.store.signing import checkpoint
 from service.store.store import Store
+from service.store.timestamping import Authority, stamp_end
 
 _LEASE_S = 30.0
 _POLL_S = 0.1
@@ -102,6 +102,7 @@ class Runner:
     protocol: Protocol
     devices: Devices
     operator: Operator
+    authority: Authority | None = None  # asked for a time stamp when the run ends
     monotonic_s: Callable[[], float] = time.monotonic
     wait: Callable[[float], None] = time.sleep
     _log: RunLog = field(init=False)
@@ -121,6 +122,8 @@ class Runner:
             self._lease = lease
             self._log = RunLog(self.store, self.run_id, self.protocol)
             if self._log.state.terminal:
+                if self.authority is not None and not self.store.timestamps(self.run_id):
+                    self._seal()  # the authority did not answer, or this process died before it was asked
                 return self._log.state
             resumed = self._log.state.sessions > 0
             self._append(
@@ -296,9 +299,12 @@ class Runner:
         self.store.record(self.run_id, payloads, actor=actor, lease=self._lease)
 
     def _seal(self) -> None:
-        """Sign the chain as it stands. A seal that fails is told; the next one covers what it would have."""
+        """Sign the chain as it stands. A seal that fails is told; the next one covers what it would have.
+
+        The end of a run is stamped as well, where an authority is configured: the run has ended already by then.
+        """
         try:
-            checkpoint(self.store, self.run_id)
+            stamp_end(self.store, self.run_id, self.authority if self._log.state.terminal else None)
         except StoreError as error:
             self.operator.tell(f"the record could not be signed: {error}")
 

@@ -13,6 +13,7 @@ from service.runner import software_versions
 from service.steps import params_models
 from service.store.records import NewArtefact
 from service.store.store import Store
+from service.store.timestamping import Authority
 
 _SCHEMES = ("ptpip:", "socket://")
 
@@ -65,6 +66,12 @@ def recorded_rig(store: Store, root: RunStarted) -> Rig:
             remedy="Restore it, or start a new run: calibration and poses belong to one rig",
         )
     return rig
+
+
+def time_stamp_authority(rig: Rig) -> Authority | None:
+    """Who is asked for a time stamp at the end of a run of this rig; None: nobody."""
+    section = rig.section.timestamp
+    return None if section is None else Authority(section.url, rig.folder / section.certificates, section.timeout_s)
 
 
 def require_rig_free(store: Store, rig: Path, *, run_id: str = "") -> None:

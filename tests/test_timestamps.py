@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,12 +13,13 @@ from service.audit import verifier
 from service.audit.bundle import export_bundle
 from service.core.model import DeviceTrouble
 from service.rig import load_rig
+from service.runs import time_stamp_authority as time_stamp_authority_of
 from service.store.audit import verify
 from service.store.errors import TimestampError
 from service.store.signing import checkpoint
 from service.store.store import Store
 from service.store.timestamping import Authority, stamp_end, timestamp
-from tests.support.bench_run import record_runs
+from tests.support.bench_run import PROTOCOL, begin_run, record_runs
 from tests.support.store import rows, tamper
 from tests.support.time_stamp_authority import TimeStampAuthority, make_certificates, time_stamp_authority
 
@@ -136,6 +138,45 @@ def test_a_run_ends_signed_whether_or_not_the_authority_answers(
     assert verify(data, run).ok
 
 
+@pytest.mark.parametrize("end", ["completed", "aborted"])
+def test_the_runner_has_the_end_of_a_run_stamped(tmp_path: Path, authority: TimeStampAuthority, end: str) -> None:
+    with Store.open(tmp_path / "data") as store:
+        bench = begin_run(store, PROTOCOL, tmp_path)
+        bench.authority = ask(authority)
+        if end == "aborted":
+            bench.act("abort", reason="the specimen fell")
+        assert bench.run().status == end
+        (stamp,) = store.timestamps(bench.run_id)
+        assert stamp.seq == len(store.events(bench.run_id)) == store.checkpoints(bench.run_id)[-1].seq
+        asked = authority.asked
+        bench.run()
+        assert authority.asked == asked
+    report = verify(tmp_path / "data", bench.run_id, certificates=authority.certificates)
+    assert (report.faults, report.timestamps) == ((), 1)
+
+
+@pytest.mark.parametrize("behaviour", ["asleep", "dripping"])
+def test_an_authority_that_is_slow_delays_the_end_no_longer_than_allowed(
+    tmp_path: Path, authority: TimeStampAuthority, behaviour: str
+) -> None:
+    authority.behaviour = behaviour
+    with Store.open(tmp_path / "data") as store:
+        bench = begin_run(store, PROTOCOL, tmp_path)
+        bench.act("abort", reason="the specimen fell")
+        bench.authority = Authority(authority.url, authority.certificates, timeout_s=0.4)
+        begun = time.monotonic()
+        assert bench.run().status == "aborted"
+        assert 0.4 < time.monotonic() - begun < 2
+        (trouble,) = bench.payloads(DeviceTrouble)
+        assert "nothing within 0.4 s" in trouble.message
+        assert store.checkpoints(bench.run_id)[-1].seq == len(store.events(bench.run_id))
+        authority.behaviour = "good"  # the next look at the run asks again
+        bench.authority = ask(authority)
+        assert bench.run().status == "aborted"
+        assert len(store.timestamps(bench.run_id)) == 1
+        bench.must_verify()
+
+
 def test_the_rig_file_names_the_authority(tmp_path: Path, authority: TimeStampAuthority) -> None:
     (tmp_path / "rig.yaml").write_text(
         "name: r\ndevices: {}\ntimestamp: {url: 'https://tsa.example/', certificates: tsa.pem}\n"
@@ -143,3 +184,5 @@ def test_the_rig_file_names_the_authority(tmp_path: Path, authority: TimeStampAu
     section = load_rig(tmp_path / "rig.yaml").section.timestamp
     assert section is not None
     assert (section.url, section.certificates, section.timeout_s) == ("https://tsa.example/", "tsa.pem", 10.0)
+    asked = time_stamp_authority_of(load_rig(tmp_path / "rig.yaml"))
+    assert asked == Authority("https://tsa.example/", tmp_path.resolve() / "tsa.pem", 10.0)

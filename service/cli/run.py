@@ -38,7 +38,14 @@ from service.core.run_state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import Rig, load_rig
 from service.runner import Runner
-from service.runs import recorded_rig, recorded_run, require_rig_free, require_simulated, start_run
+from service.runs import (
+    recorded_rig,
+    recorded_run,
+    require_rig_free,
+    require_simulated,
+    start_run,
+    time_stamp_authority,
+)
 from service.station import Station, layout_of
 from service.steps import params_models
 from service.steps.live import describe_view
@@ -228,7 +235,7 @@ def drive(
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _worker(data, wanted=worker):
-            return Runner(store, run_id, protocol, station, operator).run()
+            return Runner(store, run_id, protocol, station, operator, time_stamp_authority(rig)).run()
     finally:
         reporter.end()
         display.clear()

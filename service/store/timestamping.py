@@ -5,6 +5,9 @@ from __future__ import annotations
 import base64
 import binascii
 import hashlib
+import http.client
+import queue
+import threading
 import urllib.request
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -63,7 +66,7 @@ def timestamp(store: Store, checkpoint: Checkpoint, authority: Authority) -> Tim
     message = stamped_bytes(checkpoint)
     request = TimestampRequestBuilder().data(message).hash_algorithm(HashAlgorithm.SHA256).build()
     try:
-        reply = _post(authority, request.as_bytes())
+        reply = _post_within(authority, request.as_bytes())
         response = decode_timestamp_response(reply)
         roots, others = _certificates(authority.certificates)
         builder = VerifierBuilder.from_request(request)
@@ -172,6 +175,32 @@ def _certificates(path: Path) -> tuple[list[x509.Certificate], list[x509.Certifi
         ) from error
     roots = [certificate for certificate in found if certificate.issuer == certificate.subject]
     return roots, [certificate for certificate in found if certificate not in roots]
+
+
+def _post_within(authority: Authority, body: bytes) -> bytes:
+    """The answer. Raises OSError, ValueError.
+
+    The time-out of a socket bounds each of its operations: neither finding the address without a network nor an
+    answer that drips is bounded by it. A thread that is left behind is.
+    """
+    answered: queue.Queue[bytes | OSError | ValueError] = queue.Queue(1)
+
+    def ask() -> None:
+        try:
+            answered.put(_post(authority, body))
+        except (OSError, ValueError) as error:
+            answered.put(error)
+        except http.client.HTTPException as error:
+            answered.put(ValueError(f"its answer is no HTTP ({error!r})"))
+
+    threading.Thread(target=ask, name="time stamp", daemon=True).start()
+    try:
+        answer = answered.get(timeout=authority.timeout_s)
+    except queue.Empty:
+        raise TimeoutError(f"nothing within {authority.timeout_s:g} s") from None
+    if isinstance(answer, bytes):
+        return answer
+    raise answer
 
 
 def _post(authority: Authority, body: bytes) -> bytes:

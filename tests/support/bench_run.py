@@ -17,6 +17,7 @@ from service.runs import recorded_run, start_run
 from service.steps import params_models
 from service.store.audit import verify
 from service.store.store import Store
+from service.store.timestamping import Authority
 from tests.support.bench_rig import Answer, BenchRig, ScriptedOperator
 
 PROTOCOL = """\
@@ -69,6 +70,7 @@ class Bench:
     data: Path
     rig: BenchRig = field(default_factory=BenchRig)
     operator: ScriptedOperator = field(default_factory=ScriptedOperator)
+    authority: Authority | None = None
     ahead_s: float = 0.0  # how far the runner's clock is put forward
 
     def run(self) -> RunState:
@@ -80,6 +82,7 @@ class Bench:
             protocol,
             self.rig,
             self.operator,
+            self.authority,
             monotonic_s=lambda: time.monotonic() + self.ahead_s,
             wait=lambda s: time.sleep(min(s, 0.002)),
         ).run()

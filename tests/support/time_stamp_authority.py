@@ -37,10 +37,11 @@ class TimeStampAuthority:
 
     url: str
     certificates: Path
-    behaviour: str = "good"  # good, silent, garbage, replay, html
+    behaviour: str = "good"  # good, silent, asleep, dripping, garbage, replay, html
     asked: int = 0
     first: bytes = b""
     lock: threading.Lock = field(default_factory=threading.Lock)
+    woken: threading.Event = field(default_factory=threading.Event)
 
 
 def _name(text: str) -> x509.Name:
@@ -103,10 +104,17 @@ def time_stamp_authority(folder: Path) -> Generator[TimeStampAuthority]:
             content = {"garbage": b"\x30\x03\x02\x01\x00", "replay": authority.first}.get(authority.behaviour, answer)
             if authority.behaviour == "silent":
                 return
+            if authority.behaviour == "asleep":
+                authority.woken.wait(30)
+                return
             self.send_response(200)
             self.send_header("Content-Type", kind)
             self.send_header("Content-Length", str(len(content)))
             self.end_headers()
+            for byte in content if authority.behaviour == "dripping" else ():
+                self.wfile.write(bytes([byte]))
+                if authority.woken.wait(0.05):
+                    return
             self.wfile.write(content)
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # its name in the base class
@@ -119,5 +127,6 @@ def time_stamp_authority(folder: Path) -> Generator[TimeStampAuthority]:
         try:
             yield authority
         finally:
+            authority.woken.set()
             server.shutdown()
             thread.join()
