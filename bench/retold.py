@@ -1,0 +1,84 @@
+"""A recorded run told again as a new one, event by event, up to a point: for pictures of runs under way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from service.core.model import Event, JobEnqueued, JobFinished, OperatorAction, Payload, RunStarted, SessionStarted
+from service.core.protocol import parse_protocol
+from service.rig import Rig
+from service.runs import start_run
+from service.steps import params_models
+from service.store.records import NewArtefact, NewJob
+from service.store.store import Store
+
+Told = Callable[[Event], bool]
+
+
+def retell(
+    store: Store,
+    source: str,
+    rig: Rig,
+    person: str,
+    *,
+    until: Told,
+    more: Mapping[int, Sequence[Payload]] | None = None,
+) -> str:
+    """A new run with the same events, artefacts and jobs as `source`; the new run's name.
+
+    What was confirmed automatically is confirmed by `person`. Signatures bind the new run's own records.
+
+    Args:
+        until: the first event for which it is true, and all that follow, are left out.
+        more: events of `person` to add behind the event of that number of `source`.
+    """
+    events = store.events(source)
+    root = events[0].payload
+    assert isinstance(root, RunStarted)
+    text = store.artefact_path(root.protocol.sha256).read_bytes()
+    loaded = parse_protocol(text, params_models(), name=root.protocol.original_name)
+    run_id = start_run(store, loaded, rig, operator=person, auto_confirm=False)
+    rows: dict[int, list[NewArtefact]] = {}
+    for row in store.artefacts(source):
+        new = NewArtefact(row.ref, row.device, row.step, row.attempt, row.viewpoint)
+        rows.setdefault(row.seq, []).append(new)
+    again: dict[str, str] = {}
+    for event in events[1:]:
+        if until(event):
+            break
+        again[event.sha256] = _tell(store, run_id, person, event, rows.get(event.seq, []), again)
+        for payload in (more or {}).get(event.seq, ()):
+            actor = person if isinstance(payload, OperatorAction) else "runner"
+            store.record(run_id, [payload], actor=actor)
+    return run_id
+
+
+def _tell(
+    store: Store, run_id: str, person: str, event: Event, rows: Sequence[NewArtefact], again: Mapping[str, str]
+) -> str:
+    """Record one event again; the hash of the new one."""
+    payload = event.payload
+    actor = event.actor
+    if isinstance(payload, JobEnqueued):
+        job = NewJob(payload.job_kind, payload.step, payload.attempt, payload.idempotency_key, payload.arguments)
+        store.enqueue_job(run_id, job, actor=actor)
+        return store.events(run_id, store.head(run_id) - 1)[-1].sha256
+    if isinstance(payload, JobFinished):
+        claimed = store.claim_job(payload.worker, 60.0, run_id=run_id)
+        assert claimed is not None, payload.job
+        finished = store.finish_job(
+            claimed,
+            measures=payload.measures,
+            duration_s=payload.duration_s,
+            result=payload.result,
+            artefacts=rows,
+        )
+        return finished.sha256
+    if isinstance(payload, OperatorAction):
+        signed = again.get(payload.signed_sha256, payload.signed_sha256)
+        change: dict[str, Any] = {"automatic": False, "via": "web", "signed_sha256": signed}
+        payload, actor = payload.model_copy(update=change), person
+    if isinstance(payload, SessionStarted):
+        payload = payload.model_copy(update={"host": "table-side"})
+    return store.record(run_id, [payload], actor=actor, artefacts=rows)[-1].sha256

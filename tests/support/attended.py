@@ -1,0 +1,42 @@
+"""Runs that look driven: this process holds their leases and says of them what a runner would say."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from service.monitor.snapshot import Snapshot, write_snapshot
+from service.store.store import Store
+
+_LEASE_S = 600.0
+
+
+@contextmanager
+def attended(data: Path, runs: Mapping[str, Mapping[str, Any]]) -> Generator[None]:
+    """Run names with the fields of their snapshots; nothing moves, nothing is recorded."""
+    over = threading.Event()
+
+    def tell() -> None:
+        while True:
+            for run_id, fields in runs.items():
+                write_snapshot(data, run_id, Snapshot.model_validate({"at_utc_s": time.time(), **fields}))
+            if over.wait(1.0):
+                return
+
+    with Store.open(data) as store, contextlib.ExitStack() as leases:
+        for run_id in runs:
+            leases.enter_context(store.lease(run_id, "attended", _LEASE_S))
+        teller = threading.Thread(target=tell)
+        teller.start()
+        try:
+            yield
+        finally:
+            over.set()
+            teller.join()
+            for run_id in runs:  # who ends runners reads process numbers there
+                (data / "monitor" / f"{run_id}.json").unlink(missing_ok=True)

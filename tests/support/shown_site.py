@@ -1,0 +1,65 @@
+"""A data folder in which every page has something to show, recorded through the public surface without a rig."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.core.decide import AskOperator
+from service.core.model import ItemTicked, OperatorAction
+from service.core.run_state import RunState
+from tests.support.calibrated_run import begin_calibrated_run
+from tests.support.recorded_run import record_run
+from tests.support.reported_run import record_reported_run
+from tests.support.web import web_site
+
+
+@dataclass(frozen=True)
+class ShownSite:
+    """What lies in folder/data, folder/rig.yaml and folder/protocols."""
+
+    folder: Path
+    completed: str  # with a re-do, a skipped viewpoint, a correction, a signature and a result
+    registered: str  # scans with spheres and a registration
+    calibrated: str  # a calibration, and a capture under way
+    listing: str  # waits for the confirmation of a checklist, one item of which is ticked
+    moving: str  # waits for the confirmation of a motion
+    signing: str  # waits for the signature of an irreversible step
+    failed: str  # waits for a decision: a gate has failed
+
+    @property
+    def under_way(self) -> tuple[str, ...]:
+        return self.calibrated, self.listing, self.moving, self.signing, self.failed
+
+
+def shown_site(folder: Path) -> ShownSite:
+    """Every kind of run, and the four people of tests.support.web."""
+    registered = record_run(folder)
+    completed = record_reported_run(folder, person="grace")
+    failed = record_reported_run(folder, error_mm=0.9, person="grace")
+    with web_site(folder) as web:
+        calibrated = begin_calibrated_run(web)
+        listing = web.begin_run().run_id
+        web.store.record(
+            listing, [ItemTicked(step="fixation", attempt=1, item="wires hold", ticked=True)], actor="grace"
+        )
+        moving = web.begin_run().run_id
+        web.store.record(moving, [skip("fixation")], actor="grace")
+        signing = web.begin_run()
+        signing.script("spraying", "sign", leave)
+        with contextlib.suppress(_LeftError):
+            signing.run()
+    return ShownSite(folder, completed, registered, calibrated, listing, moving, signing.run_id, failed)
+
+
+class _LeftError(Exception):
+    """Nobody is there any more."""
+
+
+def leave(_question: AskOperator, _state: RunState) -> OperatorAction:
+    raise _LeftError
+
+
+def skip(step: str) -> OperatorAction:
+    return OperatorAction(action="skip", step=step, reason="done the day before")
