@@ -83,8 +83,8 @@ def serve_command(
                 hosts=_names(host, name or []),
             )
             record_start(store, rig_file, site.protocol_files(), address)
-            checkpoint(store, SITE)
             link = people.first_link()
+            checkpoint(store, SITE)
             config = uvicorn.Config(
                 create_app(site),
                 log_level="warning",

@@ -115,6 +115,13 @@ def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
     return row is not None and _is_live(row, clock.utc_now().timestamp())
 
 
+def held_runs(connection: Connection, clock: Clock) -> list[str]:
+    """Runs whose lease somebody has who may still live, by name."""
+    now_utc_s = clock.utc_now().timestamp()
+    rows = connection.execute(select(leases).order_by(leases.c.run_id)).all()
+    return [row.run_id for row in rows if _is_live(row, now_utc_s)]
+
+
 def _is_live(row: Row[Any], now_utc_s: float) -> bool:
     return now_utc_s < row.until_utc_s and not identity_of(row).is_surely_dead()
 

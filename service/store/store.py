@@ -17,7 +17,7 @@ from service.store.checkpoints import read_checkpoints, read_timestamps
 from service.store.database import Database, database_path, open_database
 from service.store.errors import UnknownRunError
 from service.store.events import ROOT, append, read_events
-from service.store.leases import RunLease, acquire, check_lease, is_held
+from service.store.leases import RunLease, acquire, check_lease, held_runs, is_held
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
 from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock, utc_text
 from service.store.tables import heads, runs
@@ -258,6 +258,11 @@ class Store:
         """Whether a living process holds the lease of a run."""
         with self._database.reading() as connection:
             return is_held(connection, self._clock, run_id)
+
+    def driven_runs(self) -> list[str]:
+        """All runs whose lease a living process holds."""
+        with self._database.reading() as connection:
+            return held_runs(connection, self._clock)
 
     def _require_run(self, connection: Connection, run_id: str) -> None:
         if connection.execute(select(runs.c.run_id).where(runs.c.run_id == run_id)).first() is None:

@@ -1,10 +1,10 @@
-"""The web application: its routers, its safety headers, and errors that say what happened and nothing of the inside."""
+"""The web application: routers, safety headers, a sealed record, and errors that say nothing of the inside."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 
 from service.web import (
@@ -20,6 +20,7 @@ from service.web import (
     scene_pages,
     stream,
 )
+from service.web.seal import sealed
 from service.web.security import install_security
 from service.web.site import Site
 
@@ -40,7 +41,13 @@ _PAGES = (
 
 def create_app(site: Site) -> FastAPI:
     """The application over one data folder."""
-    app = FastAPI(title="orthocapture", docs_url=None, redoc_url=None, openapi_url="/openapi.json")
+    app = FastAPI(
+        title="orthocapture",
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/openapi.json",
+        dependencies=[Depends(sealed, scope="function")],
+    )
     app.state.site = site
     install_security(app)
     for page in _PAGES:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import secrets
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 from urllib.parse import quote
@@ -82,9 +83,24 @@ def respond(request: Request, problem: Problem, headers: dict[str, str] | None =
     """A problem as page or as JSON."""
     if wants_json(request):
         return JSONResponse(asdict(problem), status_code=problem.status, headers=headers)
+    _recognise(request)
     response = render(request, "error.html.j2", status=problem.status, problem=problem)
     response.headers.update(headers or {})
     return response
+
+
+def _recognise(request: Request) -> None:
+    """Who looks at the page of an error that came before any guard, such as an address that does not exist."""
+    # Imported here: security installs these handlers.
+    from service.web.security import token_of  # noqa: PLC0415
+
+    site = request.app.state.site
+    if hasattr(request.state, "person"):
+        return
+    with suppress(OrthocaptureError):  # the page of an error shows what it can
+        request.state.person = site.people.person(
+            token_of(request, site), idle_lock_s=site.idle_lock_s, deliberate=False
+        )
 
 
 def _expected(request: Request, error: Exception) -> Response:

@@ -13,7 +13,7 @@ from service.core.protocol import LoadedProtocol, load_protocol
 from service.steps import params_models
 from service.store.records import RunRow
 from service.web.pages import render
-from service.web.run_frame import robot_banner
+from service.web.run_frame import driven_frames, robot_banner
 from service.web.security import Signed, requires
 from service.web.site import Here, Site
 
@@ -68,6 +68,12 @@ def home(
         protocols=startable,
         rig=site.rig.section,
     )
+
+
+@router.get("/robots", name="robots", dependencies=[Depends(requires("read"))])
+def robots(request: Request, site: Here, but: Annotated[str, Query(max_length=64)] = "") -> HTMLResponse:
+    """How the robots stand that are driven now, for the script that keeps every page up to date."""
+    return render(request, "robots.html.j2", others=driven_frames(site, but=but))
 
 
 @router.post(

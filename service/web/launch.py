@@ -31,6 +31,12 @@ class Launcher:
                 return True
         return self.store.driven(run_id)
 
+    def driven_runs(self) -> list[str]:
+        """All runs of which `driven` is true, by name."""
+        with self._lock:
+            started = {run_id for run_id, child in self._children.items() if child.poll() is None}
+        return sorted(started.union(self.store.driven_runs()))
+
     def start(self, run_id: str) -> None:
         """Start a runner. Raises ConfigurationError when the run has one, or it cannot be started."""
         if self.driven(run_id):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from service.core.errors import OrthocaptureError
 from service.core.model import RunStarted
 from service.core.run_state import RunState
 from service.monitor.snapshot import Snapshot, read_snapshot
@@ -78,6 +79,44 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
             Tab(f"/audit/runs/{run_id}", "Audit", below=True),
         ),
     )
+
+
+def driven_frames(site: Site, *, but: str = "") -> list[RunFrame]:
+    """The frames of all runs that a living process drives now, for the banners of pages that are not theirs.
+
+    Raises nothing: what cannot be told is unknown.
+
+    Args:
+        site: the site.
+        but: a run whose own banner the page has already.
+    """
+    try:
+        driven = [run_id for run_id in site.launcher.driven_runs() if run_id != but]
+    except OrthocaptureError:
+        return [_unreadable("")]
+    return [_frame_or_unknown(site, run_id) for run_id in driven]
+
+
+def _frame_or_unknown(site: Site, run_id: str) -> RunFrame:
+    try:
+        return run_frame(site, run_id)
+    except OrthocaptureError:
+        return _unreadable(run_id)
+
+
+def _unreadable(run_id: str) -> RunFrame:
+    text = f"The record cannot be read now. Look at the robot. {NOT_THE_STOP}"
+    banner = Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)
+    return RunFrame(run_id, run_id, "", "", "", simulated=False, live=False, pausable=False, banner=banner, tabs=())
+
+
+LOST = Banner(
+    "unknown",
+    "unknown",
+    "unknown",
+    "Robots: unknown.",
+    f"The connection to the service is lost. Take every robot as moving. {NOT_THE_STOP}",
+)
 
 
 def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner:  # noqa: PLR0911 - one return a case

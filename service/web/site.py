@@ -30,6 +30,7 @@ class Site:
     secure: bool = True  # cookies are sent over TLS, or to this machine, only
     idle_lock_s: float = 600.0
     hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask
+    sealed_seq: int = 0  # last event of the site's chain that is known to be signed
     _logs: dict[str, RunLog] = field(default_factory=dict[str, RunLog])
     _lock: Lock = field(default_factory=Lock)
 

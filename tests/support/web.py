@@ -61,6 +61,9 @@ class NoLauncher(Launcher):
     def driven(self, run_id: str) -> bool:
         return run_id in self.__dict__.get("started", []) or self.store.driven(run_id)
 
+    def driven_runs(self) -> list[str]:
+        return sorted({*self.__dict__.get("started", []), *self.store.driven_runs()})
+
 
 class Browser(TestClient):
     """A screen: keeps its cookie, sends the CSRF token of its sign-in with every POST unless told otherwise."""

@@ -4,6 +4,7 @@
 
 (() => {
   const LOST_AFTER_MS = 3500;
+  const POLL_MS = 2000;
   const body = document.body;
   const by = (id) => document.getElementById(id);
   let offline = false;
@@ -119,6 +120,38 @@
     if (now - heardAt > LOST_AFTER_MS && !offline) goOffline();
     if (now - heardAt > 1500 && now - opening > 2500) connect();
   }
+
+  // Pages without a stream ask every two seconds how the robots stand, and whether the service answers.
+  const robots = by("robots");
+  let answeredAt = Date.now();
+  let asking = false;
+  async function poll() {
+    if (asking || document.hidden) return;
+    asking = true;
+    try {
+      const answer = await fetch(robots.dataset.poll, { headers: { Accept: "text/html" }, cache: "no-store", signal: AbortSignal.timeout(POLL_MS) });
+      if (answer.redirected && new URL(answer.url).pathname === "/sign-in") { location.reload(); return; }
+      if (!answer.ok) throw new Error(answer.statusText);
+      const fresh = document.createElement("template");
+      fresh.innerHTML = await answer.text();
+      answeredAt = Date.now();
+      mergeChildren(robots, fresh.content);
+      announce();
+      if (offline && !body.dataset.stream) backOnline();
+    } catch {
+      if (Date.now() - answeredAt > LOST_AFTER_MS) robotsUnknown();
+    }
+    asking = false;
+  }
+  function robotsUnknown() {
+    if (!body.dataset.stream && !offline) goOffline();
+    // A page of a run that lost its connection says so of its own robot already.
+    if (!body.dataset.stream || robots.childElementCount) mergeChildren(robots, by("robots-lost").content);
+  }
+  document.addEventListener("visibilitychange", () => {
+    if (robots && !document.hidden) { answeredAt = Date.now(); poll(); }
+  });
+
   function goOffline() {
     offline = true;
     cancelHold();
@@ -294,7 +327,7 @@
   }
   by("lock-screen")?.addEventListener("cancel", (event) => event.preventDefault());
   function followLock() {
-    const screen = document.querySelector("[data-screen]");
+    const screen = document.querySelector("[data-part] [data-screen]");
     if (screen) showLock(screen.dataset.screen === "locked");
   }
 
@@ -306,4 +339,5 @@
     connect();
     setInterval(watch, 500);
   }
+  if (robots) setInterval(poll, POLL_MS);
 })();

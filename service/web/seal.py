@@ -1,0 +1,43 @@
+"""The site's chain is signed to its end after every request that may have changed it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncGenerator
+
+from fastapi import Request
+from fastapi.concurrency import run_in_threadpool
+
+from service.core.errors import OrthocaptureError
+from service.store.errors import UnknownRunError
+from service.store.records import SITE
+from service.store.signing import checkpoint
+from service.web.site import Here, Site
+
+_log = logging.getLogger("orthocapture.web")
+_SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
+
+
+async def sealed(request: Request, site: Here) -> AsyncGenerator[None]:
+    """For the whole application, `scope="function"`: signed before the answer leaves, refused requests included.
+
+    Accounts, invitations, sign-ins and their refusals, wrong passwords of a signature: all of it comes with a POST.
+    """
+    try:
+        yield
+    finally:
+        if request.method not in _SAFE_METHODS:
+            await run_in_threadpool(seal, site)
+
+
+def seal(site: Site) -> None:
+    """Sign what the site's chain has that is not signed. A failure is logged: what was done stays done."""
+    try:
+        seq = site.store.head(SITE)
+        if seq != site.sealed_seq:
+            checkpoint(site.store, SITE)
+            site.sealed_seq = seq
+    except UnknownRunError:
+        return  # nothing has happened here yet
+    except OrthocaptureError as error:
+        _log.error("the site's record could not be signed: %s", error)
