@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.request import urlopen
 
 import cv2
 import numpy as np
@@ -129,6 +130,23 @@ def registers(site: Site, command: str) -> None:
     assert np.abs(T - made.T_world_scan).max() < 5e-4
 
 
+def serves_pages(site: Site, command: str) -> None:
+    """The web process answers, on a free port, and ends when told to."""
+    words = shlex.split(command + " --port 0 --json")
+    with subprocess.Popen(
+        [SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.PIPE, text=True
+    ) as server:
+        try:
+            assert server.stdout is not None
+            ready = json.loads(server.stdout.readline())
+            assert "/set-up/" in ready["set_up"]
+            with urlopen(ready["url"] + "/sign-in", timeout=20) as page:
+                assert b"Sign in" in page.read()
+        finally:
+            server.terminate()
+        assert server.wait(timeout=20) == 0
+
+
 Check = Callable[[Site, str], None]
 RUN_HERE: dict[str, Check] = {
     "orthocapture protocol check protocols/exvivo_spine.yaml": succeeds,
@@ -140,6 +158,9 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture plan next latest --data runs": succeeds,
     "orthocapture act pause --run latest --data runs": succeeds,
     "orthocapture worker --data runs": serves_until_terminated,
+    "orthocapture serve --rig rig.yaml --data runs": serves_pages,
+    "orthocapture audit report latest --pdf report.pdf --data runs": succeeds,
+    "orthocapture audit export latest bundle.zip --data runs": succeeds,
     "orthocapture register --images DIR --camera camera.json --poses poses.csv --mesh scan.ply --radius-mm 15 "
     "--out result.json": registers,
     "orthocapture audit show latest --data runs": succeeds,
@@ -147,6 +168,7 @@ RUN_HERE: dict[str, Check] = {
 }
 # Commands that take minutes or a whole rig: the test of the suite that runs them.
 RUN_ELSEWHERE = {
+    "orthocapture replay latest --data runs": "tests/test_replay.py::test_command_says_equal_with_status_0",
     "orthocapture calibrate intrinsics --images DIR --board 16x23 --square-mm 15 --out camera.json": (
         "tests/test_intrinsics_command.py::test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads"
     ),

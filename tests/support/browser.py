@@ -110,7 +110,9 @@ class Served:
     def end_runners(self) -> None:
         """End the processes that drive runs, and wait for them."""
         for path in (self.data / "monitor").glob("*.json"):
-            pid = int(json.loads(path.read_text())["pid"])
+            pid = json.loads(path.read_text()).get("pid")
+            if pid is None:  # a verification's result
+                continue
             try:
                 os.kill(pid, signal.SIGTERM)
             except ProcessLookupError:

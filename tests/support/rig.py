@@ -16,17 +16,21 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 class _Lock:
-    """Only one rig at a time on a machine: RTDE's ports are fixed."""
+    """Only one rig at a time on an address: RTDE's ports are fixed."""
+
+    def __init__(self, host: str) -> None:
+        self._path = Path(tempfile.gettempdir()) / f"orthocapture-test-rig-{host}.lock"
 
     def __enter__(self) -> None:
-        self._file = (Path(tempfile.gettempdir()) / "orthocapture-test-rig.lock").open("w")
+        self._file = self._path.open("w")
         fcntl.flock(self._file, fcntl.LOCK_EX)
 
     def __exit__(self, *_exc: object) -> None:
         self._file.close()
 
 
-RIG_LOCK = _Lock()
+_USUAL = "127.0.0.1"
+RIG_LOCK = _Lock(_USUAL)
 
 
 def orthocapture(*words: str, timeout_s: float = 120) -> subprocess.CompletedProcess[str]:
@@ -42,11 +46,11 @@ def command(*words: str) -> list[str]:
 
 
 @contextmanager
-def simulated_rig(folder: Path, *options: str) -> Generator[dict[str, Any]]:
-    """A rig around one scene; yields its ready line."""
-    with RIG_LOCK, (folder / "rig.log").open("w") as log:
+def simulated_rig(folder: Path, *options: str, host: str = _USUAL) -> Generator[dict[str, Any]]:
+    """A rig around one scene; yields its ready line. On another loopback address it waits for no other rig."""
+    with _Lock(host), (folder / "rig.log").open("w") as log:
         process = subprocess.Popen(
-            command("simulate", "rig", "--dir", str(folder), *options),
+            command("simulate", "rig", "--dir", str(folder), "--host", host, *options),
             cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
         )  # fmt: skip
         try:

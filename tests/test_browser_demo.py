@@ -1,0 +1,182 @@
+"""The whole demonstration protocol, clicked through by a technician and read by an auditor, in a real browser."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.support.browser import DESKTOP, PASSWORD, Screen, Served, add_people, chromium, screen, served
+from tests.support.rig import orthocapture, simulated_rig
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("demo")
+    options = ("--scene", "7", "--image-width", "960", "--speed-up", "4", "--ct-voxel-mm", "0.8")
+    rig_folder = folder / "rig"
+    rig_folder.mkdir()
+    with (
+        simulated_rig(rig_folder, *options, host="127.0.0.9") as ready,
+        served(Path(ready["rig"]), folder / "data") as running,
+    ):
+        add_people(folder / "data", [("tina", "technician"), ("sam", "supervisor"), ("otto", "auditor")])
+        yield running
+
+
+@pytest.fixture(scope="module")
+def run(server: Served, browser: Browser) -> str:
+    """A completed run; its name."""
+    with screen(browser, server.url) as tablet:
+        tablet.sign_in("tina")
+        tablet.go("/")
+        tablet.page.get_by_role("button", name="Start Demonstration on a simulated rig").click()
+        expect(tablet.page.get_by_role("checkbox").first).to_be_visible(timeout=60_000)
+        name = tablet.page.url.rpartition("/")[2]
+        technician = Technician(tablet)
+        deadline_s = time.monotonic() + 700
+        while tablet.page.get_by_role("heading", name="The run is complete").count() == 0:
+            assert time.monotonic() < deadline_s, server.log()
+            assert tablet.page.get_by_role("heading", name="What happened").count() == 0, server.log()
+            technician.do_what_is_asked()
+        assert technician.held >= 5  # calibration and four captures
+        assert technician.signed >= 3  # before the scene is changed for good
+    return name
+
+
+class Technician:
+    """Reads the page and does the one thing that it asks for; knows nothing of the protocol."""
+
+    def __init__(self, tablet: Screen) -> None:
+        self.tablet, self.page = tablet, tablet.page
+        self.held = self.signed = 0
+        self._asked = ""
+
+    def do_what_is_asked(self) -> None:
+        """Tick, sign, confirm or hold; or wait while the software works."""
+        page = self.page
+        unticked = page.locator("[role=checkbox][aria-checked=false]:not([disabled])")
+        if unticked.count():
+            before = unticked.count()
+            unticked.first.click()
+            expect(unticked).to_have_count(before - 1)
+            return
+        actions = page.locator(".actions")
+        sign = actions.get_by_role("button", name=re.compile("^Sign"))
+        confirm = actions.get_by_role("button", name=re.compile("^Confirm:"))
+        if sign.count() and sign.is_visible():
+            self._sign(sign)
+        elif confirm.count() and confirm.is_enabled():
+            self._confirm(confirm)
+        else:
+            page.wait_for_timeout(200)
+
+    def _sign(self, sign: Any) -> None:
+        sign.click()
+        self.page.get_by_label("Your password").fill(PASSWORD)
+        self.page.get_by_role("button", name="Sign", exact=True).click()
+        expect(self.page.locator("dialog[open]")).to_have_count(0)
+        self.signed += 1
+
+    def _confirm(self, confirm: Any) -> None:
+        heading = self.page.get_by_role("heading", level=1).inner_text()
+        if confirm.get_attribute("data-hold"):
+            confirm.hover()
+            self.page.mouse.down()
+            self.page.wait_for_timeout(1800)
+            self.page.mouse.up()
+            self.held += 1
+        else:
+            confirm.click()
+        # The next question, or the work, is another one.
+        expect(confirm.and_(self.page.locator(":enabled"))).to_have_count(0) if self._stays(heading) else None
+
+    def _stays(self, heading: str) -> bool:
+        self.page.wait_for_timeout(300)
+        return self.page.get_by_role("heading", level=1).inner_text() == heading
+
+
+def test_the_technician_sees_the_accuracy_at_the_end(server: Served, browser: Browser, run: str) -> None:
+    with screen(browser, server.url, DESKTOP) as desk:
+        desk.sign_in("tina")
+        desk.go(f"/runs/{run}")
+        table = desk.page.get_by_role("table").first
+        for source in ("colmap", "glomap", "hybrid", "robot"):
+            expect(
+                table.get_by_role("rowheader", name=source, exact=True)
+                .or_(table.get_by_text(source, exact=True))
+                .first
+            ).to_be_visible()
+        errors_mm = {
+            row.locator("th, td").nth(0).inner_text(): float(row.locator("th, td").nth(1).inner_text())
+            for row in table.locator("tbody tr").all()
+        }
+        assert errors_mm["colmap"] < 0.15
+        assert errors_mm["robot"] > errors_mm["colmap"]
+
+
+def test_the_auditor_reads_everything_and_changes_nothing(server: Served, browser: Browser, run: str) -> None:
+    with screen(browser, server.url, DESKTOP) as desk:
+        page = desk.page
+        desk.sign_in("otto")
+        desk.go("/audit")
+        page.get_by_role("link", name=run).first.click()
+        expect(page.get_by_role("heading", name="Deviations")).to_be_visible()
+        for name in ("Timeline", "Artefacts", "Provenance", "Corrections", "Signatures", "Devices and clocks"):
+            page.get_by_role("navigation", name="Audit of this run").get_by_role("link", name=name).click()
+            expect(page.get_by_role("heading", level=1)).to_be_visible()
+        desk.go(f"/audit/runs/{run}/signatures")
+        expect(page.get_by_text("Tina Example").or_(page.get_by_text("tina")).first).to_be_visible()
+        desk.go(f"/audit/runs/{run}/provenance")
+        expect(page.get_by_text(re.compile("registration", re.IGNORECASE)).first).to_be_visible()
+        desk.go(f"/audit/runs/{run}/verification")
+        page.get_by_role("button", name="Verify now").click()
+        expect(page.get_by_role("heading", name="Verifies")).to_be_visible(timeout=60_000)
+        # Scene and calibration have their figures beside the pictures.
+        desk.go(f"/runs/{run}/scene")
+        expect(page.get_by_role("table").first).to_be_visible(timeout=60_000)
+        desk.go(f"/runs/{run}/calibration")
+        expect(page.get_by_role("table").first).to_be_visible(timeout=60_000)
+        assert refused(page, f"/runs/{run}/actions", {"verb": "redo", "reason": "no"}) == 403
+        assert refused(page, f"/runs/{run}/exports", {"what": "bundle"}) == 403
+
+
+def refused(page: Page, path: str, fields: dict[str, str]) -> int:
+    """Status of a POST that the page itself does not offer, sent with the sign-in's own token."""
+    return page.evaluate(
+        """async ([path, fields]) => (await fetch(path, {
+            method: "POST",
+            headers: {"X-CSRF-Token": document.body.dataset.csrf, Accept: "application/json"},
+            body: new URLSearchParams(fields),
+        })).status""",
+        [path, fields],
+    )
+
+
+def test_the_bundle_verifies_on_a_machine_without_orthocapture(server: Served, run: str, tmp_path: Path) -> None:
+    bundle = tmp_path / "bundle.zip"
+    done = orthocapture("audit", "export", run, str(bundle), "--data", str(server.data), timeout_s=240)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = next(tmp_path.glob("*.zip"))
+    with zipfile.ZipFile(found) as archive:
+        verifier = next(name for name in archive.namelist() if name.endswith("verify.py"))
+        (tmp_path / "verify.py").write_bytes(archive.read(verifier))
+    command = [sys.executable, "-I", str(tmp_path / "verify.py"), str(found)]
+    answer = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert answer.returncode == 0, answer.stdout + answer.stderr
