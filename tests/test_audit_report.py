@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 import re
 import shutil
+import zipfile
 import zlib
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -17,16 +19,22 @@ import pytest
 from typer.testing import CliRunner
 
 from service.audit import report_pdf
+from service.audit.bundle import export_bundle
 from service.audit.recorded import read_run
 from service.audit.report_blocks import Report
 from service.audit.report_content import report_content
 from service.audit.report_html import render_html
 from service.audit.report_pdf import render_pdf
 from service.cli.main import app
+from service.core.errors import StoreError
+from service.core.model import Event, EvidenceExported, RunReleased
+from service.people.accounts import Accounts
+from service.people.passwords import Passwords
 from service.store.audit import verify
 from service.store.signing import checkpoint
 from service.store.store import Store
 from tests.support.reported_run import record_reported_run
+from tests.support.web import PIN, QUICK_HASHES, password_of
 
 AT = datetime(2026, 11, 21, 11, 30, tzinfo=UTC)
 
@@ -229,6 +237,72 @@ def test_command_writes_both(folder: Path, tmp_path: Path) -> None:
     assert pdf.read_bytes().startswith(b"%PDF-")
     assert html.read_text().startswith("<!doctype html>")
     assert sorted((p, p.stat().st_mtime_ns) for p in (folder / "data" / "artefacts").rglob("*")) == before
+
+
+def test_command_records_what_leaves_before_it_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_id = record_reported_run(tmp_path)
+    data, html = tmp_path / "data", tmp_path / "r.html"
+    words = ["audit", "report", "--data", str(data), "--html", str(html), "--json", "--operator", "Grace"]
+
+    def told() -> list[Event]:
+        return [e for e in read_run(data, run_id).events if isinstance(e.payload, EvidenceExported)]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Store, "record", _refuse)
+        answer = CliRunner().invoke(app, words)
+        assert answer.exit_code == 1
+        assert "no space" in answer.output
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "rig.yaml"]
+        with Store.open(data) as store, pytest.raises(StoreError, match="no space"):
+            export_bundle(store, run_id, tmp_path / "b.zip", actor="ada")
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "rig.yaml"]
+    head = read_run(data, run_id).events[-1].sha256
+    answer = CliRunner().invoke(app, words)
+    assert json.loads(answer.stdout)["recorded"] is True
+    (event,) = told()
+    assert event.actor == "Grace"
+    assert isinstance(event.payload, EvidenceExported)
+    assert (event.payload.what, event.payload.file_name, event.payload.head_sha256) == ("report", "r.html", head)
+    assert event.payload.sha256 == hashlib.sha256(html.read_bytes()).hexdigest()
+    assert head in html.read_text()
+    monkeypatch.setattr(
+        "service.cli.audit_report._writable", lambda _data: False
+    )  # a copy on a medium that cannot be written
+    assert json.loads(CliRunner().invoke(app, words).stdout)["recorded"] is False
+    assert len(told()) == 1
+    assert verify(data, run_id).ok
+
+
+def _refuse(*_arguments: object, **_more: object) -> None:
+    raise StoreError("no space")
+
+
+def test_people_are_named_in_full(tmp_path: Path) -> None:
+    run_id = record_reported_run(tmp_path, person="ada")
+    with Store.open(tmp_path / "data") as store:
+        accounts = Accounts(store, Passwords(QUICK_HASHES))
+        token = accounts.first_link()
+        assert token is not None
+        accounts.set_up(token, "ada", "Ada, Countess of Lovelace", password_of("ada"), PIN)
+        bundle = export_bundle(store, run_id, tmp_path / "b.zip", actor="ada").path
+    html = words_of(render_html(report_of(tmp_path / "data")))
+    assert html.count("Ada, Countess of Lovelace (ada)") >= 3
+    with zipfile.ZipFile(bundle) as archive:
+        crate = json.loads(archive.read("ro-crate-metadata.json"))
+    (person,) = (entity for entity in crate["@graph"] if entity["@type"] == "Person")
+    assert (person["name"], person["alternateName"]) == ("Ada, Countess of Lovelace", "ada")
+
+
+def test_without_its_release_a_run_is_marked(tmp_path: Path) -> None:
+    run_id = record_reported_run(tmp_path, release="second_person")
+    html = render_html(report_of(tmp_path / "data"))
+    assert '<p class="simulated">NOT RELEASED<small>The protocol asks' in html
+    with Store.open(tmp_path / "data") as store:
+        released = RunReleased(meaning="read", signed_sha256=store.events(run_id)[-1].sha256)
+        store.record(run_id, [released], actor="grace")
+    html = render_html(report_of(tmp_path / "data"))
+    assert "NOT RELEASED" not in html
+    assert "Released by a second person: grace" in html
 
 
 def test_command_without_a_file_says_what_to_say(folder: Path) -> None:

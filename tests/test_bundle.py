@@ -25,6 +25,7 @@ from typer.testing import CliRunner
 
 from service.audit import verifier
 from service.audit.bundle import export_bundle
+from service.audit.bundle_report import bundle_report
 from service.cli.audit import audit_app
 from service.core.errors import DataError, IllegalTransitionError, IntegrityError
 from service.core.model import EvidenceExported, RunReleased, StepNote
@@ -185,20 +186,29 @@ def test_the_same_evidence_gives_the_same_bytes(site: Site, tmp_path: Path) -> N
         checkpoint(store, "site")
     for name in ("one", "two"):
         shutil.copytree(site.data.with_name("before"), tmp_path / name)
+        report = bundle_report(tmp_path / name, site.run_id, with_pictures=True)
         with Store.open(tmp_path / name) as store:
-            made.append(export_bundle(store, site.run_id, tmp_path / f"{name}.zip", actor="ada").path.read_bytes())
+            target = tmp_path / f"{name}.zip"
+            made.append(export_bundle(store, site.run_id, target, actor="ada", report=report).path.read_bytes())
     assert made[0] == made[1]
+    with zipfile.ZipFile(tmp_path / "one-SIMULATED.zip") as archive:
+        html = archive.read("report.html").decode()
+        head = json.loads(archive.read("manifest.json"))["head"]["sha256"]
+    assert head in html
+    assert "data:image/jpeg" in html
 
 
 def test_hashes_alone_are_enough_to_verify_the_records(site: Site, tmp_path: Path) -> None:
     with Store.open(site.data) as store:
-        report = tmp_path / "report.html"
-        report.write_text("<p>for people</p>")
+        report = bundle_report(site.data, site.run_id, with_pictures=False)
         made = export_bundle(store, site.run_id, tmp_path / "h.zip", actor="ada", hashes_only=True, report=report)
     with zipfile.ZipFile(made.path) as archive:
         names = archive.namelist()
         archive.extractall(tmp_path / "hashes")
-    assert "report.html" in names
+    html = (tmp_path / "hashes" / "report.html").read_text()
+    assert made.head_sha256 in html
+    assert "they were left out" in html.lower()
+    assert "data:image" not in html
     assert not any(name.startswith("artefacts/") for name in names)
     assert check(made.path) == []
     (tmp_path / "hashes" / "report.html").write_text("<p>other</p>")

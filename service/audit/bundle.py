@@ -21,9 +21,10 @@ from service.core.fold import fold
 from service.core.model import EvidenceExported, RunStarted
 from service.core.protocol import Protocol
 from service.core.release import refuse_export
+from service.people.rows import full_names
 from service.runs import recorded_run
 from service.store.artefacts import chunks_of, hash_file, read_artefacts
-from service.store.audit import verify
+from service.store.audit import AuditReport, verify
 from service.store.checkpoints import read_checkpoints, read_timestamps
 from service.store.events import canonical, event_text, parse_canonical, read_events
 from service.store.records import SITE, Artefact
@@ -65,6 +66,18 @@ class Exported:
 
 
 @dataclass(frozen=True, slots=True)
+class Exportable:
+    """A run whose evidence verifies and that may leave."""
+
+    protocol: Protocol
+    root: RunStarted
+    audit: AuditReport
+
+
+ReportMaker = Callable[[AuditReport, int], bytes]  # from what verifying gave; up to this event
+
+
+@dataclass(frozen=True, slots=True)
 class _Head:
     seq: int
     sha256: str
@@ -79,8 +92,8 @@ def marked_name(name: str, *, simulated: bool) -> str:
     return f"{stem}-{MARK}.{suffix}" if dot else f"{name}-{MARK}"
 
 
-def require_exportable(store: Store, run_id: str, progress: Progress | None = None) -> tuple[Protocol, RunStarted]:
-    """Verify the evidence, every file included, and that people have released it; protocol and root of the run.
+def require_exportable(store: Store, run_id: str, progress: Progress | None = None) -> Exportable:
+    """Verify the evidence, every file included, and that people have released it.
 
     Raises:
         IntegrityError: the evidence does not verify; it names the first fault.
@@ -97,18 +110,21 @@ def require_exportable(store: Store, run_id: str, progress: Progress | None = No
     refusal = refuse_export(protocol, fold(protocol, store.events(run_id)))
     if refusal is not None:
         raise refusal
-    return protocol, root
+    return Exportable(protocol, root, report)
 
 
 def record_export(
-    store: Store, run_id: str, path: Path, *, what: str, head_sha256: str, actor: str
+    store: Store, run_id: str, path: Path, *, file_name: str, what: str, head_sha256: str, actor: str
 ) -> tuple[str, int]:
-    """Write down in the run's chain that a file has left, and sign that. Hash and size of the file."""
+    """Write down in the run's chain that a file leaves, and sign that. Hash and size of the file.
+
+    Called while the file still has another name, so that nothing leaves that is not recorded.
+    """
     sha256, size = hash_file(path)
     payload = EvidenceExported.model_validate(
         {
             "what": what,
-            "file_name": path.name,
+            "file_name": file_name,
             "sha256": sha256,
             "size_bytes": size,
             "head_sha256": head_sha256,
@@ -126,7 +142,7 @@ def export_bundle(
     *,
     actor: str,
     hashes_only: bool = False,
-    report: Path | None = None,
+    report: ReportMaker | None = None,
     progress: Progress | None = None,
 ) -> Exported:
     """Write a run's bundle and record that it was exported. That record is not in the bundle: it tells its hash.
@@ -137,7 +153,7 @@ def export_bundle(
         target: the file, which must not exist; a simulated run's gets SIMULATED into its name.
         actor: who exports.
         hashes_only: leave the recorded files out; their hashes are in the records.
-        report: a report for people (HTML) to go along.
+        report: makes a report for people (HTML) that goes along.
         progress: told what is being done, in bytes.
 
     Raises:
@@ -146,22 +162,33 @@ def export_bundle(
         DataError: the file exists.
         StoreError: the disk refused, or the signing key cannot be used.
     """
-    protocol, root = require_exportable(store, run_id, progress)
+    exportable = require_exportable(store, run_id, progress)
+    protocol, root = exportable.protocol, exportable.root
     target = target.with_name(marked_name(target.name, simulated=root.simulated))
     checkpoint(store, run_id)
     checkpoint(store, SITE)
     keys = public_keys(store)
     with store.database.reading() as connection:
         head, site_head = _head(connection, run_id), _head(connection, SITE)
-        with writing_bundle(target, _zip_time(head.at_utc)) as bundle:
+        left: list[tuple[str, int]] = []
+
+        def leave(part: Path) -> None:
+            named = {"file_name": target.name, "what": "bundle", "head_sha256": head.sha256}
+            left.append(record_export(store, run_id, part, **named, actor=actor))
+
+        with writing_bundle(target, _zip_time(head.at_utc), leave) as bundle:
             recorded = read_artefacts(connection, run_id)
             _write_records(bundle, store, connection, run_id, root, keys, simulated=root.simulated)
             if report is not None:
-                bundle.add("report.html", chunks_of(report))
+                if progress is not None:
+                    progress("writing the report", 0, 0)
+                bundle.add("report.html", [report(exportable.audit, head.seq)])
             if not hashes_only:
                 _write_artefacts(bundle, store, recorded, progress)
             events = read_events(connection, run_id, 0)
-            metadata = crate(run_id, root, fold(protocol, events), events, recorded, bundle.listed)
+            metadata = crate(
+                run_id, root, fold(protocol, events), events, recorded, bundle.listed, full_names(connection)
+            )
             bundle.add(METADATA, [canonical(metadata).encode()])
             manifest = {
                 "format": FORMAT,
@@ -180,7 +207,7 @@ def export_bundle(
                 raise IntegrityError("the signing key was changed meanwhile", where=run_id, remedy="Export again")
             bundle.add("manifest.json", [signed])
             bundle.add("manifest.sig", [signature.encode() + b"\n"])
-    sha256, size = record_export(store, run_id, target, what="bundle", head_sha256=head.sha256, actor=actor)
+    ((sha256, size),) = left
     return Exported(target, sha256, size, head.seq, head.sha256, key_id, root.simulated)
 
 
@@ -299,6 +326,8 @@ keys.jsonl          the public keys, oldest first; each signed its successor as 
 artefacts.jsonl     where each recorded file came from; the files are artefacts/ab/ab… named by their SHA-256.
 jobs.jsonl          computations.
 protocol.yaml, rig.yaml     as they were when the run began.
+report.html         the same for people, made from the records above; it tells the chain up to the same event. Open it
+                    in a browser; it needs no network.
 ro-crate-metadata.json      the same for machines (RO-Crate 1.1).
 manifest.json, manifest.sig every file with its hash, and the signature over that list.
 

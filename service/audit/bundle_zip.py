@@ -6,7 +6,7 @@ import hashlib
 import os
 import stat
 import zipfile
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,8 +51,13 @@ class BundleZip:
 
 
 @contextmanager
-def writing_bundle(target: Path, at: ZipTime) -> Generator[BundleZip]:
+def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | None = None) -> Generator[BundleZip]:
     """A zip file that appears under its name only when it is complete and durable; nothing is left of it otherwise.
+
+    Args:
+        target: the file.
+        at: time stamp of its entries.
+        leaving: called with the complete file before it gets its name; when it raises, no file appears.
 
     Raises:
         DataError: a file of this name exists.
@@ -67,6 +72,8 @@ def writing_bundle(target: Path, at: ZipTime) -> Generator[BundleZip]:
                 yield BundleZip(archive, at)
             handle.flush()
             os.fsync(handle.fileno())
+        if leaving is not None:
+            leaving(part)
         os.link(part, target)  # unlike a rename, never replaces what another process has put there meanwhile
         _sync(target.parent)
     except FileExistsError as error:

@@ -52,13 +52,17 @@ def crate(
     events: Sequence[Event],
     artefacts: Sequence[Artefact],
     files: Sequence[Listed],
+    full_names: Mapping[str, str],
 ) -> dict[str, Any]:
     """The metadata as plain data. `files` are those of the bundle; recorded ones may be missing (only hashes)."""
     described = _artefact_entities(artefacts, {item.path for item in files})
     ids = {artefact.ref.sha256: entity["@id"] for artefact, entity in described}
     own = [_file_entity(item) for item in files if not item.path.startswith("artefacts/")]
     parts = [*own, *(entity for _, entity in described)]
-    people = [_person(name) for name in sorted({*state.people, *filter(None, (root.operator, state.released_by))})]
+    people = [
+        _person(name, full_names)
+        for name in sorted({*state.people, *filter(None, (root.operator, state.released_by))})
+    ]
     devices = list(_devices(events))
     actions = [*_captures(events, ids, {d["@id"] for d in devices}), *_jobs(events, ids)]
     marked = "SIMULATED " if root.simulated else ""
@@ -139,8 +143,10 @@ def _artefact_entities(artefacts: Iterable[Artefact], present: set[str]) -> list
     return list(found.values())
 
 
-def _person(name: str) -> dict[str, Any]:
-    return {"@id": _anchor("person", name), "@type": "Person", "name": name}
+def _person(account: str, full_names: Mapping[str, str]) -> dict[str, Any]:
+    """By full name; the account, as the records have it, is the other name."""
+    person = {"@id": _anchor("person", account), "@type": "Person", "name": full_names.get(account) or account}
+    return person if person["name"] == account else person | {"alternateName": account}
 
 
 def _anchor(kind: str, name: str) -> str:

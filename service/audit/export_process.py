@@ -14,14 +14,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.audit.bundle import export_bundle, marked_name, record_export, require_exportable
+from service.audit.bundle_report import bundle_report
 from service.audit.bundle_zip import writing_bundle
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.store.artefacts import chunks_of
-from service.store.audit import verify
 from service.store.store import Store
 
 if TYPE_CHECKING:
     from service.audit.recorded import RecordedRun
+    from service.store.audit import AuditReport
 
 Progress = Callable[[str, int, int], None]
 _OLDEST = (1980, 1, 1, 0, 0, 0)  # zip knows no earlier time; the files say themselves what they are of
@@ -34,45 +35,54 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
     """
     with Store.open(data, create=False) as store:
         if what in ("bundle", "hashes"):
-            made = export_bundle(store, run_id, target, actor=actor, hashes_only=what == "hashes", progress=progress)
+            hashes_only = what == "hashes"
+            report = bundle_report(data, run_id, with_pictures=not hashes_only)
+            made = export_bundle(
+                store, run_id, target, actor=actor, hashes_only=hashes_only, report=report, progress=progress
+            )
             return made.path
-        require_exportable(store, run_id, progress)
+        exportable = require_exportable(store, run_id, progress)
         # These load the numerics and the typesetting, which a bundle does without.
         from service.audit.recorded import read_run  # noqa: PLC0415
 
         run = read_run(data, run_id)
         path = target.with_name(marked_name(target.name, simulated=run.root.simulated))
         progress("writing", 0, 0)
+        kind = "dataset" if what == "dataset" else "report"
+
+        def leave(part: Path) -> None:
+            head_sha256 = run.events[-1].sha256
+            record_export(store, run_id, part, file_name=path.name, what=kind, head_sha256=head_sha256, actor=actor)
+
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
             part = Path(folder) / "part"
             if what == "dataset":
-                _write_dataset(run, part, path)
+                _write_dataset(run, part, path, leave)
             elif what in ("report", "report_pdf"):
-                _write_report(run, part, pdf=what == "report_pdf")
+                _write_report(run, exportable.audit, part, pdf=what == "report_pdf")
+                leave(part)
                 part.replace(path)
             else:
                 raise ConfigurationError(f"nothing is called {what!r}", where="what")
-        kind = "dataset" if what == "dataset" else "report"
-        record_export(store, run_id, path, what=kind, head_sha256=run.events[-1].sha256, actor=actor)
         return path
 
 
-def _write_dataset(run: RecordedRun, folder: Path, target: Path) -> None:
+def _write_dataset(run: RecordedRun, folder: Path, target: Path, leave: Callable[[Path], None]) -> None:
     from service.dataset.export import export_dataset  # noqa: PLC0415
 
     export_dataset(run.summary(), folder)
-    with writing_bundle(target, _OLDEST) as archive:
+    with writing_bundle(target, _OLDEST, leave) as archive:
         for path in sorted(path for path in folder.rglob("*") if path.is_file()):
             compress = path.suffix.lower() not in (".jpg", ".jpeg", ".png", ".npz")
             archive.add(path.relative_to(folder).as_posix(), chunks_of(path), compress=compress)
 
 
-def _write_report(run: RecordedRun, path: Path, *, pdf: bool) -> None:
+def _write_report(run: RecordedRun, audit: AuditReport, path: Path, *, pdf: bool) -> None:
     from service.audit.report_content import report_content  # noqa: PLC0415
     from service.audit.report_html import write_html  # noqa: PLC0415
     from service.audit.report_pdf import write_pdf  # noqa: PLC0415
 
-    (write_pdf if pdf else write_html)(report_content(run, verify(run.data_dir, run.run_id)), path)
+    (write_pdf if pdf else write_html)(report_content(run, audit, with_scene=not pdf), path)
 
 
 def main(arguments: list[str]) -> None:

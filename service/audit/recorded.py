@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from service.core.model import Event, RunStarted
 from service.core.protocol import Protocol, parse_protocol
 from service.core.run_state import RunState
 from service.dataset.summary import RunSummary
+from service.people.rows import full_names, named
 from service.steps import params_models
 from service.store.artefacts import ArtefactFiles, read_artefacts
 from service.store.database import open_read_only
@@ -45,14 +46,19 @@ class RecordedRun:
     state: RunState
     artefacts: Sequence[Artefact]
     files: RecordedFiles
+    full_names: Mapping[str, str]  # of accounts, as they are now
 
     def summary(self) -> RunSummary:
         """The same for the report's and the data set's functions."""
         return RunSummary(self.run_id, self.protocol, self.root, self.state, self.events, self.files)
 
+    def named(self, account: str) -> str:
+        """A person by full name and account; who has no account is called as recorded."""
+        return named(account, self.full_names)
 
-def read_run(data_dir: Path, name: str) -> RecordedRun:
-    """A run by its name, the beginning of its name, or `latest`.
+
+def read_run(data_dir: Path, name: str, *, last_seq: int | None = None) -> RecordedRun:
+    """A run by its name, the beginning of its name, or `latest`; up to its end, or as it was at an event.
 
     Raises:
         UnknownRunError: there is no such run.
@@ -65,8 +71,12 @@ def read_run(data_dir: Path, name: str) -> RecordedRun:
             run_id = resolve_run(read_runs(connection), name)
             events = read_events(connection, run_id, 0)
             artefacts = read_artefacts(connection, run_id)
+            names = full_names(connection)
     finally:
         database.close()
+    if last_seq is not None:
+        events = [event for event in events if event.seq <= last_seq]
+        artefacts = [artefact for artefact in artefacts if artefact.seq <= last_seq]
     root = events[0].payload if events else None
     if not isinstance(root, RunStarted):
         raise IntegrityError("the run's first event is not run_started", where=run_id)
@@ -74,4 +84,4 @@ def read_run(data_dir: Path, name: str) -> RecordedRun:
     content = files.artefact_path(root.protocol.sha256, verify=True).read_bytes()
     loaded = parse_protocol(content, params_models(), name=root.protocol.original_name)
     state = fold(loaded.protocol, events)
-    return RecordedRun(data_dir, run_id, root, loaded.protocol, loaded.source, events, state, artefacts, files)
+    return RecordedRun(data_dir, run_id, root, loaded.protocol, loaded.source, events, state, artefacts, files, names)

@@ -7,13 +7,12 @@ from datetime import UTC, datetime
 
 from service.audit.recorded import RecordedRun
 from service.audit.report_accuracy import accuracy_section, budget_section, result_sentence
-from service.audit.report_blocks import Cell, Facts, Report
+from service.audit.report_blocks import Cell, Facts, Paragraph, Report, Section
 from service.audit.report_certificates import certificate_sections
 from service.audit.report_course import deviations, deviations_section, people_section, steps_section
 from service.audit.report_origin import devices_section, pictures_section, software_section
 from service.audit.report_verification import verification_section
 from service.audit.report_words import duration, utc
-from service.dataset.summary import RunSummary
 from service.store.audit import AuditReport
 
 
@@ -24,6 +23,7 @@ def report_content(
     made_at: datetime | None = None,
     true_error_mm: Mapping[str, float] | None = None,
     with_scene: bool = True,
+    with_pictures: bool = True,
 ) -> Report:
     """The report of a run.
 
@@ -33,6 +33,7 @@ def report_content(
         made_at: the time stamp of the report; now unless given. With the same one the same evidence gives the same.
         true_error_mm: by source of poses, on a simulated rig where the truth is known; marked as such.
         with_scene: the 3D scene as well, which only HTML can show.
+        with_pictures: False leaves out what shows the photographs.
     """
     summary = run.summary()
     listed = deviations(run)
@@ -45,7 +46,9 @@ def report_content(
         people_section(run),
         *certificate_sections(run),
         devices_section(run),
-        pictures_section(run, with_scene=with_scene),
+        pictures_section(run, with_scene=with_scene)
+        if with_pictures
+        else Section("Pictures", (Paragraph("They were left out: this report goes with hashes alone."),)),
         verification_section(run, audit),
         software_section(run),
     ]
@@ -57,7 +60,8 @@ def report_content(
         deviations=Cell(f"{len(listed)} deviations, listed first", "attention")
         if listed
         else Cell("No deviation: every step was done as the protocol says", "ok"),
-        facts=_facts(summary),
+        release=_release(run),
+        facts=_facts(run),
         sections=tuple(section for section in sections if section is not None),
         run_id=run.run_id,
         head_sha256=run.events[-1].sha256,
@@ -74,14 +78,23 @@ def _verification(audit: AuditReport) -> Cell:
     )
 
 
-def _facts(summary: RunSummary) -> Facts:
-    root, state, events = summary.root, summary.state, summary.events
+def _release(run: RecordedRun) -> Cell | None:
+    """None where the protocol asks for no release."""
+    if run.protocol.release != "second_person":
+        return None
+    if run.state.released_by:
+        return Cell(f"Released by a second person: {run.named(run.state.released_by)}", "ok")
+    return Cell("NOT RELEASED: the protocol asks that a second person reads and releases this run", "stop")
+
+
+def _facts(run: RecordedRun) -> Facts:
+    root, state, events = run.root, run.state, run.events
     views = sum(len(step.captured) for step in state.steps.values())
-    others = sorted(state.people - {root.operator})
+    others = sorted(run.named(person) for person in state.people - {root.operator})
     status = {"active": "not finished"}.get(state.status, state.status)
     return Facts(
         (
-            ("Run", summary.run_id),
+            ("Run", run.run_id),
             ("Begun", utc(events[0].at_utc)),
             ("Last record", f"{utc(events[-1].at_utc)}, after {duration(events[0].at_utc, events[-1].at_utc)}"),
             (
@@ -91,9 +104,9 @@ def _facts(summary: RunSummary) -> Facts:
                     "ok" if status == "completed" else "attention",
                 ),
             ),
-            ("Begun by", root.operator),
+            ("Begun by", run.named(root.operator)),
             ("Others who took part", ", ".join(others) or "none"),
-            ("Released by", state.released_by or "nobody"),
+            ("Released by", run.named(state.released_by) if state.released_by else "nobody"),
             ("Protocol", f"{root.protocol_id}, version {root.protocol_version}"),
             ("SHA-256 of the protocol", root.protocol_sha256),
             ("SHA-256 of the rig's description", root.rig.sha256),

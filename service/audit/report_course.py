@@ -86,7 +86,9 @@ def deviations_section(run: RecordedRun, listed: Sequence[Departure]) -> Section
             Column("what happened", 3.2),
             Column("who", 0.8),
         )
-        rows = tuple((str(d.seq), at[d.seq], Cell(d.kind, "attention"), d.step, d.text, d.who) for d in listed)
+        rows = tuple(
+            (str(d.seq), at[d.seq], Cell(d.kind, "attention"), d.step, d.text, run.named(d.who)) for d in listed
+        )
         blocks.append(Table(columns, rows))
     else:
         blocks.append(Paragraph("None: every step was done once, as the protocol says, within its limits.", "ok"))
@@ -115,12 +117,12 @@ def steps_section(run: RecordedRun) -> Section:
     for number, step in enumerate(run.protocol.steps, 1):
         state = run.state.steps[step.id]
         heads.add(len(rows))
-        rows.append((_state(f"{number}. {step.title}", state), "", "", ""))
+        rows.append((_state(run, f"{number}. {step.title}", state), "", "", ""))
         rows += [(*measured(verdict), limit(verdict), judged(verdict)) for verdict in state.verdicts]
     return Section("Steps and gates", (Table(columns, tuple(rows), frozenset(heads), frozenset(heads)),))
 
 
-def _state(title: str, state: StepState) -> Cell:
+def _state(run: RecordedRun, title: str, state: StepState) -> Cell:
     went_on = state.phase == "passed" and not state.skipped
     phase = ("gates overridden" if state.verdicts else "skipped") if state.skipped else words(state.phase)
     parts = [phase, f"attempt {state.attempt}" if state.attempt > 1 else ""]
@@ -129,7 +131,7 @@ def _state(title: str, state: StepState) -> Cell:
     if state.started_utc and state.ended_utc:
         parts.append(f"took {duration(state.started_utc, state.ended_utc)}")
     parts.append(f"{len(state.captured)} views" if state.captured else "")
-    parts.append(f"signed by {state.signed_by}" if state.signed_by else "")
+    parts.append(f"signed by {run.named(state.signed_by)}" if state.signed_by else "")
     return Cell(f"{title}: {', '.join(filter(None, parts))}", "plain" if went_on else "attention")
 
 
@@ -146,10 +148,12 @@ def people_section(run: RecordedRun) -> Section:
             if payload.action == "sign":
                 how = "automatic" if payload.automatic else payload.via
                 meaning = f"{titles.get(payload.step or '', '')}: {payload.meaning or 'no meaning given'} ({how})"
-                rows.append((str(event.seq), utc(event.at_utc), event.actor, meaning, payload.signed_sha256))
+                rows.append(
+                    (str(event.seq), utc(event.at_utc), run.named(event.actor), meaning, payload.signed_sha256)
+                )
         elif isinstance(payload, RunReleased):
             meaning = f"Release of the run: {payload.meaning}"
-            rows.append((str(event.seq), utc(event.at_utc), event.actor, meaning, payload.signed_sha256))
+            rows.append((str(event.seq), utc(event.at_utc), run.named(event.actor), meaning, payload.signed_sha256))
     signatures = Table(
         (
             Column("event", 0.5, "number"),
@@ -164,7 +168,7 @@ def people_section(run: RecordedRun) -> Section:
     people = Table(
         (Column("name", 1.0), Column("took part by", 4.0)),
         tuple(
-            (name, ", ".join(f"{count} × {words(action)}" for action, count in sorted(counts.items())))
+            (run.named(name), ", ".join(f"{count} × {words(action)}" for action, count in sorted(counts.items())))
             for name, counts in sorted(acts.items())
         ),
     )

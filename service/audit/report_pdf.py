@@ -170,7 +170,15 @@ def _front(report: Report, styles: _Styles) -> Iterator[Flowable]:
         quiet = styles.style(9.5, color=HexColor(_TONES["stop"]))
         yield Text("A simulated rig: not a real capture. Nothing here was measured on a specimen.", quiet)
         yield Spacer(1, 4 * mm)
-    for statement in (report.verification, report.deviations, report.result):
+    first: tuple[Cell, ...] = ()
+    if report.release is not None and report.release.tone == "stop":
+        large, _, small = report.release.text.partition(": ")
+        yield Text(escape(large), styles.style(34, "bold", color=HexColor(_TONES["stop"])))
+        yield Text(escape(f"{small[:1].upper()}{small[1:]}."), styles.style(9.5, color=HexColor(_TONES["stop"])))
+        yield Spacer(1, 4 * mm)
+    elif report.release is not None:
+        first = (report.release,)
+    for statement in (*first, report.verification, report.deviations, report.result):
         end = "" if statement.text.endswith(".") else "."
         yield _statement(Cell(statement.text + end, statement.tone), styles, 10)
         yield Spacer(1, 2 * mm)

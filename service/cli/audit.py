@@ -149,23 +149,27 @@ def export_command(
     operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
     json: JsonOption = False,
 ) -> None:
-    """Write a run's evidence into one file that anybody can verify elsewhere, with the verifier inside.
+    """Write a run's evidence into one file that anybody can verify elsewhere, with a report and the verifier inside.
 
     Refused when the evidence does not verify, and when the protocol asks for a release that was not given.
     """
-    from service.audit.bundle import export_bundle  # noqa: PLC0415  # loads the numerics, which `verify` does without
+    # These load the numerics, which `verify` does without.
+    from service.audit.bundle import export_bundle  # noqa: PLC0415
+    from service.audit.bundle_report import bundle_report  # noqa: PLC0415
 
     with (
         reporting_errors(json),
         Store.open(data, create=False) as store,
         progress_bar(quiet=json) as report_progress,
     ):
+        run_id = store.find_run(run)
         made = export_bundle(
             store,
-            store.find_run(run),
+            run_id,
             bundle,
             actor=operator or getpass.getuser(),
             hashes_only=hashes_only,
+            report=bundle_report(data, run_id, with_pictures=not hashes_only),
             progress=report_progress,
         )
     if json:

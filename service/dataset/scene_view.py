@@ -141,7 +141,7 @@ def scene_html(scene: Scene) -> str:
 
     figure = scene_figure(scene)
     figure["layout"] |= {"height": 620}
-    return str(plotly.io.to_html(figure, full_html=False, include_plotlyjs=True, validate=False))
+    return str(plotly.io.to_html(figure, full_html=False, include_plotlyjs=True, validate=False, div_id="scene"))
 
 
 def figure_json(figure: Mapping[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any, Literal, cast
 
 from sqlalchemy import Connection, Row, delete, select
@@ -71,6 +72,18 @@ def get_account(connection: Connection, account: str) -> Row[Any]:
     if row is None:
         raise AccountError(f"there is no account {account!r}", where="account", remedy="See the list of accounts")
     return row
+
+
+def full_names(connection: Connection) -> dict[str, str]:
+    """Full name of every account, closed ones included."""
+    rows = connection.execute(select(accounts.c.account, accounts.c.full_name))
+    return {row.account: row.full_name for row in rows}
+
+
+def named(account: str, full_names: Mapping[str, str]) -> str:
+    """A person as documents name them: full name, then the account that the records have."""
+    full_name = full_names.get(account, "")
+    return f"{full_name} ({account})" if full_name and full_name != account else account
 
 
 def to_account(row: Row[Any]) -> Account:

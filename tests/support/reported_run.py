@@ -64,10 +64,13 @@ steps:
 """
 
 
-def record_reported_run(folder: Path, *, error_mm: float = 0.213, person: str = "Ada Λ. Müller") -> str:
+def record_reported_run(
+    folder: Path, *, error_mm: float = 0.213, person: str = "Ada Λ. Müller", release: str = "none"
+) -> str:
     """The run in folder/data; its name."""
+    text = PROTOCOL.replace("steps:", f"release: {release}\nsteps:", 1)
     (folder / "rig.yaml").write_text("name: small\nsimulated: true\ndevices: {}\n")
-    loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="reported.yaml")
+    loaded = parse_protocol(text.encode(), params_models(), name="reported.yaml")
     with Store.open(folder / "data") as store:
         run_id = start_run(store, loaded, load_rig(folder / "rig.yaml"), operator=person, auto_confirm=False)
         run = _Writer(store, run_id, loaded.protocol, person)
