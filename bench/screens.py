@@ -155,11 +155,10 @@ def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) ->
         "SET_UP": f"/set-up/{link}",
         "ARTEFACT": f"/audit/runs/{runs['RUN_DONE']}/artefacts/{files[3].ref.sha256}",
     }
-    working = STANDING | {"doing": "working", "robot": "moving", "what": "viewpoint_capture_1", "done": 6, "total": 8}
+    working = STANDING | {"doing": "working", "robot": "moving", "what": "image", "done": 6, "total": 8}
     asking = STANDING | {"doing": "asking"}
-    snapshots = {runs[name]: working if name == "RUN_WORK" else asking for name in runs if name != "RUN_DONE"}
     taken: list[Path] = []
-    with served(rig_file, data) as server, attended(data, snapshots), chromium() as browser, ExitStack() as screens:
+    with served(rig_file, data) as server, chromium() as browser, ExitStack() as screens:
         for size, suffix in ((TABLET, "tablet"), (DESKTOP, "desktop")):
             before: dict[str, Screen] = {}
             for name, who, address, _ in SHOTS:
@@ -168,21 +167,25 @@ def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) ->
                     continue
                 if who not in before:
                     before[who] = screens.enter_context(screen(browser, server.url, size))
+                    before[who].page.set_default_timeout(60_000)
                     if who:
                         before[who].sign_in(who)
                     if who == "tina":
-                        for run_id in snapshots:
+                        for run_id in runs.values():
                             take_control(before[who], run_id)
                 shot = before[who]
                 for placeholder, text in names.items():
                     path = path.replace(placeholder, text)
-                prepare(shot, path)
-                for dark in (False, True) if name in DARK else (False,):
-                    shot.page.emulate_media(color_scheme="dark" if dark else "light")
-                    shot.page.wait_for_timeout(300)
-                    target = into / f"{name}-{suffix}{'-dark' if dark else ''}.png"
-                    taken.append(write_small(shot.page.screenshot(), target))
-                shot.page.emulate_media(color_scheme="light")
+                # One rig drives one run at a time.
+                driven = [key for key in runs if key in address and key != "RUN_DONE"]
+                with attended(data, {runs[key]: working if key == "RUN_WORK" else asking for key in driven}):
+                    prepare(shot, path)
+                    for dark in (False, True) if name in DARK else (False,):
+                        shot.page.emulate_media(color_scheme="dark" if dark else "light")
+                        shot.page.wait_for_timeout(300)
+                        target = into / f"{name}-{suffix}{'-dark' if dark else ''}.png"
+                        taken.append(write_small(shot.page.screenshot(), target))
+                    shot.page.emulate_media(color_scheme="light")
             screens.close()
     return taken
 

@@ -78,6 +78,7 @@ PAGES: dict[str, tuple[tuple[Role | None, str], ...]] = {
 NO_PAGES = {
     "/openapi.json",
     "/vendor/plotly.js",
+    "/robots",
     "/runs/{run_id}/parts/{name}",
     "/runs/{run_id}/capture/parts/{name}",
     "/runs/{run_id}/scene/frame",  # sandboxed within its page, and checked there
@@ -87,6 +88,8 @@ NO_PAGES = {
     "/runs/{run_id}/live-view",
     "/runs/{run_id}/exports/{file_name}",
 }
+STANDING = {"doing": "asking", "robot": "standing", "robot_name": "robot", "light_lux": 800.0}
+WORKING = {"doing": "working", "robot": "moving", "what": "image", "done": 1, "total": 4}
 VIEWS = [view for views in PAGES.values() for view in views]
 
 
@@ -121,6 +124,16 @@ class Desk:
     def address(self, path: str) -> str:
         return path.format(**self.names)
 
+    @contextmanager
+    def attending(self, path: str) -> Generator[str]:
+        """The address; if it is of a run under way, that run is driven meanwhile, as the only one of its rig."""
+        address = self.address(path)
+        runs = {run_id: STANDING for run_id in self.site.under_way if run_id in address}
+        if self.site.calibrated in runs:
+            runs[self.site.calibrated] = STANDING | WORKING
+        with attended(self.server.data, runs):
+            yield address
+
     def _asked(self, url: str) -> None:
         if not url.startswith((self.server.url + "/", "data:", "blob:", "about:")):
             self.complaints.append(f"asks another host: {url}")
@@ -139,18 +152,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
         image = next(a.ref.sha256 for a in store.artefacts(site.completed) if a.ref.kind == "image")
     names = {name: str(getattr(site, name)) for name in ShownSite.__dataclass_fields__}
     names |= {"image": image, "link": invitation(folder)}
-    standing = {"doing": "asking", "robot": "standing", "robot_name": "robot", "light_lux": 800.0}
-    runs = dict.fromkeys(site.under_way, standing)
-    runs[site.calibrated] = standing | {
-        "doing": "working",
-        "robot": "moving",
-        "what": "capture",
-        "done": 1,
-        "total": 4,
-    }
     with (
         served(folder / "rig.yaml", data, "--protocols", str(folder / "protocols")) as server,
-        attended(data, runs),
         chromium() as browser,
         contextlib.ExitStack() as screens,
     ):
@@ -178,7 +181,14 @@ def test_page(desk: Desk, role: Role | None, path: str) -> None:
     page.emulate_media(color_scheme="light")
     page.set_viewport_size({"width": TABLET[0], "height": TABLET[1]})
     del desk.complaints[:]
-    shown.go(desk.address(path))
+    with desk.attending(path) as address:
+        shown.go(address)
+        faults = page_faults(page)
+    assert faults + desk.complaints == []
+
+
+def page_faults(page: Page) -> list[str]:
+    """What is wrong with the page that is loaded."""
     page.evaluate(CHECKS)
     faults = [f"light tablet: {fault}" for fault in accessibility_faults(page)]
     faults += [f"too small: {fault}" for fault in page.evaluate("check.small()")]
@@ -189,16 +199,21 @@ def test_page(desk: Desk, role: Role | None, path: str) -> None:
         faults += [f"sideways at {width} px: {fault}" for fault in page.evaluate("check.sideways()")]
     page.set_viewport_size({"width": DESKTOP[0], "height": DESKTOP[1]})
     page.emulate_media(color_scheme="dark")
-    faults += [f"dark desktop: {fault}" for fault in accessibility_faults(page)]
-    assert faults + desk.complaints == []
+    return faults + [f"dark desktop: {fault}" for fault in accessibility_faults(page)]
 
 
 def tab_faults(page: Page) -> list[str]:
     """Controls that Tab does not reach, that do not show the focus, or that come out of turn."""
-    count = page.evaluate("check.follow()")
-    for _ in range(count + 3):
-        page.keyboard.press("Tab")
-    return page.evaluate("check.way()")
+    count, faults = page.evaluate("check.follow()"), []
+    for _ in range(6):  # a date has several stops, and a frame has controls of its own
+        for _ in range(count + 3):
+            page.keyboard.press("Tab")
+        faults = page.evaluate("check.way()")
+        if not any("not reached" in fault for fault in faults):
+            break
+        count = 15
+    page.evaluate("document.activeElement.blur()")
+    return faults
 
 
 @pytest.mark.parametrize(
@@ -208,83 +223,87 @@ def tab_faults(page: Page) -> list[str]:
 def test_a_dialog_holds_the_focus_and_gives_it_back(desk: Desk, run: str, opener: str) -> None:
     shown = desk.screen("technician")
     page = shown.page
-    shown.go(desk.address(f"/runs/{{{run}}}"))
-    page.evaluate(CHECKS)
-    button = page.get_by_role("button", name=opener).first
-    button.focus()
-    page.keyboard.press("Enter")
-    expect(page.locator("dialog:modal")).to_be_visible()
-    assert page.evaluate("document.querySelector('dialog:modal').contains(document.activeElement)")
-    assert accessibility_faults(page) == []
-    assert page.evaluate("check.small()") == []
-    for _ in range(12):
-        page.keyboard.press("Tab")
-        assert page.evaluate("check.behind()")
-    page.keyboard.press("Escape")
-    expect(page.locator("dialog:modal")).to_have_count(0)
-    expect(button).to_be_focused()
+    with desk.attending(f"/runs/{{{run}}}") as address:
+        shown.go(address)
+        page.evaluate(CHECKS)
+        button = page.get_by_role("button", name=opener).first
+        button.focus()
+        page.keyboard.press("Enter")
+        expect(page.locator("dialog:modal")).to_be_visible()
+        assert page.evaluate("document.querySelector('dialog:modal').contains(document.activeElement)")
+        assert accessibility_faults(page) == []
+        assert page.evaluate("check.small()") == []
+        for _ in range(12):
+            page.keyboard.press("Tab")
+            assert page.evaluate("check.behind()")
+        page.keyboard.press("Escape")
+        expect(page.locator("dialog:modal")).to_have_count(0)
+        expect(button).to_be_focused()
 
 
 def test_a_locked_screen_is_unlocked_by_keys_and_cannot_be_escaped(desk: Desk) -> None:
     shown = desk.screen("technician")
     page = shown.page
-    shown.go(desk.address("/runs/{listing}"))
-    page.get_by_role("button", name="Lock").focus()
-    page.keyboard.press("Enter")
-    expect(page.get_by_label("PIN")).to_be_focused()
-    assert accessibility_faults(page) == []
-    page.keyboard.press("Escape")
-    expect(page.get_by_label("PIN")).to_be_visible()
-    page.keyboard.type(PIN)
-    page.keyboard.press("Enter")
-    expect(page.get_by_label("PIN")).to_be_hidden()
+    with desk.attending("/runs/{listing}") as address:
+        shown.go(address)
+        page.get_by_role("button", name="Lock").focus()
+        page.keyboard.press("Enter")
+        expect(page.get_by_label("PIN", exact=True)).to_be_focused()
+        assert accessibility_faults(page) == []
+        page.keyboard.press("Escape")
+        expect(page.get_by_label("PIN", exact=True)).to_be_visible()
+        page.keyboard.type(PIN)
+        page.keyboard.press("Enter")
+        expect(page.get_by_label("PIN", exact=True)).to_be_hidden()
 
 
 def test_nothing_moves_on_the_page_for_who_wants_no_motion(desk: Desk) -> None:
     shown = desk.screen("technician")
     shown.page.emulate_media(reduced_motion="no-preference")
-    shown.go(desk.address("/runs/{calibrated}"))
-    moving = "document.getAnimations().length"
-    assert shown.page.evaluate(moving) > 0
-    shown.page.emulate_media(reduced_motion="reduce")
-    assert shown.page.evaluate(moving) == 0
-    shown.page.emulate_media(reduced_motion="no-preference")
+    with desk.attending("/runs/{calibrated}") as address:
+        shown.go(address)
+        moving = "document.getAnimations().length"
+        assert shown.page.evaluate(moving) > 0
+        shown.page.emulate_media(reduced_motion="reduce")
+        assert shown.page.evaluate(moving) == 0
+        shown.page.emulate_media(reduced_motion="no-preference")
 
 
 def test_a_motion_is_confirmed_with_a_held_key_only(desk: Desk) -> None:
     shown = desk.screen("technician")
     page = shown.page
-    shown.go(desk.address("/runs/{moving}"))
-    go = page.get_by_role("button", name=re.compile("Confirm: the robot takes"))
-    expect(go).to_be_enabled()
-    go.focus()
-    page.keyboard.press("Enter")
-    page.keyboard.down("Enter")
-    page.wait_for_timeout(800)
-    page.keyboard.up("Enter")
-    assert "confirm" not in actions(desk, desk.site.moving)
-    page.keyboard.down("Enter")
-    page.wait_for_timeout(1900)
-    page.keyboard.up("Enter")
-    expect(go).to_have_count(0)
-    assert actions(desk, desk.site.moving).count("confirm") == 1
+    with desk.attending("/runs/{moving}") as address:
+        shown.go(address)
+        go = page.get_by_role("button", name=re.compile("Confirm: the robot takes"))
+        expect(go).to_be_enabled()
+        go.focus()
+        page.keyboard.press("Enter")
+        page.keyboard.down("Enter")
+        page.wait_for_timeout(800)
+        page.keyboard.up("Enter")
+        assert "confirm" not in actions(desk, desk.site.moving)
+        page.keyboard.down("Enter")
+        page.wait_for_timeout(2500)
+        page.keyboard.up("Enter")
+        expect(go).to_have_count(0, timeout=20_000)
+        assert actions(desk, desk.site.moving).count("confirm") == 1
 
 
 def test_a_checklist_is_worked_through_without_script(desk: Desk) -> None:
-    with plain_page(desk.browser, desk.server.url) as page:
+    with plain_page(desk.browser, desk.server.url) as page, desk.attending("/runs/{listing}") as address:
         page.goto("/sign-in")
-        page.get_by_label("Account").fill("emmy")
-        page.get_by_label("Password").fill(password_of("emmy"))
+        page.get_by_label("Account").fill("grace")
+        page.get_by_label("Password").fill(password_of("grace"))
         page.get_by_role("button", name="Sign in").click()
-        page.goto(desk.address("/runs/{listing}"))
-        page.get_by_role("button", name="Take control").click()
+        page.goto(address)
+        page.get_by_role("button", name="Take control here").click()
         page.get_by_role("checkbox", name=re.compile("board lies")).click()
         expect(page.locator("[aria-checked=true]")).to_have_count(2)
         page.get_by_role("button", name=re.compile("^Confirm")).click()
         assert actions(desk, desk.site.listing) == ["confirm"]
         page.get_by_role("button", name="Sign out").click()
         expect(page.get_by_role("button", name="Sign in")).to_be_visible()
-        page.goto(desk.address("/runs/{listing}"))
+        page.goto(address)
         expect(page.get_by_role("button", name="Sign in")).to_be_visible()
 
 

@@ -22,16 +22,18 @@ def attended(data: Path, runs: Mapping[str, Mapping[str, Any]]) -> Generator[Non
     over = threading.Event()
 
     def tell() -> None:
-        while True:
-            for run_id, fields in runs.items():
-                write_snapshot(data, run_id, Snapshot.model_validate({"at_utc_s": time.time(), **fields}))
-            if over.wait(1.0):
-                return
+        for run_id, fields in runs.items():
+            write_snapshot(data, run_id, Snapshot.model_validate({"at_utc_s": time.time(), **fields}))
+
+    def go_on_telling() -> None:
+        while not over.wait(1.0):
+            tell()
 
     with Store.open(data) as store, contextlib.ExitStack() as leases:
         for run_id in runs:
             leases.enter_context(store.lease(run_id, "attended", _LEASE_S))
-        teller = threading.Thread(target=tell)
+        tell()
+        teller = threading.Thread(target=go_on_telling)
         teller.start()
         try:
             yield

@@ -28,10 +28,10 @@
         const e = event.target;
         const style = getComputedStyle(e);
         const ring = style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 2;
-        window.focused.push({ e, ring: ring || e.tagName === "IFRAME", box: e.getBoundingClientRect(), y: scrollY });
+        window.focused.push({ e, ring, box: e.getBoundingClientRect(), y: scrollY });
       });
       const groups = new Set();
-      return controls().concat([...document.querySelectorAll("iframe, [tabindex='0']")].filter(shown)).filter((e) => {
+      return controls().concat([...document.querySelectorAll("[tabindex='0']")].filter(shown)).filter((e) => {
         if (e.disabled || e.tabIndex < 0) return false;
         if (e.type !== "radio") return true;
         const first = !groups.has(e.name);
