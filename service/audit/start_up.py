@@ -19,10 +19,8 @@ from service.store.events import to_event
 from service.store.leases import ProcessIdentity
 from service.store.records import SITE
 from service.store.seam import Clock
-from service.store.store import Store
+from service.store.store import Store, read_open_runs
 from service.store.tables import checkpoints, event_index, events, heads
-
-_ENDS = ("run_completed", "run_aborted")
 
 
 def record_start(store: Store, rig: Rig, protocols: Sequence[Path], address: str) -> ServiceStarted:
@@ -53,7 +51,7 @@ def record_start(store: Store, rig: Rig, protocols: Sequence[Path], address: str
             clock_jump_s=_clock_jump_s(store.clock, last) if last is not None and _same_boot(before, boot) else None,
             heads=_heads_since(connection, position),
             unsigned_runs=_unsigned_runs(connection),
-            open_runs=_open_runs(connection),
+            open_runs=tuple(sorted(read_open_runs(connection))),
         )
         store.append_site(connection, [started], actor="service", software=software)
     return started
@@ -117,14 +115,4 @@ def _unsigned_runs(connection: Connection) -> tuple[str, ...]:
         .where(heads.c.run_id != SITE, func.coalesce(signed.c.seq, 0) < heads.c.seq)
         .order_by(heads.c.run_id)
     )
-    return tuple(connection.execute(found).scalars())
-
-
-def _open_runs(connection: Connection) -> tuple[str, ...]:
-    ended = (
-        select(event_index.c.seq)
-        .where(event_index.c.run_id == heads.c.run_id, event_index.c.kind.in_(_ENDS))
-        .exists()
-    )
-    found = select(heads.c.run_id).where(heads.c.run_id != SITE, ~ended).order_by(heads.c.run_id)
     return tuple(connection.execute(found).scalars())

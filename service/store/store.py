@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, case, func, insert, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.model import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
@@ -20,8 +20,9 @@ from service.store.events import ROOT, append, read_events
 from service.store.leases import RunLease, acquire, check_lease, held_runs, is_held
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
 from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock, utc_text
-from service.store.tables import heads, runs
+from service.store.tables import event_index, events, heads, runs
 
+_ENDS = ("run_completed", "run_aborted")
 _OWN_KINDS = frozenset({"run_started", "site_opened", "job_enqueued", "job_finished", "job_failed"})
 
 
@@ -185,6 +186,11 @@ class Store:
         with self._database.reading() as connection:
             return read_runs(connection)
 
+    def open_runs(self) -> set[str]:
+        """Names of the runs that nothing has ended yet, from the index of events, without reading them."""
+        with self._database.reading() as connection:
+            return read_open_runs(connection)
+
     def find_run(self, name: str) -> str:
         """The run that `name` means: its full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
         return resolve_run(self.runs(), name)
@@ -344,6 +350,31 @@ def read_runs(connection: Connection) -> list[RunRow]:
         RunRow(row.run_id, row.created_utc, bool(row.simulated), row.root_sha256, row.seq or 0, row.sha256 or ROOT)
         for row in connection.execute(statement)
     ]
+
+
+def read_open_runs(connection: Connection) -> set[str]:
+    """Runs without an end: neither the runner's own nor a person's abort, which it records later."""
+    ended = (
+        select(event_index.c.seq)
+        .where(event_index.c.run_id == heads.c.run_id, event_index.c.kind.in_(_ENDS))
+        .exists()
+    )
+    aborted = (
+        select(events.c.seq)
+        .where(
+            events.c.run_id == heads.c.run_id,
+            events.c.seq == event_index.c.seq,
+            event_index.c.run_id == heads.c.run_id,
+            event_index.c.kind == "operator_action",
+            # A damaged payload is for the verification to find; here it must not raise.
+            case((func.json_valid(events.c.payload) == 1, func.json_extract(events.c.payload, "$.action")))
+            == "abort",
+        )
+        .correlate(heads)
+        .exists()
+    )
+    found = select(heads.c.run_id).where(heads.c.run_id != SITE, ~ended, ~aborted)
+    return set(connection.execute(found).scalars())
 
 
 def resolve_run(known: Sequence[RunRow], name: str) -> str:

@@ -52,8 +52,14 @@ class Startable:
 def home(
     request: Request, site: Here, person: Signed, page: Annotated[int, Query(ge=1, le=100_000)] = 1
 ) -> HTMLResponse:
-    """Runs under way first, then those that have ended, newest first."""
-    rows = sorted(site.store.runs(), key=lambda row: row.created_utc, reverse=True)
+    """Runs under way first (those that a process drives before the others), then those that have ended, newest first.
+
+    Only the runs of the page shown are read.
+    """
+    driven = set(site.launcher.driven_runs())
+    under_way = site.store.open_runs() | driven
+    newest_first = site.store.runs()[::-1]
+    rows = sorted(newest_first, key=lambda row: (row.run_id not in driven, row.run_id not in under_way))
     pages = max(1, -(-len(rows) // _PAGE))
     page = min(page, pages)
     lines = [_line(site, row) for row in rows[_PAGE * (page - 1) : _PAGE * page]]
