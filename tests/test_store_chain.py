@@ -27,7 +27,7 @@ from service.store import database
 from service.store.audit import verify
 from service.store.database import database_path
 from service.store.errors import StoreVersionError, UnknownRunError
-from service.store.events import ROOT, canonical, event_sha256, parse_canonical
+from service.store.events import ROOT, canonical, canonical_parsed, event_sha256, parse_canonical
 from service.store.records import NewArtefact
 from service.store.signing import checkpoint
 from service.store.store import Store
@@ -64,7 +64,32 @@ def test_canonical_json_survives_reading_back(value: object) -> None:
     text = canonical(value)
     assert canonical(parse_canonical(text)) == text
     assert parse_canonical(text) == value
+    assert canonical_parsed(parse_canonical(text)) == text
     assert json.loads(text, parse_int=float) == value  # as any JSON reader with doubles sees it
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        1e16,
+        1e21,
+        1e-5,
+        1e-7,
+        12.5e-6,
+        100.0,
+        -0.0,
+        5e-324,
+        2.0**70,
+        0.1,
+        123456789.125,
+        "1.0",
+        "2e-5",
+        '\x7f\x1f/\\"',
+    ],
+)
+def test_the_quick_way_writes_numbers_and_text_as_the_standard_says(value: float | str) -> None:
+    for whole in (value, {"é": [value, "\ue000"], "z": value, "\U0001f9b4": {"\ue000": value, "\U00010000": 1}}):
+        assert canonical_parsed(whole) == canonical(whole)
 
 
 def test_hash_is_sha256_of_rfc_8785_over_all_other_fields(store: Store) -> None:

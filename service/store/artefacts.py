@@ -13,7 +13,7 @@ from sqlalchemy import Connection, Row, insert, select
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.model import ArtefactRef, Event
-from service.store.events import canonical, references, sha256_text
+from service.store.events import canonical_parsed, references, sha256_text
 from service.store.records import Artefact, NewArtefact
 from service.store.seam import Files, Ids
 from service.store.tables import artefacts
@@ -171,7 +171,7 @@ def _put_errors() -> Generator[None]:
 def record_sha256(event_sha256: str, fields: dict[str, Any]) -> str:
     """Hash that binds an artefact's row to the event that brought it; `record_sha256` itself is left out."""
     named = {name: value for name, value in fields.items() if name != "record_sha256"}
-    return sha256_text(canonical(named | {"event_sha256": event_sha256}))
+    return sha256_text(canonical_parsed(named | {"event_sha256": event_sha256}))
 
 
 def insert_artefacts(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
 
@@ -19,6 +20,10 @@ from service.store.tables import events, heads
 
 ROOT = "0" * 64  # previous_sha256 of the first event
 _SAFE = 2**53 - 1
+# Where json.dumps and RFC 8785 may differ: 1.0, 1e-05 and 1e+16 are written otherwise, and names are sorted otherwise
+# beyond the surrogates. Text that only looks so is written out the long way.
+_MAY_DIFFER = re.compile("\\.0(?![0-9])|[0-9]e[+-]|[\ud800-\U0010ffff]")
+_PLAIN = json.JSONEncoder(ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
 _REF_FIELDS: set[str] = set(ArtefactRef.model_fields)
 
 
@@ -33,15 +38,33 @@ def canonical(value: object) -> str:
         ) from error
 
 
+def canonical_parsed(value: object) -> str:
+    """The same as `canonical`, several times faster, for plain types as `parse_canonical` gives them.
+
+    Raises StoreError as `canonical` does.
+    """
+    try:
+        text = _PLAIN.encode(value)
+    except (ValueError, RecursionError):
+        return canonical(value)
+    # Nearly every text has none of these, which is quicker to tell than where they stand.
+    if text.isascii() and ".0" not in text and "e-" not in text and "e+" not in text:
+        return text
+    return canonical(value) if _MAY_DIFFER.search(text) else text
+
+
 def parse_canonical(text: str) -> Any:
     """Read canonical JSON back; canonical(parse_canonical(t)) == t. Raises ValueError."""
-    return json.loads(text, parse_int=_integer)
+    return _READER.decode(text)
 
 
 def _integer(digits: str) -> int | float:
     # The canonical form of 1e20 has no exponent: beyond the safe range the number can only have been a float.
     value = int(digits)
     return value if -_SAFE <= value <= _SAFE else float(digits)
+
+
+_READER = json.JSONDecoder(parse_int=_integer)
 
 
 def sha256_text(text: str) -> str:
@@ -62,8 +85,8 @@ def event_sha256_of_text(fields: Mapping[str, Any], payload: str) -> str:
 def event_text(fields: Mapping[str, Any], payload: str) -> str:
     """Canonical JSON of an event from its other fields and its payload's canonical JSON."""
     # In canonical JSON the members are sorted by name, and `payload` stands alone between two groups of others.
-    before = canonical({name: value for name, value in fields.items() if name < "payload"})
-    after = canonical({name: value for name, value in fields.items() if name > "payload"})
+    before = canonical_parsed({name: value for name, value in fields.items() if name < "payload"})
+    after = canonical_parsed({name: value for name, value in fields.items() if name > "payload"})
     return f'{before[:-1]},"payload":{payload},{after[1:]}'
 
 
