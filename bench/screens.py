@@ -29,7 +29,8 @@ from tests.support.browser import DESKTOP, PASSWORD, TABLET, Screen, add_people,
 FOLDER = Path(__file__).parents[1] / "docs" / "screens"
 PEOPLE: tuple[tuple[str, Role], ...] = (("tina", "technician"), ("sam", "supervisor"), ("otto", "auditor"))
 LIMIT_BYTES = 90_000
-COLOURS = (96, 64, 40, 24, 16, 12)
+USUAL_BYTES = 40_000
+STEPS = ((1.0, 64), (1.0, 32), (1.0, 16), (0.67, 32), (0.67, 16), (0.67, 8))  # scale and colours
 STANDING = {
     "robot": "standing", "robot_name": "robot", "speed_fraction": 0.25, "camera_battery_fraction": 0.82,
     "light_lux": 812.0, "temperature_c": 21.4, "disk_free_bytes": 412_000_000_000,
@@ -72,7 +73,9 @@ SHOTS: tuple[tuple[str, str, str, str], ...] = (
     ("audit-site-event", "otto", "/audit/site/events/3", "one event of the site"),
     ("locked", "tina", "/runs/RUN_WORK#lock", "a locked screen still shows the capture"),
 )  # fmt: skip
-DARK = frozenset({"run-hold", "capture", "audit", "scene"})
+DARK = frozenset({"run-hold", "capture", "audit", "scene"})  # on the tablet
+TABLET_ONLY = frozenset({"run-hold", "run-working", "viewpoint", "sign-dialog", "looking-on", "recovery", "locked"})
+IN_README = frozenset({"capture-tablet.png", "audit-desktop.png"})
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -163,7 +166,7 @@ def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) ->
             before: dict[str, Screen] = {}
             for name, who, address, _ in SHOTS:
                 path = address
-                if not only.search(name):
+                if not only.search(name) or (name in TABLET_ONLY and size != TABLET):
                     continue
                 if who not in before:
                     before[who] = screens.enter_context(screen(browser, server.url, size))
@@ -180,7 +183,7 @@ def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) ->
                 driven = [key for key in runs if key in address and key != "RUN_DONE"]
                 with attended(data, {runs[key]: working if key == "RUN_WORK" else asking for key in driven}):
                     prepare(shot, path)
-                    for dark in (False, True) if name in DARK else (False,):
+                    for dark in (False, True) if name in DARK and size == TABLET else (False,):
                         shot.page.emulate_media(color_scheme="dark" if dark else "light")
                         shot.page.wait_for_timeout(300)
                         target = into / f"{name}-{suffix}{'-dark' if dark else ''}.png"
@@ -223,10 +226,13 @@ def prepare(shot: Screen, path: str) -> None:
 def write_small(png: bytes, target: Path) -> Path:
     """With as many colours of a palette as the limit allows."""
     whole = Image.open(io.BytesIO(png)).convert("RGB")
-    for colours in COLOURS:
+    limit = LIMIT_BYTES if target.name in IN_README else USUAL_BYTES
+    for scale, colours in STEPS:
+        size = (round(whole.width * scale), round(whole.height * scale))
+        picture = whole if scale == 1.0 else whole.resize(size, Image.Resampling.LANCZOS)
         buffer = io.BytesIO()
-        whole.quantize(colours, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
-        if len(buffer.getvalue()) <= LIMIT_BYTES:
+        picture.quantize(colours, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+        if len(buffer.getvalue()) <= limit:
             break
     target.write_bytes(buffer.getvalue())
     return target
