@@ -215,6 +215,15 @@ def test_hashes_alone_are_enough_to_verify_the_records(site: Site, tmp_path: Pat
     assert check(tmp_path / "hashes")[0].startswith("report.html: it has")
 
 
+def test_without_its_one_package_the_verifier_says_so() -> None:
+    script = Path(verifier.__file__)
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", str(script), "b.zip"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "`cryptography` is needed" in done.stderr
+
+
 # --- refused exports ---------------------------------------------------------------------------------------------
 
 

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 
 from service.audit import verifier
 from service.audit.export_process import export
+from service.compute.poses.pose_files import read_poses_csv
+from service.core.errors import StoreError
 from service.core.model import EvidenceExported, RunReleased
 from service.store.audit import verify
+from service.store.store import Store
 from service.web.export_pages import MEANINGS
 from tests.support.bench_run import PROTOCOL
+from tests.support.reported_run import T_SCAN_CAMERA, record_reported_run
 from tests.support.web import Browser, WebSite, password_of, web_site
 
 NEEDS_RELEASE = PROTOCOL.replace("steps:", "release: second_person\nsteps:", 1)
@@ -150,6 +160,58 @@ def test_a_data_set_without_registration_says_why_not(web: WebSite, supervisor: 
     page = ended(web, supervisor, run, "dataset")
     assert "Nothing was exported" in page
     assert "no evaluated registration" in page
+
+
+def test_a_data_set_leaves_with_all_that_belongs_to_it(
+    web: WebSite, supervisor: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = record_reported_run(web.folder, registered=True)
+    page = ended(web, supervisor, run, "dataset")
+    assert "Ready:" in page
+    event = web.store.events(run)[-1]
+    assert isinstance(event.payload, EvidenceExported)
+    assert (event.payload.what, event.actor) == ("dataset", web.account("supervisor"))
+    assert "SIMULATED" in event.payload.file_name
+    fetched = supervisor.get(f"/runs/{run}/exports/{event.payload.file_name}")
+    assert hashlib.sha256(fetched.content).hexdigest() == event.payload.sha256
+    with zipfile.ZipFile(io.BytesIO(fetched.content)) as archive:
+        assert archive.testzip() is None
+        files = {name: archive.read(name) for name in archive.namelist()}
+    assert files.keys() == {
+        *("images/v001.jpg", "images/v002.jpg", "camera.json", "poses.csv", "transforms.json"),
+        *("mesh.ply", "dataset.json"),
+    }
+    described = json.loads(files["dataset.json"])
+    assert described["simulated"] is True
+    assert (described["run"], described["head_of_chain_sha256"]) == (run, event.payload.head_sha256)
+    recorded = {item.ref.sha256 for item in web.store.artefacts(run) if item.attempt == 2}
+    for name, sha256 in described["image_sha256"].items():
+        assert hashlib.sha256(files[f"images/{name}"]).hexdigest() == sha256
+        assert sha256 in recorded, "of the attempt that counts"
+    assert json.loads(files["camera.json"])["fx"] == 2033.77
+    (tmp_path / "poses.csv").write_bytes(files["poses.csv"])
+    poses = read_poses_csv(tmp_path / "poses.csv")
+    assert np.allclose(poses["v002.jpg"], T_SCAN_CAMERA)
+    mesh = trimesh.load_mesh(io.BytesIO(files["mesh.ply"]), file_type="ply")
+    assert len(mesh.faces) == 4
+    assert verify(web.site.data, run).ok
+    # What cannot be recorded does not leave.
+    with monkeypatch.context() as patched:
+        patched.setattr(Store, "record", _refuse)
+        for what in ("dataset", "report", "bundle"):
+            with pytest.raises(StoreError, match="no space"):
+                export(web.site.data, run, what, tmp_path / f"{what}.zip", "emmy", lambda *_: None)
+    assert [path.name for path in tmp_path.iterdir()] == ["poses.csv"]
+    # The report that goes along in a bundle shows the scene.
+    made = export(web.site.data, run, "bundle", tmp_path / "b.zip", "emmy", lambda *_: None)
+    assert verifier.main([str(made)]) == 0
+    with zipfile.ZipFile(made) as archive:
+        html = archive.read("report.html").decode()
+    assert "Cameras and mesh in one frame" in html
+
+
+def _refuse(*_arguments: object, **_more: object) -> None:
+    raise StoreError("no space")
 
 
 def test_export_is_blocked_when_the_evidence_fails(web: WebSite, supervisor: Browser) -> None:

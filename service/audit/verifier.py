@@ -4,7 +4,8 @@
     python verify.py FOLDER        the same for an unpacked bundle; nothing is unpacked here
 
 Needs Python 3.9 or newer and the package `cryptography`, nothing else and no network. Nothing is written.
-Exit status: 0 whole and unaltered; 1 something differs, and every difference is named; 2 this is not a bundle.
+Exit status: 0 whole and unaltered; 1 something differs, and every difference is named; 2 nothing can be said, because
+this is not a bundle or `cryptography` is missing.
 
 Every signature here is checked against keys that the bundle itself brings. That the bundle comes from whom it says
 it comes from, only a key's fingerprint tells that was obtained in another way: give it with --key.
@@ -33,7 +34,8 @@ try:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
     from cryptography.x509.oid import ExtendedKeyUsageOID
 except ImportError:
-    raise SystemExit("The package `cryptography` is needed: python -m pip install cryptography") from None
+    sys.stderr.write("The package `cryptography` is needed: python -m pip install cryptography\n")
+    raise SystemExit(2) from None  # nothing was found to differ
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
