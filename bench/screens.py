@@ -227,14 +227,18 @@ def write_small(png: bytes, target: Path) -> Path:
     """With as many colours of a palette as the limit allows."""
     whole = Image.open(io.BytesIO(png)).convert("RGB")
     limit = LIMIT_BYTES if target.name in IN_README else USUAL_BYTES
+    small = png
     for scale, colours in STEPS:
         size = (round(whole.width * scale), round(whole.height * scale))
         picture = whole if scale == 1.0 else whole.resize(size, Image.Resampling.LANCZOS)
         buffer = io.BytesIO()
-        picture.quantize(colours, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
-        if len(buffer.getvalue()) <= limit:
+        # Every colour counts, however few its pixels: a photograph would take the accents' places.
+        method = Image.Quantize.MAXCOVERAGE
+        picture.quantize(colours, method, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+        small = buffer.getvalue()
+        if len(small) <= limit:
             break
-    target.write_bytes(buffer.getvalue())
+    target.write_bytes(small)
     return target
 
 
