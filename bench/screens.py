@@ -30,7 +30,7 @@ FOLDER = Path(__file__).parents[1] / "docs" / "screens"
 PEOPLE: tuple[tuple[str, Role], ...] = (("tina", "technician"), ("sam", "supervisor"), ("otto", "auditor"))
 LIMIT_BYTES = 90_000
 USUAL_BYTES = 40_000
-STEPS = ((1.0, 64), (1.0, 32), (1.0, 16), (0.67, 32), (0.67, 16), (0.67, 8))  # scale and colours
+STEPS = ((1.0, 64), (1.0, 32), (1.0, 16), (0.67, 32), (0.67, 16))  # scale and colours
 STANDING = {
     "robot": "standing", "robot_name": "robot", "speed_fraction": 0.25, "camera_battery_fraction": 0.82,
     "light_lux": 812.0, "temperature_c": 21.4, "disk_free_bytes": 412_000_000_000,
@@ -238,6 +238,12 @@ def write_small(png: bytes, target: Path) -> Path:
         small = buffer.getvalue()
         if len(small) <= limit:
             break
+    else:  # a large photograph
+        buffer = io.BytesIO()
+        whole.resize((whole.width // 2, whole.height // 2), Image.Resampling.LANCZOS).save(
+            buffer, "JPEG", quality=80, optimize=True
+        )
+        small, target = buffer.getvalue(), target.with_suffix(".jpg")
     target.write_bytes(small)
     return target
 
