@@ -149,7 +149,7 @@ class StepFields(Record):
     title: Text
     why: str = ""
     instructions: str = ""
-    drawing: str = ""  # of service/web/static/drawings, shown beside the instructions; "": as the step's kind suggests
+    drawing: str = ""  # of service/web/static/drawings, beside the instructions; "": as the kind of step suggests
     checklist: tuple[Text, ...] = ()
     gates: tuple[Gate, ...] = ()
     sign: bool = False
