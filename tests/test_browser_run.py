@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import signal
 import socket
@@ -301,8 +302,15 @@ def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a
         assert images(second.page, run) == 8
         confirm_list(second.page)
 
-        # The screen is left alone with the run open: a PIN brings it back, and the page was readable meanwhile.
+        # The runner dies: the screen says so and what is safe, and starts it again when told to.
         expect(second.page.get_by_role("heading", name="Remove the control spheres")).to_be_visible(timeout=LONG_MS)
+        runner = json.loads((server.data / "monitor" / f"{run}.json").read_text())["pid"]
+        os.kill(runner, signal.SIGKILL)
+        expect(second.page.get_by_text("Everything captured is safe").first).to_be_visible(timeout=LONG_MS)
+        second.page.get_by_role("button", name="Go on").click()
+        expect(second.page.get_by_text("Everything captured is safe")).to_have_count(0, timeout=LONG_MS)
+
+        # The screen is left alone with the run open: a PIN brings it back, and the page was readable meanwhile.
         second.page.get_by_role("button", name="Lock").click()
         expect(second.page.get_by_label("PIN")).to_be_visible()
         second.page.get_by_label("PIN").fill(PIN)
