@@ -88,11 +88,17 @@ class Technician:
             page.wait_for_timeout(200)
 
     def _sign(self, sign: Any) -> None:
+        heading = self.page.get_by_role("heading", level=1).inner_text()
         sign.click()
         self.page.get_by_label("Your password").fill(PASSWORD)
         self.page.get_by_role("button", name="Sign", exact=True).click()
         expect(self.page.locator("dialog[open]")).to_have_count(0)
         self.signed += 1
+        # Another step comes, or the same one asks for something else than a signature.
+        deadline_s = time.monotonic() + 60
+        while sign.count() and self.page.get_by_role("heading", level=1).inner_text() == heading:
+            assert time.monotonic() < deadline_s, heading
+            self.page.wait_for_timeout(100)
 
     def _confirm(self, confirm: Any) -> None:
         heading = self.page.get_by_role("heading", level=1).inner_text()

@@ -44,7 +44,7 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
     folder = tmp_path_factory.mktemp("rig")
-    with simulated_rig(folder, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.9") as ready:
+    with simulated_rig(folder, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.51") as ready:
         yield ready
 
 
@@ -271,7 +271,7 @@ def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a
         # Control is asked for and handed over.
         second.page.get_by_role("button", name="Ask for control").click()
         first.page.get_by_role("button", name="Hand over").click()
-        expect(first.page.get_by_text("Tom Example has control")).to_be_visible(timeout=LONG_MS)
+        expect(first.page.locator("main").get_by_text("Tom Example has control")).to_be_visible(timeout=LONG_MS)
         confirm_list(second.page)
 
         # The connection of one tablet is lost: it says so, its controls are off; the other goes on.

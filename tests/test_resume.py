@@ -35,7 +35,9 @@ def short_protocol(folder: Path) -> Path:
 
 def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    with simulated_rig(tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3") as ready:
+    with simulated_rig(
+        tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.31"
+    ) as ready:
         words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data), "--auto-confirm"]
         with (tmp_path / "run.log").open("w") as log:
             runner = subprocess.Popen(

@@ -94,7 +94,7 @@ def listens(host: str, port: int) -> bool:
 
 
 def test_files_world_and_hands(tmp_path: Path) -> None:
-    with simulated_rig(tmp_path, *SMALL) as ready, Hands(ready["world"]) as hands:
+    with simulated_rig(tmp_path, *SMALL, host="127.0.0.61") as ready, Hands(ready["world"]) as hands:
         # What the ready line promises is there, and the service reads it.
         assert ready["ready"] is True
         assert Path(ready["rig"]) == tmp_path / "rig.yaml"
@@ -231,7 +231,7 @@ def two_station_protocol(folder: Path) -> Path:
 
 def test_two_controllers_are_found_and_used(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    with simulated_rig(tmp_path, *SMALL, "--arms", "2") as ready:
+    with simulated_rig(tmp_path, *SMALL, "--arms", "2", host="127.0.0.61") as ready:
         answer = orthocapture("doctor", "--rig", ready["rig"], "--json")
         assert answer.returncode == 0, answer.stdout + answer.stderr
         devices = json.loads(answer.stdout)["devices"]

@@ -75,7 +75,9 @@ class Watched:
 def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path) -> None:
     data = tmp_path / "data"
     with (
-        simulated_rig(tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3") as ready,
+        simulated_rig(
+            tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.41"
+        ) as ready,
         Store.open(data) as store,
     ):
         loaded = load_protocol(short_protocol(tmp_path / "protocols"), params_models())
