@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -54,12 +54,17 @@ def test_every_marker_of_a_set_is_named_right(seed: int) -> None:
 
 @settings(max_examples=8, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0.05, 20.0))
+@example(seed=17, scale=3.0)  # only one image shows four spheres
 def test_scale_of_structure_from_motion_is_found(seed: int, scale: float) -> None:
     made = scene(6, seed=seed)
     outlines, truth = noisy_set(made, seed)
     A = transform(Rotation.random(rng=np.random.default_rng(seed)), np.array([1.0, 2.0, -3.0]))
     poses = A @ made.T_world_camera
     poses[:, :3, 3] /= scale
+    if sum(len(t) >= 4 for t in truth) < 2:  # about one set in sixty: refused, not guessed
+        with pytest.raises(ComputeError, match=r"from one image|no image shows four"):
+            identify(outlines, REGISTRATION_M, made.camera, poses, radius_m=RADIUS_M, metric=False)
+        return
     found = identify(outlines, REGISTRATION_M, made.camera, poses, radius_m=RADIUS_M, metric=False)
     for a, t in zip(found, truth, strict=True):
         assert not wrong(a.markers, t)

@@ -149,6 +149,12 @@ def _solve_group(
             where=where,
             remedy="Capture at least one image with four or more registration spheres from this station",
         )
+    if not metric and sum(bool(r) for r in readings) < 2:
+        raise ComputeError(
+            "the scale of the poses cannot be told from one image",
+            where=where,
+            remedy=f"At least two images must show four or more registration spheres (spheres found: {counts})",
+        )
     starts = _metric_starts(readings, poses) if metric else _similarity_starts(readings, poses)
     solved: list[_Reading] = []
     tried: set[frozenset[tuple[int, int, int]]] = set()
