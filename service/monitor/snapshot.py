@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from pathlib import Path
@@ -50,6 +51,19 @@ class Snapshot(Record):
     def age_s(self) -> float:
         """Seconds since it was written."""
         return time.time() - self.at_utc_s
+
+    def shown(self) -> tuple[object, ...]:
+        """What a screen would show differently, in steps that people see: without this, noise redraws every page."""
+        steps = {"light_lux": 0.05, "temperature_c": 0.2, "disk_free_bytes": 1e9, "camera_free_bytes": 1e9}
+        rounded: list[object] = []
+        for name, value in self:
+            if name == "light_lux" and value:
+                rounded.append(round(math.log(value) / steps[name]))
+            elif name in steps and value is not None:
+                rounded.append(round(value / steps[name]))
+            elif name != "at_utc_s":
+                rounded.append(value)
+        return tuple(rounded)
 
     @property
     def stale(self) -> bool:

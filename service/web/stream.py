@@ -37,7 +37,7 @@ async def stream(request: Request, site: Here, run_id: RunId) -> StreamingRespon
 
 
 async def _news(request: Request, site: Site, run_id: str) -> AsyncGenerator[str]:
-    told: tuple[int, float, bool] | None = None
+    told: tuple[int, int, bool] | None = None
     beat_s = checked_s = time.monotonic()
     token, locked = token_of(request, site), False
     while not await request.is_disconnected():
@@ -64,7 +64,7 @@ def _signed_in(site: Site, token: str) -> Person | None:
     return site.people.person(token, idle_lock_s=site.idle_lock_s, deliberate=False)
 
 
-def _newest(site: Site, run_id: str) -> tuple[int, float]:
+def _newest(site: Site, run_id: str) -> tuple[int, int]:
+    """The last event, and a number that changes with what the runner tells; its falling silent is news as well."""
     snapshot = read_snapshot(site.data, run_id)
-    # A runner that has fallen silent is news as well, once.
-    return site.store.head(run_id), 0.0 if snapshot.stale else snapshot.at_utc_s
+    return site.store.head(run_id), hash((snapshot.stale, *snapshot.shown()))
