@@ -20,6 +20,7 @@ NOISE_HU = 15.0
 BLUR_VOXELS = 0.55  # of the scanner's point spread, as a Gaussian sigma
 MARGIN_VOXELS = 8
 _SUBRAY_PITCH_M = 0.27e-3  # lateral antialiasing; along the ray it is exact
+_MOST_SUBRAYS = 6  # a side: what more would show drowns in the noise
 _ROWS = 24  # rows J computed together
 _HALO = 3  # rows that the blur needs beside them
 _RESTART_M = 2e-6  # past a hit, to find the next
@@ -69,7 +70,7 @@ class _Solid:
         if np.any(high <= low):
             return None
         n_i, n_j, n_k = (int(n) for n in high - low)
-        side = max(2, round(h / _SUBRAY_PITCH_M))
+        side = min(max(2, round(h / _SUBRAY_PITCH_M)), _MOST_SUBRAYS)
         sub = (np.arange(side) + 0.5) / side - 0.5
         x = ((np.arange(low[0], high[0])[:, None] + sub) * h).ravel()
         y = ((np.arange(low[1], high[1])[:, None] + first_row + sub) * h).ravel()

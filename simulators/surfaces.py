@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from simulators.geometry import Array, Array32, Bytes, Ints
-from simulators.lighting import Caster, vertex_light
+from simulators.geometry import Array, Array32, Bools, Bytes, Ints
+from simulators.lighting import Caster, blocked_rays, vertex_light
 from simulators.noise import Noise
-from simulators.parts import Part, grid_faces, sphere_mesh, vertex_normals
+from simulators.parts import Part, grid_faces, joined, sphere_mesh, vertex_normals
 from simulators.textures import (
     DRAPE_HALF_M,
     Texture,
@@ -102,6 +102,8 @@ class Surfaces:
         n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
         self._face_normal = (n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)).astype(np.float32)
         self._caster = Caster(self._vertices, self._faces)
+        self._parts = parts
+        self._shadow: Bools | None = None
         self._light: dict[bool, Array32] = {}
         small = max(64, texture_size // 4)
         self._textures = [
@@ -121,17 +123,23 @@ class Surfaces:
     def light(self, control: bool) -> Array32:
         """Lamp and room light at the vertices (V, 2), with the shadows of the spheres that are there."""
         if control not in self._light:
-            centres = [*self.scene.registration_m, *(self.scene.control_m if control else ())]
-            spheres = [sphere_mesh(centre, RADIUS_M, 3) for centre in centres]
-            vertices, faces = [self._vertices], [self._faces]
-            count = len(self._vertices)
-            for sphere in spheres:
-                vertices.append(sphere.vertices_m)
-                faces.append(sphere.faces + count)
-                count += len(sphere.vertices_m)
-            shadow = Caster(np.concatenate(vertices), np.concatenate(faces))
-            self._light[control] = vertex_light(shadow, self._vertices, self._normals, self.scene.lamp_m)
+            blocked = self._blocked(control)
+            self._light[control] = vertex_light(blocked, self._vertices, self._normals, self.scene.lamp_m)
         return self._light[control]
+
+    def _blocked(self, control: bool) -> Bools:
+        """Where shadow falls; of the control spheres, their own is added to that of all the rest."""
+        if control:
+            parts = [sphere_mesh(centre, RADIUS_M, 3) for centre in self.scene.control_m]
+            return self._blocked(control=False) | self._blocked_by(parts)
+        if self._shadow is None:
+            spheres = [sphere_mesh(centre, RADIUS_M, 3) for centre in self.scene.registration_m]
+            self._shadow = self._blocked_by([*self._parts, *spheres])
+        return self._shadow
+
+    def _blocked_by(self, parts: list[Part]) -> Bools:
+        solid = joined("shadow", "any", parts)
+        return blocked_rays(Caster(solid.vertices_m, solid.faces), self._vertices, self._normals, self.scene.lamp_m)
 
     def shade(self, eye: Array, directions: Array32, pixel_rad: float, *, control: bool, spray: bool) -> Shaded:
         """Cast rays (N, 3), of unit depth along the camera axis, from `eye`, world; pixel_rad is a pixel angle."""
