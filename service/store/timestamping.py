@@ -184,12 +184,14 @@ def _post_within(authority: Authority, body: bytes) -> bytes:
     answer that drips is bounded by it. A thread that is left behind is.
     """
     answered: queue.Queue[bytes | OSError | ValueError] = queue.Queue(1)
+    too_late = TimeoutError(f"nothing within {authority.timeout_s:g} s")
 
     def ask() -> None:
         try:
             answered.put(_post(authority, body))
         except (OSError, ValueError) as error:
-            answered.put(error)
+            late = isinstance(getattr(error, "reason", error), TimeoutError)
+            answered.put(too_late if late else error)
         except http.client.HTTPException as error:
             answered.put(ValueError(f"its answer is no HTTP ({error!r})"))
 
@@ -197,7 +199,7 @@ def _post_within(authority: Authority, body: bytes) -> bytes:
     try:
         answer = answered.get(timeout=authority.timeout_s)
     except queue.Empty:
-        raise TimeoutError(f"nothing within {authority.timeout_s:g} s") from None
+        raise too_late from None
     if isinstance(answer, bytes):
         return answer
     raise answer
