@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.installed
+# Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
+export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: demo test lint format docs bench lock clean
 
@@ -14,7 +16,7 @@ test: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+	$(BIN)/pyright --threads 2
 	$(BIN)/lint-imports
 
 format: $(READY)

@@ -23,11 +23,13 @@ from service.core.model import ViewpointCaptured
 from service.rig import load_rig
 from service.station import Station
 from service.store.store import Store
-from tests.support.rig import REPOSITORY, RIG_LOCK, orthocapture, simulated_rig, without_calibration_and_ct
+from tests.support.rig import REPOSITORY, RigLock, orthocapture, simulated_rig, without_calibration_and_ct
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
 
 SMALL = ("--scene", "3", "--image-width", "480", "--speed-up", "4")
+# The rigs of other tests do not stand in the way of these.
+OWN_HOST = "127.0.0.61"
 
 
 class Hands:
@@ -59,9 +61,9 @@ class Hands:
 @contextmanager
 def rig_process(folder: Path) -> Generator[tuple[subprocess.Popen[str], dict[str, Any], list[psutil.Process]]]:
     """A rig that the test ends itself; with its ready line and all its processes."""
-    with RIG_LOCK, (folder / "rig.log").open("w") as log:
+    with RigLock(OWN_HOST), (folder / "rig.log").open("w") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "simulators", "rig", "--dir", str(folder), *SMALL],
+            [sys.executable, "-m", "simulators", "rig", "--dir", str(folder), "--host", OWN_HOST, *SMALL],
             cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
         )  # fmt: skip
         assert process.stdout is not None
@@ -94,7 +96,7 @@ def listens(host: str, port: int) -> bool:
 
 
 def test_files_world_and_hands(tmp_path: Path) -> None:
-    with simulated_rig(tmp_path, *SMALL, host="127.0.0.61") as ready, Hands(ready["world"]) as hands:
+    with simulated_rig(tmp_path, *SMALL, host=OWN_HOST) as ready, Hands(ready["world"]) as hands:
         # What the ready line promises is there, and the service reads it.
         assert ready["ready"] is True
         assert Path(ready["rig"]) == tmp_path / "rig.yaml"
@@ -172,7 +174,7 @@ def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
             if c.status == psutil.CONN_LISTEN
         }
         host, port = ready["world"].split(":")
-        assert {(host, int(port)), ("127.0.0.1", 30004)} <= addresses
+        assert {(host, int(port)), (OWN_HOST, 30004)} <= addresses
         process.terminate()
         assert process.wait(timeout=20) == 0
         assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)
@@ -231,7 +233,7 @@ def two_station_protocol(folder: Path) -> Path:
 
 def test_two_controllers_are_found_and_used(tmp_path: Path) -> None:
     data = tmp_path / "data"
-    with simulated_rig(tmp_path, *SMALL, "--arms", "2", host="127.0.0.61") as ready:
+    with simulated_rig(tmp_path, *SMALL, "--arms", "2", host=OWN_HOST) as ready:
         answer = orthocapture("doctor", "--rig", ready["rig"], "--json")
         assert answer.returncode == 0, answer.stdout + answer.stderr
         devices = json.loads(answer.stdout)["devices"]

@@ -41,7 +41,7 @@ def demo_command(
         "demo-run"
     ),
     scene: Annotated[int, typer.Option("--scene", help="Seed of the simulated scene.")] = 7,
-    image_width: Annotated[int, typer.Option("--image-width", help="Width of the simulated photographs.")] = 1440,
+    image_width: Annotated[int, typer.Option("--image-width", help="Width of the simulated photographs.")] = 1280,
     json: JsonOption = False,
 ) -> None:
     """Run the demonstration protocol on a simulated rig and show what comes out. Takes a few minutes."""

@@ -15,7 +15,7 @@ from typing import Any
 REPOSITORY = Path(__file__).parents[2]
 
 
-class _Lock:
+class RigLock:
     """Only one rig at a time on an address: RTDE's ports are fixed."""
 
     def __init__(self, host: str) -> None:
@@ -30,7 +30,7 @@ class _Lock:
 
 
 _USUAL = "127.0.0.1"
-RIG_LOCK = _Lock(_USUAL)
+RIG_LOCK = RigLock(_USUAL)
 
 
 def orthocapture(*words: str, timeout_s: float = 120) -> subprocess.CompletedProcess[str]:
@@ -48,7 +48,7 @@ def command(*words: str) -> list[str]:
 @contextmanager
 def simulated_rig(folder: Path, *options: str, host: str = _USUAL) -> Generator[dict[str, Any]]:
     """A rig around one scene; yields its ready line. On another loopback address it waits for no other rig."""
-    with _Lock(host), (folder / "rig.log").open("w") as log:
+    with RigLock(host), (folder / "rig.log").open("w") as log:
         process = subprocess.Popen(
             command("simulate", "rig", "--dir", str(folder), "--host", host, *options),
             cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
