@@ -17,6 +17,7 @@ from simulators.world import NOMINAL_LUX, RADIUS_M, Scene
 
 TILE_PIXELS = 500_000
 HALO = 4  # rows beyond a tile, so that edges and the lens' blur do not see its border
+_TEXTURES = ((800, 512), (1400, 1024), (2601, 2048))  # image width below which so many texels suffice
 PREVIEW_WIDTH = 640
 FULL_WELL_E, READ_NOISE_E = 40_000.0, 4.0
 BLUR_PX = 0.42
@@ -58,7 +59,7 @@ class Renderer:
 
     def __init__(self, image_width: int) -> None:
         self.image_width = image_width
-        self._texture_size = 512 if image_width < 800 else 2048 if image_width <= 2600 else 4096
+        self._texture_size = next((size for width, size in _TEXTURES if image_width < width), 4096)
         self._surfaces: Surfaces | None = None
         self._rays: tuple[Intrinsics, Array] | None = None
 

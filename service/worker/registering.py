@@ -125,7 +125,9 @@ def register(context: JobContext) -> JobAnswer:
         result["T_scan_camera"] = {name: (T_scan_world @ T).tolist() for name, T in zip(names, poses, strict=True)}
         components = {"adjustment": np.array(adjusted["scan_covariance"])[:6, :6], "spheres": components["spheres"]}
     if arguments.get("intrinsics_covariance") is not None:
-        uncertain = solve(intrinsics_covariance=np.array(arguments["intrinsics_covariance"]))
+        uncertain = solve(
+            assignments=solved.assignments, intrinsics_covariance=np.array(arguments["intrinsics_covariance"])
+        )
         components["intrinsics"] = _added(answer, uncertain.registration, refined=source == "robot_corrected")
     covariance = np.sum(list(components.values()), axis=0)
     result["covariance"] = covariance.tolist()
