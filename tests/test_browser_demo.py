@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import yaml
 from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
 from tests.support.browser import DESKTOP, PASSWORD, Screen, Served, add_people, chromium, screen, served
 from tests.support.rig import REPOSITORY, orthocapture, simulated_rig
@@ -116,7 +117,10 @@ class Technician:
             self.page.mouse.up()
             self.held += 1
         else:
-            confirm.click()
+            try:
+                confirm.click(timeout=5_000)
+            except PlaywrightTimeoutError:
+                return  # another step had come meanwhile; look again
         self._until_something_else_is_asked(heading, lambda: confirm.count() == 0 or not confirm.is_enabled())
 
     def _until_something_else_is_asked(self, heading: str, gone: Callable[[], bool]) -> None:

@@ -79,8 +79,8 @@ NO_PAGES = {
     "/openapi.json",
     "/vendor/plotly.js",
     "/robots",
-    "/runs/{run_id}/parts/{name}",
-    "/runs/{run_id}/capture/parts/{name}",
+    "/runs/{run_id}/parts/{names}",
+    "/runs/{run_id}/capture/parts/{names}",
     "/runs/{run_id}/scene/frame",  # sandboxed within its page, and checked there
     "/runs/{run_id}/stream",
     "/runs/{run_id}/files/{sha256}",

@@ -123,6 +123,8 @@ def test_parts_are_pieces_of_the_page(shown: Shown) -> None:
         assert part.status_code == 200
         assert "<html" not in part.text
         assert words(part.text).strip()[:40] in words(whole)
+    together = shown.browser.get(f"/runs/{shown.run}/capture/parts/image,plan,sheet").text
+    assert re.findall(r'<template data-part="(\w+)">', together) == ["image", "plan", "sheet"]
 
 
 def test_a_step_takes_many_images_page_by_page(shown: Shown) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
@@ -21,6 +21,8 @@ RunId = Annotated[str, Path(max_length=64)]
 Name = Annotated[str, Query(max_length=64)]
 Page = Annotated[int, Query(ge=1, le=100_000)]
 Seq = Annotated[int, Query(ge=0, le=2**53)]
+_PART = "(image|plan|sheet)"
+Parts = Annotated[str, Path(pattern=f"^{_PART}(,{_PART}){{0,3}}$")]
 SHEET = 60  # images on one page of the contact sheet
 
 
@@ -42,13 +44,13 @@ def capture(
     return render(request, "capture.html.j2", frame=run_frame(site, run_id), **shown)
 
 
-@router.get("/runs/{run_id}/capture/parts/{name}", name="capture_part", dependencies=[Depends(requires("read"))])
-def capture_part(
+@router.get("/runs/{run_id}/capture/parts/{names}", name="capture_parts", dependencies=[Depends(requires("read"))])
+def capture_parts(
     request: Request,
     site: Here,
     person: Signed,
     run_id: RunId,
-    name: Literal["image", "plan", "sheet"],
+    names: Parts,
     step: Name = "",
     viewpoint: Name = "",
     seq: Seq = 0,
@@ -56,9 +58,9 @@ def capture_part(
     replaced: bool = False,
     plain: bool = False,
 ) -> HTMLResponse:
-    """One part of the page, for the script that keeps it up to date."""
+    """Parts of the page, all of one moment, for the script that keeps it up to date."""
     shown = _shown(site, person, run_id, step, viewpoint, seq, page, replaced=replaced, plain=plain)
-    return render(request, "capture_part.html.j2", part=name, **shown)
+    return render(request, "capture_parts.html.j2", names=names.split(","), **shown)
 
 
 def _shown(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path as FilePath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
@@ -24,7 +24,8 @@ router = APIRouter(tags=["run"])
 
 RunId = Annotated[str, Path(max_length=64)]
 Name = Annotated[str, Query(max_length=64)]
-Part = Literal["banner", "control", "vitals", "step", "actions", "dialogs", "side"]
+_PART = "(banner|control|vitals|step|actions|dialogs|side)"
+Parts = Annotated[str, Path(pattern=f"^{_PART}(,{_PART}){{0,9}}$")]
 _DRAWINGS = FilePath(__file__).with_name("static") / "drawings"
 
 
@@ -36,14 +37,15 @@ def run(
     return render(request, "run.html.j2", frame=run_frame(site, run_id), **_shown(site, person, run_id, step, dialog))
 
 
-@router.get("/runs/{run_id}/parts/{name}", name="run_part", dependencies=[Depends(requires("read"))])
-def run_part(
-    request: Request, site: Here, person: Signed, run_id: RunId, name: Part, step: Name = ""
+@router.get("/runs/{run_id}/parts/{names}", name="run_parts", dependencies=[Depends(requires("read"))])
+def run_parts(
+    request: Request, site: Here, person: Signed, run_id: RunId, names: Parts, step: Name = ""
 ) -> HTMLResponse:
-    """One part of the page, for the script that keeps it up to date."""
-    if name == "banner":
-        return render(request, "banner.html.j2", of_run=run_frame(site, run_id))
-    return render(request, f"run_{name}.html.j2", **_shown(site, person, run_id, step))
+    """Parts of the page, all of one moment, for the script that keeps it up to date."""
+    asked = names.split(",")
+    frame = run_frame(site, run_id) if "banner" in asked else None
+    shown = {} if asked == ["banner"] else _shown(site, person, run_id, step)
+    return render(request, "run_parts.html.j2", names=asked, of_run=frame, **shown)
 
 
 def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "") -> dict[str, Any]:

@@ -74,7 +74,9 @@
     do {
       again = false;
       try {
-        await Promise.all([...document.querySelectorAll("[data-part]")].map(refreshPart));
+        // Fetched together and shown at once: no button of one step beside the words of another.
+        const news = await Promise.all([...gathered()].map(([address, parts]) => fetchParts(address, parts)));
+        for (const [part, fresh] of news.flat()) if (part.isConnected) showPart(part, fresh);
       } catch { /* the stream tells that the connection is lost */ }
     } while (again);
     fetching = false;
@@ -82,13 +84,25 @@
     followLock();
     if (offline) setControls(true);
   }
-  async function refreshPart(part) {
-    const answer = await fetch(part.dataset.part, { headers: { Accept: "text/html" }, cache: "no-store" });
-    if (answer.redirected && new URL(answer.url).pathname === "/sign-in") { location.reload(); return; }
-    if (!answer.ok) return;
+  function gathered() { // the parts of one address are asked for together and tell of one moment
+    const groups = new Map();
+    for (const part of document.querySelectorAll("[data-part]")) {
+      const [, folder, name, query] = part.dataset.part.match(/^(.*\/)(\w+)(\?.*)?$/);
+      const key = `${folder}*${query || ""}`;
+      groups.set(key, (groups.get(key) || new Map()).set(name, part));
+    }
+    return groups;
+  }
+  async function fetchParts(address, parts) {
+    const names = [...parts.keys()].join(",");
+    const answer = await fetch(address.replace("*", names), { headers: { Accept: "text/html" }, cache: "no-store" });
+    if (answer.redirected && new URL(answer.url).pathname === "/sign-in") { location.reload(); return []; }
+    if (!answer.ok) return [];
     const fresh = document.createElement("template");
     fresh.innerHTML = await answer.text();
-    if (!part.isConnected) return;
+    return [...fresh.content.children].map((each) => [parts.get(each.dataset.part), each]);
+  }
+  function showPart(part, fresh) {
     for (const without of fresh.content.querySelectorAll("noscript")) without.replaceChildren(); // a template shows it
     mergeChildren(part, fresh.content);
     part.dispatchEvent(new CustomEvent("part-changed", { bubbles: true }));
