@@ -43,7 +43,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def _protocols(folder: Path) -> Path:
-    """demo.yaml without structure from motion, which has no page of its own; test_demo.py has all sources of poses."""
+    """demo.yaml without structure from motion, which has no page of its own; test_demo.py has all the sources."""
     protocol = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     (registration,) = (step for step in protocol["steps"] if step["id"] == "registration")
     registration["params"]["poses"] = ["robot", "robot_corrected"]
