@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import subprocess
 import sys
@@ -68,7 +69,8 @@ def run(server: Served, browser: Browser) -> str:
         while tablet.page.get_by_role("heading", name="The run is complete").count() == 0:
             assert time.monotonic() < deadline_s, server.log()
             assert tablet.page.get_by_role("heading", name="What happened").count() == 0, server.log()
-            technician.do_what_is_asked()
+            with contextlib.suppress(PlaywrightTimeoutError):  # the page went on between two looks: look again
+                technician.do_what_is_asked()
         assert technician.held >= 5  # calibration and four captures
         assert technician.signed >= 3  # before the scene is changed for good
     return name
@@ -80,7 +82,6 @@ class Technician:
     def __init__(self, tablet: Screen) -> None:
         self.tablet, self.page = tablet, tablet.page
         self.held = self.signed = 0
-        self._asked = ""
 
     def do_what_is_asked(self) -> None:
         """Tick, sign, confirm or hold; or wait while the software works."""
@@ -96,7 +97,7 @@ class Technician:
         confirm = actions.get_by_role("button", name=re.compile("^Confirm:"))
         if sign.count() and sign.is_visible():
             self._sign(sign)
-        elif confirm.count() and confirm.is_enabled():
+        elif confirm.count() and confirm.is_enabled(timeout=1_000):
             self._confirm(confirm)
         else:
             page.wait_for_timeout(200)
@@ -112,18 +113,17 @@ class Technician:
 
     def _confirm(self, confirm: Any) -> None:
         heading = self.page.get_by_role("heading", level=1).inner_text()
-        if confirm.get_attribute("data-hold"):
+        if confirm.get_attribute("data-hold", timeout=1_000):
             confirm.hover()
             self.page.mouse.down()
             self.page.wait_for_timeout(1800)
             self.page.mouse.up()
             self.held += 1
         else:
-            try:
-                confirm.click(timeout=5_000)
-            except PlaywrightTimeoutError:
-                return  # another step had come meanwhile; look again
-        self._until_something_else_is_asked(heading, lambda: confirm.count() == 0 or not confirm.is_enabled())
+            confirm.click(timeout=5_000)
+        self._until_something_else_is_asked(
+            heading, lambda: confirm.count() == 0 or not confirm.is_enabled(timeout=1_000)
+        )
 
     def _until_something_else_is_asked(self, heading: str, gone: Callable[[], bool]) -> None:
         """Another step comes, or the same one asks for something else."""

@@ -21,6 +21,8 @@ from service.core.errors import ComputeError, ConfigurationError, IntegrityError
 from service.core.model import ArtefactRef
 from service.worker import loop
 from service.worker.job import Handler, JobAnswer, JobContext
+from service.worker.registering import register
+from service.worker.surfaces import locate_spheres
 from tests.support.recorded_run import record_run
 
 
@@ -48,7 +50,7 @@ def hand(monkeypatch: pytest.MonkeyPatch, kind: str, handler: Handler) -> None:
 
 def moved_spheres(context: JobContext) -> JobAnswer:
     """As if the search for spheres had been changed: every centre 0.1 mm further."""
-    answer = loop.locate_spheres(context)
+    answer = locate_spheres(context)
     spheres = [[x + 1e-4, y, z] for x, y, z in answer.result["spheres_m"]]
     measures = {**answer.measures, "sphere_change_max_mm": 0.4}
     return JobAnswer(measures, answer.artefacts, {**answer.result, "spheres_m": spheres})
@@ -105,7 +107,7 @@ def test_end_to_end_carries_the_change_to_the_registration(folder: Path, monkeyp
 
 def test_rounding_is_equal_and_said(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def rounded(context: JobContext) -> JobAnswer:
-        answer = loop.register(context)
+        answer = register(context)
         return JobAnswer(
             {**answer.measures, "rms_px": answer.measures["rms_px"] * (1 + 1e-12)}, answer.artefacts, answer.result
         )

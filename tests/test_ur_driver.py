@@ -230,6 +230,7 @@ def test_emergency_stop() -> None:
         time.sleep(0.4)  # the button is released
         dashboard(host, "power on")
         wait_for(lambda: arm.state().robot_mode == "IDLE")
+        wait_for(lambda: arm.state().sample.safety is SafetyState.NORMAL)
         with pytest.raises(DeviceRefusedError, match="mode IDLE"):
             move(arm, turned(arm, 0.1))
         dashboard(host, "brake release")

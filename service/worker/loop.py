@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import socket
@@ -17,35 +18,39 @@ from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
 from service.store.errors import LeaseLostError
 from service.store.records import Job, NewArtefact
 from service.store.store import Store
-from service.worker.calibrate import calibrate
-from service.worker.evaluating import evaluate
-from service.worker.job import Handler, JobContext
-from service.worker.layout import layout
-from service.worker.live import coverage_points, live_summary, live_view
-from service.worker.poses import hybrid, structure_from_motion
-from service.worker.registering import detect_spheres, register
-from service.worker.surfaces import ct_surface, locate_spheres
+from service.worker.job import Handler, JobAnswer, JobContext
 
 _log = logging.getLogger(__name__)
 _LEASE_S = 30.0
 
-HANDLERS: Mapping[str, Handler] = {
-    handler.__name__: handler
-    for handler in (
-        calibrate,
-        ct_surface,
-        locate_spheres,
-        layout,
-        structure_from_motion,
-        hybrid,
-        detect_spheres,
-        register,
-        evaluate,
-        coverage_points,
-        live_view,
-        live_summary,
-    )
+_MODULES = {
+    "calibrate": "calibrate",
+    "ct_surface": "surfaces",
+    "locate_spheres": "surfaces",
+    "layout": "layout",
+    "structure_from_motion": "poses",
+    "hybrid": "poses",
+    "detect_spheres": "registering",
+    "register": "registering",
+    "evaluate": "evaluating",
+    "coverage_points": "live",
+    "live_view": "live",
+    "live_summary": "live",
 }
+
+
+def _handler(kind: str) -> Handler:
+    """The function of this name, imported at the first such job: a worker is ready at once."""
+
+    def handle(context: JobContext) -> JobAnswer:
+        module = importlib.import_module(f"service.worker.{_MODULES[kind]}")
+        function: Handler = getattr(module, kind)
+        return function(context)
+
+    return handle
+
+
+HANDLERS: Mapping[str, Handler] = {kind: _handler(kind) for kind in _MODULES}
 
 
 def work(
