@@ -44,12 +44,17 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def _protocols(folder: Path) -> Path:
-    """demo.yaml without structure from motion, which has no page of its own; test_demo.py has all the sources."""
+    """demo.yaml with fewer views and without structure from motion; test_demo.py has all of it."""
     protocol = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     (registration,) = (step for step in protocol["steps"] if step["id"] == "registration")
     registration["params"]["poses"] = ["robot", "robot_corrected"]
     for gate in registration["gates"]:
         gate["measure"] = gate["measure"].replace("colmap", "robot_corrected")
+    for step in protocol["steps"]:
+        if step["kind"] == "viewpoint_capture" and step["params"]["purpose"] == "dataset":
+            for arc, count in zip(step["params"]["viewpoints"][0]["arcs"], (2, 3), strict=True):
+                arc["count"] = count
+            step["gates"][0]["min"] = 5
     (folder / "protocols").mkdir()
     (folder / "protocols" / "demo.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False))
     return folder / "protocols"

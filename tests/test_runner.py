@@ -125,6 +125,7 @@ def test_pause_in_mid_motion_stops_the_arm_and_resume_goes_on_with_the_next_view
 
     def pause(move: int) -> None:
         if move == 3:
+            bench.rig.arm.dawdle()
             bench.act("pause")
 
     def paused(what: str) -> None:
@@ -141,7 +142,12 @@ def test_pause_in_mid_motion_stops_the_arm_and_resume_goes_on_with_the_next_view
 
 
 def test_abort_in_mid_motion_stops_the_arm_and_ends_the_run(bench: Bench) -> None:
-    bench.rig.arm.on_move = lambda move: bench.act("abort", reason="someone stepped in") if move == 2 else None
+    def abort(move: int) -> None:
+        if move == 2:
+            bench.rig.arm.dawdle()
+            bench.act("abort", reason="someone stepped in")
+
+    bench.rig.arm.on_move = abort
     state = bench.run()
     assert (state.status, state.stop_reason) == ("aborted", "someone stepped in")
     assert bench.rig.arm.stopped_short == 1
@@ -163,9 +169,12 @@ def test_redo_of_a_viewpoint_while_the_arm_moves_takes_it_again_and_keeps_both(b
 
 
 def test_redo_of_a_step_while_the_arm_moves_stops_it_and_begins_again(bench: Bench) -> None:
-    bench.rig.arm.on_move = lambda move: (
-        bench.act("redo", step="capture", reason="the lamp moved") if move == 3 else None
-    )
+    def redo(move: int) -> None:
+        if move == 3:
+            bench.rig.arm.dawdle()
+            bench.act("redo", step="capture", reason="the lamp moved")
+
+    bench.rig.arm.on_move = redo
     state = bench.run()
     assert state.status == "completed"
     assert bench.rig.arm.stopped_short == 1
@@ -517,6 +526,7 @@ def test_killed_between_exposure_and_record_leaves_an_orphan_and_no_viewpoint_is
 def test_a_defect_while_the_arm_moves_stops_it(bench: Bench) -> None:
     def die(move: int) -> None:
         if move == 2:
+            bench.rig.arm.dawdle()
             raise KilledError
 
     bench.rig.arm.on_move = die

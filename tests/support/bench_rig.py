@@ -108,6 +108,11 @@ class BenchArm:
     def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
         self.move_joints(to_rotation_vector(T_base_flange), speed_rad_s=1.0, acceleration_rad_s2=1.0)
 
+    def dawdle(self) -> None:
+        """The motion under way takes ten seconds: whoever wants to stop it has the time, on any machine."""
+        start_s, start, _, target = self._legs[-1]
+        self._legs[-1] = (start_s, start, start_s + 10.0, target)
+
     def stop(self) -> None:
         self.stops += 1
         if self.is_moving():
