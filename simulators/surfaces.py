@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -103,7 +105,6 @@ class Surfaces:
         self._face_normal = (n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30)).astype(np.float32)
         self._caster = Caster(self._vertices, self._faces)
         self._parts = parts
-        self._shadow: Bools | None = None
         self._light: dict[bool, Array32] = {}
         small = max(64, texture_size // 4)
         self._textures = [
@@ -123,19 +124,16 @@ class Surfaces:
     def light(self, control: bool) -> Array32:
         """Lamp and room light at the vertices (V, 2), with the shadows of the spheres that are there."""
         if control not in self._light:
-            blocked = self._blocked(control)
+            blocked = self._shadow
+            if control:
+                blocked = blocked | self._blocked_by(_spheres(self.scene.control_m))
             self._light[control] = vertex_light(blocked, self._vertices, self._normals, self.scene.lamp_m)
         return self._light[control]
 
-    def _blocked(self, control: bool) -> Bools:
-        """Where shadow falls; of the control spheres, their own is added to that of all the rest."""
-        if control:
-            parts = [sphere_mesh(centre, RADIUS_M, 3) for centre in self.scene.control_m]
-            return self._blocked(control=False) | self._blocked_by(parts)
-        if self._shadow is None:
-            spheres = [sphere_mesh(centre, RADIUS_M, 3) for centre in self.scene.registration_m]
-            self._shadow = self._blocked_by([*self._parts, *spheres])
-        return self._shadow
+    @cached_property
+    def _shadow(self) -> Bools:
+        """Where shadow falls without the control spheres; that of theirs is added to it."""
+        return self._blocked_by([*self._parts, *_spheres(self.scene.registration_m)])
 
     def _blocked_by(self, parts: list[Part]) -> Bools:
         solid = joined("shadow", "any", parts)
@@ -238,3 +236,7 @@ def drape_part(scene: Scene) -> Part:
     uv = np.stack([drape_coordinate(gx), drape_coordinate(gy)], axis=-1).reshape(-1, 2)
     vertices = np.stack([gx, gy, z], axis=-1).reshape(-1, 3)
     return Part("drape", "drape", vertices, grid_faces(len(axis), len(axis)), uv)
+
+
+def _spheres(centres_m: Iterable[Array]) -> list[Part]:
+    return [sphere_mesh(centre, RADIUS_M, 3) for centre in centres_m]

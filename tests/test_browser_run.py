@@ -8,7 +8,6 @@ import os
 import re
 import signal
 import socket
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from tests.support.browser import (
 )
 from tests.support.rig import simulated_rig
 from tests.support.short_protocol import short_protocol
+from tests.support.waiting import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -135,14 +135,6 @@ def captured(server: Served, run: str) -> list[ViewpointCaptured]:
     """The viewpoints in the evidence by now."""
     with Store.open(server.data, create=False) as store:
         return [e.payload for e in store.events(run) if isinstance(e.payload, ViewpointCaptured)]
-
-
-def wait_for_views(server: Served, run: str, count: int) -> None:
-    """Until so many are captured; read from the evidence, which is quicker than a page on a busy machine."""
-    deadline_s = time.monotonic() + LONG_MS / 1000
-    while len(captured(server, run)) < count:
-        assert time.monotonic() < deadline_s, server.log()
-        time.sleep(0.1)
 
 
 def images(page: Page, run: str) -> int:
@@ -309,7 +301,8 @@ def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a
         expect(second.page.get_by_text("Working").first).to_be_visible(timeout=LONG_MS)
 
         # The web process is killed in the middle of the capture: the runner does not notice.
-        wait_for_views(server, run, 2)
+        # Read from the evidence: quicker than a page on a busy machine.
+        until(lambda: len(captured(server, run)) >= 2, server.log)
         server.kill(signal.SIGKILL)
         assert len(captured(server, run)) < 8, "the capture was over before the web process was killed"
         expect(second.page.get_by_text("Connection lost")).to_be_visible(timeout=LONG_MS)

@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -26,15 +25,9 @@ from service.store.store import Store
 from service.web.launch import Launcher
 from tests.support.rig import simulated_rig
 from tests.support.short_protocol import short_protocol
+from tests.support.waiting import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
-
-
-def until(condition: Callable[[], bool], what: str, within_s: float = 60.0) -> None:
-    deadline_s = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < deadline_s, what
-        time.sleep(0.1)
 
 
 def press_pedal(world: str) -> None:

@@ -55,15 +55,10 @@ class Snapshot(Record):
     def shown(self) -> tuple[object, ...]:
         """What a screen would show differently, in steps that people see: without this, noise redraws every page."""
         steps = {"light_lux": 0.05, "temperature_c": 0.2, "disk_free_bytes": 1e9, "camera_free_bytes": 1e9}
-        rounded: list[object] = []
-        for name, value in self:
-            if name == "light_lux" and value:
-                rounded.append(round(math.log(value) / steps[name]))
-            elif name in steps and value is not None:
-                rounded.append(round(value / steps[name]))
-            elif name != "at_utc_s":
-                rounded.append(value)
-        return tuple(rounded)
+        seen = dict(self) | {"at_utc_s": 0.0}
+        if self.light_lux:
+            seen["light_lux"] = math.log(self.light_lux)
+        return tuple(round(value / steps[name]) if name in steps and value else value for name, value in seen.items())
 
     @property
     def stale(self) -> bool:

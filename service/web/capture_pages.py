@@ -9,7 +9,7 @@ from fastapi.responses import HTMLResponse
 
 from service.people.control import Control
 from service.people.person import Person
-from service.web.pages import render
+from service.web.pages import part_names, render
 from service.web.run_frame import run_frame
 from service.web.security import Signed, requires
 from service.web.site import Here, Site
@@ -21,8 +21,7 @@ RunId = Annotated[str, Path(max_length=64)]
 Name = Annotated[str, Query(max_length=64)]
 Page = Annotated[int, Query(ge=1, le=100_000)]
 Seq = Annotated[int, Query(ge=0, le=2**53)]
-_PART = "(image|plan|sheet)"
-Parts = Annotated[str, Path(pattern=f"^{_PART}(,{_PART}){{0,3}}$")]
+Parts = Annotated[str, part_names("image", "plan", "sheet")]
 SHEET = 60  # images on one page of the contact sheet
 
 

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Person
-from service.web.pages import render
+from service.web.pages import part_names, render
 from service.web.run_frame import run_frame
 from service.web.run_view import Looker, run_view
 from service.web.security import Signed, requires
@@ -24,8 +24,7 @@ router = APIRouter(tags=["run"])
 
 RunId = Annotated[str, Path(max_length=64)]
 Name = Annotated[str, Query(max_length=64)]
-_PART = "(banner|control|vitals|step|actions|dialogs|side)"
-Parts = Annotated[str, Path(pattern=f"^{_PART}(,{_PART}){{0,9}}$")]
+Parts = Annotated[str, part_names("banner", "control", "vitals", "step", "actions", "dialogs", "side")]
 _DRAWINGS = FilePath(__file__).with_name("static") / "drawings"
 
 

@@ -150,11 +150,7 @@ def _solve_group(
             remedy="Capture at least one image with four or more registration spheres from this station",
         )
     if not metric and sum(bool(r) for r in readings) < 2:
-        raise ComputeError(
-            "the scale of the poses cannot be told from one image",
-            where=where,
-            remedy=f"At least two images must show four or more registration spheres (spheres found: {counts})",
-        )
+        raise _scale_unknown(where, counts)
     starts = _metric_starts(readings, poses) if metric else _similarity_starts(readings, poses)
     solved: list[_Reading] = []
     tried: set[frozenset[tuple[int, int, int]]] = set()
@@ -186,11 +182,7 @@ def _solve_group(
     n_hypotheses = sum(bool(r) for r in readings)
     agreeing = _agreeing(best, readings)
     if not metric and len(poses) > 1 and support < 2:
-        raise ComputeError(
-            "the scale of the poses cannot be told from one image",
-            where=where,
-            remedy="At least two images must show four or more spheres",
-        )
+        raise _scale_unknown(where, counts)
     if n_hypotheses >= 3 and agreeing < 0.34 * n_hypotheses:
         raise ComputeError(
             f"the poses contradict the images: {agreeing} of {n_hypotheses} images agree with one registration",
@@ -198,6 +190,14 @@ def _solve_group(
             remedy="Check that the poses belong to these images, their convention and their unit",
         )
     return best
+
+
+def _scale_unknown(where: str, counts: str) -> ComputeError:
+    return ComputeError(
+        "the scale of the poses cannot be told from one image",
+        where=where,
+        remedy=f"At least two images must show four or more registration spheres (spheres found: {counts})",
+    )
 
 
 def _agreeing(best: _Reading, readings: Sequence[list[Hypothesis]]) -> int:
