@@ -274,6 +274,15 @@ def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
         wait_for(lambda: not arm.is_moving())
 
 
+def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() -> None:
+    drop = {"on": "move", "kind": "drop", "value": "receivers"}  # the samples end before the motion, its command lives
+    with faulty(61, drop), opened(address(61), stale_after_s=3.0) as arm:
+        with pytest.raises(DeviceUnavailableError, match="no new sample"):
+            travel(arm, turned(arm, 0.1))
+        arm.open()
+        travel(arm, turned(arm, 0.1))
+
+
 def test_stalled_stream_is_not_taken_for_a_still_arm() -> None:
     with faulty(55, {"on": "move", "kind": "stall"}), opened(address(55), stale_after_s=0.5) as arm:
         with pytest.raises(DeviceUnavailableError, match="no new sample"):

@@ -254,20 +254,25 @@ class UrRobot:
 
     def is_moving(self) -> bool:
         """See RobotArm. Raises SafetyStopError when a stop has ended the motion."""
-        sample = self._streaming().latest()
-        if not sample.safety.may_move:
-            raise self._safety_error(sample)
-        if time.monotonic() - self._motion_started_s < MOTION_START_S:
-            return True
-        if np.any(np.abs(sample.target_velocities_rad_s) > 1e-9):
+        if self._driven(self._streaming().latest()) or time.monotonic() - self._motion_started_s < MOTION_START_S:
             return True
         control = self._control
         with vendor(self._where, "asking for the motion's progress"):
-            return (
+            if (
                 control is not None
                 and control.isProgramRunning()
                 and control.getAsyncOperationProgressEx().isAsyncOperationRunning()
-            )
+            ):
+                return True
+        # On a link that has just died the newest sample is one from before the motion, and no program seems to
+        # run: only a sample that arrives from now on proves that the arm is at rest.
+        return self._driven(self._streaming().next())
+
+    def _driven(self, sample: RobotSample) -> bool:
+        """Whether the controller drives the arm in this sample. Raises SafetyStopError when a stop has ended it."""
+        if not sample.safety.may_move:
+            raise self._safety_error(sample)
+        return bool(np.any(np.abs(sample.target_velocities_rad_s) > 1e-9))
 
     def settle(self, criteria: SettleCriteria) -> SettleReport:
         """See RobotArm."""

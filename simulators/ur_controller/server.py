@@ -129,6 +129,11 @@ class RtdeLink(Link):
         self.send(codec.setup_reply(codec.SETUP_INPUTS, number, types))
 
     @property
+    def only_receives(self) -> bool:
+        """Whether the client has asked for outputs and never for an input."""
+        return self._output is not None and not self._inputs
+
+    @property
     def streaming(self) -> bool:
         """Whether data packages are wanted and the client reads them."""
         return self._streaming and not self.dead and len(self.out) < MAX_BACKLOG_BYTES
@@ -365,7 +370,8 @@ class Server:
             self._stalled_until_s = now_s + seconds
         elif fault is not None:
             for link in self._links:
-                link.dead = link.dead or isinstance(link, RtdeLink)
+                if isinstance(link, RtdeLink) and (fault.value != "receivers" or link.only_receives):
+                    link.dead = True
         if now_s < self._stalled_until_s:
             return
         for link in self._links:
