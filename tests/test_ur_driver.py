@@ -275,7 +275,7 @@ def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
 
 
 def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() -> None:
-    drop = {"on": "move", "kind": "drop", "value": "receivers"}  # the samples end before the motion, its command lives
+    drop: dict[str, object] = {"on": "move", "kind": "drop", "value": "receivers"}  # no samples; the command lives
     with faulty(61, drop), opened(address(61), stale_after_s=3.0) as arm:
         with pytest.raises(DeviceUnavailableError, match="no new sample"):
             travel(arm, turned(arm, 0.1))
