@@ -89,7 +89,7 @@ def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
     start = time.monotonic()
     with pytest.raises(DeviceTimeoutError, match=r"hang did not return within 0\.5 s"):
         device.hang(60)
-    assert time.monotonic() - start < 3
+    assert time.monotonic() - start < 30, "it waited for the call"
     assert not psutil.pid_exists(pid)
     with pytest.raises(DeviceUnavailableError, match="killed after hang"):
         device.double(np.ones(1))

@@ -296,11 +296,11 @@ def test_mute_server_does_not_hang_the_driver(on: str, server: str) -> None:
     with faulty(56, {"on": on, "kind": "stall"}):
         begin = time.monotonic()
         with (
-            pytest.raises(DeviceUnavailableError, match=rf"the {server} server did not answer within 0\.5 s"),
-            opened(address(56), connect_timeout_s=0.5),
+            pytest.raises(DeviceUnavailableError, match=rf"the {server} server did not answer within 1\.5 s"),
+            opened(address(56), connect_timeout_s=1.5),
         ):
             pass
-        assert time.monotonic() - begin < 5
+        assert time.monotonic() - begin < 30, "it hung"
 
 
 def test_nobody_there() -> None:

@@ -310,27 +310,34 @@ def fit_pose(
     """
     pose = start
     for _ in range(iterations):
-        rotated = centres_m @ pose[:3, :3].T
-        c = rotated + pose[:3, 3]
-        distance = np.linalg.norm(c, axis=1)
-        if np.any(distance < 1.5 * radius_m):
+        step = _pose_step(pose, axes, half_angles, centres_m, radius_m)
+        if step is None:
             return start
-        u = c / distance[:, None]
-        place = (u - axes) / half_angles[:, None]
-        size = np.arcsin(radius_m / distance) / half_angles - 1
-        residual = np.column_stack([place, size])  # (N, 4) in radii
-        across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / (distance * half_angles)[:, None, None]
-        shrink = -radius_m / (distance**2 * np.sqrt(1 - (radius_m / distance) ** 2) * half_angles)
-        by_centre = np.concatenate([across, (shrink[:, None] * u)[:, None, :]], axis=1)  # (N, 4, 3)
-        J = np.concatenate([by_centre, -by_centre @ skew(rotated)], axis=2)
-        error = np.linalg.norm(residual, axis=1)
-        scale = max(0.01, 1.5 * float(np.median(error)))
-        weight = 1 / (1 + (error / scale) ** 2)
-        H = np.einsum("n,nki,nkj->ij", weight, J, J)
-        g = np.einsum("n,nki,nk->i", weight, J, residual)
-        d = 1 / np.sqrt(np.maximum(np.diag(H), 1e-12))
-        step = -d * np.linalg.lstsq(H * np.outer(d, d), d * g, rcond=1e-12)[0]
         pose = transform(Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[:3])
         if float(np.abs(step).max()) < 1e-9:
             break
     return pose
+
+
+def _pose_step(pose: Transform, axes: Array, half_angles: Array, centres_m: Array, radius_m: float) -> Array | None:
+    """One Gauss–Newton step (6,) of translation and rotation; None where the camera would be within a sphere."""
+    rotated = centres_m @ pose[:3, :3].T
+    c = rotated + pose[:3, 3]
+    distance = np.linalg.norm(c, axis=1)
+    if np.any(distance < 1.5 * radius_m):
+        return None
+    u = c / distance[:, None]
+    place = (u - axes) / half_angles[:, None]
+    size = np.arcsin(radius_m / distance) / half_angles - 1
+    residual = np.column_stack([place, size])  # (N, 4) in radii
+    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / (distance * half_angles)[:, None, None]
+    shrink = -radius_m / (distance**2 * np.sqrt(1 - (radius_m / distance) ** 2) * half_angles)
+    by_centre = np.concatenate([across, (shrink[:, None] * u)[:, None, :]], axis=1)  # (N, 4, 3)
+    J = np.concatenate([by_centre, -by_centre @ skew(rotated)], axis=2)
+    error = np.linalg.norm(residual, axis=1)
+    scale = max(0.01, 1.5 * float(np.median(error)))
+    weight = 1 / (1 + (error / scale) ** 2)
+    H = np.einsum("n,nki,nkj->ij", weight, J, J)
+    g = np.einsum("n,nki,nk->i", weight, J, residual)
+    d = 1 / np.sqrt(np.maximum(np.diag(H), 1e-12))
+    return -d * np.linalg.lstsq(H * np.outer(d, d), d * g, rcond=1e-12)[0]

@@ -218,13 +218,19 @@ def _pose_steps(
             break
         slope = slope / seen.sigma_rad[flat][:, :, None]
         J = np.concatenate([slope, -slope @ skew(turned.reshape(-1, 3))], axis=2).reshape(K, 3 * k, 6)
-        JJ = J.transpose(0, 2, 1) @ J
-        H = JJ + 1e-9 * np.trace(JJ, axis1=1, axis2=2)[:, None, None] * np.eye(6)
-        dx = -np.linalg.solve(H, np.einsum("kni,kn->ki", J, r.reshape(K, -1))[:, :, None])[:, :, 0]
-        dx[:, 3:] = np.clip(dx[:, 3:], -0.3, 0.3)
+        dx = _damped_steps(J, r.reshape(K, -1))
         rotation = Rotation.from_rotvec(dx[:, 3:]).as_matrix() @ rotation
         t = t + dx[:, :3]
     return rotation, t, chi2
+
+
+def _damped_steps(J: Array, r: Array) -> Array:
+    """Gauss–Newton steps (K, 6) from J (K, N, 6) and residuals (K, N); turns are kept small."""
+    JJ = J.transpose(0, 2, 1) @ J
+    H = JJ + 1e-9 * np.trace(JJ, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+    dx = -np.linalg.solve(H, np.einsum("kni,kn->ki", J, r)[:, :, None])[:, :, 0]
+    dx[:, 3:] = np.clip(dx[:, 3:], -0.3, 0.3)
+    return dx
 
 
 def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: float) -> tuple[NDArray[np.int64], Array]:
