@@ -32,7 +32,7 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("demo")
-    options = ("--scene", "7", "--image-width", "780", "--speed-up", "6", "--ct-voxel-mm", "1.0")
+    options = ("--scene", "7", "--image-width", "780", "--speed-up", "10", "--ct-voxel-mm", "1.0")
     rig_folder = folder / "rig"
     rig_folder.mkdir()
     with (
@@ -50,11 +50,13 @@ def _protocols(folder: Path) -> Path:
     registration["params"]["poses"] = ["robot", "robot_corrected"]
     for gate in registration["gates"]:
         gate["measure"] = gate["measure"].replace("colmap", "robot_corrected")
+    counts = {"dataset": (2, 3), "control": (2,)}
     for step in protocol["steps"]:
-        if step["kind"] == "viewpoint_capture" and step["params"]["purpose"] == "dataset":
-            for arc, count in zip(step["params"]["viewpoints"][0]["arcs"], (2, 3), strict=True):
+        if step["kind"] == "viewpoint_capture":
+            views = counts[step["params"]["purpose"]]
+            for arc, count in zip(step["params"]["viewpoints"][0]["arcs"], views, strict=True):
                 arc["count"] = count
-            step["gates"][0]["min"] = 5
+            step["gates"][0]["min"] = sum(views)
     (folder / "protocols").mkdir()
     (folder / "protocols" / "demo.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False))
     return folder / "protocols"
@@ -105,7 +107,7 @@ class Technician:
         elif confirm.count() and confirm.is_enabled(timeout=1_000):
             self._confirm(confirm)
         else:
-            page.wait_for_timeout(200)
+            page.wait_for_timeout(400)
 
     def _sign(self, sign: Any) -> None:
         heading = self.page.get_by_role("heading", level=1).inner_text()
@@ -135,7 +137,7 @@ class Technician:
         deadline_s = time.monotonic() + 60
         while self.page.get_by_role("heading", level=1).inner_text() == heading and not gone():
             assert time.monotonic() < deadline_s, heading
-            self.page.wait_for_timeout(100)
+            self.page.wait_for_timeout(200)
 
 
 def test_the_technician_sees_the_accuracy_at_the_end(server: Served, browser: Browser, run: str) -> None:

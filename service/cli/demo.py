@@ -116,7 +116,7 @@ def _simulated_rig(folder: Path, scene: int, image_width: int) -> Generator[dict
     folder.mkdir(parents=True)
     command = [
         sys.executable, "-m", "simulators", "rig", "--scene", str(scene), "--dir", str(folder),
-        "--image-width", str(image_width), "--speed-up", "6", "--ct-voxel-mm", "1.0", "--with-parent",
+        "--image-width", str(image_width), "--speed-up", "10", "--ct-voxel-mm", "1.0", "--with-parent",
     ]  # fmt: skip
     log = folder / "rig.log"
     with log.open("w") as errors:
