@@ -27,7 +27,7 @@ from tests.support.rig import REPOSITORY, RigLock, orthocapture, simulated_rig, 
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
 
-SMALL = ("--scene", "3", "--image-width", "480", "--speed-up", "4")
+SMALL = ("--scene", "3", "--image-width", "480", "--speed-up", "10")
 # The rigs of other tests do not stand in the way of these.
 OWN_HOST = "127.0.0.61"
 
