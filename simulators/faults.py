@@ -23,7 +23,9 @@ class Fault(BaseModel):
     kind: str = Field(description="drop, stall, truncate, corrupt, reject, protective_stop, disk_full, …")
     nth: int = Field(default=1, ge=1)
     times: int = Field(default=1, ge=1)
-    value: float | int | str | bool | None = Field(default=None, description="what the kind needs: seconds, bytes")
+    value: float | int | str | bool | None = Field(
+        default=None, description="what the kind needs: seconds, bytes, links"
+    )
 
     def due(self, count: int) -> bool:
         """Whether the count-th (from 1) matching message is one of those to go wrong."""

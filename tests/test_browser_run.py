@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from tests.support.browser import (
     screen,
     served,
 )
-from tests.support.rig import simulated_rig
+from tests.support.rig import press_pedal, simulated_rig
 from tests.support.short_protocol import short_protocol
 from tests.support.waiting import until
 
@@ -122,13 +121,6 @@ def tick_all(page: Page) -> None:
 def confirm_list(page: Page) -> None:
     tick_all(page)
     page.get_by_role("button", name="Confirm: all of this is done").click()
-
-
-def press_pedal(rig: dict[str, Any]) -> None:
-    host, _, port = rig["world"].rpartition(":")
-    with socket.create_connection((host, int(port)), timeout=10) as link:
-        link.sendall(b'{"op": "act", "action": "press_pedal"}\n')
-        assert json.loads(link.makefile().readline())["ok"]
 
 
 def captured(server: Served, run: str) -> list[ViewpointCaptured]:
@@ -294,10 +286,10 @@ def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a
         expect(go).to_be_enabled()
 
         # The foot pedal takes the same way as the button; one press shows, two move.
-        press_pedal(rig)
+        press_pedal(rig["world"])
         expect(second.page.get_by_text("Foot pedal pressed once").first).to_be_visible(timeout=LONG_MS)
         second.page.wait_for_timeout(800)  # less would be a bounce
-        press_pedal(rig)
+        press_pedal(rig["world"])
         expect(second.page.get_by_text("Working").first).to_be_visible(timeout=LONG_MS)
 
         # The web process is killed in the middle of the capture: the runner does not notice.

@@ -72,8 +72,8 @@ def test_settings_take_no_delayed_acknowledgements() -> None:
     with camera_simulator() as camera:
         steps = [["set", "iso", value] for value in ("100", "200") * 6]
         times_s = vendor_session(camera.gphoto_port, *steps)
-    # A delayed acknowledgement takes 40 ms; without TCP_QUICKACK every one is.
-    assert min(times_s) < 0.03
+    # Without TCP_QUICKACK every one takes 44 ms: half of them may lose their slice of a busy machine.
+    assert sorted(times_s)[len(times_s) // 2] < 0.02
 
 
 def test_capture_raw_and_jpeg_share_a_stem_and_the_log_has_the_bytes_that_were_sent(tmp_path: Path) -> None:

@@ -8,8 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from service.rig import load_rig
 from service.station import Station
 from service.store.store import Store
 from tests.support.rig import REPOSITORY, RigLock, orthocapture, simulated_rig, without_calibration_and_ct
+from tests.support.waiting import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
 
@@ -76,15 +76,6 @@ def rig_process(folder: Path) -> Generator[tuple[subprocess.Popen[str], dict[str
             process.kill()
             process.wait(timeout=30)
             process.stdout.close()
-
-
-def wait_until(fulfilled: Callable[[], bool], timeout_s: float = 20) -> bool:
-    deadline_s = time.monotonic() + timeout_s
-    while not fulfilled():
-        if time.monotonic() > deadline_s:
-            return False
-        time.sleep(0.05)
-    return True
 
 
 def listens(host: str, port: int) -> bool:
@@ -188,7 +179,7 @@ def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
         camera = next(p for p in processes if "camera" in p.cmdline())
         os.kill(camera.pid, signal.SIGKILL)
         process.wait(timeout=20)
-        assert wait_until(lambda: not any(p.is_running() for p in processes))
+        until(lambda: not any(p.is_running() for p in processes), "all have ended", 20)
         log = (tmp_path / "rig.log").read_text()
         assert "camera ended with status -9" in log
         assert "Traceback" not in log
@@ -198,7 +189,7 @@ def test_a_killed_rig_takes_its_devices_with_it(tmp_path: Path) -> None:
     with rig_process(tmp_path) as (process, _, processes):
         process.kill()
         process.wait(timeout=10)
-        assert wait_until(lambda: not any(p.is_running() for p in processes[1:]))
+        until(lambda: not any(p.is_running() for p in processes[1:]), "its devices have ended", 20)
 
 
 # --- two controllers --------------------------------------------------------------------------------------

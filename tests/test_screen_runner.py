@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import socket
 import time
 from pathlib import Path
 
@@ -23,18 +21,11 @@ from service.steps import params_models
 from service.store.audit import verify
 from service.store.store import Store
 from service.web.launch import Launcher
-from tests.support.rig import simulated_rig
+from tests.support.rig import press_pedal, simulated_rig
 from tests.support.short_protocol import short_protocol
 from tests.support.waiting import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
-
-
-def press_pedal(world: str) -> None:
-    host, _, port = world.rpartition(":")
-    with socket.create_connection((host, int(port)), timeout=10) as link:
-        link.sendall(b'{"op": "act", "action": "press_pedal"}\n')
-        assert json.loads(link.makefile().readline())["ok"]
 
 
 class Watched:

@@ -25,6 +25,7 @@ from drivers.ur import UrConfig
 from drivers.ur.stream import judge, safety_state
 from service.core.geometry import inverse, rotation_angle_rad, transform
 from tests.support.ur_simulator import address, simulated_ur
+from tests.support.waiting import until
 
 SPEED_UP = "3"
 SPEED, ACCELERATION = 1.05, 1.4
@@ -67,10 +68,7 @@ def dashboard(host: str, *orders: str) -> list[str]:
 
 
 def wait_for(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.02)
+    until(condition, "waited in vain", timeout_s, every_s=0.02)
 
 
 def move(arm: RobotArm, joints: Array) -> None:
@@ -296,11 +294,11 @@ def test_mute_server_does_not_hang_the_driver(on: str, server: str) -> None:
     with faulty(56, {"on": on, "kind": "stall"}):
         begin = time.monotonic()
         with (
-            pytest.raises(DeviceUnavailableError, match=rf"the {server} server did not answer within 1\.5 s"),
-            opened(address(56), connect_timeout_s=1.5),
+            pytest.raises(DeviceUnavailableError, match=rf"the {server} server did not answer within 0\.5 s"),
+            opened(address(56), connect_timeout_s=0.5),
         ):
             pass
-        assert time.monotonic() - begin < 30, "it hung"
+        assert time.monotonic() - begin < 5
 
 
 def test_nobody_there() -> None:

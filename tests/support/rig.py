@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import socket
 import subprocess
 import sys
 import tempfile
@@ -31,6 +32,14 @@ class RigLock:
 
 _USUAL = "127.0.0.1"
 RIG_LOCK = RigLock(_USUAL)
+
+
+def press_pedal(world: str) -> None:
+    """Press the foot pedal of the rig whose world listens at `world`, as somebody in the room."""
+    host, _, port = world.rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=10) as link:
+        link.sendall(b'{"op": "act", "action": "press_pedal"}\n')
+        assert json.loads(link.makefile().readline())["ok"]
 
 
 def orthocapture(*words: str, timeout_s: float = 120) -> subprocess.CompletedProcess[str]:

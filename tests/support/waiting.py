@@ -6,9 +6,11 @@ import time
 from collections.abc import Callable
 
 
-def until(condition: Callable[[], bool], what: Callable[[], str] | str, within_s: float = 60.0) -> None:
+def until(
+    condition: Callable[[], bool], what: Callable[[], str] | str, within_s: float = 60.0, *, every_s: float = 0.1
+) -> None:
     """Return as soon as the condition holds; fail with `what` if it does not in time."""
     deadline_s = time.monotonic() + within_s
     while not condition():
         assert time.monotonic() < deadline_s, what if isinstance(what, str) else what()
-        time.sleep(0.1)
+        time.sleep(every_s)
