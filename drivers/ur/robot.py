@@ -65,6 +65,7 @@ VARIABLES = (
 )
 READ_BACK_S = 1.0
 SCRIPT_START_S = 5.0
+TOOL_CHANGE_S = 0.05  # of the controller's clock, for a new tool to show in the stream
 MOTION_START_S = 0.06  # for the target velocity to show in the stream
 
 _LOG = logging.getLogger(__name__)
@@ -181,6 +182,10 @@ class UrRobot:
             if not control.setPayload(payload.mass_kg, list(payload.centre_of_gravity_m)):
                 raise self._refusal(f"the payload of {payload.mass_kg:g} kg was not taken")
         self._read_tool()
+        # The stream runs behind the answer: poses of the former tool are still under way.
+        settled_s = self._streaming().latest().controller_time_s + TOOL_CHANGE_S
+        while self._streaming().next().controller_time_s < settled_s:
+            pass
         self._streaming().clear()
         difference = inverse(self._T_flange_tcp) @ T_flange_tcp - np.eye(4)
         if float(np.max(np.abs(difference))) > 1e-6:
