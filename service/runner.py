@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import distributions
@@ -92,6 +92,10 @@ class Operator(Interface):
         """The work of a step is about to begin: a simulated technician does now what was confirmed as done."""
         ...
 
+    def mend(self, step: str, attempt: int, hands: Sequence[Mapping[str, Any]]) -> None:
+        """A confirmed retry is about to begin: a simulated technician first does what the step has asked for."""
+        ...
+
 
 @dataclass
 class Runner:
@@ -162,6 +166,8 @@ class Runner:
                 self.operator.tell(f"{self.protocol.step(step).title}: passed")
             case Retry(step, attempt, why, wait_s):
                 self.wait(wait_s)
+                if state.step.retry_granted:
+                    self.operator.mend(step, attempt, state.step.mend.get("hands", ()))
                 self._append(StepRetried(step=step, attempt=attempt, why=why))
             case FinishRun(deviations):
                 self._append(RunCompleted(deviations=deviations))

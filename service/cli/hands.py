@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,13 +22,23 @@ class SimulatedHands:
 
     def do(self, step: Step, attempt: int) -> None:
         """What a technician does before confirming this step; once for each attempt."""
-        if self.address is None or (step.id, attempt) in self._done:
+        self.act(step.id, attempt, [action.model_dump(exclude_none=True) for action in step.simulated_hands])
+
+    def act(self, step: str, attempt: int, actions: Sequence[Mapping[str, Any]]) -> None:
+        """Do these actions (the vocabulary of simulators/rig_world.py) one after the other; once for each attempt.
+
+        Raises OrthocaptureError when the simulated world does not answer or cannot do one of them.
+        """
+        if self.address is None or (step, attempt) in self._done:
             return
-        for action in step.simulated_hands:
-            answer = _ask_world(self.address, {"op": "act", **action.model_dump(exclude_none=True)})
+        for action in actions:
+            answer = _ask_world(self.address, {**action, "op": "act"})
             if not answer.get("ok"):
-                raise OrthocaptureError(f"the simulated technician could not {action.action}: {answer.get('error')}")
-        self._done.add((step.id, attempt))
+                raise OrthocaptureError(
+                    f"the simulated technician could not {action.get('action')}: {answer.get('error')}",
+                    where=f"step {step}",
+                )
+        self._done.add((step, attempt))
 
 
 def _ask_world(address: str, request: dict[str, Any]) -> dict[str, Any]:

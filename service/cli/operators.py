@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import select
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
@@ -20,6 +20,8 @@ from service.core.protocol import Protocol
 from service.core.run_state import RunState
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Doing
+
+_MOST_MENDS = 4  # of one step: whoever has followed its advice so often decides by himself
 
 
 class Display:
@@ -92,6 +94,10 @@ class _Operator:
     def prepare(self, step: str, attempt: int) -> None:
         """The simulated technician's hands, if there are any."""
         self.hands.do(self.protocol.step(step), attempt)
+
+    def mend(self, step: str, attempt: int, hands: Sequence[Mapping[str, Any]]) -> None:
+        """The simulated technician does what the step has asked for."""
+        self.hands.act(step, attempt, hands)
 
 
 @dataclass
@@ -172,11 +178,17 @@ class TerminalOperator(_Operator):
 
 @dataclass
 class AutomaticOperator(_Operator):
-    """Confirms and signs on a simulated rig."""
+    """Confirms and signs on a simulated rig, and follows a step's advice on how to mend what fell short."""
+
+    _mends: dict[str, int] = field(default_factory=dict[str, int])  # step → how often its advice was followed
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction:
-        """Say yes; recorded as automatic."""
+        """Say yes; recorded as automatic. Raises OrthocaptureError where there is no advice to follow, or no end."""
         if question.for_ == "recovery":
+            mends = self._mends.get(question.step, 0)
+            if state.step.mend and "confirm" in question.options and mends < _MOST_MENDS:
+                self._mends[question.step] = mends + 1
+                return OperatorAction(action="confirm", step=question.step, via="auto", automatic=True)
             raise OrthocaptureError(
                 question.text,
                 where=f"step {question.step}",

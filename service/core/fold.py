@@ -206,7 +206,7 @@ def _step_started(protocol: Protocol, state: RunState, event: Event, p: StepStar
 def _step_note(protocol: Protocol, state: RunState, event: Event, p: StepNote) -> RunState:
     if _is_void(state, event, p.step, p.attempt):
         return _void(state, event)
-    note = Note(event.seq, event.at_utc, p.note, p.data)
+    note = Note(event.seq, event.at_utc, p.note, p.data, p.attempt)
     return change(state, p.step, notes=(*state.steps[p.step].notes, note))
 
 

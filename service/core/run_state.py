@@ -42,6 +42,7 @@ class Note:
     at_utc: str
     note: str
     data: Mapping[str, Any]
+    attempt: int = 0  # of the step
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +91,14 @@ class StepState:
     def passed_its_gates(self) -> bool:
         """Passed, and not merely skipped."""
         return self.phase == "passed" and self.gates_passed and not self.skipped
+
+    @property
+    def mend(self) -> Mapping[str, Any]:
+        """What would mend this attempt, as it found out: data of its newest note with `advice`; empty without one."""
+        advised = (
+            note.data for note in reversed(self.notes) if note.attempt == self.attempt and "advice" in note.data
+        )
+        return next(advised, {})
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -315,6 +316,9 @@ class ScriptedOperator:
     told: list[str] = field(default_factory=list[str])
     attended: list[tuple[Doing, bool]] = field(default_factory=list[tuple[Doing, bool]])
     prepared: list[tuple[str, int]] = field(default_factory=list[tuple[str, int]])
+    mended: list[tuple[str, int, tuple[Mapping[str, Any], ...]]] = field(
+        default_factory=list[tuple[str, int, tuple[Mapping[str, Any], ...]]]
+    )
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
         self.asked.append(question)
@@ -336,6 +340,9 @@ class ScriptedOperator:
 
     def prepare(self, step: str, attempt: int) -> None:
         self.prepared.append((step, attempt))
+
+    def mend(self, step: str, attempt: int, hands: Sequence[Mapping[str, Any]]) -> None:
+        self.mended.append((step, attempt, tuple(hands)))
 
 
 def other_settings(applied: CameraSettings) -> CameraSettings:

@@ -1,0 +1,149 @@
+"""What a step advises when it falls short: the simulated technician does it and confirms, and gives up in the end."""
+
+from __future__ import annotations
+
+import io
+import json
+import socketserver
+import threading
+import time
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from service.cli.hands import SimulatedHands
+from service.cli.operators import AutomaticOperator, Display
+from service.core.errors import OrthocaptureError
+from service.core.model import OperatorAction, StepNote
+from service.core.protocol import parse_protocol
+from service.core.run_state import RunState
+from service.monitor.reporter import OpenDevices, Reporter
+from service.rig import load_rig
+from service.runner import Runner
+from service.runs import recorded_run, start_run
+from service.steps import params_models
+from service.store.store import Store
+from tests.support.bench_rig import BenchRig, other_settings
+from tests.support.bench_run import PROTOCOL, Bench
+
+ADVICE = {
+    "advice": "Turn the ISO wheel back",
+    "hands": [{"action": "turn_wheel", "iso": 100}, {"action": "step_back"}],
+}
+
+
+class _World(socketserver.ThreadingTCPServer):
+    """The other end of the hands: writes down what it is asked to do, and does it."""
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self) -> None:
+        self.asked: list[dict[str, Any]] = []
+        super().__init__(("127.0.0.1", 0), _Client)
+
+
+class _Client(socketserver.StreamRequestHandler):
+    def handle(self) -> None:
+        assert isinstance(self.server, _World)
+        for line in self.rfile:
+            request = json.loads(line)
+            self.server.asked.append(request)
+            answer = {"ok": request["action"] != "juggle", "error": "hands cannot do 'juggle'"}
+            self.wfile.write(json.dumps(answer).encode() + b"\n")
+
+
+@contextmanager
+def _serving() -> Generator[_World]:
+    with _World() as world:
+        threading.Thread(target=world.serve_forever, daemon=True).start()
+        yield world
+        world.shutdown()
+
+
+@pytest.fixture
+def world() -> Iterator[_World]:
+    with _serving() as world:
+        yield world
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    with Store.open(tmp_path / "data") as store:
+        (tmp_path / "rig.yaml").write_text("name: bench\nsimulated: true\ndevices: {}\n")
+        loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="bench.yaml")
+        run_id = start_run(store, loaded, load_rig(tmp_path / "rig.yaml"), operator="Ada", auto_confirm=True)
+        yield Bench(store, run_id, tmp_path / "data")
+
+
+def automatic_run(bench: Bench, world: _World) -> RunState:
+    """The run with --auto-confirm and the simulated world as the technician's hands."""
+    protocol, _ = recorded_run(bench.store, bench.run_id)
+    reporter = Reporter(bench.data, bench.run_id, OpenDevices, bench.rig.camera)
+    host, port = world.server_address[:2]
+    operator = AutomaticOperator(
+        "Ada", protocol, Display(Console(file=io.StringIO()), reporter), SimulatedHands(f"{host!s}:{port}")
+    )
+    return Runner(
+        bench.store, bench.run_id, protocol, bench.rig, operator, wait=lambda s: time.sleep(min(s, 0.002))
+    ).run()
+
+
+def advise(bench: Bench, rig: BenchRig, data: dict[str, Any]) -> None:
+    """With every exposure, the capture notes what would mend it: as a step does that knows a way on."""
+
+    def note(_exposure: int) -> None:
+        attempt = bench.state().steps["capture"].attempt
+        bench.store.record(
+            bench.run_id, [StepNote(step="capture", attempt=attempt, note="wheel", data=data)], actor=""
+        )
+
+    rig.shutter.on_capture = note
+
+
+def mends(bench: Bench) -> list[OperatorAction]:
+    actions = [a for a in bench.payloads(OperatorAction) if a.step == "capture" and a.action == "confirm"]
+    return actions[1:]  # the first one began the capture
+
+
+def test_the_simulated_technician_does_what_a_step_advises_and_confirms(bench: Bench, world: _World) -> None:
+    bench.rig.shutter.exif = lambda applied: applied if world.asked else other_settings(applied)
+    advise(bench, bench.rig, ADVICE)
+    assert automatic_run(bench, world).status == "completed"
+    assert world.asked == [
+        {"op": "act", "action": "turn_wheel", "iso": 100},
+        {"op": "act", "action": "step_back"},
+    ]
+    (mend,) = mends(bench)
+    assert mend.automatic
+    assert mend.via == "auto"
+    bench.must_verify()
+
+
+def test_he_gives_up_after_a_few_mends_that_did_not_help(bench: Bench, world: _World) -> None:
+    bench.rig.shutter.exif = other_settings
+    advise(bench, bench.rig, ADVICE)
+    with pytest.raises(OrthocaptureError, match="settings_departures"):
+        automatic_run(bench, world)
+    assert len(mends(bench)) == 4
+    assert bench.state().phase == "recovering", "the run is whole and can be resumed"
+
+
+def test_without_advice_from_this_attempt_he_leaves_it_to_a_person(bench: Bench, world: _World) -> None:
+    bench.rig.shutter.exif = other_settings
+    bench.store.record(bench.run_id, [StepNote(step="fixation", attempt=1, note="wheel", data=ADVICE)], actor="")
+    with pytest.raises(OrthocaptureError, match="settings_departures"):
+        automatic_run(bench, world)
+    assert not mends(bench)
+    assert not world.asked
+
+
+def test_hands_that_cannot_do_it_say_so(bench: Bench, world: _World) -> None:
+    bench.rig.shutter.exif = other_settings
+    advise(bench, bench.rig, {"advice": "Juggle", "hands": [{"action": "juggle"}]})
+    with pytest.raises(OrthocaptureError, match="could not juggle"):
+        automatic_run(bench, world)
