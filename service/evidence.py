@@ -10,7 +10,7 @@ from pathlib import Path
 
 from service.core.decide import advance, fold
 from service.core.errors import ComputeError, IntegrityError
-from service.core.model import ArtefactRef, Event, Payload, ViewpointCaptured
+from service.core.model import ArtefactRef, Event, Payload, View
 from service.core.protocol import Protocol
 from service.core.run_state import JobState, RunState
 from service.steps.context import JobRequest, JobResult
@@ -40,10 +40,10 @@ class RunLog:
             self.state = advance(self.protocol, self.state, event)
         return self.state
 
-    def captures(self, step_id: str) -> tuple[ViewpointCaptured, ...]:
+    def captures(self, step_id: str) -> tuple[View, ...]:
         """The valid captures of a step's current attempt, in order."""
         payloads = (self.events[seq - 1].payload for seq in sorted(self.refresh().steps[step_id].captured.values()))
-        return tuple(payload for payload in payloads if isinstance(payload, ViewpointCaptured))
+        return tuple(payload for payload in payloads if isinstance(payload, View))
 
 
 @dataclass
@@ -74,7 +74,7 @@ class StepEvidence:
         """Where an artefact's bytes lie."""
         return self.log.store.artefact_path(ref.sha256)
 
-    def captures(self, step_id: str) -> tuple[ViewpointCaptured, ...]:
+    def captures(self, step_id: str) -> tuple[View, ...]:
         """See service.steps.context.Evidence."""
         return self.log.captures(step_id)
 

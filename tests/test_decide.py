@@ -45,7 +45,7 @@ from service.core.model import (
 )
 from service.core.protocol import Recovery
 from service.core.recovery import FATAL, NEEDS_A_PERSON, PASSING, recovery_policy
-from tests.support.core import GOOD, TOY, Log, captured, toy_protocol
+from tests.support.core import GOOD, TOY, Log, captured, imported, toy_protocol
 from tests.support.counting import calls_of
 
 
@@ -429,6 +429,16 @@ def test_redo_of_one_viewpoint_while_running_and_after() -> None:
     log.accept()
     assert kinds(log) == ["redo_viewpoint", "redo_viewpoint"]
     refused(log, "in the current step only", action="redo", step="capture", viewpoint="a", reason="late")
+
+
+def test_imported_photographs_count_as_views_and_the_run_says_so() -> None:
+    log = at_capture()
+    log.begin()
+    log.append(imported("capture", log.state.step.attempt, "a"))
+    log.append(imported("capture", log.state.step.attempt, "a"))
+    assert set(log.state.step.captured) == {"a"}
+    assert log.state.superseded[-1].reason == "imported again"
+    assert log.state.origin == "captured"  # what the root of the chain says, also of runs from before it said so
 
 
 def test_a_redo_races_with_the_last_record(log: Log) -> None:

@@ -13,6 +13,7 @@ from service.core.model import (
     JobEnqueued,
     JobFinished,
     RunStarted,
+    ViewImported,
     ViewpointCaptured,
 )
 from service.core.run_state import RunState
@@ -181,6 +182,17 @@ def _captures(events: Sequence[Event], ids: Mapping[str, str], devices: set[str]
                 "@type": "CreateAction",
                 "name": f"Capture of {payload.viewpoint}, attempt {payload.attempt} of {payload.step}",
                 "instrument": [{"@id": camera if camera in devices else "#software"}],
+                "endTime": event.at_utc,
+                "result": _links(payload.artefacts, ids),
+            }
+        elif isinstance(payload, ViewImported):
+            yield {
+                "@id": f"#event-{event.seq}",
+                "@type": "CreateAction",
+                "name": f"Import of {payload.file_name} as {payload.viewpoint} in {payload.step}",
+                "description": "How the photograph was captured is not in evidence.",
+                "agent": {"@id": _anchor("person", payload.imported_by)},
+                "instrument": [{"@id": "#software"}],
                 "endTime": event.at_utc,
                 "result": _links(payload.artefacts, ids),
             }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from service.audit.computed import Computed, Step
 from service.audit.queries import Facets, head, root
 from service.core.errors import IntegrityError, OrthocaptureError
 from service.core.fold import advance, initial_state
-from service.core.model import PAYLOAD, Event, GatesEvaluated, Payload, ViewpointCaptured
+from service.core.model import PAYLOAD, Event, GatesEvaluated, Payload, ViewImported, ViewpointCaptured
 from service.core.protocol import Protocol, parse_protocol
 from service.core.run_state import Deviation, RunState
 from service.store.store import Store
@@ -32,6 +32,7 @@ FOLDED = (
     "step_passed",
     "step_measured",
     "viewpoint_captured",
+    "view_imported",
     "viewpoint_failed",
     "run_completed",
     "run_aborted",
@@ -39,6 +40,11 @@ FOLDED = (
     "control_taken",
 )
 
+# Of these the fold needs only step, attempt and name.
+_VIEWS: Mapping[str, type[ViewpointCaptured | ViewImported]] = {
+    "viewpoint_captured": ViewpointCaptured,
+    "view_imported": ViewImported,
+}
 _PLACE: TypeAdapter[tuple[str, int, str]] = TypeAdapter(tuple[str, int, str])
 
 
@@ -154,9 +160,9 @@ def _quoted() -> str:
 def _rows(connection: Connection, run_id: str, after: int, upto: int) -> Sequence[Any]:
     return connection.execute(
         text(
-            "SELECT seq, kind, at_utc, monotonic_s, actor, previous_sha256, sha256, CASE kind "
-            "WHEN 'step_measured' THEN json_remove(payload, '$.result', '$.artefacts') "
-            "WHEN 'viewpoint_captured' THEN json_array(json_extract(payload, '$.step'), "
+            "SELECT seq, kind, at_utc, monotonic_s, actor, previous_sha256, sha256, CASE "
+            "WHEN kind = 'step_measured' THEN json_remove(payload, '$.result', '$.artefacts') "
+            "WHEN kind IN ('viewpoint_captured', 'view_imported') THEN json_array(json_extract(payload, '$.step'), "
             "json_extract(payload, '$.attempt'), json_extract(payload, '$.viewpoint')) "
             "ELSE payload END AS payload FROM events "
             f"WHERE run_id = :run AND seq > :after AND seq <= :upto AND kind IN ({_quoted()}) ORDER BY seq"
@@ -210,7 +216,7 @@ def _advance(digest: Digest, row: Any) -> None:
 
 
 def _payload(kind: str, content: str) -> Payload:
-    if kind != "viewpoint_captured":
+    if kind not in _VIEWS:
         return PAYLOAD.validate_json(content)
     step, attempt, viewpoint = _PLACE.validate_json(content)
-    return ViewpointCaptured.model_construct(step=step, attempt=attempt, viewpoint=viewpoint)
+    return _VIEWS[kind].model_construct(step=step, attempt=attempt, viewpoint=viewpoint)

@@ -11,7 +11,7 @@ from service.audit.recorded import RecordedRun
 from service.audit.report_blocks import Block, Cell, Column, Drawings, Facts, Heading, Paragraph, Section, Table
 from service.audit.report_drawings import bars_drawing, coverage_drawing, residual_drawing, uncertainty_drawing
 from service.audit.report_words import judged, limit, measured, utc
-from service.core.model import ViewpointCaptured
+from service.core.model import View
 
 _INVARIANTS = ("settings_departures", "optics_departures")
 
@@ -34,7 +34,7 @@ def certificate_sections(run: RecordedRun) -> Iterator[Section]:
 def _facts(run: RecordedRun, step_id: str, sha256: str) -> Facts:
     state = run.state.steps[step_id]
     first = next((run.events[seq - 1].payload for seq in sorted(state.captured.values())), None)
-    camera = first.camera if isinstance(first, ViewpointCaptured) else {}
+    camera = first.camera if isinstance(first, View) else {}
     optics = ", ".join(
         text
         for text in (

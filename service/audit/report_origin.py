@@ -13,7 +13,7 @@ from service.audit.report_pictures import LARGE_PX, THUMBNAIL_PX, picture
 from service.audit.report_words import clock
 from service.compute.budget.closure import Alignment
 from service.core.errors import IntegrityError
-from service.core.model import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
+from service.core.model import DeviceOpened, JobFinished, SessionStarted, View, ViewpointCaptured
 from service.dataset.summary import RunSummary
 
 _COMPUTES = ("orthocapture", "numpy", "scipy", "opencv-python-headless", "pycolmap", "trimesh", "scikit-image")
@@ -48,7 +48,7 @@ def devices_section(run: RecordedRun) -> Section:
                 )
             )
     blocks: list[Block] = [Table(columns, tuple(rows), small=True)]
-    captures = list(run.summary().captures())
+    captures = [view for view in run.summary().captures() if isinstance(view, ViewpointCaptured)]
     if captures:
         offsets = np.array([capture.clock_offset_s for capture in captures])
         sigma_m = max(capture.pose_sigma_m for capture in captures)
@@ -92,14 +92,14 @@ def pictures_section(run: RecordedRun, *, with_scene: bool) -> Section:
         sheet = tuple(
             picture(run, capture.artefacts[0].sha256, _caption(capture), THUMBNAIL_PX)
             for capture in captures
-            if isinstance(capture, ViewpointCaptured)
+            if isinstance(capture, View)
         )
         if sheet:
             blocks += [Heading(f"Contact sheet: {step.title}"), Pictures(sheet, 5)]
     return Section("Pictures", tuple(blocks) or (Paragraph("No photograph was taken."),))
 
 
-def _caption(capture: ViewpointCaptured) -> str:
+def _caption(capture: View) -> str:
     failed = [name for name, passed in capture.verdicts.items() if not passed]
     return capture.viewpoint + (f" ✗ {', '.join(failed)}" if failed else "")
 

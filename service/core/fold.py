@@ -36,6 +36,8 @@ from service.core.model import (
     StepPassed,
     StepRetried,
     StepStarted,
+    View,
+    ViewImported,
     ViewpointCaptured,
     ViewpointFailed,
 )
@@ -152,6 +154,7 @@ def _run_started(protocol: Protocol, state: RunState, event: Event, p: RunStarte
         run_id=event.run_id,
         operator=p.operator,
         simulated=p.simulated,
+        origin=p.origin,
         auto_confirm=p.auto_confirm,
         people=frozenset({p.operator}),
     )
@@ -210,14 +213,15 @@ def _step_note(protocol: Protocol, state: RunState, event: Event, p: StepNote) -
     return change(state, p.step, notes=(*state.steps[p.step].notes, note))
 
 
-def _viewpoint_captured(protocol: Protocol, state: RunState, event: Event, p: ViewpointCaptured) -> RunState:
+def _view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> RunState:
     if _is_void_now(state, event, p.step, p.attempt):
         return _void(state, event)
     _require_running(state, event)
     now = state.step
     if p.viewpoint in now.captured:  # taken again within the attempt: the later one counts
         earlier = {p.viewpoint: now.captured[p.viewpoint]}
-        state = supersede(state, event, p.step, "captured again", p.viewpoint, earlier)
+        again = "imported again" if isinstance(p, ViewImported) else "captured again"
+        state = supersede(state, event, p.step, again, p.viewpoint, earlier)
     return change(
         state,
         p.step,
@@ -362,7 +366,8 @@ _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunStat
     StepStarted: _step_started,
     FilesKept: _files_kept,
     StepNote: _step_note,
-    ViewpointCaptured: _viewpoint_captured,
+    ViewpointCaptured: _view_added,
+    ViewImported: _view_added,
     ViewpointFailed: _viewpoint_failed,
     StepMeasured: _step_measured,
     StepFailed: _step_failed,

@@ -73,6 +73,8 @@ class RunStarted(Record):
     auto_confirm: bool
     operator: str
     software: dict[str, str]  # distribution → version
+    # imported: the photographs were captured earlier, elsewhere; `rig` is then the list of what was imported
+    origin: Literal["captured", "imported"] = "captured"
 
 
 class SessionStarted(Record):
@@ -135,15 +137,23 @@ class FilesKept(Record):
     artefacts: tuple[ArtefactRef, ...]
 
 
-class ViewpointCaptured(Record):
-    """One exposure, complete: files, pose, settings, environment."""
+class View(Record):
+    """What the record holds of every photograph, however it came to be."""
 
-    kind: Literal["viewpoint_captured"] = "viewpoint_captured"
     step: str
     attempt: int
-    viewpoint: str
-    station: str
-    artefacts: tuple[ArtefactRef, ...]  # the JPEG first; pose log beside it
+    viewpoint: str  # name of the view, unique within its step
+    station: str  # where a robot stood; "" without one
+    artefacts: tuple[ArtefactRef, ...]  # the photograph first
+    camera: dict[str, Any]  # EXIF settings, counter, time, lens
+    environment: dict[str, float] = Field(default_factory=dict)  # light_lux, temperature_c
+    verdicts: dict[str, bool] = Field(default_factory=dict)  # still, settings, sharp …
+
+
+class ViewpointCaptured(View):
+    """One exposure of a camera that a robot carried, complete: files, pose, settings, environment."""
+
+    kind: Literal["viewpoint_captured"] = "viewpoint_captured"
     T_base_flange: Matrix4  # mean over the exposure
     pose_sigma_m: float  # standard deviation of the position over the exposure
     pose_sigma_rad: float
@@ -153,9 +163,17 @@ class ViewpointCaptured(Record):
     arrival_monotonic_s: float
     controller_time_s: float
     clock_offset_s: float  # controller time minus host monotonic
-    camera: dict[str, Any]  # EXIF settings, counter, time, lens
-    environment: dict[str, float] = Field(default_factory=dict)  # light_lux, temperature_c
-    verdicts: dict[str, bool] = Field(default_factory=dict)  # still, settings, sharp …
+
+
+class ViewImported(View):
+    """One photograph that was captured earlier. How is not in evidence: only when and by whom it was imported."""
+
+    kind: Literal["view_imported"] = "view_imported"
+    imported_by: str
+    file_name: str  # within the imported folder
+    modified_utc: str  # of the file, as the file system has it
+    T_base_flange: Matrix4 | None = None  # as a file of poses says that came with the photographs
+    T_base_camera: Matrix4 | None = None
 
 
 class ViewpointFailed(Record):
@@ -412,6 +430,7 @@ Payload = Annotated[
     | StepNote
     | FilesKept
     | ViewpointCaptured
+    | ViewImported
     | ViewpointFailed
     | StepMeasured
     | StepFailed

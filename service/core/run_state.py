@@ -165,6 +165,7 @@ class RunState:
     run_id: str = ""
     operator: str = ""
     simulated: bool = False
+    origin: Literal["captured", "imported"] = "captured"
     auto_confirm: bool = False
     sessions: int = 0
     stop_reason: str = ""

@@ -12,7 +12,7 @@ import numpy as np
 
 from service.core.fold import fold
 from service.core.geometry import Array
-from service.core.model import ArtefactRef, Event, JobFinished, RunStarted, ViewpointCaptured
+from service.core.model import ArtefactRef, Event, JobFinished, RunStarted, View
 from service.core.protocol import Protocol
 from service.core.run_state import RunState
 from service.store.store import Store
@@ -51,11 +51,11 @@ class RunSummary:
         rows = self.table()
         return min(rows, key=lambda row: row["mean_radial_error_mm"])["poses"] if rows else None
 
-    def captures(self) -> Iterable[ViewpointCaptured]:
+    def captures(self) -> Iterable[View]:
         """Every valid capture, in order, calibration included."""
         seqs = sorted(seq for step in self.state.steps.values() for seq in step.captured.values())
         payloads = (self.events[seq - 1].payload for seq in seqs)
-        return (payload for payload in payloads if isinstance(payload, ViewpointCaptured))
+        return (payload for payload in payloads if isinstance(payload, View))
 
     def artefacts(self, kind: str) -> tuple[ArtefactRef, ...]:
         """Artefacts of a kind among the results of the run's valid steps."""

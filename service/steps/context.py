@@ -10,7 +10,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox, RobotArm, Scanner, Transform
 from service.core.decide import RunState, StepState
 from service.core.errors import OrthocaptureError
-from service.core.model import ArtefactRef, Payload, Record, StepNote, ViewpointCaptured
+from service.core.model import ArtefactRef, Payload, Record, StepNote, View
 from service.core.protocol import Protocol as LabProtocol
 from service.core.protocol import Step
 from service.core.run_state import JobState
@@ -114,7 +114,7 @@ class Evidence(Protocol):
         """Where the bytes of an artefact lie."""
         ...
 
-    def captures(self, step_id: str) -> tuple[ViewpointCaptured, ...]:
+    def captures(self, step_id: str) -> tuple[View, ...]:
         """The valid captures of a step's current attempt, this moment's included, in order."""
         ...
 

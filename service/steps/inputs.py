@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from service.core.errors import ConfigurationError
-from service.core.model import ArtefactRef
+from service.core.model import ArtefactRef, View, ViewImported, ViewpointCaptured
 from service.steps.context import StepContext
 
 
@@ -51,13 +51,21 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[dict[
                     "viewpoint": capture.viewpoint,
                     "station": capture.station,
                     "sha256": photograph.sha256,
-                    "T_base_flange": [list(row) for row in capture.T_base_flange],
-                    "joints_rad": list(capture.joints_rad),
+                    **robot_pose_of(capture),
                 }
             )
     if not images:
         raise ConfigurationError(f"no usable image from {', '.join(step_ids)}", where=f"step {context.step.id}")
     return images
+
+
+def robot_pose_of(view: View) -> dict[str, Any]:
+    """The robot's pose at a photograph, as job arguments; empty where there was no robot."""
+    if isinstance(view, ViewpointCaptured):
+        return {"T_base_flange": [list(row) for row in view.T_base_flange], "joints_rad": list(view.joints_rad)}
+    if isinstance(view, ViewImported) and view.T_base_flange is not None:
+        return {"T_base_flange": [list(row) for row in view.T_base_flange]}
+    return {}
 
 
 def hand_eye_of(context: StepContext, step_id: str, stations: Iterable[str]) -> dict[str, Any]:

@@ -11,11 +11,11 @@ from pydantic import Field
 
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.gates import limits as gate_text
-from service.core.model import Record, ViewpointCaptured
+from service.core.model import Record, View
 from service.core.protocol import Gate
 from service.core.run_state import JobState
 from service.steps.context import JobRequest, StepContext
-from service.steps.inputs import artefact_of, hand_eye_of, result_of
+from service.steps.inputs import artefact_of, hand_eye_of, result_of, robot_pose_of
 from service.steps.viewpoints import Viewpoint
 
 ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
@@ -95,8 +95,7 @@ class LiveAnalysis:
                 "viewpoint": capture.viewpoint,
                 "station": capture.station,
                 "sha256": sha256,
-                "T_base_flange": [list(row) for row in capture.T_base_flange],
-                "joints_rad": list(capture.joints_rad),
+                **robot_pose_of(capture),
             }
             hand_eye = hand_eye_of(self.context, self.params.hand_eye, [capture.station])
             earlier = [job.artefacts[0].sha256 for job in self._finished()]
@@ -175,7 +174,7 @@ class LiveAnalysis:
     def _finished(self) -> list[JobState]:
         """The answers for images that still count, in the order of capture."""
         by_image = {j.arguments["image"]["sha256"]: j for j in self._jobs("live_view") if j.status == "finished"}
-        captures: list[ViewpointCaptured] = []
+        captures: list[View] = []
         for step in dict.fromkeys((*self.params.images_of, self.context.step.id)):
             captures += self.context.evidence.captures(step)
         hashes = [capture.artefacts[0].sha256 for capture in captures]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from service.compute.calibration.optics import Optics, OpticsDeparture, compare_optics, summary
-from service.core.model import ViewpointCaptured
+from service.core.model import View
 from service.steps.context import StepContext
 
 _STATED = (
@@ -36,7 +36,7 @@ def departing_images(departures: Sequence[OpticsDeparture]) -> int:
     return len({departure.image for departure in departures})
 
 
-def _calibration_images(context: StepContext) -> tuple[ViewpointCaptured, ...]:
+def _calibration_images(context: StepContext) -> tuple[View, ...]:
     ids = [step.id for step in context.protocol.steps]
     until = ids.index(context.step.id) + 1
     for step in reversed(context.protocol.steps[:until]):
@@ -48,6 +48,6 @@ def _calibration_images(context: StepContext) -> tuple[ViewpointCaptured, ...]:
     return ()
 
 
-def _optics(capture: ViewpointCaptured) -> Optics:
+def _optics(capture: View) -> Optics:
     record = capture.camera
     return Optics(image=capture.viewpoint, **{name: record[name] for name in _STATED if record.get(name)})

@@ -22,7 +22,7 @@ from service.core.model import (
     OperatorVerb,
     SessionStarted,
     StepNote,
-    ViewpointCaptured,
+    View,
 )
 from service.core.protocol import load_protocol
 from service.core.run_state import RunState
@@ -53,7 +53,7 @@ _HARMLESS = (
     JobFinished,
     SessionStarted,
     StepNote,
-    ViewpointCaptured,
+    View,
 )
 
 

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Path, Request
 from fastapi.responses import HTMLResponse
 
 from service.core.errors import IllegalTransitionError
+from service.core.model import ViewpointCaptured
 from service.evidence import RunLog
 from service.web.calibration_view import (
     Calibration,
@@ -87,7 +88,7 @@ def _advice(site: Site, log: RunLog, found: Calibration) -> dict[str, object]:
     poses = advised_poses(
         found.hand_eye,
         found.camera,
-        [capture for capture in found.captures if capture.viewpoint in used],
+        [c for c in found.captures if isinstance(c, ViewpointCaptured) and c.viewpoint in used],
         board,
         recorded_rig(log).collision.arm or "",
         site.data,

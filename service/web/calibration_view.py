@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from service.core.model import ArtefactRef, DeviceOpened, OperatorAction, ViewpointCaptured
+from service.core.model import ArtefactRef, DeviceOpened, OperatorAction, View
 from service.core.protocol import Step
 from service.core.run_state import StepState
 from service.evidence import RunLog
@@ -49,7 +49,7 @@ class Calibration:
     intrinsics: Mapping[str, Any] | None
     hand_eye: Mapping[str, Any] | None
     best: Mapping[str, Any] | None
-    captures: tuple[ViewpointCaptured, ...]
+    captures: tuple[View, ...]
     artefact: ArtefactRef | None
     robots: tuple[str, ...]
 
@@ -77,7 +77,7 @@ def calibration_of(log: RunLog) -> Calibration | None:
     intrinsics: Mapping[str, Any] | None = None
     hand_eye: Mapping[str, Any] | None = None
     camera: Mapping[str, float] = {}
-    captures: list[ViewpointCaptured] = []
+    captures: list[View] = []
     robots: tuple[str, ...] = ()
     for step, state in solved:
         details: Mapping[str, Any] = state.result["details"]

@@ -11,7 +11,7 @@ import numpy as np
 
 from service.core.actions import refuse
 from service.core.gates import limits
-from service.core.model import OperatorAction
+from service.core.model import OperatorAction, ViewpointCaptured
 from service.core.protocol import Protocol, Step
 from service.core.run_state import StepState
 from service.evidence import RunLog
@@ -161,7 +161,7 @@ def _refused(state: StepState) -> dict[str, str]:
 def _place(log: RunLog, capture: Capture) -> tuple[Vector, Vector] | tuple[None, None]:
     """Where a camera stood that no plan names, by the drawing of its mount."""
     mount = nominal_T_flange_camera(log)
-    if mount is None:
+    if mount is None or not isinstance(capture.payload, ViewpointCaptured):
         return None, None
     return place(np.array(capture.payload.T_base_flange) @ np.array(mount))
 
@@ -229,14 +229,15 @@ def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
     """What was judged when the image was taken."""
     payload = capture.payload
     out: list[Verdict] = []
-    still = payload.verdicts.get("still")
-    words = {None: "not judged", True: "Still", False: "Moved"}
-    figures = (
-        f"σ {_small(1e3 * payload.pose_sigma_m)} mm, {_small(1e3 * payload.pose_sigma_rad)} mrad "
-        f"over {payload.pose_samples} poses"
-    )
-    limit = f"limit {1e3 * protocol.settle.position_peak_to_peak_m:.3g} mm peak to peak"
-    out.append(Verdict("Pose", still, words[still], figures, limit))
+    if isinstance(payload, ViewpointCaptured):
+        still = payload.verdicts.get("still")
+        words = {None: "not judged", True: "Still", False: "Moved"}
+        figures = (
+            f"σ {_small(1e3 * payload.pose_sigma_m)} mm, {_small(1e3 * payload.pose_sigma_rad)} mrad "
+            f"over {payload.pose_samples} poses"
+        )
+        limit = f"limit {1e3 * protocol.settle.position_peak_to_peak_m:.3g} mm peak to peak"
+        out.append(Verdict("Pose", still, words[still], figures, limit))
 
     settings = payload.verdicts.get("settings")
     words = {None: "not judged", True: "As wanted", False: "Differ"}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
 
-from service.core.model import Event, GateVerdict, SessionStarted, ViewpointCaptured
+from service.core.model import Event, GateVerdict, SessionStarted, View
 from service.core.protocol import Gate, Protocol, Step
 from service.core.run_state import RunState
 from service.monitor.snapshot import Snapshot
@@ -111,7 +111,7 @@ def view_intervals_s(events: Sequence[Event], step: str | None = None) -> list[f
     for event in events:
         if isinstance(event.payload, SessionStarted):
             chains.append([])
-        elif isinstance(event.payload, ViewpointCaptured) and step in (None, event.payload.step):
+        elif isinstance(event.payload, View) and step in (None, event.payload.step):
             chains[-1].append((event.payload.step, event.payload.attempt, event.monotonic_s))
     pairs = [pair for chain in chains for pair in pairwise(chain)]
     return [later[2] - earlier[2] for earlier, later in pairs if earlier[:2] == later[:2] and later[2] > earlier[2]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from service.core.model import ViewpointCaptured, ViewpointFailed
+from service.core.model import View, ViewpointFailed
 from service.core.run_state import JobState, StepState, Superseded
 from service.evidence import RunLog
 
@@ -21,7 +21,7 @@ class Capture:
 
     seq: int
     at_utc: str
-    payload: ViewpointCaptured
+    payload: View
     replaced: Superseded | None
     live: JobState | None
 
@@ -38,7 +38,7 @@ def captures_of(log: RunLog, step: str) -> list[Capture]:
     out: list[Capture] = []
     for event in log.events:
         payload = event.payload
-        if isinstance(payload, ViewpointCaptured) and payload.step == step and event.seq not in log.state.overtaken:
+        if isinstance(payload, View) and payload.step == step and event.seq not in log.state.overtaken:
             job = live.get(payload.artefacts[0].sha256)
             out.append(Capture(event.seq, event.at_utc, payload, replaced.get(event.seq), job))
     return out
@@ -55,7 +55,7 @@ def capture_at(log: RunLog, seq: int) -> Capture | None:
     if not 1 <= seq <= len(log.events):
         return None
     event = log.events[seq - 1]
-    if not isinstance(event.payload, ViewpointCaptured) or event.payload.step not in log.state.steps:
+    if not isinstance(event.payload, View) or event.payload.step not in log.state.steps:
         return None
     job = live_jobs(log.state.steps[event.payload.step]).get(event.payload.artefacts[0].sha256)
     return Capture(seq, event.at_utc, event.payload, replaced_events(log).get(seq), job)

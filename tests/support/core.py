@@ -20,6 +20,7 @@ from service.core.model import (
     StepMeasured,
     StepPassed,
     StepStarted,
+    ViewImported,
     ViewpointCaptured,
 )
 from service.core.protocol import LoadedProtocol, Protocol, parse_protocol
@@ -121,6 +122,21 @@ def captured(step: str, attempt: int, viewpoint: str) -> ViewpointCaptured:
         controller_time_s=1.0,
         clock_offset_s=0.0,
         camera={},
+    )
+
+
+def imported(step: str, attempt: int, viewpoint: str) -> ViewImported:
+    """A photograph that somebody brought."""
+    return ViewImported(
+        step=step,
+        attempt=attempt,
+        viewpoint=viewpoint,
+        station="",
+        artefacts=(artefact(),),
+        camera={},
+        imported_by="Ada",
+        file_name=f"images/{viewpoint}.jpg",
+        modified_utc="2024-03-01T10:00:00Z",
     )
 
 
