@@ -41,6 +41,7 @@ _VERIFIER = Path(__file__).with_name("verifier.py")
 _EVENT = ("actor", "at_utc", "monotonic_s", "previous_sha256", "run_id", "seq", "sha256")
 _NOT_OF_JOBS = (
     "position",
+    "priority",
     "token",
     "until_utc_s",
     "host",

@@ -17,17 +17,19 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
-from service.store.store import Store
-from service.worker.loop import work
+from service.worker.pool import work_side_by_side
 
 
 def worker_command(
     data: DataOption = DEFAULT_DATA,
     until_idle: Annotated[bool, typer.Option("--until-idle", help="End when no job is left.")] = False,
+    jobs: Annotated[
+        int, typer.Option("--jobs", min=0, help="How many to compute at once; 0: as many as there are cores.")
+    ] = 0,
     with_parent: Annotated[bool, typer.Option("--with-parent", hidden=True)] = False,
     json: JsonOption = False,
 ) -> None:
-    """Compute: calibration, spheres, structure from motion, registration. Start as many as you have cores for."""
+    """Compute: calibration, spheres, structure from motion, registration, as many jobs at once as there are cores."""
     parent = os.getppid()
     stopped = False
 
@@ -36,9 +38,10 @@ def worker_command(
         stopped = True
 
     signal.signal(signal.SIGTERM, on_terminate)
-    with reporting_errors(json), Store.open(data) as store, progress_bar(quiet=json) as progress:
-        done = work(
-            store,
+    with reporting_errors(json), progress_bar(quiet=json) as progress:
+        done = work_side_by_side(
+            data,
+            at_once=jobs or os.cpu_count() or 1,
             until_idle=until_idle,
             stop=lambda: stopped or (with_parent and os.getppid() != parent),
             progress=progress,

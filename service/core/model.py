@@ -261,6 +261,7 @@ class JobEnqueued(Record):
     attempt: int
     idempotency_key: str
     arguments: dict[str, Any]
+    priority: int = 1  # smaller goes first: see service.core.priorities
 
 
 class JobFinished(Record):
@@ -289,6 +290,7 @@ class JobFailed(Record):
     worker: str
     error: str
     message: str
+    traceback: str = ""  # of an error that nobody had foreseen
 
 
 # --- people --------------------------------------------------------------------------------------------------

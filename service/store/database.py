@@ -19,7 +19,7 @@ from service.store.seam import Files
 
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0
-REVISIONS = ("0001", "0002", "0003")  # of migrations/versions, in order
+REVISIONS = ("0001", "0002", "0003", "0004")  # of migrations/versions, in order
 _MIGRATIONS = Path(__file__).with_name("migrations")
 
 

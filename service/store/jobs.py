@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Row, insert, select, update
+from sqlalchemy import ColumnElement, Connection, Row, func, insert, select, true, update
 
 from service.core.model import Event, JobEnqueued, JobFailed, JobFinished, StepNote
+from service.core.priorities import EARLY, Lane
 from service.store.errors import LeaseLostError
 from service.store.events import append, canonical, parse_canonical
 from service.store.leases import ProcessIdentity, identity_of, identity_values
@@ -33,6 +34,7 @@ def enqueue(
             attempt=job.attempt,
             idempotency_key=job.idempotency_key,
             arguments=dict(job.arguments),
+            priority=job.priority,
         )
         (event,) = append(connection, clock, run_id, [payload], actor)
         connection.execute(
@@ -49,6 +51,7 @@ def enqueue(
                 try_limit=job.try_limit,
                 enqueued_seq=event.seq,
                 enqueued_utc=event.at_utc,
+                priority=job.priority,
             )
         )
         appended.append(event)
@@ -71,6 +74,14 @@ def read_jobs(connection: Connection, run_id: str) -> list[Job]:
     ]
 
 
+def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> int:
+    """How many jobs are queued or being computed."""
+    statement = select(func.count()).select_from(jobs).where(jobs.c.state.in_(("queued", "running")), _of_lane(lane))
+    if run_id is not None:
+        statement = statement.where(jobs.c.run_id == run_id)
+    return connection.execute(statement).scalar_one()
+
+
 def claim(
     connection: Connection,
     clock: Clock,
@@ -80,13 +91,17 @@ def claim(
     lease_s: float,
     kinds: Collection[str] | None,
     run_id: str | None,
+    lane: Lane | None = None,
 ) -> Job | None:
-    """Take the oldest job that is queued, or whose worker died or let its lease run out.
+    """Take the job of the highest priority, the oldest of these, that is queued or that its worker has lost.
+
+    A worker loses a job when it dies or lets its lease run out. `lane`: only what is waited for, or only the rest.
 
     A job that has killed its worker `try_limit` times is failed here, so that it cannot go round for ever.
     """
     now = clock.utc_now()
-    statement = select(jobs).where(jobs.c.state.in_(("queued", "running"))).order_by(jobs.c.position)
+    statement = select(jobs).where(jobs.c.state.in_(("queued", "running"))).order_by(jobs.c.priority, jobs.c.position)
+    statement = statement.where(_of_lane(lane))
     if kinds is not None:
         statement = statement.where(jobs.c.kind.in_(tuple(kinds)))
     if run_id is not None:
@@ -119,6 +134,12 @@ def claim(
     return None
 
 
+def _of_lane(lane: Lane | None) -> ColumnElement[bool]:
+    if lane is None:
+        return true()
+    return jobs.c.priority < EARLY if lane == "waited" else jobs.c.priority >= EARLY
+
+
 def renew(connection: Connection, clock: Clock, job: Job, lease_s: float) -> Job:
     """Push the time limit out again. Raises LeaseLostError."""
     held_row(connection, job)
@@ -135,23 +156,41 @@ def finish(connection: Connection, clock: Clock, job: Job, payload: JobFinished)
     return event
 
 
-def fail(connection: Connection, clock: Clock, job: Job, error: str, message: str, *, retry: bool) -> list[Event]:
+def release(connection: Connection, pids: Collection[int]) -> None:
+    """Queue the jobs of these processes of this host again, untried: they were told to stop, and have."""
+    here = ProcessIdentity.of_this_process()
+    mine = (jobs.c.state == "running", jobs.c.host == here.host, jobs.c.boot == here.boot, jobs.c.pid.in_(pids))
+    values = {"state": "queued", "tries": jobs.c.tries - 1, "token": None, "until_utc_s": None}
+    connection.execute(update(jobs).where(*mine).values(**values))
+
+
+def fail(
+    connection: Connection, clock: Clock, job: Job, error: str, message: str, *, retry: bool, traceback: str = ""
+) -> list[Event]:
     """Put the job back in the queue, or fail it for good when not `retry` or its tries are used up.
 
     Raises LeaseLostError when the job has gone to another worker.
     """
     row = held_row(connection, job)
     if not retry or row.tries >= row.try_limit:
-        return [
-            _end_failed(connection, clock, row, worker=row.worker, error=error, message=message, actor=row.worker)
-        ]
+        end = _end_failed(
+            connection,
+            clock,
+            row,
+            worker=row.worker,
+            error=error,
+            message=message,
+            actor=row.worker,
+            traceback=traceback,
+        )
+        return [end]
     event = _note(
         connection,
         clock,
         row,
         actor=row.worker,
         note="job_failed_will_retry",
-        data={"error": error, "message": message},
+        data={"error": error, "message": message} | ({"traceback": traceback} if traceback else {}),
     )
     connection.execute(
         update(jobs)
@@ -188,7 +227,15 @@ def _note(
 
 
 def _end_failed(
-    connection: Connection, clock: Clock, row: Row[Any], *, worker: str, error: str, message: str, actor: str
+    connection: Connection,
+    clock: Clock,
+    row: Row[Any],
+    *,
+    worker: str,
+    error: str,
+    message: str,
+    actor: str,
+    traceback: str = "",
 ) -> Event:
     payload = JobFailed(
         job=row.job_id,
@@ -198,6 +245,7 @@ def _end_failed(
         worker=worker,
         error=error,
         message=message,
+        traceback=traceback,
     )
     (event,) = append(connection, clock, row.run_id, [payload], actor)
     _end(connection, row, event, state="failed", error=f"{error}: {message}")
@@ -232,4 +280,5 @@ def to_job(row: Row[Any]) -> Job:
         ended_utc=row.ended_utc,
         ended_seq=row.ended_seq,
         error=row.error,
+        priority=row.priority,
     )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.core.model import ArtefactRef
+from service.core.priorities import WAITED
 
 SITE = "site"  # name of the chain that holds what happens outside of runs: sign-ins, accounts, keys, starts
 
@@ -56,6 +57,7 @@ class NewJob:
     idempotency_key: str
     arguments: Mapping[str, Any] = field(default_factory=dict[str, Any])
     try_limit: int = 3
+    priority: int = WAITED
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +81,7 @@ class Job:
     ended_utc: str | None
     ended_seq: int | None
     error: str | None
+    priority: int
 
 
 @dataclass(frozen=True, slots=True)

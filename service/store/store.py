@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -11,6 +12,7 @@ from sqlalchemy import Connection, case, func, insert, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
 from service.core.model import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
+from service.core.priorities import Lane
 from service.store import jobs as queue
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, read_artefacts
 from service.store.checkpoints import read_checkpoints, read_timestamps
@@ -291,13 +293,34 @@ class Store:
             raise IntegrityError(f"the job just enqueued is not there: {job.idempotency_key}", where=run_id)
         return found
 
+    def open_jobs(self, run_id: str | None = None, *, lane: Lane | None = None) -> int:
+        """How many jobs of a run, or of all, are queued or being computed; see `claim_job` for `lane`."""
+        with self._database.reading() as connection:
+            return queue.open_jobs(connection, run_id, lane)
+
     def claim_job(
-        self, worker: str, lease_s: float, kinds: Collection[str] | None = None, *, run_id: str | None = None
+        self,
+        worker: str,
+        lease_s: float,
+        kinds: Collection[str] | None = None,
+        *,
+        run_id: str | None = None,
+        lane: Lane | None = None,
     ) -> Job | None:
-        """The oldest open job, now this worker's for `lease_s` seconds; None when there is nothing to do."""
+        """The first open job by priority and age, now this worker's for `lease_s` seconds; None without any.
+
+        `lane`: only what a person or a step waits for, or only what nobody waits for.
+        """
         with self._database.writing() as connection:
             return queue.claim(
-                connection, self._clock, self._ids, worker=worker, lease_s=lease_s, kinds=kinds, run_id=run_id
+                connection,
+                self._clock,
+                self._ids,
+                worker=worker,
+                lease_s=lease_s,
+                kinds=kinds,
+                run_id=run_id,
+                lane=lane,
             )
 
     def renew_job(self, job: Job, lease_s: float) -> Job:
@@ -332,10 +355,20 @@ class Store:
         return event
 
     def fail_job(self, job: Job, error: Exception, *, retry: bool) -> list[Event]:
-        """Try a job again later, or fail it for good when not `retry` or no tries are left. Raises LeaseLostError."""
-        name, message = type(error).__name__, str(error) if isinstance(error, OrthocaptureError) else repr(error)
+        """Try a job again later, or fail it for good when not `retry` or no tries are left. Raises LeaseLostError.
+
+        What is no OrthocaptureError was not foreseen: its traceback goes into the record.
+        """
+        foreseen = isinstance(error, OrthocaptureError)
+        name, message = type(error).__name__, str(error) if foreseen else repr(error)
+        trace = "" if foreseen else "".join(traceback.format_exception(error))
         with self._database.writing() as connection:
-            return queue.fail(connection, self._clock, job, name, message, retry=retry)
+            return queue.fail(connection, self._clock, job, name, message, retry=retry, traceback=trace)
+
+    def release_jobs(self, pids: Collection[int]) -> None:
+        """Queue the jobs of these processes of this host again, untried: they were told to stop, and have."""
+        with self._database.writing() as connection:
+            queue.release(connection, pids)
 
 
 def read_runs(connection: Connection) -> list[RunRow]:

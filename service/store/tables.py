@@ -133,6 +133,7 @@ jobs = Table(
     Column("boot", Text),
     Column("pid", Integer),
     Column("process_started_s", REAL),
+    Column("priority", Integer, nullable=False, server_default="1"),  # smaller is claimed first
     ForeignKeyConstraint(["run_id", "enqueued_seq"], ["events.run_id", "events.seq"]),
     UniqueConstraint("run_id", "idempotency_key", name="jobs_idempotency"),
     CheckConstraint("state IN ('queued', 'running', 'finished', 'failed')", name="jobs_state"),

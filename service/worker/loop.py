@@ -10,11 +10,12 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-
-import numpy as np
+from types import TracebackType
 
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
+from service.core.priorities import Lane
 from service.store.errors import LeaseLostError
 from service.store.records import Job, NewArtefact
 from service.store.store import Store
@@ -22,6 +23,7 @@ from service.worker.job import Handler, JobAnswer, JobContext
 
 _log = logging.getLogger(__name__)
 _LEASE_S = 30.0
+_POLL_S = 0.2
 
 _MODULES = {
     "calibrate": "calibrate",
@@ -54,49 +56,74 @@ HANDLERS: Mapping[str, Handler] = {kind: _handler(kind) for kind in _MODULES}
 
 
 def work(
-    store: Store, *, until_idle: bool, stop: Callable[[], bool], progress: Callable[[str, int, int], None]
+    store: Store,
+    *,
+    until_idle: bool,
+    stop: Callable[[], bool],
+    progress: Callable[[str, int, int], None],
+    lane: Lane | None = None,
+    finished: Callable[[], None] = lambda: None,
 ) -> int:
-    """Serve jobs until `stop()`, or with `until_idle` until none is left; the number of jobs done."""
+    """Serve jobs one by one until `stop()`, or with `until_idle` until none is left; the number of jobs done.
+
+    Args:
+        store: of the data folder.
+        until_idle: see above.
+        stop: asked between jobs.
+        progress: told what a job does, how much of it is done, and all of it.
+        lane: only jobs that are waited for, or only those that are not; None: all.
+        finished: told after each job.
+    """
     name = f"worker {socket.gethostname()}:{os.getpid()}"
     done = 0
     while not stop():
-        job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS))
+        job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS), lane=lane)
         if job is None:
             if until_idle:
                 return done
-            time.sleep(0.2)
+            time.sleep(_POLL_S)
             continue
         _do(store, job, progress)
         done += 1
+        finished()
     return done
 
 
 def _do(store: Store, job: Job, progress: Callable[[str, int, int], None]) -> None:
     started_s = time.monotonic()
-    keeper = _LeaseKeeper(store, job)
+    answer = JobAnswer({})
+    attempt = _Attempt(store, job)
+    progress(job.kind.replace("_", " "), 0, 0)
+    with attempt, tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
+        answer = HANDLERS[job.kind](JobContext(job.arguments, store, Path(scratch), progress))
     try:
-        with keeper, tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
-            answer = HANDLERS[job.kind](JobContext(job.arguments, store, Path(scratch), progress))
-    except OrthocaptureError as error:
-        # The same input gives the same refusal: only trouble that passes is worth another try.
-        store.fail_job(job, error, retry=not isinstance(error, (ComputeError, IntegrityError)))
-        return
-    except (ValueError, ArithmeticError, LookupError, OSError, MemoryError, np.linalg.LinAlgError) as error:
-        _log.exception("job %s failed", job.kind)
-        store.fail_job(job, error, retry=False)
-        return
-    duration_s = time.monotonic() - started_s
-    rows = [NewArtefact(ref=ref, device="worker", step=job.step, attempt=job.attempt) for ref in answer.artefacts]
-    try:
-        store.finish_job(job, measures=answer.measures, duration_s=duration_s, result=answer.result, artefacts=rows)
+        if attempt.error is not None:
+            store.fail_job(job, attempt.error, retry=_worth_another_try(attempt.error))
+            return
+        rows = [NewArtefact(ref=r, device="worker", step=job.step, attempt=job.attempt) for r in answer.artefacts]
+        store.finish_job(
+            job,
+            measures=answer.measures,
+            duration_s=time.monotonic() - started_s,
+            result=answer.result,
+            artefacts=rows,
+        )
     except LeaseLostError:
         _log.warning("job %s was taken over by another worker; its result stands", job.job_id)
 
 
-class _LeaseKeeper:
-    """Renews a job's lease while it is computed."""
+def _worth_another_try(error: Exception) -> bool:
+    """The same input gives the same refusal: only trouble that passes is worth another try."""
+    if isinstance(error, OrthocaptureError):
+        return not isinstance(error, (ComputeError, IntegrityError))
+    return isinstance(error, BrokenProcessPool)  # a helper of the job was killed
+
+
+class _Attempt:
+    """Renews a job's lease while it is computed, and keeps the error that ends it, whatever it is."""
 
     def __init__(self, store: Store, job: Job) -> None:
+        self.error: Exception | None = None
         self._store, self._job = store, job
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._renew, daemon=True)
@@ -104,9 +131,17 @@ class _LeaseKeeper:
     def __enter__(self) -> None:
         self._thread.start()
 
-    def __exit__(self, *_exc: object) -> None:
+    def __exit__(
+        self, _kind: type[BaseException] | None, error: BaseException | None, _traceback: TracebackType | None
+    ) -> bool:
         self._stop.set()
         self._thread.join()
+        if not isinstance(error, Exception):
+            return False
+        self.error = error
+        if not isinstance(error, OrthocaptureError):
+            _log.error("job %s failed", self._job.kind, exc_info=error)
+        return True
 
     def _renew(self) -> None:
         while not self._stop.wait(_LEASE_S / 3):
