@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import takewhile
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +16,7 @@ from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotSample, SafetyState, SettleCriteria, SettleReport
 from service.core.geometry import transform
 
-BUFFER_S = 30.0
+BUFFER_S = 120.0  # an image's pose is looked up once its files have arrived, which takes a while for 60 megapixels
 STREAM_HZ = 125.0
 POLL_S = 0.004
 MINIMUM_COVERAGE = 0.8  # of the settle window by samples
@@ -102,7 +103,10 @@ class PoseStream:
     def between(self, start_s: float, end_s: float) -> tuple[RobotSample, ...]:
         """Samples that arrived between two host times, oldest first."""
         with self._lock:
-            return tuple(s for s in self._samples if start_s <= s.monotonic_s <= end_s)
+            # From the newest backwards: what is asked for is nearly always recent, and the buffer is long.
+            recent = takewhile(lambda s: s.monotonic_s >= start_s, reversed(self._samples))
+            found = [s for s in recent if s.monotonic_s <= end_s]
+        return tuple(reversed(found))
 
     def clear(self) -> None:
         """Forget everything, since the tool offset behind the flange poses changed on the way."""

@@ -215,7 +215,7 @@ def _step_note(protocol: Protocol, state: RunState, event: Event, p: StepNote) -
 
 def _view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> RunState:
     if _is_void_now(state, event, p.step, p.attempt):
-        return _void(state, event)
+        return _void(_among_the_superseded(state, event, p), event)
     _require_running(state, event)
     now = state.step
     if p.viewpoint in now.captured:  # taken again within the attempt: the later one counts
@@ -229,6 +229,17 @@ def _view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> R
         skipped_viewpoints=tuple(name for name in now.skipped_viewpoints if name != p.viewpoint),
         failures=0,
     )
+
+
+def _among_the_superseded(state: RunState, event: Event, p: ViewpointCaptured) -> RunState:
+    """The image of an attempt that was replaced while it was on its way is listed with the others of that attempt."""
+    listed = [
+        replace(past, captured={**past.captured, p.viewpoint: event.seq})
+        if (past.step, past.attempt, past.viewpoint) == (p.step, p.attempt, None)
+        else past
+        for past in state.superseded
+    ]
+    return replace(state, superseded=tuple(listed))
 
 
 def _viewpoint_failed(protocol: Protocol, state: RunState, event: Event, p: ViewpointFailed) -> RunState:

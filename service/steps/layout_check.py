@@ -8,8 +8,9 @@ from typing import Any
 
 from service.core.model import ArtefactRef, Record
 from service.steps.arrivals import keep
-from service.steps.capture import photograph, wanted_settings
+from service.steps.capture import photograph
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.exposure import wanted_settings
 
 
 class Params(Record):

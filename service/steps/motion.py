@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ from drivers.interfaces import RobotArm, SettleCriteria, SettleReport
 from service.core.geometry import Array
 from service.steps.context import StepContext, StepInterruptedError
 
-_POLL_S = 0.05
+_POLL_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +37,21 @@ def settle_criteria(context: StepContext) -> SettleCriteria:
 
 
 def move_and_settle(
-    context: StepContext, robot: RobotArm, target_rad: Array, limits: MotionLimits, criteria: SettleCriteria
+    context: StepContext,
+    robot: RobotArm,
+    target_rad: Array,
+    limits: MotionLimits,
+    criteria: SettleCriteria,
+    *,
+    meanwhile: Callable[[], None] = lambda: None,
 ) -> SettleReport:
-    """Move to joints (6,) and return once the pose stream is quiet.
+    """Move to joints (6,) and return once the pose stream is quiet. `meanwhile` is called once the motion has begun.
 
     Raises SafetyStopError, DeviceTimeoutError (after stopping the arm), StepInterruptedError (arm stands still).
     """
     try:
         robot.move_joints(target_rad, speed_rad_s=limits.speed_rad_s, acceleration_rad_s2=limits.acceleration_rad_s2)
+        meanwhile()
         return _wait_settled(context, robot, limits, criteria)
     except StepInterruptedError:
         _stand_still(context, robot, criteria)

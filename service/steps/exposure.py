@@ -1,0 +1,251 @@
+"""One exposure with a robot: the picture, the arm's pose during it, the verdicts, and all of it into the evidence."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivers.errors import DeviceBusyError, DeviceUnavailableError
+from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, RobotSample, SettleReport
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
+from service.core.model import ArtefactRef, Matrix4, ViewpointCaptured
+from service.steps.context import StepContext
+from service.steps.motion import settle_criteria
+from service.steps.viewpoints import Viewpoint
+from service.store.records import NewArtefact
+
+#: How long a busy camera is left alone before the next try: nearly a minute in all.
+_BUSY_PAUSES_S = (0.5, 1.0, 2.0, 4.0, *(8.0,) * 6)
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """An image that has arrived from the camera, with all that belongs to it, before it is recorded."""
+
+    viewpoint: Viewpoint
+    image: CapturedImage
+    folder: tempfile.TemporaryDirectory[str]  # holds the image's files until they are in the store
+    window: tuple[RobotSample, ...]  # of the pose stream, over the exposure
+    pose: ExposurePose
+    environment: dict[str, float]
+    verdicts: dict[str, bool]
+    image_kind: str
+
+
+def expose(
+    context: StepContext,
+    camera: Camera,
+    robot: RobotArm,
+    viewpoint: Viewpoint,
+    settled: SettleReport,
+    wanted: CameraSettings,
+    image_kind: str,
+) -> Shot:
+    """Take the picture and judge it. Nothing is recorded yet: `record_shot` does that while the arm moves on.
+
+    Raises DeviceError, DeviceUnavailableError when no pose of the arm is known for the exposure.
+    """
+    environment = _environment(context)
+    folder = tempfile.TemporaryDirectory(prefix="orthocapture-")
+    try:
+        image = expose_when_free(context, camera, Path(folder.name))
+        window = robot.samples(image.trigger_monotonic_s, image.trigger_monotonic_s + wanted.exposure_s + 0.3)
+        pose = _mean_pose(window, settled)
+    except BaseException:
+        folder.cleanup()
+        raise
+    criteria = settle_criteria(context)
+    verdicts = {
+        "still": pose.spread_m <= criteria.position_peak_to_peak_m
+        and pose.spread_rad <= criteria.rotation_peak_to_peak_rad,
+        "settings": settings_agree(image.exif, wanted),
+    }
+    return Shot(viewpoint, image, folder, window, pose, environment, verdicts, image_kind)
+
+
+def record_shot(context: StepContext, shot: Shot) -> None:
+    """Write a shot down: files first, then one transaction with rows and event."""
+    viewpoint, image, pose = shot.viewpoint, shot.image, shot.pose
+    with shot.folder:
+        refs = [
+            context.evidence.put_file(
+                file.path,
+                kind=shot.image_kind if file.media_type == "image/jpeg" else "raw",
+                media_type=file.media_type,
+                original_name=file.camera_name,
+            )
+            for file in image.files
+        ]
+    refs.append(_pose_log(context, viewpoint, shot.window))
+    rows = tuple(
+        NewArtefact(
+            ref=ref,
+            device="robot" if ref.kind == "pose_log" else "camera",
+            step=context.step.id,
+            attempt=context.attempt,
+            viewpoint=viewpoint.name,
+            who=context.operator,
+            monotonic_s=image.trigger_monotonic_s,
+        )
+        for ref in refs
+    )
+    context.evidence.record(
+        ViewpointCaptured(
+            step=context.step.id,
+            attempt=context.attempt,
+            viewpoint=viewpoint.name,
+            station=viewpoint.station,
+            artefacts=tuple(refs),
+            T_base_flange=_rows(pose.T_base_flange),
+            pose_sigma_m=pose.sigma_m,
+            pose_sigma_rad=pose.sigma_rad,
+            joints_rad=tuple(float(q) for q in pose.joints_rad),
+            pose_samples=pose.samples,
+            trigger_monotonic_s=image.trigger_monotonic_s,
+            arrival_monotonic_s=image.arrival_monotonic_s,
+            controller_time_s=pose.controller_time_s,
+            clock_offset_s=pose.clock_offset_s,
+            camera=_camera_record(image),
+            environment=shot.environment,
+            verdicts=shot.verdicts,
+        ),
+        artefacts=rows,
+    )
+
+
+def expose_when_free(context: StepContext, camera: Camera, folder: Path) -> CapturedImage:
+    """Release the shutter, and wait for a camera that is still busy with what came before."""
+    for pause_s in _BUSY_PAUSES_S:
+        try:
+            return camera.capture(folder)
+        except DeviceBusyError:
+            context.checkpoint()
+            context.progress("waiting for the camera, which is busy", 0, 1)
+            context.wait(pause_s)
+    return camera.capture(folder)
+
+
+@dataclass(frozen=True, slots=True)
+class ExposurePose:
+    """The mean pose of the flange over an exposure, and how far it strayed."""
+
+    T_base_flange: Transform
+    joints_rad: Array
+    samples: int
+    sigma_m: float
+    sigma_rad: float
+    spread_m: float
+    spread_rad: float
+    controller_time_s: float
+    clock_offset_s: float
+
+
+def _mean_pose(window: Sequence[RobotSample], settled: SettleReport) -> ExposurePose:
+    """Average the pose over the exposure; rotations average on the tangent of the settled pose."""
+    if not window:
+        raise DeviceUnavailableError(
+            "the robot's pose stream has no sample during the exposure",
+            remedy="The image cannot be used without its pose; the viewpoint is taken again",
+        )
+    reference = inverse(settled.T_base_flange)
+    deltas = [reference @ s.T_base_flange for s in window]
+    positions = np.array([s.T_base_flange[:3, 3] for s in window])
+    angles = np.array([rotation_angle_rad(d) for d in deltas])
+    middle = window[len(window) // 2]
+    T = settled.T_base_flange.copy() if len(window) < 3 else middle.T_base_flange.copy()
+    T[:3, 3] = positions.mean(axis=0)
+    return ExposurePose(
+        T_base_flange=T,
+        joints_rad=np.mean([s.joints_rad for s in window], axis=0),
+        samples=len(window),
+        sigma_m=float(np.sqrt(positions.var(axis=0).sum())),
+        sigma_rad=float(angles.std()),
+        spread_m=float(np.ptp(positions, axis=0).max()),
+        spread_rad=float(np.ptp(angles)),
+        controller_time_s=middle.controller_time_s,
+        clock_offset_s=middle.controller_time_s - middle.monotonic_s,
+    )
+
+
+def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
+    """Whether an image's EXIF shows the protocol's settings (aperture and time to 2 %, ISO exactly)."""
+    return (
+        abs(actual.aperture_f / wanted.aperture_f - 1) < 0.02
+        and abs(actual.exposure_s / wanted.exposure_s - 1) < 0.02
+        and actual.iso == wanted.iso
+    )
+
+
+def wanted_settings(context: StepContext) -> CameraSettings:
+    """The camera settings of the protocol."""
+    camera = context.protocol.camera
+    return CameraSettings(
+        aperture_f=camera.aperture_f,
+        exposure_s=camera.exposure_s,
+        iso=camera.iso,
+        focus_mode=camera.focus_mode,
+        image_quality=camera.image_quality,
+    )
+
+
+def _environment(context: StepContext) -> dict[str, float]:
+    lightbox = context.devices.lightbox()
+    if lightbox is None:
+        return {}
+    try:
+        reading = lightbox.read()
+    except DeviceUnavailableError:
+        context.devices.reopen(lightbox)
+        reading = lightbox.read()
+    return {"light_lux": reading.light_lux, "temperature_c": reading.temperature_c}
+
+
+def _pose_log(context: StepContext, viewpoint: Viewpoint, window: Sequence[RobotSample]) -> ArtefactRef:
+    """The pose stream over the exposure, as it was received."""
+    lines = [
+        json.dumps(
+            {
+                "controller_time_s": s.controller_time_s,
+                "monotonic_s": s.monotonic_s,
+                "joints_rad": s.joints_rad.tolist(),
+                "T_base_flange": s.T_base_flange.tolist(),
+                "tcp_speed_m_s": s.tcp_speed_m_s,
+                "safety": s.safety.value,
+            }
+        )
+        for s in window
+    ]
+    return context.evidence.put_bytes(
+        ("\n".join(lines) + "\n").encode(),
+        kind="pose_log",
+        media_type="application/x-ndjson",
+        original_name=f"{viewpoint.name}.poses.jsonl",
+    )
+
+
+def _camera_record(image: CapturedImage) -> dict[str, object]:
+    return {
+        **dataclasses.asdict(image.exif),
+        "counter": image.counter,
+        "exif_time": image.exif_time,
+        "lens": image.lens,
+        "focal_length_mm": image.focal_length_mm,
+        "width": image.width,
+        "height": image.height,
+        "lens_serial": image.lens_serial,
+        "body_serial": image.body_serial,
+        "focus_distance_m": image.focus_distance_m,
+    }
+
+
+def _rows(T: Transform) -> Matrix4:
+    if T.shape != (4, 4):
+        raise DataError(f"a pose is a 4×4 matrix, not {T.shape}")
+    return tuple((float(r[0]), float(r[1]), float(r[2]), float(r[3])) for r in T)
