@@ -1,0 +1,118 @@
+"""Seconds of a recorded run: of its steps, of a viewpoint beyond what arm and camera need, of the worker's jobs."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Sequence
+from datetime import datetime
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from service.core.model import (
+    Event,
+    JobFinished,
+    RunCompleted,
+    StepPassed,
+    StepStarted,
+    ViewpointCaptured,
+)
+from service.core.protocol import Protocol
+from service.dataset.summary import RunSummary
+
+_PATIENCE_S = 3.0  # a longer overhead is a pause, a retry or another part of the step, and no viewpoint's share
+
+
+def run_figures(summary: RunSummary, speed_up: float = 1.0) -> dict[str, Any]:
+    """Everything about time that a run's own record tells. `speed_up`: by how much the simulated arm is too fast."""
+    return {
+        "views": sum(isinstance(e.payload, ViewpointCaptured) for e in summary.events),
+        "steps_s": steps_s(summary.events),
+        "overhead_s": overhead(summary.events, summary.protocol, speed_up),
+        "after_the_scan_s": after_the_scan_s(summary),
+        "jobs_s": jobs_s(summary.events),
+    }
+
+
+def seconds_between(first: Event, last: Event) -> float:
+    """Wall time between two events."""
+    a, b = (datetime.fromisoformat(event.at_utc) for event in (first, last))
+    return (b - a).total_seconds()
+
+
+def steps_s(events: Sequence[Event]) -> dict[str, float]:
+    """From the first start of each step to its passing, waits for people included."""
+    begun: dict[str, Event] = {}
+    took: dict[str, float] = {}
+    for event in events:
+        match event.payload:
+            case StepStarted(step=step):
+                begun.setdefault(step, event)
+            case StepPassed(step=step) if step in begun:
+                took[step] = round(seconds_between(begun[step], event), 1)
+            case _:
+                pass
+    return took
+
+
+def overhead(events: Iterable[Event], protocol: Protocol, speed_up: float) -> dict[str, float]:
+    """Seconds between two exposures that neither the arm nor the camera nor the protocol's waits account for.
+
+    Arm: the time of the joint that turns furthest, at the protocol's speed and acceleration. Camera: from the release
+    to the last byte. Waits: the settle window and the dwell.
+    """
+    motion, settle = protocol.motion, protocol.settle
+    v, a = motion.speed_rad_s, motion.acceleration_rad_s2
+    shots = [e.payload for e in events if isinstance(e.payload, ViewpointCaptured)]
+    spent: list[float] = []
+    for before, after in pairwise(shots):
+        if (before.step, before.attempt, before.station) != (after.step, after.attempt, after.station):
+            continue
+        turn_rad = float(np.max(np.abs(np.array(after.joints_rad) - np.array(before.joints_rad))))
+        travel_s = turn_rad / v + v / a if turn_rad > v**2 / a else 2 * float(np.sqrt(turn_rad / a))
+        camera_s = before.arrival_monotonic_s - before.trigger_monotonic_s
+        cycle_s = after.trigger_monotonic_s - before.trigger_monotonic_s
+        spent.append(cycle_s - camera_s - travel_s / speed_up - settle.window_s - motion.dwell_s)
+    usual = [s for s in spent if s < _PATIENCE_S]
+    if not usual:
+        return {}
+    return {
+        "pairs": len(spent),
+        "longer_pauses": len(spent) - len(usual),
+        "median": round(statistics.median(usual), 3),
+        "mean": round(statistics.fmean(usual), 3),
+        "worst": round(max(usual), 3),
+    }
+
+
+def after_the_scan_s(summary: RunSummary) -> dict[str, float]:
+    """From the passing of the last scan to each later step's passing, the run's end, and the last result of a job."""
+    scans = {step.id for step in summary.protocol.steps if step.kind == "scan_import"}
+    passed = [e for e in summary.events if isinstance(e.payload, StepPassed) and e.payload.step in scans]
+    if not passed:
+        return {}
+    scan = passed[-1]
+    after: dict[str, float] = {}
+    for event in summary.events:
+        if event.seq <= scan.seq:
+            continue
+        match event.payload:
+            case StepPassed(step=step):
+                after[step] = round(seconds_between(scan, event), 1)
+            case RunCompleted():
+                after["run completed"] = round(seconds_between(scan, event), 1)
+            case JobFinished():
+                after["last result"] = round(seconds_between(scan, event), 1)
+            case _:
+                pass
+    return after
+
+
+def jobs_s(events: Iterable[Event]) -> dict[str, dict[str, float]]:
+    """Number and total duration of the jobs of each kind."""
+    kinds: dict[str, list[float]] = {}
+    for event in events:
+        if isinstance(event.payload, JobFinished):
+            kinds.setdefault(event.payload.job_kind, []).append(event.payload.duration_s)
+    return {kind: {"jobs": len(took), "seconds": round(sum(took), 1)} for kind, took in sorted(kinds.items())}
