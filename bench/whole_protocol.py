@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.machine import REPOSITORY, commit, machine
-from bench.shortened import shortened
 from bench.whole_run import whole_run
+from tests.support.shortened import shortened
 
 RESULTS = Path(__file__).parent / "results"
 PROTOCOL = REPOSITORY / "protocols" / "exvivo_spine.yaml"

@@ -183,6 +183,26 @@ def test_redo_of_a_step_while_the_arm_moves_stops_it_and_begins_again(bench: Ben
     assert [(s.step, sorted(s.captured)) for s in state.superseded] == [("capture", VIEWS[:2])]
 
 
+def test_an_image_is_recorded_once_the_arm_is_on_its_way_to_the_next(bench: Bench) -> None:
+    recorded: list[int] = []
+    bench.rig.arm.on_move = lambda _move: recorded.append(len(bench.captured()))
+    assert bench.run().status == "completed"
+    assert recorded == [0, 0, 1, 2]
+    assert bench.captured() == VIEWS
+
+
+def test_an_image_that_has_arrived_is_recorded_though_the_next_motion_is_refused(bench: Bench) -> None:
+    def stop(move: int) -> None:
+        if move == 3:
+            bench.rig.arm.safety = SafetyState.PROTECTIVE_STOP
+
+    bench.rig.arm.on_move = stop
+    bench.script("capture", "recovery", say("abort", reason="enough"))
+    assert bench.run().status == "aborted"
+    assert bench.captured() == VIEWS[:2]
+    bench.must_verify()
+
+
 def test_skip_needs_the_protocols_leave_and_a_reason(bench: Bench) -> None:
     bench.script("fixation", "confirm", say("skip"), say("skip", reason="fixed yesterday"))
     bench.script("capture", "confirm", say("skip", reason="no time"))
