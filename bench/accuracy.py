@@ -26,7 +26,8 @@ from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, detect_all, register_images
 from service.compute.poses.hybrid import HybridPoses, hybrid_poses
 from service.compute.poses.pose_files import read_camera_json, read_poses_csv, read_spheres_json
-from service.compute.poses.sfm import Effort, Mapper, SfmModel, options_for, reconstruct
+from service.compute.poses.sfm import SfmModel, reconstruct
+from service.compute.poses.sfm_options import Effort, Mapper, options_for
 from service.compute.registration.cost import residuals
 from service.compute.registration.evaluation import true_error_m
 from service.compute.registration.joint_poses import with_joint_pose_covariance

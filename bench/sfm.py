@@ -22,7 +22,8 @@ from bench.scenes import CACHE, render_scene
 from service.compute.locating import detect_all
 from service.compute.pipeline import register_images
 from service.compute.poses.hybrid import hybrid_poses
-from service.compute.poses.sfm import Effort, Mapper, SfmModel, options_for, reconstruct
+from service.compute.poses.sfm import SfmModel, reconstruct
+from service.compute.poses.sfm_options import Effort, Mapper, options_for
 from service.compute.registration.evaluation import true_error_m
 from service.core.geometry import Array, align_points, apply, inverse
 

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from service.compute.camera_model import CameraModel
+from service.compute.poses.features import ImageFeatures, pack_matches, unpack_matches
+from service.compute.poses.front_end import FrontEnd, missing_pairs, pairs_of, pairs_with
 from service.compute.poses.pairs import choose_pairs
-from service.compute.poses.sfm import SfmModel, SfmOptions, reconstruct
+from service.compute.poses.sfm import SfmModel, reconstruct, reconstruct_from
+from service.compute.poses.sfm_options import SfmOptions
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Transform, align_points, apply, inverse
 from tests.support.textured_scene import camera_of_width, render, ring_of_poses, slabs
@@ -98,6 +101,41 @@ def test_both_mappers_share_features_and_find_the_poses(
     assert {stage for stage, _, _ in seen} == {"extract", "match", "map"}
     assert all(0 <= done <= total for _, done, total in seen)
     assert capfd.readouterr() == ("", "")
+
+
+def test_pieces_in_any_order_make_the_same_model(
+    camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path
+) -> None:
+    """Image by image as they arrive, kept as bytes in between, in two orders: the files of the model are the same."""
+    prior = {name: T for name, (_, T) in views.items()}
+    planned = pairs_of(views, prior, OPTIONS)
+    models: list[SfmModel] = []
+    for turn, order in enumerate((sorted(views), sorted(views, reverse=True))):
+        features: dict[str, ImageFeatures] = {}
+        packed: list[bytes] = []
+        with FrontEnd(camera, OPTIONS, processes=1 + turn) as front:
+            for name in order:
+                features[name] = ImageFeatures.from_bytes(front.extract_features(views[name][0]).to_bytes())
+                found = front.match_pairs(features, pairs_with(name, features, planned[: 5 * turn + 8]))
+                packed.append(pack_matches(found))
+            early = [match for data in packed for match in unpack_matches(data)]
+            late = missing_pairs(planned, early)
+            assert len(late) + len(early) == len(planned)
+            matches = front.match_pairs(features, late)
+        models.append(reconstruct_from(features, [*early, *matches], camera, tmp_path / str(turn), options=OPTIONS))
+    images = {name: path for name, (path, _) in views.items()}
+    models.append(reconstruct(images, camera, tmp_path / "one", T_world_camera_prior=prior, options=OPTIONS))
+    for model in models[1:]:
+        for file in models[0].folder.iterdir():
+            assert (model.folder / file.name).read_bytes() == file.read_bytes(), file.name
+        assert np.array_equal(model.tracks.pixels, models[0].tracks.pixels)
+
+
+def test_damaged_pieces_are_refused() -> None:
+    with pytest.raises(DataError, match="features"):
+        ImageFeatures.from_bytes(b"no archive")
+    with pytest.raises(DataError, match="matches"):
+        unpack_matches(b"no archive")
 
 
 def test_wrong_size_or_broken_image_is_named(

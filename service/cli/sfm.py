@@ -29,7 +29,8 @@ from service.compute.poses.pose_files import (
     write_camera_json,
     write_poses_csv,
 )
-from service.compute.poses.sfm import Effort, Refine, SfmModel, SfmOptions, options_for, reconstruct
+from service.compute.poses.sfm import SfmModel, reconstruct
+from service.compute.poses.sfm_options import Effort, Refine, SfmOptions, options_for
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, align_points, apply

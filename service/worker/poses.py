@@ -12,7 +12,8 @@ import numpy as np
 from service.compute.markers.archive import outline_from_record
 from service.compute.poses.hybrid import HybridPoses, hybrid_poses
 from service.compute.poses.pose_covariance import blocks
-from service.compute.poses.sfm import SfmModel, SfmOptions, reconstruct
+from service.compute.poses.sfm import SfmModel, reconstruct
+from service.compute.poses.sfm_options import SfmOptions
 from service.compute.poses.tracks import Tracks
 from service.core.geometry import Array
 from service.worker.job import JobAnswer, JobContext

@@ -76,3 +76,8 @@ def from_colmap_pose(cam_from_world: pycolmap.Rigid3d) -> Transform:
 def from_colmap_pixels(points: Array) -> Array:
     """Our pixels (N, 2) of COLMAP's image coordinates (N, 2)."""
     return points - HALF_PIXEL
+
+
+def to_colmap_pixels(pixels: Array) -> Array:
+    """COLMAP's image coordinates (N, 2) of our pixels (N, 2)."""
+    return pixels + HALF_PIXEL

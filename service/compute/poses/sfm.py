@@ -2,105 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import importlib
+import hashlib
 import json
 import logging
 import math
-import multiprocessing
 import os
-import shutil
-import sqlite3
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.pairs import choose_pairs
+from service.compute.poses.colmap_process import ColmapProcess
+from service.compute.poses.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
+from service.compute.poses.front_end import FrontEnd, missing_pairs, pairs_of
 from service.compute.poses.pose_covariance import blocks, similarity_covariance
+from service.compute.poses.sfm_options import Mapper, Progress, SfmOptions
 from service.compute.poses.tracks import Tracks
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 
 logger = logging.getLogger(__name__)
 
-_TABLES = {"extract": "SELECT COUNT(*) FROM keypoints", "match": "SELECT COUNT(*) FROM two_view_geometries"}
-
-Mapper = Literal["incremental", "global"]
-Refine = Literal["nothing", "principal_point", "intrinsics"]
-Progress = Callable[[str, int, int], None]  # stage, done, total (total 0: unknown)
-
-
-@dataclass(frozen=True, slots=True)
-class SfmOptions:
-    """Settings of the front end and of the refinement.
-
-    Attributes:
-        max_image_size: longer side to which images are reduced for feature extraction; 0 keeps the full size.
-        max_features: per image, the largest scales first.
-        first_octave: -1 doubles the image first (finer and four times slower), 0 does not.
-        neighbours: how many images, nearest in viewing direction, each image is matched with (needs a prior).
-        max_angle_deg: views further apart than this, as seen from the scene, are not matched.
-        verification_error_px: epipolar distance up to which a match is an inlier, at extraction size.
-        filter_error_px: observations beyond this are dropped before the final bundle adjustment.
-        min_track: views a point needs to take part in the final bundle adjustment.
-        loss_px: scale of the final bundle adjustment's robust (Cauchy) loss.
-        threads: of extraction and matching.
-        mapping_threads: of mapping and bundle adjustment. With one, the same features give the same model bit for
-            bit; with more, sums are added up in the order in which threads finish.
-        refine: what the final bundle adjustment may change in the calibrated camera.
-        seed: of every random choice.
-        timeout_s: after which one stage is given up.
-    """
-
-    max_image_size: int = 3200
-    max_features: int = 3000
-    first_octave: int = 0
-    neighbours: int = 8
-    max_angle_deg: float = 60.0
-    verification_error_px: float = 2.0
-    filter_error_px: float = 1.5
-    min_track: int = 3
-    loss_px: float = 0.5
-    threads: int = 2
-    mapping_threads: int = 1
-    refine: Refine = "nothing"
-    seed: int = 1
-    timeout_s: float = 3600.0
-
-
-Effort = Literal["quick", "normal", "quality"]
-
-
-def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothing", threads: int = 2) -> SfmOptions:
-    """Settings for images of this camera.
-
-    Camera positions were off by 0.017–0.028 mm (normal) and 0.013 mm (quality) on 20 rendered images 1920 px wide of
-    a scene 0.65 m away (bench/sfm.py); the errors are noise, so more features are what makes them smaller.
-    """
-    longer = max(camera.width, camera.height)
-    if effort == "quick":
-        return SfmOptions(max_image_size=1280, max_features=2500, neighbours=8, refine=refine, threads=threads)
-    if effort == "normal":
-        return SfmOptions(
-            max_image_size=min(longer, 2400), max_features=4000, neighbours=8, refine=refine, threads=threads
-        )
-    # Small images are doubled first; large ones have the pixels themselves.
-    small = longer <= 2400
-    return SfmOptions(
-        max_image_size=min(longer, 4000),
-        max_features=8000,
-        first_octave=-1 if small else 0,
-        neighbours=10,
-        refine=refine,
-        threads=threads,
-    )
+_FEW = 50  # features below which an image has hardly any texture
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,21 +89,22 @@ def reconstruct(
     options: SfmOptions | None = None,
     progress: Progress | None = None,
 ) -> SfmModel:
-    """Estimate the poses of images of one calibrated camera, up to a similarity.
+    """Estimate the poses of images of one calibrated camera, up to a similarity: all pieces in one call.
 
-    Features and matches are kept in the workspace and shared by later calls with the same input, whatever the
-    mapper. COLMAP runs in a child process, so that its crash is an error of this call and nothing more.
+    The same as `FrontEnd` for every image and pair, then `reconstruct_from`. Features and matches are kept in the
+    workspace and shared by later calls, whatever the mapper; only what is missing is made. COLMAP runs in child
+    processes, so that its crash is an error of this call and nothing more.
 
     Args:
         images: file of each image by name, or files whose names are unique.
         camera: calibrated at the images' size; held fixed unless the options refine it.
-        workspace: folder for the database, the models and COLMAP's log; made if missing.
+        workspace: folder for features, matches, the models and COLMAP's logs; made if missing.
         mapper: COLMAP's incremental mapper or the global one (GLOMAP).
         T_world_camera_prior: rough poses in one frame (from the robot) that choose the pairs to match; images
             that it misses are matched with all others. Not used for anything else.
         stations: where poses of the prior are in several frames, the frame of each image.
         options: settings.
-        progress: told (stage, done, total) now and then.
+        progress: told (stage, done, total) now and then; stages extract, match and those of `reconstruct_from`.
 
     Raises:
         DataError: an image is missing, unreadable or of another size than the camera.
@@ -183,31 +112,163 @@ def reconstruct(
     """
     settings = options or SfmOptions()
     files = _by_name(images)
-    if len(files) < 3:
-        raise ComputeError(f"structure from motion needs at least 3 images, got {len(files)}")
-    report: Progress = progress or (lambda _stage, _done, _total: None)
+    _check_count(len(files))
     workspace.mkdir(parents=True, exist_ok=True)
-    names = sorted(files)
+    pairs = pairs_of(files, T_world_camera_prior, settings, stations=stations)
     seconds: dict[str, float] = {}
-    pairs = choose_pairs(names, T_world_camera_prior, settings.neighbours, settings.max_angle_deg, stations=stations)
-    job = _job(files, camera, workspace, settings, pairs)
-    stamp = workspace / "features.json"
-    recipe = json.dumps({k: v for k, v in job.items() if k not in {"options", "workspace"}}, sort_keys=True)
-    if not (stamp.is_file() and stamp.read_text(encoding="utf-8") == recipe):
-        stamp.unlink(missing_ok=True)
-        (workspace / "database.db").unlink(missing_ok=True)
-        _link_images(workspace / "images", files, names)
-        for stage in ("extract", "match"):
-            start = time.monotonic()
-            outcome = _run(stage, job, report, settings.timeout_s)
-            seconds[stage] = time.monotonic() - start
-            if stage == "extract":
-                _check_features(outcome["keypoints"], names, files, camera)
-        stamp.write_text(recipe, encoding="utf-8")
+    with FrontEnd(camera, settings, processes=settings.threads, log=workspace / "colmap_front.log") as front:
+        features = _features(files, camera, settings, workspace, front, seconds, progress)
+        matches = _matches(features, pairs, camera, settings, workspace, front, seconds, progress)
+    model = reconstruct_from(features, matches, camera, workspace, mapper, options=settings, progress=progress)
+    return dataclasses.replace(model, seconds={**seconds, **model.seconds})
+
+
+def reconstruct_from(
+    features: Mapping[str, ImageFeatures],
+    matches: Iterable[PairMatches],
+    camera: CameraModel,
+    workspace: Path,
+    mapper: Mapper = "incremental",
+    *,
+    options: SfmOptions | None = None,
+    progress: Progress | None = None,
+) -> SfmModel:
+    """Poses of images whose features and matches are there already (see `FrontEnd`), in one child process.
+
+    Images and pairs are taken in the order of their names: in which order they arrived, or which process made them,
+    changes no bit of the model. Two mappers may work side by side in one workspace.
+
+    Args:
+        features: of every image, by name.
+        matches: of the pairs that count (`pairs_of` the images); pairs of images without features are left out.
+        camera: calibrated at the images' size; held fixed unless the options refine it.
+        workspace: folder for the model and COLMAP's log; made if missing.
+        mapper: COLMAP's incremental mapper or the global one (GLOMAP).
+        options: settings.
+        progress: told ("map", done, total) now and then; total 0 where COLMAP does not tell how far it is.
+
+    Raises:
+        DataError: an image's features are those of another size than the camera's.
+        ComputeError: too few images, no model, or COLMAP failed.
+    """
+    settings = options or SfmOptions()
+    names = sorted(features)
+    _check_count(len(names))
+    for name in names:
+        if (features[name].width, features[name].height) != (camera.width, camera.height):
+            raise DataError(
+                f"image {name} is {features[name].width}×{features[name].height}, "
+                f"the camera {camera.width}×{camera.height}",
+                remedy="check that the calibration was made at the images' size",
+            )
+    poor = [name for name in names if len(features[name].pixels) < _FEW]
+    if poor:
+        logger.warning("images with hardly any texture: %s", ", ".join(poor))
+    workspace.mkdir(parents=True, exist_ok=True)
+    index = {name: k for k, name in enumerate(names)}
+    used = sorted((m for m in matches if m.first in index and m.second in index), key=lambda m: m.pair)
+    job = {
+        "workspace": str(workspace),
+        "names": names,
+        "mapper": mapper,
+        "camera": dataclasses.asdict(camera),
+        "options": dataclasses.asdict(settings),
+        "pixels": [features[name].pixels for name in names],
+        "matches": [(index[m.first], index[m.second], m.features, m.configuration, m.matrices) for m in used],
+    }
+    report: Progress = progress or (lambda _stage, _done, _total: None)
     start = time.monotonic()
-    outcome = _run("map", {**job, "mapper": mapper}, report, settings.timeout_s)
-    seconds["map"] = time.monotonic() - start
-    return _model(outcome, names, mapper, workspace, seconds)
+    report("map", 0, len(names))
+    with ColmapProcess(seed=settings.seed, log=workspace / f"colmap_{mapper}.log") as child:
+        outcome = child.run(
+            "map",
+            job,
+            timeout_s=settings.timeout_s,
+            told=lambda done, total: report("map", min(done, total), total),
+        )
+    report("map", len(names), len(names))
+    return _model(outcome, names, mapper, workspace, {"map": time.monotonic() - start})
+
+
+def _check_count(count: int) -> None:
+    if count < 3:
+        raise ComputeError(f"structure from motion needs at least 3 images, got {count}")
+
+
+def _features(
+    files: Mapping[str, Path],
+    camera: CameraModel,
+    settings: SfmOptions,
+    workspace: Path,
+    front: FrontEnd,
+    seconds: dict[str, float],
+    progress: Progress | None,
+) -> dict[str, ImageFeatures]:
+    """Features of every image, those of the workspace where file, camera and settings are the same."""
+    folder = workspace / "features"
+    folder.mkdir(exist_ok=True)
+    kept = {name: folder / f"{_key(file, camera, settings)}.npz" for name, file in files.items()}
+    wanted = {name: files[name] for name, path in kept.items() if not path.is_file()}
+    start = time.monotonic()
+    fresh = front.extract_all(wanted, progress) if wanted else {}
+    if wanted:
+        seconds["extract"] = time.monotonic() - start
+    for name, found in fresh.items():
+        _write(kept[name], found.to_bytes())
+    return {
+        name: fresh[name] if name in fresh else ImageFeatures.from_bytes(kept[name].read_bytes())
+        for name in sorted(files)
+    }
+
+
+def _matches(
+    features: Mapping[str, ImageFeatures],
+    pairs: Sequence[tuple[str, str]],
+    camera: CameraModel,
+    settings: SfmOptions,
+    workspace: Path,
+    front: FrontEnd,
+    seconds: dict[str, float],
+    progress: Progress | None,
+) -> list[PairMatches]:
+    """Matches of exactly the pairs; those that the workspace has of the same features are not made again."""
+    kept = workspace / "matches.npz"
+    stamp = workspace / "matches.json"
+    recipe = json.dumps([dataclasses.asdict(camera), settings.verification_error_px, settings.seed, _hash(features)])
+    known: list[PairMatches] = []
+    if kept.is_file() and stamp.is_file() and stamp.read_text(encoding="utf-8") == recipe:
+        known = unpack_matches(kept.read_bytes())
+    missing = missing_pairs(pairs, known)
+    if missing:
+        start = time.monotonic()
+        known += front.match_pairs(features, missing, progress)
+        seconds["match"] = time.monotonic() - start
+        stamp.unlink(missing_ok=True)
+        _write(kept, pack_matches(known))
+        stamp.write_text(recipe, encoding="utf-8")
+    wanted = set(pairs)
+    return [m for m in known if m.pair in wanted]
+
+
+def _hash(features: Mapping[str, ImageFeatures]) -> str:
+    digest = hashlib.sha256()
+    for name, found in features.items():
+        digest.update(name.encode() + found.pixels.tobytes() + found.descriptors.tobytes())
+    return digest.hexdigest()
+
+
+def _key(file: Path, camera: CameraModel, settings: SfmOptions) -> str:
+    stat = file.stat()
+    front = ("max_image_size", "max_features", "first_octave")
+    words = [str(file.resolve()), stat.st_size, stat.st_mtime_ns, camera.width, camera.height]
+    text = json.dumps([*words, *(getattr(settings, key) for key in front)])
+    return hashlib.sha256(text.encode()).hexdigest()[:24]
+
+
+def _write(path: Path, data: bytes) -> None:
+    part = path.with_suffix(".part")
+    part.write_bytes(data)
+    part.replace(path)
 
 
 def _by_name(images: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
@@ -221,131 +282,6 @@ def _by_name(images: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
         if not path.is_file():
             raise DataError(f"image {name} does not exist", where=str(path))
     return files
-
-
-def _job(
-    files: Mapping[str, Path],
-    camera: CameraModel,
-    workspace: Path,
-    options: SfmOptions,
-    pairs: list[tuple[int, int]],
-) -> dict[str, Any]:
-    """Everything the child process needs, as plain data. Its front-end part is the key of the feature cache."""
-    names = sorted(files)
-    stats = [files[name].stat() for name in names]
-    front = ("max_image_size", "max_features", "first_octave", "verification_error_px", "seed")
-    return {
-        "workspace": str(workspace),
-        "names": names,
-        "files": [[str(files[n].resolve()), s.st_size, s.st_mtime_ns] for n, s in zip(names, stats, strict=True)],
-        "internal": [_internal_name(k, files[name]) for k, name in enumerate(names)],
-        "camera": dataclasses.asdict(camera),
-        "pairs": [list(pair) for pair in pairs],
-        "front": {key: getattr(options, key) for key in front},
-        "options": dataclasses.asdict(options),
-    }
-
-
-def _internal_name(index: int, path: Path) -> str:
-    """A name that COLMAP's list files cannot misread; artefacts of the store have no suffix."""
-    return f"{index:05d}{path.suffix or '.jpg'}"
-
-
-def _link_images(folder: Path, files: Mapping[str, Path], names: Sequence[str]) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    for index, name in enumerate(names):
-        link = folder / _internal_name(index, files[name])
-        try:
-            link.symlink_to(files[name].resolve())
-        except OSError:  # file systems without links
-            shutil.copyfile(files[name], link)
-
-
-def _check_features(
-    keypoints: Mapping[int, int], names: Sequence[str], files: Mapping[str, Path], camera: CameraModel
-) -> None:
-    unread = [name for index, name in enumerate(names) if index not in keypoints]
-    if unread:
-        raise DataError(
-            f"{len(unread)} images cannot be read or are not {camera.width}×{camera.height}: {', '.join(unread[:5])}",
-            where=str(files[unread[0]]),
-            remedy="check the files, and that the calibration was made at the images' size",
-        )
-    poor = [names[index] for index, count in keypoints.items() if count < 50]
-    if poor:
-        logger.warning("images with hardly any texture: %s", ", ".join(poor))
-
-
-def _child(stage: str, job: dict[str, Any], pipe: Connection) -> None:
-    """Import pycolmap in the child only: its import takes over the process's signal handlers."""
-    importlib.import_module("service.compute.poses.sfm_process").main(stage, job, pipe)
-
-
-def _run(stage: str, job: dict[str, Any], report: Progress, timeout_s: float) -> dict[str, Any]:
-    """Run one stage in a child process; its messages are progress, then one result or one error."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(stage, job, theirs), daemon=True, name=f"sfm-{stage}")
-    process.start()
-    theirs.close()
-    total = {"extract": len(job["names"]), "match": len(job["pairs"]), "map": len(job["names"])}[stage]
-    report(stage, 0, total)
-    try:
-        outcome = _await(ours, stage, job, report=report, total=total, deadline=time.monotonic() + timeout_s)
-    finally:
-        ours.close()
-        process.join(timeout=5)
-        if process.is_alive():
-            process.kill()
-            process.join()
-        process.close()
-    report(stage, total, total)
-    return outcome
-
-
-def _await(
-    pipe: Connection, stage: str, job: dict[str, Any], *, report: Progress, total: int, deadline: float
-) -> dict[str, Any]:
-    log = Path(job["workspace"]) / f"colmap_{stage}.log"
-    while True:
-        if pipe.poll(0.5):
-            try:
-                kind, value = pipe.recv()
-            except EOFError:
-                raise ComputeError(
-                    f"COLMAP crashed during {stage}: {_tail(log)}", where=str(log), remedy="see its log"
-                ) from None
-            if kind == "progress":
-                report(stage, min(int(value), total), total)
-            elif kind == "error":
-                raise ComputeError(f"COLMAP failed during {stage}: {value}", where=str(log), remedy="see its log")
-            else:
-                logger.debug("colmap %s done: %s", stage, _tail(log))
-                return value
-        elif time.monotonic() > deadline:
-            raise ComputeError(f"COLMAP did not end {stage} in time", where=str(log))
-        elif stage in {"extract", "match"}:
-            report(stage, _rows_done(Path(job["workspace"]) / "database.db", stage), total)
-
-
-def _rows_done(database: Path, stage: str) -> int:
-    """How many images or pairs the running stage has written; 0 while the database is not there or busy."""
-    if not database.is_file():
-        return 0
-    try:
-        with contextlib.closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0.2)) as connection:
-            return int(connection.execute(_TABLES[stage]).fetchone()[0])
-    except sqlite3.Error:
-        return 0
-
-
-def _tail(log: Path) -> str:
-    try:
-        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    except FileNotFoundError:
-        return "no log"
-    return " | ".join(lines[-3:]) if lines else "empty log"
 
 
 def _model(

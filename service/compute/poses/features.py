@@ -1,0 +1,167 @@
+"""Features of one image and verified matches of a pair: the pieces that structure from motion is built from.
+
+Both are pure functions of the images: of which other images there are, and of the order in which they came, they
+know nothing. So they can be made as images arrive, in any process, and kept.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.core.errors import DataError
+from service.core.geometry import Array
+
+_NORM = 512.0  # length of a descriptor of unsigned bytes
+_ROWS = 512  # descriptors compared at a time: the products stay in the processor's cache
+_MOST_ANGLE_RAD = 0.7  # between descriptors of one scene point
+_MOST_RATIO = 0.8  # of the nearest descriptor's angle and the second nearest's (Lowe, 2004, 7.1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageFeatures:
+    """SIFT features of one image, the largest scales first to be kept.
+
+    Attributes:
+        width, height: of the image as captured, px.
+        pixels: (n, 2) float32 in the image as captured, first pixel's centre at 0.
+        scales_px: (n,) float32 in the image as captured.
+        descriptors: (n, 128) uint8.
+    """
+
+    width: int
+    height: int
+    pixels: NDArray[np.float32] = field(repr=False)
+    scales_px: NDArray[np.float32] = field(repr=False)
+    descriptors: NDArray[np.uint8] = field(repr=False)
+
+    def to_bytes(self) -> bytes:
+        """A NumPy archive (.npz, about 0.1 kB a feature); the same features give the same bytes."""
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            size=np.array([self.width, self.height]),
+            pixels=self.pixels,
+            scales_px=self.scales_px,
+            descriptors=self.descriptors,
+        )
+        return buffer.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> ImageFeatures:
+        """The features again.
+
+        Raises:
+            DataError: the bytes are no such archive.
+        """
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+                width, height = (int(v) for v in archive["size"])
+                return cls(width, height, archive["pixels"], archive["scales_px"], archive["descriptors"])
+        except (ValueError, KeyError, OSError, EOFError) as error:
+            raise DataError("these bytes hold no features of an image", remedy="extract them again") from error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairMatches:
+    """Matches of two images that agree with one epipolar geometry; none where the pair shares nothing.
+
+    Attributes:
+        first, second: names of the images, first < second.
+        features: (m, 2) uint32 indices of the features of the first and the second image.
+        configuration: COLMAP's kind of two-view geometry.
+        matrices: (3, 3, 3) essential, fundamental and homography matrix of the second image by the first; zero where
+            there is none.
+    """
+
+    first: str
+    second: str
+    features: NDArray[np.uint32] = field(repr=False)
+    configuration: int
+    matrices: Array = field(repr=False)
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """Names of both images in order."""
+        return self.first, self.second
+
+
+def pack_matches(matches: Sequence[PairMatches]) -> bytes:
+    """Matches of any number of pairs as a NumPy archive (.npz), sorted by pair: the order given does not matter."""
+    ordered = sorted(matches, key=lambda m: m.pair)
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        pairs=np.array(json.dumps([m.pair for m in ordered])),
+        counts=np.array([len(m.features) for m in ordered], dtype=np.int64),
+        features=np.concatenate([np.empty((0, 2), np.uint32), *(m.features for m in ordered)]),
+        configurations=np.array([m.configuration for m in ordered], dtype=np.int64),
+        matrices=np.array([m.matrices for m in ordered]).reshape(-1, 3, 3, 3),
+    )
+    return buffer.getvalue()
+
+
+def unpack_matches(data: bytes) -> list[PairMatches]:
+    """The matches again, sorted by pair.
+
+    Raises:
+        DataError: the bytes are no such archive.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            pairs = json.loads(str(archive["pairs"]))
+            ends = np.cumsum(archive["counts"])
+            each = np.split(archive["features"], ends[:-1])
+            kinds, matrices = archive["configurations"], archive["matrices"]
+            return [
+                PairMatches(first, second, each[k], int(kinds[k]), matrices[k])
+                for k, (first, second) in enumerate(pairs)
+            ]
+    except (ValueError, KeyError, OSError, EOFError) as error:
+        raise DataError("these bytes hold no matches of images", remedy="match the images again") from error
+
+
+def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """(m, 2) indices of descriptors (n, 128) and (k, 128) that are each other's nearest, and clearly so.
+
+    Products of unsigned bytes are whole numbers below 2^24, exact in single precision in whatever order they are
+    added: the same descriptors give the same matches on every machine.
+    """
+    if len(first) < 2 or len(second) < 2:
+        return np.empty((0, 2), dtype=np.uint32)
+    a, b = first.astype(np.float32), second.astype(np.float32)
+    forth, clear = _nearest(a, b)
+    rows = np.flatnonzero(clear)
+    wanted = np.unique(forth[rows])
+    back = np.full(len(b), -1, dtype=np.int64)
+    nearest, clear = _nearest(b[wanted], a)
+    back[wanted[clear]] = nearest[clear]
+    rows = rows[back[forth[rows]] == rows]
+    return np.column_stack([rows, forth[rows]]).astype(np.uint32)
+
+
+def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """For each descriptor of a the nearest of b, and whether it is near and clearly nearer than the second."""
+    index = np.empty(len(a), dtype=np.int64)
+    clear = np.empty(len(a), dtype=np.bool_)
+    turned = np.ascontiguousarray(b.T)
+    buffer = np.empty((_ROWS, len(b)), dtype=np.float32)
+    for start in range(0, len(a), _ROWS):
+        part = a[start : start + _ROWS]
+        products = np.matmul(part, turned, out=buffer[: len(part)])
+        rows = np.arange(len(part))
+        best = products.argmax(axis=1)
+        cosine = products[rows, best].astype(np.float64) / _NORM**2
+        products[rows, best] = -1.0
+        second = products.max(axis=1).astype(np.float64) / _NORM**2
+        angle = np.arccos(np.minimum(cosine, 1.0))
+        index[start : start + len(part)] = best
+        clear[start : start + len(part)] = (angle <= _MOST_ANGLE_RAD) & (
+            angle < _MOST_RATIO * np.arccos(np.minimum(second, 1.0))
+        )
+    return index, clear
