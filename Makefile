@@ -1,53 +1,70 @@
-# The commands of the project; `make demo` and `make test` need nothing but Python 3.11+.
-PYTHON ?= python3
+# The commands of the project. `make demo` installs what the program needs; `make test` and `make lint` the tools on top.
+# The Python to install with; found by .ci/find-python where it is not given.
+PYTHON ?=
 BIN := .venv/bin
 READY := .venv/.installed
+TOOLS := .venv/.installed-dev
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test lint format docs bench lock clean
+.PHONY: demo test test-versions lint format docs bench lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
 
-test: $(READY)
+test: $(TOOLS)
 	$(BIN)/pytest
 
-lint: $(READY)
+# Installs the locks under every supported Python of this machine and runs the fast tests there.
+test-versions:
+	.ci/versions
+
+lint: $(TOOLS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --threads 2
 	$(BIN)/lint-imports
 
-format: $(READY)
+format: $(TOOLS)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 # What docs/ holds that is made from the code: protocol schema and state diagram.
-docs: $(READY)
+docs: $(TOOLS)
 	$(BIN)/orthocapture protocol schema > docs/protocol.schema.json
 	$(BIN)/orthocapture protocol diagram protocols/exvivo_spine.yaml > docs/state_machine.md
 
 # Measurements that take long; each is a script of its own and writes to bench/results.
-bench: $(READY)
+bench: $(TOOLS)
 	$(BIN)/python -m bench.demo_accuracy
 	$(BIN)/python -m bench.accuracy
 	$(BIN)/python -m bench.marker_speed
 	$(BIN)/python -m bench.register_scale
 
-# A new lock: needs uv (pip install uv).
+# New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
+COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \
+	--python-version 3.11 --group build pyproject.toml
 lock:
-	uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \
-		--python-version 3.11 pyproject.toml --extra dev -o constraints.txt
-	sed -i '1i # Locked versions and hashes of everything orthocapture installs; made by `make lock`.' constraints.txt
+	$(COMPILE) -o constraints.txt
+	$(COMPILE) --extra dev --constraint constraints.txt -o constraints-dev.txt
+	sed -i '1i # Locked versions and hashes of everything that orthocapture needs; made by `make lock`.' constraints.txt
+	sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt
 
+# Ready-made packages only: nothing is compiled on the way, and what has none for this Python is named at once.
 $(READY): pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "orthocapture needs Python 3.11 or newer; say which: make PYTHON=python3.12")'
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --require-hashes -r constraints.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	test -x $(BIN)/python || { python="$(PYTHON)"; python="$${python:-$$(.ci/find-python)}" && "$$python" -m venv .venv; }
+	$(BIN)/python -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 14) and \
+		"orthocapture runs on Python 3.11 to 3.13, not on %d.%d: make clean, then make" % sys.version_info[:2])'
+	$(PIP) --no-compile --only-binary :all: --require-hashes -r constraints.txt
+	$(PIP) --no-deps --no-build-isolation --editable .
 	$(BIN)/python -m compileall -qq -j 0 -x '/include/' .venv/lib service drivers simulators
 	touch $(READY)
+
+$(TOOLS): $(READY) constraints-dev.txt
+	$(PIP) --no-compile --only-binary :all: --require-hashes -r constraints-dev.txt
+	$(BIN)/python -m compileall -qq -j 0 -x '/include/' .venv/lib
+	touch $(TOOLS)
 
 clean:
 	rm -rf .venv build *.egg-info

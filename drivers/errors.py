@@ -13,6 +13,10 @@ class DeviceUnavailableError(DeviceError):
     """Nobody answers, or the link dropped: reconnecting may help."""
 
 
+class DriverMissingError(DeviceError):
+    """The vendor's library is not installed: it has no ready-made package for this Python or this machine."""
+
+
 class DeviceTimeoutError(DeviceError):
     """The device or its driver process did not answer in time."""
 

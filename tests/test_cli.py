@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import os
 import signal
@@ -285,6 +286,34 @@ def test_doctor_says_what_is_missing(tmp_path: Path) -> None:
     assert report["devices"]["ct"]["error"]["kind"] == "DeviceUnavailableError"
     assert report["devices"]["ct"]["error"]["remedy"]
     assert report["data"]["free_bytes"] > 0
+
+
+def test_doctor_says_that_the_library_of_an_arm_is_not_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    absent = tmp_path / "absent"  # stands before the installed library, as if there were none
+    absent.mkdir()
+    for name in ("dashboard_client", "rtde_control"):
+        (absent / f"{name}.py").write_text(f"raise ModuleNotFoundError('no {name}', name='{name}')\n")
+    monkeypatch.syspath_prepend(str(absent))
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("name: bare\ndevices:\n  robot: {driver: ur, host: 127.0.0.9}\n")
+    result = invoke("doctor", "--rig", rig, "--data", tmp_path / "data", "--json")
+    assert result.exit_code == 1
+    error = answer_of(result)["devices"]["robot"]["error"]
+    assert error["kind"] == "DriverMissingError"
+    assert "ur-rtde" in error["what"]
+    assert "docs/installation.md" in error["remedy"]
+
+
+def test_doctor_names_what_is_not_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rtde_control" else found(name))
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("name: bare\ndevices:\n  scanner: {driver: scan_folder, folder: .}\n")
+    result = invoke("doctor", "--rig", rig, "--data", tmp_path / "data")
+    assert result.exit_code == 0
+    assert "not installed: ur-rtde" in result.output
 
 
 def test_doctor_is_content_with_a_rig_that_is_well(tmp_path: Path) -> None:

@@ -9,10 +9,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Generator
+from pathlib import Path
 
 import numpy as np
 import pytest
-import ur_analytic_ik
 
 from simulators.ur_controller import rtde_codec as codec
 from simulators.ur_controller.kinematics import MODELS, forward, from_pose, inverse, to_pose
@@ -20,6 +20,7 @@ from simulators.ur_controller.motion import MoveJ, MoveL, Stop
 from tests.support.ur_rtde_protocol import RtdeClient
 from tests.support.ur_simulator import address, simulated_ur
 
+DATA = Path(__file__).parent / "data"
 VERSIONS = {"3.15": "UR10", "5.12": "UR10e", "5.25": "UR5e"}
 
 
@@ -51,17 +52,21 @@ def test_frames_are_cut_from_any_pieces() -> None:
 # --- kinematics and motion ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
-def test_kinematics_agree_with_an_independent_package(model: object) -> None:
-    name = next(k for k, m in MODELS.items() if m is model)
+# Forward kinematics of six postures of each model by the package ur-analytic-ik 0.1.0, which is not ours.
+POSTURES = [json.loads(line) for line in (DATA / "ur_forward_kinematics.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_kinematics_agree_with_an_independent_package(model: str) -> None:
     rng = np.random.default_rng(3)
-    for _ in range(40):
-        q = rng.uniform(-3, 3, 6)
-        T = getattr(ur_analytic_ik, name.lower()).forward_kinematics(*q)
-        np.testing.assert_allclose(forward(MODELS[name], q), T, atol=1e-12)
-        found = inverse(MODELS[name], T, q + rng.normal(0, 0.01, 6))
+    postures = [posture for posture in POSTURES if posture["model"] == model]
+    assert len(postures) == 6
+    for posture in postures:
+        q, T = np.array(posture["q_rad"]), np.vstack([posture["T_base_flange"], [0.0, 0.0, 0.0, 1.0]])
+        np.testing.assert_allclose(forward(MODELS[model], q), T, atol=1e-12)
+        found = inverse(MODELS[model], T, q + rng.normal(0, 0.01, 6))
         assert found is not None
-        np.testing.assert_allclose(forward(MODELS[name], found), T, atol=1e-9)
+        np.testing.assert_allclose(forward(MODELS[model], found), T, atol=1e-9)
         assert np.max(np.abs(found - q)) < 0.2
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import platform
 from typing import TYPE_CHECKING, cast
 
 from pydantic import Field
 
+from drivers.errors import DriverMissingError
 from drivers.plugin import DriverConfig, DriverSpec
 
 if TYPE_CHECKING:
@@ -24,8 +26,22 @@ class UrConfig(DriverConfig):
     stop_deceleration_rad_s2: float = Field(default=2.0, gt=0)
 
 
+_LIBRARY = ("dashboard_client", "rtde_control", "rtde_io", "rtde_receive")
+
+
 def _build(config: UrConfig) -> Device:
-    return cast("Device", importlib.import_module("drivers.ur.robot").UrRobot(config))
+    try:
+        module = importlib.import_module("drivers.ur.robot")
+    except ModuleNotFoundError as error:
+        if error.name not in _LIBRARY:
+            raise
+        raise DriverMissingError(
+            f"ur-rtde, the library for arms of Universal Robots, is not installed; it has no ready-made package for "
+            f"Python {platform.python_version()} on {platform.system()} {platform.machine()}",
+            where=config.host,
+            remedy="Use Python 3.12 or 3.11 on Linux x86_64, or build the library as docs/installation.md says",
+        ) from error
+    return cast("Device", module.UrRobot(config))
 
 
 DRIVER = DriverSpec(kind="robot", config=UrConfig, build=_build, hosted=True, call_timeout_s=30.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import shutil
 from typing import Any
 
@@ -26,6 +27,12 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 from service.rig import load_rig
 from service.station import Station
 
+# Libraries without a ready-made package for every Python and machine, and what cannot be done without them.
+_PARTS = {
+    "rtde_control": "ur-rtde: arms of Universal Robots cannot be driven",
+    "pycolmap": "pycolmap: camera poses cannot be found from images alone",
+    "embreex": "embreex: rigs cannot be simulated",
+}
 _LOW_DISK_BYTES = 20e9  # a full capture of RAW and JPEG with its scans
 
 
@@ -47,10 +54,14 @@ def doctor_command(rig: RigOption, data: DataOption = DEFAULT_DATA, json: JsonOp
     existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
     free_bytes = shutil.disk_usage(existing).free
     healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
+    missing = [what for module, what in _PARTS.items() if importlib.util.find_spec(module) is None]
     if json:
         devices = {name: _record(report) for name, report in found.items()}
-        print_json({"ok": healthy, "devices": devices, "data": {"folder": str(data), "free_bytes": free_bytes}})
+        space = {"folder": str(data), "free_bytes": free_bytes}
+        print_json({"ok": healthy, "devices": devices, "data": space, "missing": missing})
     else:
+        for what in missing:
+            console.print(f"[bold yellow]![/] not installed: {escape(what)} (see docs/installation.md)")
         for name, report in found.items():
             _print(name, report)
         note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"
