@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -273,6 +274,57 @@ def test_unmodified_ur_rtde(controller: tuple[str, str]) -> None:
     assert "until 5s after occurrence" in said["early_unlock"]
     assert said["again"] == [False, True]
     assert said["slider"] == pytest.approx(0.5)
+
+
+@pytest.fixture(scope="module")
+def rare_calls() -> dict[str, Any]:
+    """What the client says to calls that are seldom made, in one session."""
+    host = address(48)
+    with simulated_ur(host, "--version", "5.12", "--model", "UR10e", "--speed-up", "5"):
+        command = [sys.executable, "-m", "tests.support.ur_vendor_calls", host]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_a_package_longer_than_its_recipe_leaves_the_link_alive(rare_calls: dict[str, Any]) -> None:
+    said = rare_calls["forward_kinematics"]
+    assert said["long"] == [6, 6]
+    assert said["connected"] is True
+    difference = np.subtract(said["with_tool"][:3], said["plain"][:3])
+    assert np.linalg.norm(difference) == pytest.approx(0.1, abs=1e-6)
+    assert said["moveJ"] is True
+
+
+def test_a_watchdog_that_is_not_kicked_ends_the_program(rare_calls: dict[str, Any]) -> None:
+    assert rare_calls["watchdog"] == {"set": True, "kicked": True, "alone": False, "moveJ": False}
+
+
+def test_the_upper_registers_work_as_the_lower_ones(rare_calls: dict[str, Any]) -> None:
+    said = rare_calls["upper_registers"]
+    assert said["moveJ"] is True
+    assert len(said["fk"]) == 6
+    assert said["tcp"][0] is True
+    assert said["tcp"][1] == pytest.approx([0, 0, 0.1, 0, 0, 0])
+
+
+def test_a_function_of_ones_own_is_reported_done(rare_calls: dict[str, Any]) -> None:
+    assert rare_calls["own_function"] == {"done": True, "again": True}
+
+
+def test_a_program_file_is_loaded_played_held_and_stopped(rare_calls: dict[str, Any]) -> None:
+    said = rare_calls["pendant"]
+    assert "Failed to execute: play" in said["nothing_loaded"]
+    assert "File not found: x" in said["no_file"]
+    assert said["loaded"] == "Loaded program: capture.urp"
+    assert said["states"] == [
+        ["PLAYING capture.urp", True],
+        ["PAUSED capture.urp", False],
+        ["PLAYING capture.urp", True],
+        ["STOPPED capture.urp", False],
+    ]
+    assert "Failed to execute: pause" in said["pause_idle"]
+    assert "Unlock protective stop failure" in said["unlock_idle"]
 
 
 # --- world --------------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ class Code(IntEnum):
     BATTERY = 0xD218
     ISO = 0xD21E
     CAPTURE_TARGET = 0xD222
+    FOCAL_POSITION = 0xD24C
     JPEG_QUALITY = 0xD252
     FILE_FORMAT = 0xD253
     PRIORITY_MODE = 0xD25A
@@ -139,6 +140,7 @@ def initial_properties() -> list[CameraProperty]:
         CameraProperty(Code.BATTERY, _I8, 87, limits=(-1, 100, 1), enabled=Enabled.DISPLAY_ONLY),
         CameraProperty(Code.ISO, _U32, 400, _ISO),
         CameraProperty(Code.CAPTURE_TARGET, _U16, TARGET_COMPUTER, (TARGET_COMPUTER, TARGET_BOTH, TARGET_CARD)),
+        CameraProperty(Code.FOCAL_POSITION, _U8, 50, limits=(0, 100, 1), enabled=Enabled.DISPLAY_ONLY),
         CameraProperty(Code.JPEG_QUALITY, _U8, 2, (1, 2, 3, 4)),
         CameraProperty(Code.FILE_FORMAT, _U8, FILE_JPEG, (FILE_RAW, FILE_RAW_JPEG, FILE_JPEG)),
         CameraProperty(Code.PRIORITY_MODE, _U8, 0, (0, 1)),

@@ -85,6 +85,7 @@ class Controller:
         self.runtime = Runtime.STOPPED
         self.program_name = ""
         self.inputs, self.outputs = Registers(), Registers()
+        self.int_written_s = [0.0] * 48  # when a client last wrote each of the integer inputs
         self.payload_kg, self.payload_cog_m, self.payload_inertia = 0.0, [0.0] * 3, [0.0] * 6
         self.tcp_pose_m = np.zeros(6)
         self.speed_fraction = 1.0
@@ -288,6 +289,7 @@ class Controller:
         for name, value in written.items():
             if name.startswith("input_int_register_"):
                 self.inputs.ints[int(name[19:])] = int(value[0])
+                self.int_written_s[int(name[19:])] = self.time_s
             elif name.startswith("input_double_register_"):
                 self.inputs.doubles[int(name[22:])] = value[0]
         if written.get("speed_slider_mask", (0,))[0]:

@@ -4,36 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from simulators.ur_controller.controller import Controller, Runtime
+from simulators.ur_controller.controller import Controller, Runtime, SafetyMode
+from simulators.ur_controller.program import Interpreter
 
 WELCOME = "Connected: Universal Robots Dashboard Server"
 _BUILD = {3: "106331 (Jul 07 2021)", 5: "1101319 (Mar 22 2022)"}
+_FIXED = {
+    "close popup": "closing popup",
+    "close safety popup": "closing safety popup",
+    "restart safety": "Restarting safety",
+    "is in remote control": "true",
+    "get operational mode": "NONE",
+    "quit": "Disconnected",
+    "shutdown": "Shutting down",
+}
 
 
 class Dashboard:
-    """Answers one client's lines. `stop_program` ends whatever program runs."""
+    """Answers one client's lines. Every program file (.urp) that is asked for exists; it runs until it is stopped."""
 
-    def __init__(self, controller: Controller, stop_program: Callable[[], None]) -> None:
+    def __init__(self, controller: Controller, interpreter: Interpreter) -> None:
         self._controller = controller
-        self._stop_program = stop_program
-        self._loaded = ""
-        self._fixed = {
-            "close popup": "closing popup",
-            "close safety popup": "closing safety popup",
-            "restart safety": "Restarting safety",
-            "isprogramsaved": "true",
-            "is in remote control": "true",
-            "get operational mode": "NONE",
-            "quit": "Disconnected",
-            "shutdown": "Shutting down",
-        }
+        self._interpreter = interpreter
 
     def answer(self, line: str) -> str:
         """The reply to one line, without its line end."""
-        c = self._controller
         command = " ".join(line.strip().split())
         word = command.lower()
-        queries: dict[str, Callable[[], str]] = {
+        if word in _FIXED:
+            return _FIXED[word]
+        queries = self._queries()
+        if word in queries:
+            return queries[word]()
+        return self._act(command, word)
+
+    def _queries(self) -> dict[str, Callable[[], str]]:
+        c, loaded = self._controller, self._interpreter.loaded
+        saved = f"true {loaded}" if loaded else "false <unnamed>"
+        return {
             "polyscopeversion": lambda: f"URSoftware {self._version()}",
             "version": self._version,
             "get serial number": lambda: c.serial,
@@ -42,45 +50,54 @@ class Dashboard:
             "safetymode": lambda: f"Safetymode: {c.safety.name}",
             "safetystatus": lambda: f"Safetystatus: {c.safety.name}",
             "running": lambda: f"Program running: {str(c.runtime is Runtime.PLAYING).lower()}",
-            "programstate": lambda: f"{c.runtime.name} {self._loaded or '<unnamed>'}",
-            "get loaded program": lambda: f"Loaded program: {self._loaded}" if self._loaded else "No program loaded",
+            "programstate": lambda: f"{c.runtime.name} {loaded or '<unnamed>'}",
+            "get loaded program": lambda: f"Loaded program: {loaded}" if loaded else "No program loaded",
+            "isprogramsaved": lambda: saved,
         }
-        if word in self._fixed:
-            return self._fixed[word]
-        if word in queries:
-            return queries[word]()
-        return self._act(command, word)
 
     def _act(self, command: str, word: str) -> str:
-        c = self._controller
+        c, interpreter = self._controller, self._interpreter
         actions: dict[str, tuple[Callable[[], None], str]] = {
             "power on": (c.power_on, "Powering on"),
             "power off": (c.power_off, "Powering off"),
             "brake release": (c.brake_release, "Brake releasing"),
-            "stop": (self._stop_program, "Stopped"),
+            "stop": (interpreter.stop, "Stopped"),
         }
         if word in actions:
             actions[word][0]()
             return actions[word][1]
         if word == "unlock protective stop":
-            if c.unlock_protective_stop():
-                return "Protective stop releasing"
-            return (
-                "Cannot unlock protective stop until 5s after occurrence. "
-                "Always inspect cause of protective stop before unlocking"
-            )
-        if word in ("play", "pause"):
-            return f"Failed to execute: {word}"
+            return self._unlock(command)
+        if word == "play":
+            return "Starting program" if interpreter.play() else f"Failed to execute: {command}"
+        if word == "pause":
+            return "Pausing program" if interpreter.pause() else f"Failed to execute: {command}"
         verb, _, rest = command.partition(" ")
         if verb.lower() == "load" and rest:
-            self._loaded = rest
-            return f"Loading program: {rest}"
+            return self._load(rest)
         replies = {
             "addtolog": "Added log message",
             "popup": "showing popup",
             "setuserrole": f"Setting user role: {rest}",
         }
         return replies.get(verb.lower(), f"could not understand: '{command}'")
+
+    def _load(self, name: str) -> str:
+        if not name.endswith(".urp"):
+            return f"File not found: {name}"
+        self._interpreter.stop()
+        self._interpreter.loaded = name
+        return f"Loading program: {name}"
+
+    def _unlock(self, command: str) -> str:
+        if self._controller.safety is not SafetyMode.PROTECTIVE_STOP:
+            return f"Failed to execute: {command}"
+        if self._controller.unlock_protective_stop():
+            return "Protective stop releasing"
+        return (
+            "Cannot unlock protective stop until 5s after occurrence. "
+            "Always inspect cause of protective stop before unlocking"
+        )
 
     def _version(self) -> str:
         major, minor = self._controller.version

@@ -19,6 +19,7 @@ READY, DONE = 1, 2
 _RUNNING_BIT = 1 << 15
 _NUMBERS = r"\[([^\]]*)\]"
 _LEG = re.compile(rf"\b(movej|movel|movep)\s*\(\s*(p?){_NUMBERS}\s*,([^)]*)\)")
+_WRITE = re.compile(r"\bwrite_output_integer_register\(\s*(\d+)\s*(?:\+\s*(\d+)\s*)?,\s*(-?\d+)\s*\)")
 _OPTION = re.compile(r"\b([avr])\s*=\s*([-+0-9.eE]+)")
 
 
@@ -62,6 +63,7 @@ class ControlProgram:
         self._blocking = False  # the loop waits for the motion
         self._async = False  # a motion thread reports its progress
         self._writes = self._operations = 0
+        self._watchdog_s = 0.0  # longest time between two writes of the command register; 0: not watched
         self._handlers = self._table()
         self._progress(-1)
 
@@ -97,6 +99,9 @@ class ControlProgram:
 
     def step(self) -> None:
         """One cycle. Raises StopProgram when the script ends."""
+        written_s = self._c.int_written_s[self._int]
+        if 0.0 < self._watchdog_s < self._c.time_s - written_s:
+            raise StopProgram(f"watchdog: nothing written for {self._c.time_s - written_s:.3f} s")
         if self._async:
             self._watch_async()
         if self._blocking:
@@ -162,6 +167,7 @@ class ControlProgram:
             31: lambda: self._c.protective_stop("asked for by the program"),
             33: self._stop_now,
             34: self._stop_now,
+            35: self._watch,
             36: lambda: self._answer(self._c.inverse(self._vector(0), self._c.target_q) is not None),
             37: lambda: self._answer(self._c.within_limits(self._vector(0))),
             38: lambda: self._out([0.0] * 6),
@@ -259,6 +265,10 @@ class ControlProgram:
         self._c.replace(Stop(self._c.target_q, self._c.planned_qd, deceleration))
         self._blocking = self._in_int(1) != 1 or self._executing not in (33, 34)
 
+    def _watch(self) -> None:
+        frequency_hz = self._in(0)
+        self._watchdog_s = 1.0 / frequency_hz if frequency_hz > 0 else 0.0
+
     def _payload(self) -> None:
         cog = [self._in(1), self._in(2), self._in(3)]
         if not self._c.set_payload(self._in(0), cog if any(cog) else self._c.payload_cog_m):
@@ -267,29 +277,43 @@ class ControlProgram:
 
 # Done every cycle for as long as the command stays in the register.
 _STREAMED = frozenset((6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71))
-_UNMODELLED = frozenset(
-    (6, 7, 8, 12, 18, 19, 20, 21, 25, 35, 51, 52, 53, 56, 57, 59, 62, 63, 64, 66, 67, 68, 69, 70, 71)
-)
+_UNMODELLED = frozenset((6, 7, 8, 12, 18, 19, 20, 21, 25, 51, 52, 53, 56, 57, 59, 62, 63, 64, 66, 67, 68, 69, 70, 71))
 
 
 class OtherProgram:
-    """Any other script: it is not interpreted, it ends after one cycle."""
+    """Any other script: it is not interpreted but for the integers that it writes, one a cycle, and then ends."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, controller: Controller, text: str) -> None:
         match = re.match(r"(?:def|sec)\s+(\w+)", text)
         self.name = match.group(1) if match else "unnamed"
+        self._outputs = controller.outputs
+        self._writes = [(int(at) + int(more or 0), int(value)) for at, more, value in _WRITE.findall(text)]
 
     def step(self) -> None:
         """See ControlProgram."""
-        raise StopProgram("not modelled")
+        if not self._writes:
+            raise StopProgram("at its end; the rest of it is not modelled")
+        at, value = self._writes.pop(0)
+        self._outputs.ints[at] = value
+
+
+class PendantProgram:
+    """A program file that was loaded and started by the dashboard: it runs until it is stopped."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def step(self) -> None:
+        """See ControlProgram."""
 
 
 class Interpreter:
-    """The one program that runs."""
+    """The one program that runs; `loaded` names the program file that the pendant has open."""
 
     def __init__(self, controller: Controller) -> None:
         self._c = controller
-        self._program: ControlProgram | OtherProgram | None = None
+        self._program: ControlProgram | OtherProgram | PendantProgram | None = None
+        self.loaded = ""
 
     def load(self, text: str) -> None:
         """Start a program in place of the present one, if the robot may move."""
@@ -297,14 +321,38 @@ class Interpreter:
         if not self._c.may_move:
             _LOG.info("program ignored: %s, %s", self._c.robot_mode.name, self._c.safety.name)
             return
-        self._program = ControlProgram(self._c, text) if "reg_offset_int" in text else OtherProgram(text)
-        self._c.program_name = self._program.name
+        known = "reg_offset_int" in text
+        self._run(ControlProgram(self._c, text) if known else OtherProgram(self._c, text))
+
+    def play(self) -> bool:
+        """Start the loaded program file, or go on with a paused program; False where that is not possible."""
+        if not self._c.may_move:
+            return False
+        if self._c.runtime is Runtime.PAUSED and self._program is not None:
+            self._run(self._program)
+            return True
+        if not self.loaded or self._program is not None:
+            return False
+        self._run(PendantProgram(self.loaded))
+        return True
+
+    def pause(self) -> bool:
+        """Hold the program that runs, and the arm; False when none does."""
+        if self._program is None or self._c.runtime is not Runtime.PLAYING:
+            return False
+        self._c.runtime = Runtime.PAUSED
+        self._c.generation += 1
+        return True
+
+    def _run(self, program: ControlProgram | OtherProgram | PendantProgram) -> None:
+        self._program = program
+        self._c.program_name = program.name
         self._c.runtime = Runtime.PLAYING
         self._c.generation += 1
 
     def step(self) -> None:
         """One cycle of the program, if one runs."""
-        if self._program is None:
+        if self._program is None or self._c.runtime is Runtime.PAUSED:
             return
         if self._c.runtime is not Runtime.PLAYING:  # a safety stop killed it
             self._program = None
@@ -325,7 +373,8 @@ class Interpreter:
 
 
 def _offset(text: str, name: str) -> int:
-    match = re.search(rf"{name}\s*=\s*(\d+)", text)
+    # The client writes the number behind the comment that follows, on the next line.
+    match = re.search(rf"{name}\s*=\s*(?:#[^\n]*\n\s*)?(\d+)", text)
     return int(match.group(1)) if match else 0
 
 

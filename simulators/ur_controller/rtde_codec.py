@@ -78,10 +78,13 @@ class Recipe:
         return self._head + self._struct.pack(self.number, *flat)
 
     def unpack(self, payload: bytes) -> dict[str, tuple[float, ...]]:
-        """Field name → numbers, of a payload that begins with the recipe's number. Raises FrameError."""
-        if len(payload) != self._struct.size:
+        """Field name → numbers, of a payload that begins with the recipe's number.
+
+        Bytes beyond the recipe are left unread: ur_rtde sends such packages. Raises FrameError for a short one.
+        """
+        if len(payload) < self._struct.size:
             raise FrameError(f"recipe {self.number} takes {self._struct.size} bytes, not {len(payload)}")
-        flat = self._struct.unpack(payload)[1:]
+        flat = self._struct.unpack_from(payload)[1:]
         fields: dict[str, tuple[float, ...]] = {}
         at = 0
         for name, length in zip(self.names, self._lengths, strict=True):

@@ -84,8 +84,7 @@ class RtdeLink(Link):
         if kind == codec.DATA_PACKAGE:
             recipe = self._inputs.get(payload[0]) if payload else None
             if recipe is not None:
-                controller.apply(recipe.unpack(payload))
-                self._server.interpreter.step()
+                self._apply(recipe, payload)
         elif kind == codec.REQUEST_PROTOCOL_VERSION:
             wanted = struct.unpack_from(">H", payload)[0] if len(payload) >= 2 else 0
             self.send(codec.frame(kind, bytes([wanted == codec.PROTOCOL_VERSION])))
@@ -99,6 +98,15 @@ class RtdeLink(Link):
             self._streaming = kind == codec.START and self._output is not None
             self._next_s = time.monotonic()
             self.send(codec.frame(kind, bytes([kind == codec.PAUSE or self._streaming])))
+
+    def _apply(self, recipe: codec.Recipe, payload: bytes) -> None:
+        try:
+            written = recipe.unpack(payload)
+        except codec.FrameError as error:  # the frame itself was whole: the link goes on
+            _LOG.warning("data package left out: %s", error)
+            return
+        self._server.controller.apply(written)
+        self._server.interpreter.step()
 
     def _set_up_outputs(self, payload: bytes) -> None:
         frequency_hz, names = codec.parse_setup_outputs(payload)
@@ -167,7 +175,7 @@ class LineLink(Link):
     def __init__(self, connection: socket.socket, server: Server) -> None:
         super().__init__(connection)
         self._server = server
-        self._dashboard = Dashboard(server.controller, server.interpreter.stop)
+        self._dashboard = Dashboard(server.controller, server.interpreter)
         self._rest = b""
         if not server.faulty(self, "dashboard_connect"):
             self.send(f"{WELCOME}\n".encode())
