@@ -60,6 +60,30 @@ def test_settings_are_set_and_survive_a_session(camera: RunningCamera, widget: s
     assert vendor_session(camera.gphoto_port, ["value", widget]) == [value]
 
 
+def test_the_focal_position_is_read_and_moved_by_hand_in_manual_focus_only(camera: RunningCamera) -> None:
+    """Read-only, 0 to 100; `manualfocus` moves it by steps of the client's own scale."""
+    before, refused, *_ = vendor_session(
+        camera.gphoto_port,
+        ["value", "focalposition"],
+        ["set", "focalposition", 20.0],
+        ["set", "focusmode", "Automatic"],
+        ["sleep", 2.1],
+    )
+    assert before == 50.0
+    assert refused["error"] < 0
+    denied, _, up, _, near = vendor_session(
+        camera.gphoto_port,
+        ["set", "manualfocus", 3.0],
+        ["set", "focusmode", "Manual"],
+        ["set", "manualfocus", 3.0],
+        ["sleep", 2.1],
+        ["value", "focalposition"],
+    )
+    assert denied["error"] < 0
+    assert isinstance(up, float)
+    assert near == 53.0
+
+
 def test_a_value_that_is_not_offered_is_refused_and_nothing_changes(camera: RunningCamera) -> None:
     # The client reads a setting from its cache for two seconds.
     words = (["set", "iso", "100"], ["set", "iso", "123"], ["sleep", 2.2], ["value", "iso"])

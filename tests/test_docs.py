@@ -187,7 +187,10 @@ RUN_ELSEWHERE = {
     ),
     "orthocapture layout --spheres spheres.json": "tests/test_layout.py::test_command",
     "make demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
-    "make test": "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
+    **dict.fromkeys(
+        ("make test", "make lint", "make test-versions", "make clean"),
+        "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
+    ),
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
     ),
@@ -214,8 +217,14 @@ def test_the_test_that_runs_it_exists(command: str, test: str) -> None:
 
 
 def test_make_targets_do_what_the_documents_say() -> None:
-    """`make test` runs pytest and `make demo` the demo (tests/test_demo.py runs the same command)."""
-    for target, last in (("test", ".venv/bin/pytest"), ("demo", ".venv/bin/orthocapture demo")):
+    """The last line of each target; tests/test_demo.py runs the command of `make demo`."""
+    for target, last in (
+        ("test", ".venv/bin/pytest"),
+        ("demo", ".venv/bin/orthocapture demo"),
+        ("lint", ".venv/bin/lint-imports"),
+        ("test-versions", ".ci/versions"),
+        ("clean", "rm -rf .venv build *.egg-info"),
+    ):
         done = subprocess.run(
             ["make", "--dry-run", "--no-print-directory", target],
             cwd=ROOT, capture_output=True, text=True, timeout=30, check=False,

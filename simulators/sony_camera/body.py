@@ -21,9 +21,11 @@ from simulators.sony_camera.exif import Shot, encode_jpeg, encode_raw
 from simulators.sony_camera.properties import (
     FILE_JPEG,
     FILE_RAW,
+    MANUAL_FOCUS,
     TARGET_COMPUTER,
     Code,
     ExposureSettings,
+    NotWritableError,
     PropertyTable,
 )
 from simulators.sony_camera.scene import ImageSource, Moment
@@ -90,12 +92,23 @@ class CameraBody:
         return self._exposing.is_set()
 
     def button(self, code: int, state: int) -> None:
-        """Half or full press (2) and release (1). Raises BusyError or CardFullError on a full press."""
+        """Half or full press (2) and release (1), or a step of the focus as a signed 16-bit number.
+
+        Raises BusyError or CardFullError on a full press, NotWritableError for a step in autofocus.
+        """
         if code == Code.HALF_PRESS:
             self._half_pressed = state == _PRESSED
             self.properties.put(Code.FOCUS_STATUS, FOCUSED if self._half_pressed else NOT_FOCUSED)
         elif code == Code.FULL_PRESS and state == _PRESSED:
             self._shoot()
+        elif code == Code.FOCUS_STEP:
+            self._step_focus(state - 0x10000 if state & 0x8000 else state)
+
+    def _step_focus(self, steps: int) -> None:
+        if self.properties.value(Code.FOCUS_MODE) != MANUAL_FOCUS:
+            raise NotWritableError("the focus is moved by hand in manual focus only")
+        position = self.properties.value(Code.FOCAL_POSITION) + steps
+        self.properties.put(Code.FOCAL_POSITION, min(100, max(0, position)))
 
     def _shoot(self) -> None:
         settings = self.properties.exposure_settings()
