@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import distributions
 from os import getpid
-from typing import Any
+from typing import Any, NamedTuple
 from typing import Protocol as Interface
 
 from drivers.errors import DeviceError
@@ -63,12 +63,19 @@ _PEDAL_RETRY_S = 30.0
 _PEDAL_SECOND_PRESS_S = (0.5, 6.0)
 
 
+class Spoken(NamedTuple):
+    """An answer by somebody else than the person who runs the run: a supervisor at the same terminal."""
+
+    action: OperatorAction
+    actor: str
+
+
 class Operator(Interface):
     """The person in front of the run, or what stands in for one on a simulated rig."""
 
     name: str
 
-    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
         """An answer if there is one by now; called about ten times a second while a question is open."""
         ...
 
@@ -186,18 +193,19 @@ class Runner:
         if answer is None:
             self.wait(_POLL_S)
             return
-        self.submit(answer)
+        if isinstance(answer, Spoken):
+            self.submit(answer.action, answer.actor)
+        else:
+            self.submit(answer, self.operator.name)
 
-    def submit(self, action: OperatorAction) -> None:
+    def submit(self, action: OperatorAction, actor: str) -> None:
         """Append an action if it is allowed now; otherwise append its refusal and say why."""
         state = self._log.refresh()
-        refusal = refuse(self.protocol, state, action, self.operator.name)
+        refusal = refuse(self.protocol, state, action, actor)
         if refusal is None:
-            self._append(action, actor=self.operator.name)
+            self._append(action, actor=actor)
             return
-        self._append(
-            ActionRefused(action=action.action, step=action.step, why=str(refusal)), actor=self.operator.name
-        )
+        self._append(ActionRefused(action=action.action, step=action.step, why=str(refusal)), actor=actor)
         self.operator.tell(f"refused: {refusal}")
 
     def _pedal_press(self, question: AskOperator, state: RunState) -> OperatorAction | None:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from service.audit.bundle_zip import Listed
+from service.core.acceptance import describe_accepted
 from service.core.model import (
     ArtefactRef,
     DeviceOpened,
@@ -58,6 +59,7 @@ def crate(
     """The metadata as plain data. `files` are those of the bundle; recorded ones may be missing (only hashes)."""
     described = _artefact_entities(artefacts, {item.path for item in files})
     ids = {artefact.ref.sha256: entity["@id"] for artefact, entity in described}
+    accepted = [f"{name}: {describe_accepted(s.accepted)}" for name, s in state.steps.items() if s.accepted]
     own = [_file_entity(item) for item in files if not item.path.startswith("artefacts/")]
     parts = [*own, *(entity for _, entity in described)]
     people = [
@@ -74,6 +76,7 @@ def crate(
         "description": (
             f"{marked}Evidence of {root.protocol_id} {root.protocol_version}: every event, signature and file."
             + (" No real device took part: the whole rig was simulated." if root.simulated else "")
+            + "".join(f" Accepted outside its limits: {text}." for text in accepted)
         ),
         "datePublished": events[-1].at_utc,
         "license": {"@id": "#rights"},

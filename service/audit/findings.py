@@ -46,8 +46,8 @@ def signatures(connection: Connection, run_id: str, digest: Digest | None) -> li
         text(
             "SELECT i.seq FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
             "WHERE i.run_id = :run AND i.kind = 'operator_action' AND i.position IN "
-            "(SELECT rowid FROM event_words WHERE event_words MATCH '\"sign\"') "
-            "AND json_extract(e.payload, '$.action') = 'sign' "
+            '(SELECT rowid FROM event_words WHERE event_words MATCH \'"sign" OR "accept"\') '
+            "AND json_extract(e.payload, '$.action') IN ('sign', 'accept') "
             "UNION SELECT seq FROM event_index WHERE run_id = :run AND kind = 'run_released' "
             "ORDER BY 1 LIMIT :limit"
         ),
@@ -66,7 +66,7 @@ def _signature(connection: Connection, run_id: str, row: EventRow, digest: Diges
         seq=row.seq,
         at_utc=row.at_utc,
         person=row.actor,
-        meaning=str(row.payload.get("meaning", "")),
+        meaning=_meaning(row),
         step=row.step,
         signed_sha256=signed,
         bound=bound,
@@ -74,6 +74,12 @@ def _signature(connection: Connection, run_id: str, row: EventRow, digest: Diges
         stands=None if digest is None or digest.state is None else _stands(digest, row, signed) and not refused,
         refused=refused,
     )
+
+
+def _meaning(row: EventRow) -> str:
+    if row.payload.get("action") == "accept":
+        return f"accepted outside its limits: {row.payload.get('reason', '')}"
+    return str(row.payload.get("meaning", ""))
 
 
 def _is_unaltered(run_id: str, bound: EventRow, signed: str) -> bool:
@@ -89,6 +95,8 @@ def _stands(digest: Digest, row: EventRow, signed: str) -> bool:
     if row.kind == "run_released":
         return state.released_by == row.actor and state.completed_sha256 == signed
     step = state.steps.get(row.step)
+    if step is not None and row.payload.get("action") == "accept":
+        return step.accepted is not None and step.accepted.seq == row.seq
     if step is None or not step.signed or step.signed_by != row.actor:
         return False
     # A step binds its gates; the release of an irreversible step binds what passed before it.

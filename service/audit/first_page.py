@@ -14,6 +14,7 @@ from service.core.run_state import DeviationKind
 
 # Group on the page → its name, and the kinds of deviations in it.
 GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
+    "accepted": ("Gates accepted", frozenset({"gate_accepted"})),
     "redone": ("Re-dos", frozenset({"redo", "redo_viewpoint", "reset_by_redo"})),
     "skipped_views": ("Skipped views", frozenset({"viewpoint_skipped"})),
     "skipped_steps": ("Skipped steps", frozenset({"skip"})),
@@ -24,6 +25,7 @@ GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
 }
 _NAMES: Mapping[str, str] = {
     "skip": "Step skipped",
+    "gate_accepted": "Gate accepted outside its limits",
     "gate_overridden": "Gate overridden",
     "redo": "Step done again",
     "redo_viewpoint": "View taken again",
@@ -58,7 +60,7 @@ class Finding:
 
 
 def findings(digest: Digest, group: str = "") -> list[Finding]:
-    """Deviations and failed gates in the order of their events; of one group, or all without the notes."""
+    """Deviations and failed gates, what was accepted first; of one group, or all without the notes."""
     kinds = GROUPS[group][1] if group in GROUPS else None
     found = [
         Finding(d.seq, digest.times.get(d.seq, ""), d.kind, d.step or "", d.actor, d.text)
@@ -78,7 +80,7 @@ def findings(digest: Digest, group: str = "") -> list[Finding]:
             )
             for gate in digest.failed_gates
         ]
-        found.sort(key=lambda finding: finding.seq)
+        found.sort(key=lambda finding: (finding.kind != "gate_accepted", finding.seq))
     return found
 
 

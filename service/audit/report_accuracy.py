@@ -9,6 +9,7 @@ import numpy as np
 
 from service.audit.report_blocks import Cell, Column, Heading, Paragraph, Section, Table
 from service.audit.report_words import mm, words
+from service.core.dependence import depends_on
 from service.dataset.summary import RunSummary
 
 PAPER_LIMIT_MM = 0.35
@@ -48,9 +49,17 @@ def result_sentence(summary: RunSummary) -> Cell:
         f"With {best} poses ({_SOURCES.get(row['source'], words(row['source']))}), the mean error on the "
         f"{on.get(row['evaluated_on'], 'spheres, each predicted by the others,')} is {error_mm:.3f} mm, "
         f"{'within' if within else 'OUTSIDE'} the limit of {limit_mm:g} mm ({whose}), with a predicted uncertainty "
-        f"of the registration of {row['predicted_error_mm']:.3f} mm (1σ, 3D){budget}.{simulated}",
-        "ok" if within else "stop",
+        f"of the registration of {row['predicted_error_mm']:.3f} mm (1σ, 3D){budget}.{simulated}"
+        + (" It depends on figures that were accepted outside their limits, see below." if rests_on(summary) else ""),
+        ("attention" if rests_on(summary) else "ok") if within else "stop",
     )
+
+
+def rests_on(summary: RunSummary) -> tuple[str, ...]:
+    """The accepted gates on which the evaluation rests, in words."""
+    evaluations = [step.id for step in summary.protocol.steps if step.kind == "evaluation"]
+    gates = (gate for step in evaluations for gate in depends_on(summary.protocol, summary.state, step))
+    return tuple(dict.fromkeys(f"Depends on an accepted gate: {gate.text}" for gate in gates))
 
 
 def _limit(summary: RunSummary) -> tuple[float, str]:
@@ -105,7 +114,8 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
         "scan, across the line of sight; the reprojection error is the same in the image. The paper's figures are of "
         "real images at its own widths; reprojection errors compare only at the same width."
     )
-    return Section(title, (Table(tuple(columns), tuple(shown), frozenset(strong)), Paragraph(explained)))
+    accepted = tuple(Paragraph(text, "attention") for text in rests_on(summary))
+    return Section(title, (*accepted, Table(tuple(columns), tuple(shown), frozenset(strong)), Paragraph(explained)))
 
 
 def _paper(row: Mapping[str, Any]) -> str:
@@ -159,6 +169,7 @@ def budget_section(summary: RunSummary) -> Section | None:
     return Section(
         "Error budget",
         (
+            *(Paragraph(text, "attention") for text in rests_on(summary)),
             Paragraph(f"Standard deviations (3D) in the middle of the anatomy, with the poses of {best}."),
             sources,
             Heading("Does it hold?"),

@@ -11,6 +11,7 @@ from service.audit.recorded import RecordedRun
 from service.audit.report_blocks import Block, Cell, Column, Drawings, Facts, Heading, Paragraph, Section, Table
 from service.audit.report_drawings import bars_drawing, coverage_drawing, residual_drawing, uncertainty_drawing
 from service.audit.report_words import judged, limit, measured, utc
+from service.core.dependence import depends_on
 from service.core.model import View
 
 _INVARIANTS = ("settings_departures", "optics_departures")
@@ -24,6 +25,10 @@ def certificate_sections(run: RecordedRun) -> Iterator[Section]:
         if step.kind == "calibration" and state.result and kept:
             blocks = (
                 _facts(run, step.id, kept[-1].sha256),
+                *(
+                    Paragraph(f"Depends on an accepted gate: {gate.text}", "attention")
+                    for gate in depends_on(run.protocol, run.state, step.id)
+                ),
                 *_intrinsics(state.result),
                 *_hand_eye(state.result),
                 *_validity(run, step.id),

@@ -33,7 +33,7 @@ class Departure:
 
 
 def deviations(run: RecordedRun) -> list[Departure]:
-    """Deviations, failed gates and attempts, troubles of devices and corrections, in order of their events."""
+    """Accepted gates first; then deviations, failed gates, troubles of devices and corrections, by their events."""
     titles = {step.id: step.title for step in run.protocol.steps}
     found = [
         Departure(d.seq, words(d.kind), titles.get(d.step or "", ""), d.text, d.actor)
@@ -52,7 +52,7 @@ def deviations(run: RecordedRun) -> list[Departure]:
             found.append(Departure(last, "unsigned", step.title, "nobody has signed this step", ""))
         elif state.phase != "passed":
             found.append(Departure(last, "not done", step.title, f"the step is {words(state.phase)}", ""))
-    return sorted(found, key=lambda departure: departure.seq)
+    return sorted(found, key=lambda departure: (departure.kind != words("gate_accepted"), departure.seq))
 
 
 def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
@@ -125,14 +125,19 @@ def steps_section(run: RecordedRun) -> Section:
 def _state(run: RecordedRun, title: str, state: StepState) -> Cell:
     went_on = state.phase == "passed" and not state.skipped
     phase = ("gates overridden" if state.verdicts else "skipped") if state.skipped else words(state.phase)
-    parts = [phase, f"attempt {state.attempt}" if state.attempt > 1 else ""]
+    parts = [
+        phase,
+        "accepted outside its limits" if state.accepted else "",
+        f"attempt {state.attempt}" if state.attempt > 1 else "",
+    ]
     if state.started_utc:
         parts.append(f"begun {clock(state.started_utc)}")
     if state.started_utc and state.ended_utc:
         parts.append(f"took {duration(state.started_utc, state.ended_utc)}")
     parts.append(f"{len(state.captured)} views" if state.captured else "")
     parts.append(f"signed by {run.named(state.signed_by)}" if state.signed_by else "")
-    return Cell(f"{title}: {', '.join(filter(None, parts))}", "plain" if went_on else "attention")
+    within = went_on and state.accepted is None
+    return Cell(f"{title}: {', '.join(filter(None, parts))}", "plain" if within else "attention")
 
 
 def people_section(run: RecordedRun) -> Section:
@@ -145,9 +150,14 @@ def people_section(run: RecordedRun) -> Section:
         if isinstance(payload, OperatorAction):
             counts = acts.setdefault(event.actor, {})
             counts[payload.action] = counts.get(payload.action, 0) + 1
-            if payload.action == "sign":
+            if payload.action in ("sign", "accept"):
                 how = "automatic" if payload.automatic else payload.via
-                meaning = f"{titles.get(payload.step or '', '')}: {payload.meaning or 'no meaning given'} ({how})"
+                said = (
+                    f"accepted outside its limits, {payload.reason}"
+                    if payload.action == "accept"
+                    else payload.meaning
+                )
+                meaning = f"{titles.get(payload.step or '', '')}: {said or 'no meaning given'} ({how})"
                 rows.append(
                     (str(event.seq), utc(event.at_utc), run.named(event.actor), meaning, payload.signed_sha256)
                 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import termios
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,6 +14,7 @@ from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from service.cli.hands import SimulatedHands
+from service.core.acceptance import demanded_role
 from service.core.decide import AskOperator
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.model import OperatorAction
@@ -20,6 +22,10 @@ from service.core.protocol import Protocol
 from service.core.run_state import RunState
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Doing
+from service.people.errors import PeopleError
+from service.people.people import People
+from service.people.proof import identity_for
+from service.runner import Spoken
 
 _MOST_MENDS = 4  # of one step: whoever has followed its advice so often decides by himself
 
@@ -91,6 +97,9 @@ class _Operator:
         """The whole list: so the terminal says what a confirmation means."""
         return question.checklist
 
+    def close(self) -> None:
+        """The run has ended, or this process is about to."""
+
     def prepare(self, step: str, attempt: int) -> None:
         """The simulated technician's hands, if there are any."""
         self.hands.do(self.protocol.step(step), attempt)
@@ -114,24 +123,38 @@ class ScreenOperator(_Operator):
 
 
 @dataclass
+class _Accepting:
+    """An acceptance that is being typed: its reason, the figures that it binds, and the name once it is told."""
+
+    reason: str
+    sha256: str
+    name: str = ""
+
+
+@dataclass
 class TerminalOperator(_Operator):
     """A person who types; the terminal is polled so that pedal and web can answer as well."""
 
     descriptor: int = 0  # of the terminal
     preview: Callable[[str], str] = lambda _step: ""  # what a step is going to do, where that can be told
+    people: People | None = None  # accounts of the site, for what demands a role
     _asked: AskOperator | None = None
     _typed: bytes = b""
+    _accepting: _Accepting | None = None
 
-    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
         """Show a new question once, then look whether a line was typed."""
         if question != self._asked:
             self._asked = question
+            self._stop_accepting()
             self._print(question)
         line = self._line()
         if line is None:
             return None
+        if self._accepting is not None:
+            return self._accept(self._accepting, line, state)
         verb, _, reason = line.strip().partition(" ")
-        action = self._action(question, verb, reason.strip())
+        action = self._action(question, state, verb, reason.strip())
         if action is not None:
             self._asked = None
         return action
@@ -160,9 +183,56 @@ class TerminalOperator(_Operator):
             lines.append("By `confirm` you say that every item of the list is done.")
         self.display.console.print(Panel("\n".join(lines), title=step.title, subtitle=step.why or None))
 
-    def _action(self, question: AskOperator, verb: str, reason: str) -> OperatorAction | None:
+    def _accept(self, accepting: _Accepting, line: str, state: RunState) -> Spoken | None:
+        """The name first, then the password, each a line of its own: the run is attended to between them."""
+        if not accepting.name:
+            accepting.name = line.strip() or self.name
+            self.display.tell(f"the password of {accepting.name}, then Enter (it is not shown):")
+            self._echo(on=False)
+            return None
+        self._stop_accepting()
+        assert self.people is not None  # nobody is asked for a name otherwise
+        try:
+            who = identity_for(self.people, self.protocol, state, "accept", accepting.name, lambda: line)
+        except PeopleError as error:
+            self.display.tell(str(error))
+            return None
+        self._asked = None
+        action = OperatorAction(
+            action="accept",
+            step=state.current,
+            reason=accepting.reason,
+            signed_sha256=accepting.sha256,
+            role=who.role if who else "",
+            identified=who.identified if who else "",
+        )
+        return Spoken(action, who.name if who else accepting.name)
+
+    def close(self) -> None:
+        """What is typed is shown again."""
+        self._stop_accepting()
+
+    def _stop_accepting(self) -> None:
+        if self._accepting is not None:
+            self._accepting = None
+            self._echo(on=True)
+
+    def _echo(self, *, on: bool) -> None:
+        if os.isatty(self.descriptor):
+            mode = termios.tcgetattr(self.descriptor)
+            mode[3] = mode[3] | termios.ECHO if on else mode[3] & ~termios.ECHO
+            termios.tcsetattr(self.descriptor, termios.TCSADRAIN, mode)
+
+    def _action(self, question: AskOperator, state: RunState, verb: str, reason: str) -> OperatorAction | None:
         if verb not in question.options:
             self.display.tell(f"{verb!r} is not possible now; one of: {', '.join(question.options)}")
+            return None
+        if verb == "accept":
+            if not reason:
+                self.display.tell("accept needs a reason: type `accept`, a space and why")
+                return None
+            self._accepting = _Accepting(reason, state.step.gates_sha256)
+            self.display.tell(f"who accepts it? The name of the {demanded_role(self.protocol, state)}, then Enter:")
             return None
         return OperatorAction.model_validate(
             {

@@ -36,6 +36,8 @@ from service.core.model import ActionRefused, OperatorAction
 from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
+from service.people.people import People
+from service.people.proof import identity_for
 from service.rig import Rig, load_rig
 from service.runner import Runner
 from service.runs import (
@@ -56,6 +58,9 @@ RigOption = Annotated[Path, typer.Option("--rig", help="The rig file: devices an
 OperatorOption = Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")]
 AutoOption = Annotated[
     bool, typer.Option("--auto-confirm", help="Answer every question automatically; simulated rigs only.")
+]
+PasswordOption = Annotated[
+    bool, typer.Option("--password-stdin", help="Where an action demands a role: read the password from stdin.")
 ]
 WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
 
@@ -103,13 +108,14 @@ def resume_command(
 
 
 def act_command(
-    verb: Annotated[str, typer.Argument(help="confirm, sign, redo, skip, pause, resume or abort.")],
+    verb: Annotated[str, typer.Argument(help="confirm, sign, redo, skip, accept, pause, resume or abort.")],
     run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
     step: Annotated[str | None, typer.Option("--step", help="The step, if it is not the current one.")] = None,
     viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo this viewpoint alone.")] = None,
-    reason: Annotated[str, typer.Option("--reason", help="Why; needed for redo, skip and abort.")] = "",
+    reason: Annotated[str, typer.Option("--reason", help="Why; needed for redo, skip, accept and abort.")] = "",
     meaning: Annotated[str, typer.Option("--meaning", help="What a signature says.")] = "",
     operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
@@ -121,6 +127,10 @@ def act_command(
         protocol, _ = recorded_run(store, run_id)
         state = fold(protocol, store.events(run_id))
         name = operator or getpass.getuser()
+        identity = identity_for(
+            People(store), protocol, state, verb, name, partial(_password, name, from_stdin=password_stdin)
+        )
+        name = identity.name if identity else name
         action = OperatorAction(
             action=verb,
             step=step or state.current,
@@ -128,7 +138,9 @@ def act_command(
             reason=reason,
             checklist=protocol.step(state.current).checklist if verb == "confirm" else (),
             meaning=meaning,
-            signed_sha256=record_to_sign(protocol, state) if verb == "sign" else "",
+            signed_sha256=signed_by_verb(verb, protocol, state),
+            role=identity.role if identity else "",
+            identified=identity.identified if identity else "",
         )
         refusal = refuse(protocol, state, action, name)
         if refusal is not None:
@@ -140,6 +152,22 @@ def act_command(
             print_json({"run": run_id, "recorded": verb, "step": action.step})
         else:
             console.print(f"Recorded: {verb} of {action.step} by {escape(name)}")
+
+
+def signed_by_verb(verb: str, protocol: Protocol, state: RunState) -> str:
+    """SHA-256 of the event that an action binds; "" for one that is no signature."""
+    if verb == "accept":
+        return state.step.gates_sha256
+    return record_to_sign(protocol, state) if verb == "sign" else ""
+
+
+def _password(name: str, *, from_stdin: bool) -> str:
+    if from_stdin:
+        return sys.stdin.readline().rstrip("\n")
+    try:
+        return getpass.getpass(f"Password of {name}: ")
+    except EOFError as error:
+        raise ConfigurationError("no password was given", remedy="Type it, or give --password-stdin") from error
 
 
 def status_command(
@@ -230,7 +258,7 @@ def drive(
         operator = ScreenOperator(root.operator, protocol, display, hands)
     else:
         preview = partial(_preview, protocol, rig)
-        operator = TerminalOperator(root.operator, protocol, display, hands, preview=preview)
+        operator = TerminalOperator(root.operator, protocol, display, hands, preview=preview, people=People(store))
     # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -239,6 +267,7 @@ def drive(
     finally:
         reporter.end()
         display.clear()
+        operator.close()
         station.close()
         signal.signal(signal.SIGTERM, before)
 

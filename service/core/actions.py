@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from service.core.acceptance import acceptance_refusal, acceptor_refusal
 from service.core.errors import IllegalTransitionError
 from service.core.lifecycle import lifecycle, redo
 from service.core.model import OperatorAction, OperatorVerb
@@ -11,7 +12,7 @@ from service.core.protocol import Protocol, Step
 from service.core.run_state import RunState
 
 Refusal = IllegalTransitionError
-VERBS: tuple[OperatorVerb, ...] = ("confirm", "sign", "redo", "skip", "pause", "resume", "abort")
+VERBS: tuple[OperatorVerb, ...] = ("confirm", "sign", "redo", "skip", "accept", "pause", "resume", "abort")
 
 
 def check_action(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> None:
@@ -35,7 +36,7 @@ def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: s
         )
     if action.step is not None and action.step not in state.steps:
         return Refusal(f"there is no step {action.step!r}", where=action.action)
-    if action.action in ("confirm", "sign", "skip"):
+    if action.action in ("confirm", "sign", "skip", "accept"):
         if state.paused:
             return Refusal("the run is paused", where=action.action, remedy="Resume first")
         if action.step is not None and action.step != state.current:
@@ -89,7 +90,13 @@ def allowed_actions(protocol: Protocol, state: RunState) -> tuple[OperatorVerb, 
     return tuple(
         verb
         for verb, action in actions.items()
-        if (redo_possible if verb == "redo" else refuse(protocol, state, action, "operator") is None)
+        if (
+            redo_possible
+            if verb == "redo"
+            else acceptance_refusal(protocol, state) is None and not state.paused and not state.terminal
+            if verb == "accept"
+            else refuse(protocol, state, action, "operator") is None
+        )
     )
 
 
@@ -198,6 +205,20 @@ def _has_begun(state: RunState, step: Step) -> bool:
     return bool(there.started_utc) or any(past.step == step.id and past.began for past in state.superseded)
 
 
+def _accept(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:
+    step = protocol.step(state.current)
+    refusal = acceptance_refusal(protocol, state) or acceptor_refusal(protocol, state, action, actor)
+    if refusal is not None:
+        return refusal
+    if action.signed_sha256 != state.step.gates_sha256:
+        return Refusal(
+            "the acceptance is for other figures than those on which this step now stands",
+            where=step.id,
+            remedy="Read the figures again and decide on them as they are now",
+        )
+    return _reason_refusal(action, step.id)
+
+
 def _pause(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:
     return Refusal("the run is paused already", where=state.current) if state.paused else None
 
@@ -215,6 +236,7 @@ _RULES: Mapping[OperatorVerb, Callable[[Protocol, RunState, OperatorAction, str]
     "sign": _sign,
     "redo": _redo,
     "skip": _skip,
+    "accept": _accept,
     "pause": _pause,
     "resume": _resume,
     "abort": _abort,

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from service.core.acceptance import describe_accepted
 from service.core.actions import (
     allowed_actions,
     check_action,
@@ -137,13 +138,18 @@ def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - 
             return EvaluateGates(now.step, now.attempt, now.measures)
         case "awaiting_operator":
             if needs_signature_now(protocol, state):
-                figures = "; ".join(describe(verdict) for verdict in now.verdicts) or "this step has no gates"
-                return _ask(protocol, state, "sign", f"Passed its gates: {figures}. Check the figures and sign")
+                return _ask(protocol, state, "sign", _what_is_signed(now))
             return Accept(now.step, now.attempt)
         case "recovering":
             return _decide_recovering(protocol, state)
         case "passed":
             return FinishRun(state.deviation_count)
+
+
+def _what_is_signed(now: StepState) -> str:
+    figures = "; ".join(describe(verdict) for verdict in now.verdicts) or "this step has no gates"
+    head = "Passed its gates" if now.accepted is None else f"{describe_accepted(now.accepted)}. All its figures"
+    return f"{head}: {figures}. Check the figures and sign"
 
 
 def _decide_ready(protocol: Protocol, state: RunState) -> Decision:

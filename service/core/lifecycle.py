@@ -37,6 +37,7 @@ STEP_RULES: tuple[Rule, ...] = (
     Rule("failed", "running", "recovering"),
     Rule("gates_passed", "checking", "awaiting_operator"),
     Rule("gates_failed", "checking", "recovering"),
+    Rule("gates_accepted", "recovering", "awaiting_operator"),
     Rule("accept", "awaiting_operator", "passed"),
     Rule("retry", "recovering", "running"),
     Rule("skip", "ready", "passed"),

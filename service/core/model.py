@@ -30,7 +30,7 @@ class ArtefactRef(Record):
 
 # --- operator ------------------------------------------------------------------------------------------
 
-OperatorVerb = Literal["confirm", "sign", "redo", "skip", "pause", "resume", "abort"]
+OperatorVerb = Literal["confirm", "sign", "redo", "skip", "accept", "pause", "resume", "abort"]
 
 
 class OperatorAction(Record):
@@ -44,6 +44,9 @@ class OperatorAction(Record):
     checklist: tuple[str, ...] = ()  # items ticked
     meaning: str = ""  # of a signature
     signed_sha256: str = ""  # hash of the event that was signed
+    role: str = ""  # of the person, where the action demands one
+    # How the program knows: the account's password was asked, or it is a claim (a site without accounts).
+    identified: Literal["", "claimed", "password"] = ""
     via: Literal["cli", "web", "pedal", "auto"] = "cli"
     automatic: bool = False
 

@@ -19,6 +19,7 @@ UNMEASURED: Mapping[str, Any] = {
     "verdicts": (),
     "gates_passed": False,
     "gates_sha256": "",
+    "accepted": None,
     "signed": False,
     "signed_by": "",
     "failure": None,

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from service.core.acceptance import describe_accepted, failed_gates
 from service.core.actions import refuse
 from service.core.lifecycle import redo
 from service.core.model import Event, OperatorAction
 from service.core.moves import UNMEASURED, change, deviate, go, pass_on, supersede
 from service.core.protocol import Protocol
-from service.core.run_state import DeviationKind, RunState, StepState
+from service.core.run_state import Accepted, DeviationKind, RunState, StepState
 
 
 def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return a verb
@@ -25,11 +26,15 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
         )
     match p.action:
         case "confirm" if state.phase == "recovering":
-            return change(state, state.current, retry_granted=True)
+            return change(state, state.current, retry_granted=True, confirmed_by=event.actor)
         case "confirm":
-            return change(state, state.current, confirmed=True, ticked=p.checklist)
+            return change(state, state.current, confirmed=True, confirmed_by=event.actor, ticked=p.checklist)
         case "sign":
             return change(state, state.current, signed=True, signed_by=event.actor)
+        case "accept":
+            accepted = Accepted(event.seq, event.actor, p.role, p.identified, p.reason, failed_gates(state.step))
+            state = deviate(state, event, "gate_accepted", state.current, describe_accepted(accepted))
+            return go(protocol, state, "gates_accepted", accepted=accepted)
         case "skip":
             overridden = bool(state.step.verdicts) and not state.step.gates_passed
             kind: DeviationKind = "gate_overridden" if overridden else "skip"

@@ -115,8 +115,12 @@ class Settle(Record):
     timeout_s: Positive = 20.0
 
 
+# Who may accept a gate outside its limits; `another_supervisor`: who neither began the run nor confirmed the step.
+AcceptedBy = Literal["supervisor", "another_supervisor"]
+
+
 class Gate(Record):
-    """A measured number and its limits; a step passes only within all of them."""
+    """A measured number and its limits; a step passes only within all of them, or as somebody accepts it."""
 
     measure: Text
     min: Finite | None = None
@@ -124,6 +128,7 @@ class Gate(Record):
     unit: str = ""
     why: str = ""
     unless_skipped: str | None = None  # the earlier step without which there is no such number; skipped: no such gate
+    accept_by: AcceptedBy | None = None  # None: nobody may; see service.core.acceptance
 
 
 class Recovery(Record):

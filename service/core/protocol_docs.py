@@ -103,5 +103,6 @@ def _gates(gates: tuple[Gate, ...]) -> str:
     return "; ".join(
         f"{gate.measure} {limits(gate.min, gate.max)} {gate.unit}".rstrip()
         + (f" (unless {gate.unless_skipped} is skipped)" if gate.unless_skipped else "")
+        + (f" (or accepted by {gate.accept_by.replace('_', ' ')})" if gate.accept_by else "")
         for gate in gates
     )

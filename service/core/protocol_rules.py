@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import cast
 
 from service.core.yaml_tree import FieldPath, Plain
+
+# The one list of measures that no protocol may let anybody accept: outside their limits an image or the evidence
+# itself is invalid, which no judgement mends. Measure → what is wrong then.
+NEVER_ACCEPTED: Mapping[str, str] = {
+    "settings_departures": "means images taken with other settings than the calibration's",
+    "optics_departures": "means images taken through other optics than the calibrated ones",
+    "moved_during_exposure": "means images whose pose is not known",
+    "checklist_items_open": "means that work was not done which the record says is done",
+    "checklist_items_ticked": "means that work was not done which the record says is done",
+    "applications": "means that no coat was applied",
+}
 
 
 def rule_violations(data: dict[str, Plain]) -> Iterator[tuple[FieldPath, str]]:
@@ -82,6 +93,11 @@ def _gates(
                 yield (*where, "unless_skipped"), f"{unless!r} is no earlier step that may be skipped"
         measure = gate.get("measure")
         if isinstance(measure, str):
+            if gate.get("accept_by") is not None and measure in NEVER_ACCEPTED:
+                yield (
+                    (*where, "accept_by"),
+                    f"{measure!r} outside its limits {NEVER_ACCEPTED[measure]}: nobody accepts it",
+                )
             if measure in measures:
                 yield (*where, "measure"), f"a second gate on {measure!r}; give min and max in one gate"
             measures.add(measure)

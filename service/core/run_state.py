@@ -12,7 +12,15 @@ from service.core.model import ArtefactRef, GateVerdict
 StepPhase = Literal["pending", "ready", "running", "checking", "awaiting_operator", "recovering", "passed"]
 Status = Literal["active", "paused", "completed", "aborted"]
 DeviationKind = Literal[
-    "skip", "gate_overridden", "redo", "redo_viewpoint", "reset_by_redo", "viewpoint_skipped", "refused", "automatic"
+    "skip",
+    "gate_overridden",
+    "gate_accepted",
+    "redo",
+    "redo_viewpoint",
+    "reset_by_redo",
+    "viewpoint_skipped",
+    "refused",
+    "automatic",
 ]
 
 
@@ -56,6 +64,18 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
+class Accepted:
+    """Figures outside their limits with which a person let a step pass."""
+
+    seq: int  # of the action
+    by: str
+    role: str
+    identified: Literal["", "claimed", "password"]
+    reason: str
+    verdicts: tuple[GateVerdict, ...]  # the failed ones
+
+
+@dataclass(frozen=True, slots=True)
 class StepState:
     """Where a step stands. `attempt` counts from 1 and is the one under way or to come next."""
 
@@ -63,6 +83,7 @@ class StepState:
     attempt: int = 1
     phase: StepPhase = "pending"
     confirmed: bool = False
+    confirmed_by: str = ""  # who let the present work begin: by the confirmation, or of a retry
     ticked: tuple[str, ...] = ()  # checklist items of the confirmation
     signed: bool = False
     signed_by: str = ""
@@ -74,6 +95,7 @@ class StepState:
     verdicts: tuple[GateVerdict, ...] = ()
     gates_passed: bool = False
     gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds
+    accepted: Accepted | None = None  # outside the limits, and yet to count as passed
     passed_sha256: str = ""  # of the step_passed event: what the release of an irreversible step binds
     passed_seq: int = 0
     failure: Failure | None = None
@@ -89,8 +111,8 @@ class StepState:
 
     @property
     def passed_its_gates(self) -> bool:
-        """Passed, and not merely skipped."""
-        return self.phase == "passed" and self.gates_passed and not self.skipped
+        """Passed, by its figures or as they were accepted, and not merely skipped."""
+        return self.phase == "passed" and (self.gates_passed or self.accepted is not None) and not self.skipped
 
     @property
     def mend(self) -> Mapping[str, Any]:

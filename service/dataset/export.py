@@ -11,6 +11,7 @@ import trimesh
 
 from service.compute.camera_model import CameraModel
 from service.compute.poses.pose_files import write_camera_json, write_poses_csv, write_transforms_json
+from service.core.dependence import accepted_gates
 from service.core.errors import DataError
 from service.core.geometry import Transform
 from service.dataset.summary import RunSummary
@@ -61,6 +62,7 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
         "poses": "poses.csv is T_scan_camera: x right, y down, z forward; transforms.json has OpenGL axes",
         "pose_source": best,
         "evaluation": list(summary.table()),
+        "accepted_gates": [gate.text for gate in accepted_gates(summary.protocol, summary.state)],
         "deviations": [d.text for d in summary.state.deviations if not d.is_note],
         "head_of_chain_sha256": summary.events[-1].sha256,
         "image_sha256": sources,

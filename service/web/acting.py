@@ -29,6 +29,7 @@ from service.core.run_state import RunState
 from service.evidence import RunLog
 from service.people.control import Control
 from service.people.errors import NotAllowedError
+from service.people.proof import identity_for
 from service.rig import load_rig
 from service.runs import require_rig_free, start_run
 from service.steps import params_models
@@ -123,6 +124,7 @@ def act(
     reason: Words = "",
     meaning: Words = "",
     password: Annotated[str, Form(max_length=1000)] = "",
+    account: Short = "",
     signed_sha256: Short = "",
     seen_seq: Number = 0,
     back: Annotated[Literal["", "capture"], Form()] = "",
@@ -134,12 +136,14 @@ def act(
     log = site.run(run_id)
     if verb != "pause":
         Control(site.store).require(run_id, person)
-    if verb in ("confirm", "sign", "skip"):
+    if verb in ("confirm", "sign", "skip", "accept"):
         _require_current(log, step, attempt, seen_seq)
     if verb == "sign":
         if not person.may("sign"):
             raise NotAllowedError(f"the role {person.role} may not sign", where=run_id)
         site.people.check_password(person.account, password)
+    # A supervisor may accept on the technician's screen, by name and password.
+    who = identity_for(site.people, log.protocol, log.state, verb, account or person.account, lambda: password)
     action = OperatorAction(
         action=verb,
         step=step or log.state.current,
@@ -148,9 +152,11 @@ def act(
         checklist=log.state.step.ticked if verb == "confirm" else (),
         meaning=meaning.strip(),
         signed_sha256=signed_sha256,
+        role=who.role if who else "",
+        identified=who.identified if who else "",
         via="web",
     )
-    _append(site, log, action, person.account)
+    _append(site, log, action, who.name if who else person.account)
     return _back(run_id, back)
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Request
 from fastapi.responses import HTMLResponse
 
+from service.core.dependence import AcceptedGate, depends_on
 from service.core.errors import IllegalTransitionError
 from service.core.model import ViewpointCaptured
 from service.evidence import RunLog
@@ -43,6 +44,7 @@ def calibration(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
             "hand_eye_chart": hand_eye_chart(found),
             "images": image_rows(found),
             "held_out": held_out_mm(found),
+            "depends": _depends(log, found),
             **_advice(site, log, found),
         }
     return render(request, "calibration.html.j2", **context)
@@ -68,11 +70,17 @@ def certificate(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
         run_id=run_id,
         found=found,
         held_out=held_out_mm(found),
+        depends=_depends(log, found),
         certificate=certificate_of(log, found),
         simulated=log.state.simulated,
         head=log.events[-1],
         **_WORDS,
     )
+
+
+def _depends(log: RunLog, found: Calibration) -> list[AcceptedGate]:
+    gates = (gate for step, _ in found.steps for gate in depends_on(log.protocol, log.state, step.id))
+    return list(dict.fromkeys(gates))
 
 
 def _advice(site: Site, log: RunLog, found: Calibration) -> dict[str, object]:

@@ -9,7 +9,7 @@ from statistics import median
 
 from service.core.model import Event, GateVerdict, SessionStarted, View
 from service.core.protocol import Gate, Protocol, Step
-from service.core.run_state import RunState
+from service.core.run_state import RunState, StepState
 from service.monitor.snapshot import Snapshot
 from service.web.run_words import limit, measure_name, number, planned_views
 
@@ -25,7 +25,7 @@ class GateLine:
     value: str
     limit: str
     why: str
-    status: str  # Within, Outside, Not yet, Not judged
+    status: str  # Within, Outside, Accepted, Not yet, Not judged
     tone: str
     percent: float | None  # length of its bar; None where a bar would say nothing
     limit_percent: float
@@ -54,13 +54,14 @@ class Reading:
     note: str = ""
 
 
-def gate_lines(step: Step, verdicts: Sequence[GateVerdict], skipped: frozenset[str]) -> tuple[GateLine, ...]:
+def gate_lines(step: Step, now: StepState, skipped: frozenset[str]) -> tuple[GateLine, ...]:
     """Every gate of a step with what is known of it."""
-    known = {verdict.measure: verdict for verdict in verdicts}
-    return tuple(_gate_line(gate, known.get(gate.measure), skipped) for gate in step.gates)
+    known = {verdict.measure: verdict for verdict in now.verdicts}
+    accepted = now.accepted is not None
+    return tuple(_gate_line(gate, known.get(gate.measure), skipped, accepted=accepted) for gate in step.gates)
 
 
-def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str]) -> GateLine:
+def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str], *, accepted: bool) -> GateLine:
     limits = limit(gate.min, gate.max, gate.unit)
     name = measure_name(gate.measure)
     if verdict is None:
@@ -72,7 +73,9 @@ def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str])
     bound = gate.max if gate.max is not None else gate.min
     if verdict.value is not None and bound is not None and bound > 0 and verdict.value >= 0:
         percent = min(100.0, _BAR_LIMIT * verdict.value / bound)
-    status, tone = ("Within", "ok") if verdict.passed else ("Outside", "stop")
+    status, tone = (
+        ("Within", "ok") if verdict.passed else ("Accepted", "attention") if accepted else ("Outside", "stop")
+    )
     return GateLine(name, number(verdict.value, gate.unit), limits, gate.why, status, tone, percent, _BAR_LIMIT)
 
 

@@ -11,6 +11,7 @@ from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
+from service.core.dependence import accepted_gates
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Person
@@ -63,6 +64,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         "dialog": dialog,
         "drawing": drawing(view.shown.drawing),
         "now_utc": datetime.now(UTC).isoformat(),
+        "depends": accepted_gates(log.protocol, log.state),
         "result_table": next((result["table"] for result in reversed(results) if result.get("table")), ()),
     }
 

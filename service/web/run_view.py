@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 from typing import Protocol as Interface
 
+from service.core.acceptance import acceptors, demanded_role, failed_gates
 from service.core.actions import needs_signature_now, record_to_sign, redoable_steps
 from service.core.decide import AskOperator, decide
+from service.core.dependence import AcceptedGate, dependent_steps, depends_on
 from service.core.model import Event, OperatorVerb
 from service.core.protocol import Protocol, Step
 from service.core.run_state import Deviation, RunState
@@ -112,6 +114,7 @@ class Shown:
     started_utc: str
     ended_utc: str
     table: Sequence[Mapping[str, Any]]  # of an evaluation
+    depends: tuple[AcceptedGate, ...]  # what was accepted outside its limits and this rests on
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +150,18 @@ class Signature:
 
 
 @dataclass(frozen=True, slots=True)
+class Acceptance:
+    """What somebody could accept outside its limits now, and who."""
+
+    sha256: str  # of the figures that the acceptance binds
+    title: str
+    figures: tuple[str, ...]
+    role: str
+    another: bool  # neither who began the run nor who confirmed the step
+    affects: tuple[str, ...]  # later steps that will say that they rest on it
+
+
+@dataclass(frozen=True, slots=True)
 class Trouble:
     """A step that needs a decision."""
 
@@ -178,6 +193,7 @@ class RunView:
     looker: Looker
     trouble: Trouble | None
     signature: Signature | None
+    acceptance: Acceptance | None
     redos: tuple[Redo, ...]
     skip_overrides: bool  # a skip now would set aside figures outside of their limits
     progress: Progress
@@ -221,6 +237,7 @@ def run_view(log: Recorded, snapshot: Snapshot, looker: Looker, *, driven: bool,
         looker=looker,
         trouble=_trouble(protocol, state, decision),
         signature=_signature(protocol, state),
+        acceptance=_acceptance(protocol, state),
         redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
         skip_overrides=bool(state.step.verdicts) and not state.step.gates_passed,
         progress=capture_progress(protocol, state, log.events),
@@ -287,7 +304,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
         current=step.id == state.current and not state.terminal,
         checklist=checks,
         open_items=sum(not check.ticked for check in checks),
-        gates=gate_lines(step, now.verdicts, state.skipped),
+        gates=gate_lines(step, now, state.skipped),
         warning=irreversible_warning(protocol, step) if undone else "",
         requires=tuple((protocol.step(name).title, state.steps[name].passed_its_gates) for name in step.requires),
         captured=len(now.captured),
@@ -297,6 +314,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
         started_utc=now.started_utc,
         ended_utc=now.ended_utc,
         table=now.result.get("table", ()) if step.kind == "evaluation" else (),
+        depends=depends_on(protocol, state, step.id),
     )
 
 
@@ -334,7 +352,7 @@ def _options(decision: object, state: RunState) -> tuple[OperatorVerb, ...]:
     if state.terminal:
         return ()
     asked = decision.options if isinstance(decision, AskOperator) else ()
-    others: tuple[OperatorVerb, ...] = ("skip",) if "skip" in asked else ()
+    others: list[OperatorVerb] = [verb for verb in asked if verb in ("accept", "skip")]
     return (*others, "redo", "abort")
 
 
@@ -370,6 +388,20 @@ def _signature(protocol: Protocol, state: RunState) -> Signature | None:
     )
     sha256 = record_to_sign(protocol, state)
     return Signature(sha256, step.title, figures, meaning) if sha256 else None
+
+
+def _acceptance(protocol: Protocol, state: RunState) -> Acceptance | None:
+    role = "" if state.terminal else demanded_role(protocol, state)
+    if not role:
+        return None
+    return Acceptance(
+        sha256=state.step.gates_sha256,
+        title=protocol.step(state.current).title,
+        figures=tuple(figure_line(verdict) for verdict in failed_gates(state.step)),
+        role=role,
+        another="another_supervisor" in acceptors(protocol, state),
+        affects=tuple(protocol.step(name).title for name in dependent_steps(protocol, state.current)),
+    )
 
 
 def _redo(protocol: Protocol, state: RunState, target: str) -> Redo:

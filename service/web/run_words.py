@@ -138,6 +138,8 @@ def phase_words(state: RunState, step: StepState) -> tuple[str, str, str]:
     """A step's status in the list of steps: word, tone, icon."""
     if step.skipped:
         return "skipped", "skipped", "skip"
+    if step.phase == "passed" and step.accepted is not None:
+        return "accepted outside its limits", "skipped", "attention"
     if step.phase == "passed":
         return "passed", "passed", "ok"
     if step.step == state.current and not state.terminal:

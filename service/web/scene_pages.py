@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
 
+from service.core.dependence import accepted_gates
 from service.web.pages import render
 from service.web.run_frame import run_frame
 from service.web.security import requires
@@ -46,6 +47,7 @@ def scene(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
         frame=run_frame(site, run_id),
         run_id=run_id,
         tables=tables,
+        depends=accepted_gates(log.protocol, log.state),
         live=not log.state.terminal,
     )
 

@@ -88,11 +88,14 @@ def record_reported_run(
     person: str = "Ada Λ. Müller",
     release: str = "none",
     registered: bool = False,
+    accepted_by: str = "",
 ) -> str:
-    """The run in folder/data; its name."""
+    """The run in folder/data; its name. `accepted_by`: who accepts a figure that is outside its limit."""
     text = PROTOCOL.replace("steps:", f"release: {release}\nsteps:", 1)
     if registered:
         text = text.replace("  - id: evaluation\n", REGISTRATION)
+    if accepted_by:
+        text = text.replace("max: 0.35, unit: mm", "max: 0.35, unit: mm, accept_by: another_supervisor")
     (folder / "rig.yaml").write_text("name: small\nsimulated: true\ndevices: {}\n")
     loaded = parse_protocol(text.encode(), params_models(), name="reported.yaml")
     with Store.open(folder / "data") as store:
@@ -132,7 +135,9 @@ def record_reported_run(
             run.register()
         run.add(StepStarted(step="evaluation", attempt=1))
         judged = run.measure("evaluation", 1, {"best_mean_radial_error_mm": error_mm}, evaluation(error_mm))
-        if error_mm > 0.35:  # the gate has failed: nobody can sign, and the run waits
+        if accepted_by:
+            run.accept("evaluation", judged, accepted_by)
+        elif error_mm > 0.35:  # the gate has failed: nobody can sign, and the run waits
             return run_id
         run.act("sign", step="evaluation", meaning="reviewed and accepted", signed_sha256=judged)
         run.add(StepPassed(step="evaluation", attempt=1), RunCompleted(deviations=3))
@@ -149,6 +154,17 @@ class _Writer:
 
     def act(self, verb: str, **fields: Any) -> None:
         self.add(OperatorAction.model_validate({"action": verb, **fields}), actor=self._person)
+
+    def accept(self, step: str, judged: str, by: str) -> None:
+        action = OperatorAction(
+            action="accept",
+            step=step,
+            reason="the pilot does not need it",
+            signed_sha256=judged,
+            role="supervisor",
+            identified="password",
+        )
+        self.add(action, actor=by)
 
     def put(self, data: bytes, kind: str, media_type: str, name: str) -> ArtefactRef:
         return self._store.put_bytes(data, kind=kind, media_type=media_type, original_name=name)

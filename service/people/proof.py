@@ -1,0 +1,56 @@
+"""Who somebody is when an action demands a role: by the password of an account, or by claim where there are none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from service.core.acceptance import demanded_role
+from service.core.protocol import Protocol
+from service.core.run_state import RunState
+from service.people.errors import NotAllowedError
+from service.people.people import People
+from service.people.rows import plain_name
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """A person as an event names them, and how the program knows."""
+
+    name: str
+    role: str
+    identified: Literal["claimed", "password"]
+
+
+def identity_for(
+    people: People, protocol: Protocol, state: RunState, verb: str, typed: str, password: Callable[[], str]
+) -> Identity | None:
+    """Who acts, for a verb that demands a role now; None for the others. Raises as `identify` does."""
+    role = demanded_role(protocol, state) if verb == "accept" else ""
+    return identify(people, typed, role, password) if role else None
+
+
+def identify(people: People, typed: str, role: str, password: Callable[[], str]) -> Identity:
+    """The person of this name, in this role.
+
+    Args:
+        people: accounts of the data folder.
+        typed: name as it was typed.
+        role: what the action demands.
+        password: asks for it; not called on a site that has no accounts, where a name is a claim.
+
+    Raises:
+        SignInRefusedError: name and password do not belong together.
+        NotAllowedError: no name was given, or the account has another role.
+    """
+    if not typed.strip():
+        raise NotAllowedError("a name is needed", where="name", remedy=f"Give the name of the {role}")
+    if not any(account.state == "active" for account in people.accounts.all()):
+        return Identity(typed.strip(), role, "claimed")
+    name = plain_name(typed)
+    people.check_password(name, password())
+    account = people.accounts.get(name)
+    if account.role != role:
+        raise NotAllowedError(f"{name} is {account.role}; this needs a {role}", where="role", remedy=f"Call a {role}")
+    return Identity(name, account.role, "password")
