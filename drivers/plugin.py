@@ -16,6 +16,11 @@ class DriverConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    @property
+    def longest_call_s(self) -> float:
+        """Time that one call may take by this configuration, where that may exceed the driver's usual time."""
+        return 0.0
+
 
 @dataclass(frozen=True, slots=True)
 class DriverSpec:
@@ -26,7 +31,7 @@ class DriverSpec:
         config: the pydantic model of the driver's section in rig.yaml (without the key `driver`).
         build: makes the driver object from a validated config; connects to nothing yet.
         hosted: whether the driver must run in a supervised child process (native libraries).
-        call_timeout_s: longest time that one call may take before the child is restarted.
+        call_timeout_s: longest time that one call may take before the child is restarted; a config may ask for more.
     """
 
     kind: str

@@ -171,7 +171,8 @@ class Station:
         config = self._config(name, spec)
         if spec.hosted:
             interface = INTERFACES[spec.kind]
-            return cast(Device, hosted(interface, spec_path, config, call_timeout_s=spec.call_timeout_s, name=name))
+            call_timeout_s = max(spec.call_timeout_s, config.longest_call_s)
+            return cast(Device, hosted(interface, spec_path, config, call_timeout_s=call_timeout_s, name=name))
         return spec.build(config)
 
     def _config(self, name: str, spec: DriverSpec) -> DriverConfig:

@@ -155,7 +155,7 @@ class _Rig:
             "hands": self.server.address,
             "devices": {
                 **robots,
-                "camera": {"driver": "gphoto", "port": gphoto_port},
+                "camera": {"driver": "gphoto", "port": gphoto_port, "capture_timeout_s": self._exposure_s()},
                 "scanner": {"driver": "scan_folder", "folder": "scans", "unit": "mm", "stable_s": 1.0},
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
@@ -165,6 +165,11 @@ class _Rig:
             "payload": {"mass_kg": 1.6, "centre_of_gravity_m": [0.0, 0.0, 0.08]},
             "collision": {"arm": ARM_MODEL.name},
         }
+
+    def _exposure_s(self) -> float:
+        """How long a picture may take: this camera computes what it sees, up to some seconds a megapixel."""
+        megapixels = self.args.image_width**2 * 2 / 3 / 1e6
+        return round(40.0 + 4.0 * megapixels, 0)
 
     def _station(self, index: int, name: str) -> dict[str, Any]:
         T_base_world = inverse(self.scene.T_world_base[name])

@@ -43,6 +43,11 @@ class GphotoConfig(DriverConfig):
     capture_target: Literal["computer", "card", "both"] = "computer"
     capture_timeout_s: float = 40.0
 
+    @property
+    def longest_call_s(self) -> float:
+        """An exposure, and a minute to fetch its files."""
+        return self.capture_timeout_s + 60.0
+
 
 class GphotoCamera:
     """Implements drivers.interfaces.Camera. Blocking; to be run in a process of its own by drivers.host."""

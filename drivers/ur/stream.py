@@ -16,7 +16,7 @@ from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotSample, SafetyState, SettleCriteria, SettleReport
 from service.core.geometry import transform
 
-BUFFER_S = 120.0  # an image's pose is looked up once its files have arrived, which takes a while for 60 megapixels
+BUFFER_S = 300.0  # an image's pose is looked up once its files have arrived, which takes a while for 60 megapixels
 STREAM_HZ = 125.0
 POLL_S = 0.004
 MINIMUM_COVERAGE = 0.8  # of the settle window by samples
