@@ -244,6 +244,14 @@ class Camera(Device, Protocol):
         """Take one exposure and download its undecoded files into `folder`; StaleImageError if not new."""
         ...
 
+    def released_images(self, folder: Path, timeout_s: float) -> tuple[CapturedImage, ...]:
+        """Images that the camera's own button has released, oldest first, downloaded into `folder`.
+
+        Waits up to `timeout_s` for the first one; empty when the button was not pressed. The trigger's time is that
+        of the camera's announcement.
+        """
+        ...
+
     def preview(self) -> bytes:
         """One live-view frame, JPEG."""
         ...

@@ -17,6 +17,7 @@ import yaml
 from simulators.arm import ARM_MODEL
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, apply, inverse, look_at
+from simulators.hand import MISHAP_EVERY, Hand
 from simulators.rig_world import World, WorldServer
 from simulators.serve import SimulatorError, Termination, announce
 from simulators.ur_controller.kinematics import inverse as solve_joints
@@ -36,6 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--version", default="5.12", help="of Polyscope")
     parser.add_argument("--arms", type=int, choices=(1, 2), default=1, help="one arm that is moved, or one a station")
     parser.add_argument("--host", default="127.0.0.1", help="address of the first controller")
+    parser.add_argument(
+        "--hand", choices=tuple(MISHAP_EVERY), help="no arm: a technician holds the camera, who makes mistakes or not"
+    )
 
 
 def serve(args: argparse.Namespace) -> None:
@@ -56,9 +60,12 @@ class _Rig:
         self.folder: Path = args.dir.resolve()
         self.faults: FaultPlan = args.faults
         self.scene = Scene.generate(args.scene)
-        self.arms = ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
+        self.arms = () if args.hand else ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
         self.children: dict[str, subprocess.Popen[str]] = {}
-        self.world = World(self.scene, args.image_width, self.arms, self._start_joints())
+        self.world = World(self.scene, args.image_width, self.arms, self._start_joints(), camera_held=bool(args.hand))
+        self.hand = args.hand and Hand(
+            args.hand, args.scene, self.world.hold, self.world.press_shutter, SCENE_CENTRE_M.copy()
+        )
         self.server = WorldServer(self.world, self._act)
         self._deliveries = threading.Lock()
         self._truth: dict[str, Any] = {}
@@ -149,7 +156,7 @@ class _Rig:
 
     def _rig_file(self, gphoto_port: str, hosts: list[str]) -> dict[str, Any]:
         robots = {arm: {"driver": "ur", "host": host} for arm, host in zip(self.arms, hosts, strict=True)}
-        return {
+        rig: dict[str, Any] = {
             "name": f"simulated rig, scene {self.scene.seed}",
             "simulated": True,
             "hands": self.server.address,
@@ -160,6 +167,11 @@ class _Rig:
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
             },
+        }
+        if not robots:
+            return rig
+        return {
+            **rig,
             "stations": {name: self._station(i, name) for i, name in enumerate(STATIONS)},
             "T_flange_camera_nominal": nominal_hand_eye().tolist(),
             "payload": {"mass_kg": 1.6, "centre_of_gravity_m": [0.0, 0.0, 0.08]},
@@ -205,6 +217,10 @@ class _Rig:
         match request.get("action"):
             case "hand_scan":
                 return self._deliver("scanner", "scans", ["--spray"] if self.world.spray else [])
+            case "read":
+                if self.hand:
+                    self.hand.read(str(request.get("words", "")))
+                return {"ok": True}
             case "ct_scan":
                 return self._deliver("ct", "ct", ["--voxel-mm", str(self.args.ct_voxel_mm)])
             case _:

@@ -12,10 +12,13 @@ from typing import Any, cast
 import numpy as np
 
 from simulators.geometry import Array, look_at
+from simulators.hand import Press
 from simulators.world import STATIONS, Scene
 
 # Where the technician holds the camera for an overview: nearly above the scene, so that no sphere hides another.
 HELD_CAMERA = look_at(np.array([0.06, -0.17, 0.78]), np.array([0.0, 0.0, 0.05]), np.array([0.0, 1.0, 0.0]))
+
+_LONGEST_WAIT_S = 1.0
 
 Act = Callable[[Mapping[str, Any]], dict[str, Any]]
 
@@ -34,9 +37,16 @@ class World:
     board_placed: bool = False
     pedal_presses: int = 0
     camera_held: bool = False  # in the technician's hands, instead of on the arm
+    T_world_held: Array = field(default_factory=HELD_CAMERA.copy)  # where he holds it
+    shutter_presses: int = 0  # of the camera's own button
+    press: Press = field(default_factory=Press)  # the last one
     station: str = STATIONS[0]
     _joints: dict[str, Array] = field(default_factory=dict[str, Array])
     _lock: threading.Lock = field(default_factory=threading.Lock)
+    _pressed: threading.Condition = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._pressed = threading.Condition(self._lock)
 
     def arm_moved(self, arm: str, q: Array) -> None:
         """A controller says where its joints are (6,)."""
@@ -51,9 +61,11 @@ class World:
     def view(self) -> dict[str, Any]:
         """What the camera sees now, and what the light box measures."""
         with self._lock:
-            q = self._joints.get(self.camera_arm, self.start_joints_rad)
             board = self.scene.board_placement(self.board_placements) if self.board_placed else None
-            camera = HELD_CAMERA if self.camera_held else self.scene.true_camera(q, self.station)
+            camera = self.T_world_held
+            if not self.camera_held:
+                q = self._joints.get(self.camera_arm, self.start_joints_rad)
+                camera = self.scene.true_camera(q, self.station)
             return {
                 "T_world_camera": camera.tolist(),
                 "intrinsics": self.scene.camera_intrinsics(self.image_width).to_json(),
@@ -67,7 +79,26 @@ class World:
                 "light_lux": self.scene.light_lux,
                 "temperature_c": self.scene.temperature_c,
                 "pedal_presses": self.pedal_presses,
+                "hand": {"shake": self.press.shake, "finger": self.press.finger},
             }
+
+    def hold(self, T_world_camera: Array) -> None:
+        """The technician holds the camera there."""
+        with self._lock:
+            self.T_world_held = T_world_camera
+
+    def press_shutter(self, press: Press) -> None:
+        """The technician presses the camera's own button."""
+        with self._pressed:
+            self.press = press
+            self.shutter_presses += 1
+            self._pressed.notify_all()
+
+    def await_shutter(self, after: int) -> dict[str, Any]:
+        """Answers once the button was pressed more than `after` times, or after a while; what else was touched."""
+        with self._pressed:
+            self._pressed.wait_for(lambda: self.shutter_presses > after, timeout=_LONGEST_WAIT_S)
+            return {"shutter_presses": self.shutter_presses, "iso": self.press.iso}
 
     def act(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """The technician's hands, as far as they only change the scene."""
@@ -87,8 +118,14 @@ class World:
                     self.control_spheres = action == "place_control_spheres"
                 case "spray":
                     self.spray = True
+                case "mount_camera" if not self.arms:
+                    return {"ok": False, "error": "there is no arm to mount the camera on"}
                 case "hold_camera" | "mount_camera":
                     self.camera_held = action == "hold_camera"
+                case "press_shutter":
+                    self.press = Press()
+                    self.shutter_presses += 1
+                    self._pressed.notify_all()
                 case "press_pedal":
                     self.pedal_presses += 1
                 case _:
@@ -97,7 +134,7 @@ class World:
 
 
 class WorldServer(socketserver.ThreadingTCPServer):
-    """JSON lines on a loopback port: `robot` (no answer), `view`, `act`."""
+    """JSON lines on a loopback port: `robot` (no answer), `view`, `act`, `shutter` (answers at a press)."""
 
     daemon_threads = True
     allow_reuse_address = True
@@ -132,15 +169,21 @@ def _answer(server: WorldServer, line: bytes) -> dict[str, Any] | None:
         if not isinstance(request, dict):
             return {"ok": False, "error": "bad request: not a JSON object"}
         request = cast("dict[str, Any]", request)
-        match request.get("op"):
-            case "robot":
-                server.world.arm_moved(str(request["arm"]), np.array(request["q"], dtype=np.float64))
-                return None
-            case "view":
-                return server.world.view()
-            case "act":
-                return server.act(request)
-            case other:
-                return {"ok": False, "error": f"no operation {other!r}"}
+        if request.get("op") == "robot":
+            server.world.arm_moved(str(request["arm"]), np.array(request["q"], dtype=np.float64))
+            return None
+        return _operation(server, request)
     except (ValueError, KeyError, TypeError) as error:
         return {"ok": False, "error": f"bad request: {error}"}
+
+
+def _operation(server: WorldServer, request: dict[str, Any]) -> dict[str, Any]:
+    match request.get("op"):
+        case "view":
+            return server.world.view()
+        case "act":
+            return server.act(request)
+        case "shutter":
+            return server.world.await_shutter(int(request["after"]))
+        case other:
+            return {"ok": False, "error": f"no operation {other!r}"}

@@ -189,6 +189,29 @@ class GphotoCamera:
         self._check_space()
         trigger_s = self._trigger()
         added = self._collect(2 if quality == "RAW+JPEG" else 1, trigger_s)
+        return self._image(added, folder, trigger_s, quality, focus)
+
+    def released_images(self, folder: Path, timeout_s: float) -> tuple[CapturedImage, ...]:
+        """See drivers.interfaces.Camera. Files come as events; RAW and JPEG of one exposure together."""
+        deadline_s = time.monotonic() + timeout_s
+        images: list[CapturedImage] = []
+        while True:
+            left_ms = max(1, round(1000 * (deadline_s - time.monotonic())))
+            event, data = self._link.next_event(1 if images else min(200, left_ms))
+            if event == gp.GP_EVENT_FILE_ADDED:
+                announced_s = time.monotonic()
+                quality = words.quality_of(self._link.value(words.QUALITY))
+                focus = self._link.value(words.FOCUS)
+                first = AddedFile(str(data.folder), str(data.name))
+                added = self._collect(2 if quality == "RAW+JPEG" else 1, announced_s, first)
+                images.append(self._image(added, folder, announced_s, quality, focus))
+            elif event == gp.GP_EVENT_TIMEOUT and (images or time.monotonic() >= deadline_s):
+                return tuple(images)
+
+    def _image(
+        self, added: list[AddedFile], folder: Path, trigger_s: float, quality: str, focus: str
+    ) -> CapturedImage:
+        """Download the files of one exposure and make sure that they are new."""
         arrival_s = time.monotonic()
         stems = {_parse(one.name)[0] for one in added}
         if len(stems) != 1:
@@ -246,8 +269,8 @@ class GphotoCamera:
                 return trigger_s
         raise AssertionError
 
-    def _collect(self, expected: int, trigger_s: float) -> list[AddedFile]:
-        added: list[AddedFile] = []
+    def _collect(self, expected: int, trigger_s: float, *first: AddedFile) -> list[AddedFile]:
+        added = list(first)
         while len(added) < expected:
             if time.monotonic() - trigger_s > self._config.capture_timeout_s:
                 names = ", ".join(one.name for one in added) or "none"

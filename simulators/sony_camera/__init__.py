@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import threading
 from pathlib import Path
 
-from simulators.serve import Termination, announce
+from simulators.serve import SimulatorError, Termination, announce
 from simulators.sony_camera.body import BodyOptions, CameraBody
 from simulators.sony_camera.scene import ImageSource, PictureFiles, StillLife, WorldSource
 from simulators.sony_camera.server import CameraServer
 
 DEFAULT_WIDTH = 1536
+_LOG = logging.getLogger(__name__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +37,21 @@ def _source(args: argparse.Namespace) -> ImageSource:
     return StillLife(args.image_width or DEFAULT_WIDTH)
 
 
+def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event) -> None:
+    """Release whenever somebody in the world presses the body's own button."""
+    presses: int | None = None
+    while not stop.is_set():
+        try:
+            count, iso = source.await_press(-1 if presses is None else presses)
+        except SimulatorError as error:
+            _LOG.debug("the button: %s", error)
+            stop.wait(1.0)
+            continue
+        if presses is not None and count > presses:
+            body.press(iso)
+        presses = count
+
+
 def serve(args: argparse.Namespace) -> None:
     """Announce the address and serve until SIGTERM."""
     termination = Termination(with_parent=args.with_parent)
@@ -43,6 +60,7 @@ def serve(args: argparse.Namespace) -> None:
     body = CameraBody(source, args.faults, options)
     if isinstance(source, WorldSource):
         threading.Thread(target=source.warm_up, args=(stop,), name="warm-up", daemon=True).start()
+        threading.Thread(target=_attend_button, args=(source, body, stop), name="button", daemon=True).start()
     with CameraServer(args.host, args.port, body, args.faults) as server:
         host, port = server.address
         announce(simulator="camera", host=host, port=port, gphoto_port=f"ptpip:{host}:{port}:{port}")

@@ -110,6 +110,15 @@ class CameraBody:
         position = self.properties.value(Code.FOCAL_POSITION) + steps
         self.properties.put(Code.FOCAL_POSITION, min(100, max(0, position)))
 
+    def press(self, iso: int = 0) -> None:
+        """The button on the body, perhaps after somebody turned the ISO dial; a busy or full body ignores it."""
+        if iso:
+            self.properties.put(Code.ISO, iso)
+        try:
+            self._shoot()
+        except (BusyError, CardFullError):
+            _LOG.warning("the button was pressed while the body was busy or full")
+
     def _shoot(self) -> None:
         settings = self.properties.exposure_settings()
         if self._exposing.is_set():

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from simulators.hand_effects import hand_in_picture
 from simulators.serve import SimulatorError
 from simulators.sony_camera.properties import ExposureSettings
 
@@ -187,20 +188,26 @@ class WorldSource:
         return self._built
 
     def _view(self) -> dict[str, Any]:
+        answer = self._ask({"op": "view"})
+        if "T_world_camera" not in answer:
+            raise SimulatorError(f"the world refused a view: {answer.get('error', answer)}")
+        return answer
+
+    def _ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
         try:
             with socket.create_connection(self._address, self._timeout_s) as link, link.makefile("rwb") as stream:
-                stream.write(b'{"op":"view"}\n')
+                stream.write(json.dumps(request).encode() + b"\n")
                 stream.flush()
                 line = stream.readline()
         except OSError as error:
             raise SimulatorError(f"the world at {self._address[0]}:{self._address[1]} is silent: {error}") from error
         try:
-            answer = json.loads(line)
+            answer: object = json.loads(line)
         except ValueError as error:
             raise SimulatorError(f"the world answered {line[:80]!r}") from error
-        if "T_world_camera" not in answer:
-            raise SimulatorError(f"the world refused a view: {answer.get('error', line[:80])}")
-        return answer
+        if not isinstance(answer, dict):
+            raise SimulatorError(f"the world answered {line[:80]!r}")
+        return cast("dict[str, Any]", answer)
 
     def freeze(self, counter: int) -> Moment:
         """Ask the world what is before the lens now."""
@@ -211,7 +218,8 @@ class WorldSource:
         """Render that view."""
         lens = {"aperture_f": settings.aperture_f, "exposure_s": settings.exposure_s, "iso": float(settings.iso)}
         with self._rendering:
-            return self._renderer.render(moment.view, lens, moment.counter)
+            picture = self._renderer.render(moment.view, lens, moment.counter)
+        return hand_in_picture(picture, moment.view)
 
     def preview(self) -> Rgb:
         """Render a small frame of now."""
@@ -222,6 +230,16 @@ class WorldSource:
             return self._renderer.preview(view)
         finally:
             self._rendering.release()
+
+    def await_press(self, after: int) -> tuple[int, int]:
+        """Presses of the body's button so far, and the ISO to which the dial was turned before the last (0: not).
+
+        Answers once there were more than `after`, or after a second.
+        """
+        answer = self._ask({"op": "shutter", "after": after})
+        if "shutter_presses" not in answer:
+            raise SimulatorError(f"the world has no button: {answer.get('error', '')}")
+        return int(answer["shutter_presses"]), int(answer["iso"])
 
     def warm_up(self, stop: threading.Event, interval_s: float = 0.5) -> None:
         """Build the renderer's scene as soon as the world answers, so that no client waits for it."""

@@ -159,6 +159,8 @@ class BenchCamera:
     opened: int = 0
     exposures: int = 0
     applied: CameraSettings | None = None
+    # Presses of its own button that nobody has collected; with settings to which somebody has turned its dials.
+    pressed: list[CameraSettings | None] = field(default_factory=list[CameraSettings | None])
 
     def open(self) -> DeviceIdentity:
         self.connected, self.opened = True, self.opened + 1
@@ -205,6 +207,17 @@ class BenchCamera:
             trigger_monotonic_s=trigger,
             arrival_monotonic_s=time.monotonic(),
         )
+
+    def released_images(self, folder: Path, timeout_s: float) -> tuple[CapturedImage, ...]:
+        pressed, self.pressed = self.pressed, []
+        images: list[CapturedImage] = []
+        for number, dialled in enumerate(pressed):
+            inside = folder / str(number)
+            inside.mkdir()
+            if dialled is not None:
+                self.applied = dialled
+            images.append(self.capture(inside))
+        return tuple(images)
 
     def preview(self) -> bytes:
         raise NotImplementedError
