@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from service.core.decide import advance, fold
 from service.core.errors import ComputeError, IntegrityError
@@ -113,6 +114,10 @@ class StepEvidence:
         if all(job.idempotency_key != key for job in self.jobs(self.step)):
             job = NewJob(request.kind, self.step, self.attempt, key, request.arguments)
             self.log.store.record(self.log.run_id, [], actor="runner", jobs=[job], lease=self.lease)
+
+    def asked(self) -> tuple[Literal["release", "finish"], ...]:
+        """See service.steps.context.Evidence."""
+        return self.log.refresh().steps[self.step].asked
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
         """See service.steps.context.Evidence."""

@@ -14,6 +14,7 @@ from service.core.model import (
     JobEnqueued,
     JobFinished,
     RunStarted,
+    ViewHeld,
     ViewImported,
     ViewpointCaptured,
 )
@@ -179,7 +180,7 @@ def _captures(events: Sequence[Event], ids: Mapping[str, str], devices: set[str]
     camera = _anchor("device", "camera")
     for event in events:
         payload = event.payload
-        if isinstance(payload, ViewpointCaptured):
+        if isinstance(payload, (ViewpointCaptured, ViewHeld)):
             yield {
                 "@id": f"#event-{event.seq}",
                 "@type": "CreateAction",

@@ -12,6 +12,8 @@ from typing import Any
 from service.core.errors import OrthocaptureError
 from service.core.protocol import Step
 
+_WAY_ON = "next: "  # how a message begins that says where to hold the camera
+
 
 @dataclass
 class SimulatedHands:
@@ -39,6 +41,11 @@ class SimulatedHands:
                     where=f"step {step}",
                 )
         self._done.add((step, attempt))
+
+    def read(self, message: str) -> None:
+        """The technician reads what the screen says."""
+        if self.address is not None and message.startswith(_WAY_ON):
+            _ask_world(self.address, {"op": "act", "action": "read", "words": message})
 
 
 def _ask_world(address: str, request: dict[str, Any]) -> dict[str, Any]:

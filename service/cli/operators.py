@@ -252,6 +252,11 @@ class AutomaticOperator(_Operator):
 
     _mends: dict[str, int] = field(default_factory=dict[str, int])  # step → how often its advice was followed
 
+    def tell(self, message: str) -> None:
+        """News; a simulated hand that holds the camera goes where the words lead."""
+        super().tell(message)
+        self.hands.read(message)
+
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction:
         """Say yes; recorded as automatic. Raises OrthocaptureError where there is no advice to follow, or no end."""
         if question.for_ == "recovery":

@@ -12,6 +12,7 @@ from service.core.gates import evaluate_gates
 from service.core.lifecycle import lifecycle
 from service.core.model import (
     ActionRefused,
+    CaptureAsked,
     ControlTaken,
     DeviceOpened,
     DeviceTrouble,
@@ -37,6 +38,7 @@ from service.core.model import (
     StepRetried,
     StepStarted,
     View,
+    ViewHeld,
     ViewImported,
     ViewpointCaptured,
     ViewpointFailed,
@@ -213,6 +215,13 @@ def _step_note(protocol: Protocol, state: RunState, event: Event, p: StepNote) -
     return change(state, p.step, notes=(*state.steps[p.step].notes, note))
 
 
+def _capture_asked(protocol: Protocol, state: RunState, event: Event, p: CaptureAsked) -> RunState:
+    """What comes too late has no effect."""
+    if state.terminal or (p.step, p.attempt, "running") != (state.current, state.step.attempt, state.phase):
+        return _void(state, event)
+    return change(state, p.step, asked=(*state.step.asked, p.what))
+
+
 def _view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> RunState:
     if _is_void_now(state, event, p.step, p.attempt):
         return _void(_among_the_superseded(state, event, p), event)
@@ -231,7 +240,7 @@ def _view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> R
     )
 
 
-def _among_the_superseded(state: RunState, event: Event, p: ViewpointCaptured) -> RunState:
+def _among_the_superseded(state: RunState, event: Event, p: View) -> RunState:
     """The image of an attempt that was replaced while it was on its way is listed with the others of that attempt."""
     listed = [
         replace(past, captured={**past.captured, p.viewpoint: event.seq})
@@ -379,6 +388,8 @@ _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunStat
     StepNote: _step_note,
     ViewpointCaptured: _view_added,
     ViewImported: _view_added,
+    ViewHeld: _view_added,
+    CaptureAsked: _capture_asked,
     ViewpointFailed: _viewpoint_failed,
     StepMeasured: _step_measured,
     StepFailed: _step_failed,

@@ -179,6 +179,24 @@ class ViewImported(View):
     T_base_camera: Matrix4 | None = None
 
 
+class ViewHeld(View):
+    """One exposure of a camera in a person's hands. Where it was the image itself tells, in the worker's answer."""
+
+    kind: Literal["view_held"] = "view_held"
+    # By the camera's own button, by the software for a press on a screen or the pedal, or found as a file of a card.
+    released_by: Literal["camera", "screen", "pedal", "card"]
+    arrival_monotonic_s: float
+
+
+class CaptureAsked(Record):
+    """A person at a screen asks the step that works for a release of the shutter, or to end with what it has."""
+
+    kind: Literal["capture_asked"] = "capture_asked"
+    step: str
+    attempt: int
+    what: Literal["release", "finish"]
+
+
 class ViewpointFailed(Record):
     """A viewpoint could not be captured this time."""
 
@@ -436,6 +454,8 @@ Payload = Annotated[
     | FilesKept
     | ViewpointCaptured
     | ViewImported
+    | ViewHeld
+    | CaptureAsked
     | ViewpointFailed
     | StepMeasured
     | StepFailed

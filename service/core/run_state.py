@@ -9,6 +9,8 @@ from typing import Any, Literal
 from service.core.lifecycle import Phase
 from service.core.model import ArtefactRef, GateVerdict
 
+# What a step shows as its progress while a person takes the images: the camera is idle, and shows its live view.
+WAITING_FOR_HAND = "waiting for the next image"
 StepPhase = Literal["pending", "ready", "running", "checking", "awaiting_operator", "recovering", "passed"]
 Status = Literal["active", "paused", "completed", "aborted"]
 DeviationKind = Literal[
@@ -105,6 +107,7 @@ class StepState:
     viewpoint_failures: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → times
     skipped_viewpoints: tuple[str, ...] = ()  # given up
     notes: tuple[Note, ...] = ()
+    asked: tuple[Literal["release", "finish"], ...] = ()  # by a person at a screen, of a capture by hand
     jobs: Mapping[str, JobState] = field(default_factory=dict[str, JobState])
     started_utc: str = ""
     ended_utc: str = ""

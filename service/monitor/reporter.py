@@ -16,7 +16,16 @@ from typing import Any
 from drivers.errors import DeviceError
 from drivers.interfaces import Camera, Lightbox, RobotArm, SafetyState
 from service.core.errors import OrthocaptureError
-from service.monitor.snapshot import Doing, Message, RobotPhase, Snapshot, frames_wanted, write_frame, write_snapshot
+from service.core.run_state import WAITING_FOR_HAND
+from service.monitor.snapshot import (
+    Doing,
+    Message,
+    RobotPhase,
+    Snapshot,
+    frames_wanted,
+    write_frame,
+    write_snapshot,
+)
 
 _log = logging.getLogger(__name__)
 _EVERY_S = 0.4
@@ -99,7 +108,7 @@ class Reporter:
             disk_free_bytes=shutil.disk_usage(self.data).free,
         )
         self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
-        if doing in ("asking", "paused"):
+        if doing in ("asking", "paused") or what == WAITING_FOR_HAND:
             self._frame()
 
     def end(self) -> None:

@@ -74,7 +74,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
             },
         )
     )
-    robots = {context.devices.layout(image["station"]).robot for image in images}
+    robots = {context.devices.layout(image["station"]).robot for image in images if image["station"]}
     result = Result.model_validate({**answer.result, "robots": sorted(robots)})
     return StepOutcome({**measures, **answer.measures}, answer.artefacts, result.model_dump(mode="json"))
 

@@ -25,7 +25,7 @@ from service.steps.motion import MotionLimits, move_and_settle, settle_criteria
 from service.steps.viewpoints import Viewpoint, flange_target
 
 #: Errors after which the same viewpoint may be tried again on a reopened device.
-_WORTH_ANOTHER_TRY = (
+WORTH_ANOTHER_TRY = (
     DeviceUnavailableError,
     DeviceTimeoutError,
     DeviceBusyError,
@@ -173,7 +173,7 @@ class _CaptureLoop:
                 settled = self._go_to(robot, viewpoint, later)
                 arrived = True
                 return expose(context, self.camera, robot, viewpoint, settled, self.wanted, self.image_kind)
-            except _WORTH_ANOTHER_TRY as error:
+            except WORTH_ANOTHER_TRY as error:
                 self.keep()
                 self._record_failure(viewpoint, error, skipped=False)
                 if tries_left == 0:
@@ -237,7 +237,7 @@ def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, fol
         try:
             _apply(context, camera, wanted)
             return expose_when_free(context, camera, inside)
-        except _WORTH_ANOTHER_TRY as error:
+        except WORTH_ANOTHER_TRY as error:
             if tries_left == 0:
                 raise
             context.note("photograph_repeated", why=str(error))
@@ -250,7 +250,7 @@ def _apply(context: StepContext, camera: Camera, wanted: CameraSettings) -> None
     """Set the camera, which may have dropped its link since it was last used."""
     try:
         camera.apply(wanted)
-    except _WORTH_ANOTHER_TRY:
+    except WORTH_ANOTHER_TRY:
         context.devices.reopen(camera)
         camera.apply(wanted)
 
@@ -258,6 +258,6 @@ def _apply(context: StepContext, camera: Camera, wanted: CameraSettings) -> None
 def _streams(robot: RobotArm) -> bool:
     try:
         robot.state()
-    except _WORTH_ANOTHER_TRY:
+    except WORTH_ANOTHER_TRY:
         return False
     return True

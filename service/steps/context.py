@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox, RobotArm, Scanner, Transform
 from service.core.decide import RunState, StepState
@@ -124,6 +124,10 @@ class Evidence(Protocol):
 
     def enqueue(self, request: JobRequest, name: str) -> None:
         """Enqueue a job without waiting for it, once for each `name` (and again after it has failed)."""
+        ...
+
+    def asked(self) -> tuple[Literal["release", "finish"], ...]:
+        """What people at screens have asked of this step so far, in order."""
         ...
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:

@@ -52,7 +52,7 @@ def expose(
 
     Raises DeviceError, DeviceUnavailableError when no pose of the arm is known for the exposure.
     """
-    environment = _environment(context)
+    environment = environment_now(context)
     folder = tempfile.TemporaryDirectory(prefix="orthocapture-")
     try:
         image = expose_when_free(context, camera, Path(folder.name))
@@ -112,7 +112,7 @@ def record_shot(context: StepContext, shot: Shot) -> None:
             arrival_monotonic_s=image.arrival_monotonic_s,
             controller_time_s=pose.controller_time_s,
             clock_offset_s=pose.clock_offset_s,
-            camera=_camera_record(image),
+            camera=camera_record(image),
             environment=shot.environment,
             verdicts=shot.verdicts,
         ),
@@ -195,7 +195,8 @@ def wanted_settings(context: StepContext) -> CameraSettings:
     )
 
 
-def _environment(context: StepContext) -> dict[str, float]:
+def environment_now(context: StepContext) -> dict[str, float]:
+    """Light and temperature, where a light box measures them."""
     lightbox = context.devices.lightbox()
     if lightbox is None:
         return {}
@@ -230,7 +231,8 @@ def _pose_log(context: StepContext, viewpoint: Viewpoint, window: Sequence[Robot
     )
 
 
-def _camera_record(image: CapturedImage) -> dict[str, object]:
+def camera_record(image: CapturedImage) -> dict[str, object]:
+    """What the event of an exposure says of the camera."""
     return {
         **dataclasses.asdict(image.exif),
         "counter": image.counter,

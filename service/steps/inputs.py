@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from service.core.errors import ConfigurationError
-from service.core.model import ArtefactRef, View, ViewImported, ViewpointCaptured
+from service.core.model import ArtefactRef, View, ViewHeld, ViewImported, ViewpointCaptured
 from service.steps.context import StepContext
 
 
@@ -40,10 +40,13 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[dict[
     """
     images: list[dict[str, Any]] = []
     for step_id in step_ids:
+        held = held_views(context, step_id)
         for capture in context.evidence.captures(step_id):
             if not all(capture.verdicts.values()):
                 continue
             photograph = capture.artefacts[0]
+            if isinstance(capture, ViewHeld) and not held.get(photograph.sha256, {}).get("used"):
+                continue
             images.append(
                 {
                     "name": f"{capture.viewpoint}.jpg",
@@ -52,6 +55,7 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[dict[
                     "station": capture.station,
                     "sha256": photograph.sha256,
                     **robot_pose_of(capture),
+                    **_held_pose(held.get(photograph.sha256, {})),
                 }
             )
     if not images:
@@ -66,6 +70,19 @@ def robot_pose_of(view: View) -> dict[str, Any]:
     if isinstance(view, ViewImported) and view.T_base_flange is not None:
         return {"T_base_flange": [list(row) for row in view.T_base_flange]}
     return {}
+
+
+def held_views(context: StepContext, step_id: str) -> dict[str, Mapping[str, Any]]:
+    """By photograph: what the worker found in the hand-held images of a step."""
+    return {
+        str(job.arguments["image"]["sha256"]): job.result
+        for job in context.evidence.jobs(step_id)
+        if job.kind in ("hand_view", "hand_board") and job.status == "finished"
+    }
+
+
+def _held_pose(found: Mapping[str, Any]) -> dict[str, Any]:
+    return {"T_scene_camera": found["T_scene_camera"]} if found.get("T_scene_camera") else {}
 
 
 def hand_eye_of(context: StepContext, step_id: str, stations: Iterable[str]) -> dict[str, Any]:

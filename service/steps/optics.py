@@ -14,18 +14,24 @@ _STATED = (
 )  # fmt: skip
 
 
-def optics_departures(context: StepContext) -> tuple[OpticsDeparture, ...] | None:
+def optics_departures(
+    context: StepContext, captures: Sequence[View] | None = None, *, quiet: bool = False
+) -> tuple[OpticsDeparture, ...] | None:
     """How the images of this step depart from those that the intrinsics were calibrated from, by viewpoint.
 
     The calibration is the last one before this step that has images; a calibration is held against itself. None if
     there is none: nothing can be said then. What departs is noted in the record and told to the operator.
+
+    Args:
+        captures: images of this step to look at; None: all.
+        quiet: neither note nor tell.
     """
-    mine = context.evidence.captures(context.step.id)
+    mine = context.evidence.captures(context.step.id) if captures is None else captures
     reference = _calibration_images(context)
     if not mine or not reference:
         return None
     departures = compare_optics([_optics(c) for c in reference], [_optics(c) for c in mine]).departures
-    if departures:
+    if departures and not quiet:
         context.note("images depart from the calibration", departures=[str(departure) for departure in departures])
         context.tell(f"the lens is not as it was calibrated: {'; '.join(summary(departures))}")
     return departures

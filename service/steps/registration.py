@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from pydantic import field_validator
 
@@ -26,7 +26,8 @@ class StructureFromMotion(Record):
 
 # "robot" is what the paper compares with: the arm's poses as reported. "robot_corrected" takes off what the hand-eye
 # calibration found of the arm's errors, and what the spheres show of each pose's.
-Source = Literal["robot", "robot_corrected", "colmap", "glomap", "hybrid"]
+# "spheres" places each image of a hand-held camera by the spheres that it shows, before any registration.
+Source = Literal["robot", "robot_corrected", "spheres", "colmap", "glomap", "hybrid"]
 
 
 class Params(Record):
@@ -35,9 +36,9 @@ class Params(Record):
     images_of: tuple[str, ...]
     control_images_of: tuple[str, ...] = ()  # these see the control spheres and are kept for the evaluation too
     calibration: str  # step with the intrinsics
-    hand_eye: str  # step with T_flange_camera
+    hand_eye: str | None = None  # step with T_flange_camera; None: a person held the camera
     scan: str
-    poses: tuple[Source, ...] = get_args(Source)
+    poses: tuple[Source, ...] = ("robot", "robot_corrected", "colmap", "glomap", "hybrid")
     structure_from_motion: StructureFromMotion = StructureFromMotion()
     detector: Literal["classical", "paper"] = "classical"  # "paper" searches every image whole, for comparison
     reduced: tuple[str, ...] = ()  # "1920x1080": lower resolutions, for the comparison that the paper makes
@@ -70,7 +71,11 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     shared = {
         "images": images,
         "camera": camera,
-        **hand_eye_of(context, params.hand_eye, (image["station"] for image in images)),
+        **(
+            {}
+            if params.hand_eye is None
+            else hand_eye_of(context, params.hand_eye, (image["station"] for image in images))
+        ),
         "spheres_m": scan["spheres_m"],
         "sphere_covariance_m2": [sphere["covariance_m2"] for sphere in scan["details"]["spheres"]],
         "radius_m": context.protocol.spheres.radius_mm / 1000,
@@ -125,7 +130,7 @@ def _at_one_resolution(
         search["colour"] = context.protocol.spheres.colour
     (detected,) = run_jobs(JobRequest("detect_spheres", {**shared, **search}))
     markers = {**shared, "outlines": detected.artefacts[0].sha256}
-    from_robot = {"robot": {**markers, "arm_correction": None}, "robot_corrected": markers}
+    from_robot = {"robot": {**markers, "arm_correction": None}, "robot_corrected": markers, "spheres": markers}
     asked = [source for source in from_robot if source in poses]
     registered = run_jobs(*(JobRequest("register", {**from_robot[source], "poses": source}) for source in asked))
     by_poses = dict(zip(asked, registered, strict=True))

@@ -48,7 +48,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         "radius_m": context.protocol.spheres.radius_mm / 1000,
         "expected": params.spheres,
     }
-    if params.compare_with is not None:
+    if params.compare_with is not None and params.compare_with not in context.run.skipped:
         reference = result_of(context, params.compare_with)
         arguments["reference_m"] = reference["spheres_m"]
         arguments["reference_covariances_m2"] = [s["covariance_m2"] for s in reference["details"]["spheres"]]

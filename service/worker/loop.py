@@ -38,6 +38,8 @@ _MODULES = {
     "coverage_points": "live",
     "live_view": "live",
     "live_summary": "live",
+    "hand_view": "hand",
+    "hand_board": "hand",
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -81,7 +81,7 @@ def hybrid(context: JobContext) -> JobAnswer:
         camera,
         np.array(arguments["spheres_m"]),
         float(arguments["radius_m"]),
-        T_base_camera=robot_camera_poses(arguments, images),
+        T_base_camera=None if _held(images) else robot_camera_poses(arguments, images),
         groups=[stations.index(image["station"]) for image in images],
         # The camera is held: overlays and control spheres are read with the calibrated one, which must fit the poses.
         sphere_covariance_m2=np.array(arguments["sphere_covariance_m2"]),
@@ -94,6 +94,10 @@ def hybrid(context: JobContext) -> JobAnswer:
     }
     ref = context.keep_json(_record(answer, names, stations), kind="hybrid_poses", name="hybrid_poses.json")
     return JobAnswer(measures, (ref,))
+
+
+def _held(images: Sequence[Mapping[str, Any]]) -> bool:
+    return any("T_scene_camera" in image for image in images)
 
 
 def _record(answer: HybridPoses, names: list[str], stations: list[str]) -> dict[str, Any]:

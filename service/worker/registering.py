@@ -88,7 +88,7 @@ def register(context: JobContext) -> JobAnswer:
         spheres,
         radius_m,
         groups=groups,
-        estimate_scale=source not in ("robot", "robot_corrected", "hybrid"),
+        estimate_scale=source not in ("robot", "robot_corrected", "spheres", "hybrid"),
         names=names,
         sphere_covariance_m2=np.array(arguments["sphere_covariance_m2"]),
     )
@@ -180,7 +180,7 @@ def _poses(context: JobContext) -> tuple[Array, list[int], list[dict[str, Any]]]
     """(N, 4, 4) poses in the frame of each image's group, the groups, and the images that have a pose."""
     arguments = context.arguments
     images = arguments["images"]
-    if arguments["poses"] in ("robot", "robot_corrected"):
+    if arguments["poses"] in ("robot", "robot_corrected", "spheres"):
         stations = sorted({image["station"] for image in images})
         return robot_camera_poses(arguments, images), [stations.index(image["station"]) for image in images], images
     model = context.input_json(arguments["model"])["T_world_camera"]

@@ -16,11 +16,14 @@ def robot_camera_poses(arguments: Mapping[str, Any], images: Sequence[Mapping[st
 
     Args:
         arguments: of the job, with `T_flange_camera` and perhaps `arm_correction` (steps/inputs.hand_eye_of).
-        images: with `T_base_flange`, and for a correction `station` and `joints_rad`.
+        images: with `T_scene_camera` of a hand-held camera, or with `T_base_flange`, and for a correction `station`
+            and `joints_rad`.
 
     Raises:
         DataError: joints of another arm than the correction's.
     """
+    if all("T_scene_camera" in image for image in images):  # hand-held: by the spheres of each image
+        return np.array([image["T_scene_camera"] for image in images], dtype=np.float64)
     flange = np.array([image["T_base_flange"] for image in images], dtype=np.float64)
     poses = flange @ np.array(arguments["T_flange_camera"], dtype=np.float64)
     record = arguments.get("arm_correction")

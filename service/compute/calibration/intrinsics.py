@@ -140,7 +140,7 @@ def calibrate_intrinsics(
     inflation, by_image = _inflation(solution, root, variance)
     covariance = independent * inflation
     poses = solution.T_camera_board()
-    counts = _coverage_map([view.corners for view in seen], size)
+    counts = coverage_map_of([view.corners for view in seen], size)
     squares = sum(float(view.residual @ view.residual) for view in solution.views)
     return IntrinsicsResult(
         camera=solution.camera,
@@ -318,7 +318,7 @@ def _largest_angle_deg(directions: Array) -> float:
     return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1))))
 
 
-def _coverage_map(corners: Sequence[Array], size: tuple[int, int]) -> NDArray[np.int64]:
+def coverage_map_of(corners: Sequence[Array], size: tuple[int, int]) -> NDArray[np.int64]:
     """(rows, columns) corners in each cell of the image."""
     edges = [np.linspace(-0.5, size[k] - 0.5, COVERAGE_GRID[k] + 1) for k in (1, 0)]
     everything = np.concatenate(corners)

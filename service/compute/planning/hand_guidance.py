@@ -1,0 +1,155 @@
+"""Words that lead a hand-held camera from where it is to where it is wanted, and the places where it is wanted.
+
+A level frame stands in the middle of the scene: z up, y the way the first image's top pointed, so that the person
+stood at −y. A camera's attitude is `turn` about z, `lean` of its right side down and `tilt` of its axis down from the
+horizon: R = Rz(turn) Ry(lean) Rx(−tilt) C0, where C0 looks along y with its top up. This has no singularity where a
+camera looks straight down, only where its side points up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from service.core.geometry import Array, Transform, inverse, transform
+
+_FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # C0: columns are x, y, z of the camera
+_COARSE_FROM_M = 0.10  # from here on distances are told to five centimetres, below to one
+_ANGLE_STEP_DEG = 5.0
+RELEASE = "hold it there and release the shutter"
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """How a camera is held, radians; see the module."""
+
+    turn_rad: float
+    lean_rad: float
+    tilt_rad: float
+
+    @classmethod
+    def of(cls, R_level_camera: Array) -> Attitude:
+        """Of a rotation matrix (3, 3)."""
+        x, z = R_level_camera[:, 0], R_level_camera[:, 2]
+        turn, lean = float(np.arctan2(x[1], x[0])), float(np.arcsin(np.clip(-x[2], -1.0, 1.0)))
+        ahead = (Rotation.from_euler("z", turn) * Rotation.from_euler("y", lean)).inv().apply(z)
+        return cls(turn, lean, float(np.arctan2(-ahead[2], ahead[1])))
+
+    def matrix(self) -> Array:
+        """(3, 3) R_level_camera."""
+        turned = Rotation.from_euler("z", self.turn_rad) * Rotation.from_euler("y", self.lean_rad)
+        return np.asarray((turned * Rotation.from_euler("x", -self.tilt_rad)).as_matrix() @ _FORWARD)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A view that is wanted: where the camera should be, in the level frame."""
+
+    name: str
+    T_level_camera: Transform
+    aim_m: Array  # (3,) the point that is looked at
+
+
+def level_frame(centre_m: Array, up: Array, top: Array) -> Transform:
+    """T_scene_level: origin at `centre_m` (3,), z along `up` (3,), y along `top` (3,) as far as that is level."""
+    z = up / np.linalg.norm(up)
+    y = top - z * (top @ z)
+    if np.linalg.norm(y) < 1e-6:
+        y = np.cross(z, [1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0])
+    y = y / np.linalg.norm(y)
+    return transform(np.column_stack([np.cross(y, z), y, z]), np.asarray(centre_m, dtype=np.float64))
+
+
+def away_from_plane(spheres_m: Array, eye_m: Array) -> Array:
+    """The normal (3,) of the plane nearest to the spheres (M, 3), on the side of the camera at `eye_m` (3,)."""
+    middle = spheres_m.mean(axis=0)
+    normal = np.linalg.svd(spheres_m - middle)[2][2]
+    return np.asarray(normal if (eye_m - middle) @ normal > 0 else -normal, dtype=np.float64)
+
+
+def place_at(
+    name: str, *, tilt_deg: float, azimuth_deg: float, distance_m: float, walk_round: bool, aim_m: Sequence[float]
+) -> Place:
+    """A place on the hemisphere.
+
+    Args:
+        tilt_deg: of the line of sight from the vertical.
+        azimuth_deg: 0 is the person's side, positive to its right.
+        distance_m: from the point that is looked at.
+        walk_round: the top of the image points away from the person who walks round the scene; otherwise it stays as
+            it was in the first image.
+        aim_m: (3,) the point that is looked at, level frame.
+    """
+    tilt, azimuth = np.deg2rad(tilt_deg), np.deg2rad(azimuth_deg)
+    aim, out = np.asarray(aim_m, dtype=np.float64), np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    axis = -(np.cos(tilt) * np.array([0.0, 0.0, 1.0]) + np.sin(tilt) * out)
+    top = -out if walk_round else np.array([0.0, 1.0, 0.0])
+    right = np.cross(axis, top)
+    right /= np.linalg.norm(right)
+    return Place(name, transform(np.column_stack([right, np.cross(axis, right), axis]), aim - distance_m * axis), aim)
+
+
+def words(T_level_here: Transform, T_level_there: Transform) -> str:
+    """`20 cm to the left, 10 cm lower, tilt 15° down`: from one camera pose (4, 4) to another, level frame.
+
+    Left, right, forward and back are the holder's, who looks the way the top of the image points; the camera is moved
+    first and turned then. Empty where there is nothing to change.
+    """
+    here, there = Attitude.of(T_level_here[:3, :3]), Attitude.of(T_level_there[:3, :3])
+    moved = Rotation.from_euler("z", -here.turn_rad).apply(T_level_there[:3, 3] - T_level_here[:3, 3])
+    parts = [
+        _distance(float(moved[0]), "to the right", "to the left"),
+        _distance(float(moved[1]), "forward", "back"),
+        _distance(float(moved[2]), "higher", "lower"),
+        _angle(there.turn_rad - here.turn_rad, "turn", "to the left", "to the right"),
+        _angle(there.tilt_rad - here.tilt_rad, "tilt", "down", "up"),
+        _angle(there.lean_rad - here.lean_rad, "lean", "to the right", "to the left"),
+    ]
+    return ", ".join(part for part in parts if part)
+
+
+def _distance(metres: float, positive: str, negative: str) -> str:
+    step_cm = 5 if abs(metres) >= _COARSE_FROM_M else 1
+    centimetres = step_cm * round(100 * abs(metres) / step_cm)
+    return f"{centimetres} cm {positive if metres > 0 else negative}" if centimetres else ""
+
+
+def _angle(radians: float, verb: str, positive: str, negative: str) -> str:
+    degrees = float(np.rad2deg((radians + np.pi) % (2 * np.pi) - np.pi))
+    told = int(_ANGLE_STEP_DEG * round(abs(degrees) / _ANGLE_STEP_DEG))
+    return f"{verb} {told}° {positive if degrees > 0 else negative}" if told else ""
+
+
+def covered(places: Iterable[Place], T_level_cameras: Sequence[Transform], within_deg: float) -> set[str]:
+    """Names of the places from which an image looks: side and axis agree to `within_deg`."""
+    limit = np.cos(np.deg2rad(within_deg))
+    done: set[str] = set()
+    for place in places:
+        from_aim = place.T_level_camera[:3, 3] - place.aim_m
+        for T in T_level_cameras:
+            away = T[:3, 3] - place.aim_m
+            cosine = (from_aim @ away) / (np.linalg.norm(from_aim) * np.linalg.norm(away))
+            if min(cosine, place.T_level_camera[:3, 2] @ T[:3, 2]) >= limit:
+                done.add(place.name)
+                break
+    return done
+
+
+def nearest(places: Iterable[Place], T_level_here: Transform) -> Place:
+    """The place with the shortest way from here, a radian of turning counted as 40 cm. Needs at least one place."""
+
+    def way(place: Place) -> float:
+        moved = float(np.linalg.norm(place.T_level_camera[:3, 3] - T_level_here[:3, 3]))
+        turned = Rotation.from_matrix(T_level_here[:3, :3].T @ place.T_level_camera[:3, :3]).magnitude()
+        return moved + 0.4 * float(turned)
+
+    return min(places, key=lambda place: (round(way(place), 3), place.name))
+
+
+def same_view(T_a: Transform, T_b: Transform, apart_m: float, apart_rad: float) -> bool:
+    """Whether two camera poses in one frame are so near that the second image brings nothing new."""
+    T = inverse(T_a) @ T_b
+    return bool(np.linalg.norm(T[:3, 3]) < apart_m and Rotation.from_matrix(T[:3, :3]).magnitude() < apart_rad)

@@ -1,0 +1,316 @@
+"""Jobs on hand-held images: what one shows, where the camera was, and where it should go next, in words."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.calibration.board import Board, find_board
+from service.compute.calibration.intrinsics import coverage_map_of, locate_view
+from service.compute.camera_model import CameraModel
+from service.compute.hand_view import look_at_image
+from service.compute.images import read_grey, read_image
+from service.compute.live import expected_spheres
+from service.compute.markers.detectors import options_for
+from service.compute.planning.coverage import CoverageLimits, CoverageSurface, covered_fraction, seen
+from service.compute.planning.hand_guidance import (
+    Place,
+    away_from_plane,
+    covered,
+    level_frame,
+    nearest,
+    place_at,
+    same_view,
+    words,
+)
+from service.compute.planning.information import predicted_information
+from service.compute.planning.next_best_view import Candidate, Present, next_best_views
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, inverse
+from service.worker.job import JobAnswer, JobContext
+from service.worker.layout import nominal_camera
+
+_SAME_M, _SAME_RAD = 0.02, np.deg2rad(3.0)  # nearer than this, an image repeats another
+_LOST_AFTER = 1  # images in a row, before this one, that do not tell where the camera is
+AGAIN = "take this one again: hold the camera still, with everything in view and nothing before the lens"
+_DENSER_TILTS_DEG, _DENSER_AZIMUTHS_DEG = (10.0, 25.0, 40.0, 48.0), tuple(np.arange(-180.0, 180.0, 30.0))
+_TYPICAL_PX = 0.08  # of an outline's place and size, where a view is only planned
+
+
+@dataclass(frozen=True, slots=True)
+class _Earlier:
+    """An image that was looked at before."""
+
+    viewpoint: str
+    used: bool
+    T_scene_camera: Transform | None
+    T_scene_level: Transform | None
+    information: Array = field(repr=False)  # (6, 6)
+    seen: NDArray[np.bool_] = field(repr=False)
+    cells: NDArray[np.int64] = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What the new image itself says."""
+
+    T_scene_camera: Transform | None
+    why: str
+    measures: Mapping[str, float]
+    information: Array = field(repr=False)
+    up: Array
+    middle_m: Array
+    cells: NDArray[np.int64] = field(repr=False)
+
+
+def hand_view(context: JobContext) -> JobAnswer:
+    """An image of the specimen: pose from the spheres, verdict, coverage, predicted error, way on."""
+    cv2.setNumThreads(1)
+    arguments, camera = context.arguments, context.camera()
+    spheres, radius_m = np.array(arguments["spheres_m"]), float(arguments["radius_m"])
+    pixels = read_image(context.input(arguments["image"]["sha256"]))
+    options = options_for(arguments.get("colour"))
+    view = look_at_image(pixels, camera, spheres, radius_m, options, rough=bool(arguments.get("rough")))
+    measures = {
+        "outlines": float(view.outlines),
+        "spheres_seen": float(view.spheres_seen),
+        "spheres_expected": float(view.spheres_expected),
+        "edge_width_px": view.edge_px,
+        "outline_rms_px": view.rms_px,
+        "clipped_fraction": view.clipped,
+    }
+    eye = np.zeros(3) if view.T_scene_camera is None else view.T_scene_camera[:3, 3]
+    information = np.zeros((6, 6)) if view.information is None else view.information.information
+    found = _Seen(
+        view.T_scene_camera, view.why, measures, information, away_from_plane(spheres, eye), spheres.mean(axis=0),
+        np.zeros((0, 0), dtype=np.int64),
+    )  # fmt: skip
+    return _answer(context, found, camera)
+
+
+def hand_board(context: JobContext) -> JobAnswer:
+    """An image of the calibration board: pose from the board by the nominal lens, verdict, coverage, way on."""
+    cv2.setNumThreads(1)
+    arguments = context.arguments
+    image = arguments["image"]
+    board = Board(int(arguments["columns"]), int(arguments["rows"]), float(arguments["square_m"]))
+    grey = read_grey(context.input(image["sha256"]))
+    size = (grey.shape[1], grey.shape[0])
+    camera = nominal_camera(*size, image["focal_mm"], arguments["sensor_width_mm"])
+    middle = board.points().mean(axis=0)
+    pose, why, measures, cells = None, "", {}, np.zeros((0, 0), dtype=np.int64)
+    try:
+        corners = find_board(grey, board)
+        T_camera_board, rms_px = locate_view(corners, board, camera)
+    except ComputeError as error:
+        why = error.what
+    else:
+        pose, cells = inverse(T_camera_board), coverage_map_of([corners.corners], size)
+        measures = {"corners": float(len(corners.indices)), "nominal_rms_px": rms_px}
+    up = np.array([0.0, 0.0, -1.0])  # the board's z points into the table
+    return _answer(context, _Seen(pose, why, measures, np.zeros((6, 6)), up, middle, cells), camera)
+
+
+def _answer(context: JobContext, found: _Seen, camera: CameraModel) -> JobAnswer:
+    """The verdict on the image among those before it, what all of them come to, and where to go next."""
+    arguments = context.arguments
+    image = arguments["image"]
+    surface = _surface(context)
+    earlier = [_read(context, sha256, surface) for sha256 in arguments["earlier"]]
+    used = [e for e in earlier if e.used and e.T_scene_camera is not None]
+    T = found.T_scene_camera
+    why = str(image["settings"]) or found.why or _repeats(T, used)
+    level = next((e.T_scene_level for e in earlier if e.T_scene_level is not None), None)
+    if level is None and T is not None:
+        level = level_frame(found.middle_m, found.up, -T[:3, 1])
+    visible = _visible(context, surface, T, camera)
+    mine = _Earlier(image["viewpoint"], not why, T, level, found.information, visible, found.cells)
+    good = [*used, mine] if mine.used and T is not None else used
+    places = _places(arguments["places"])
+    poses = [] if level is None else [inverse(level) @ e.T_scene_camera for e in good if e.T_scene_camera is not None]
+    done = covered(places, poses, float(arguments["within_deg"]))
+    measures = {**found.measures, "images_used": float(len(good)), "hemisphere_coverage": len(done) / len(places)}
+    measures |= _totals(context, good, surface)
+    next_words, target = _way_on(context, mine, earlier, good, places, done, measures, surface, camera)
+    record = {
+        "viewpoint": mine.viewpoint,
+        "used": mine.used,
+        "T_scene_camera": None if T is None else T.tolist(),
+        "T_scene_level": None if level is None else level.tolist(),
+        "information": found.information.tolist(),
+        "seen": base64.b64encode(np.packbits(visible).tobytes()).decode(),
+        "cells": found.cells.tolist(),
+    }
+    ref = context.keep_json(record, kind="hand_view", name=f"{mine.viewpoint}.hand.json")
+    result = {
+        "viewpoint": mine.viewpoint,
+        "used": mine.used,
+        "why": why,
+        "words": next_words,
+        "target": None if target is None else _listed(target),
+        "T_scene_camera": record["T_scene_camera"],
+        "T_level_camera": None if T is None or level is None else (inverse(level) @ T).tolist(),
+        "places": [{**_listed(p), "done": p.name in done} for p in places],
+        "cells": np.sum([e.cells for e in good if e.cells.size], axis=0).tolist() if found.cells.size else [],
+    }
+    return JobAnswer({k: v for k, v in measures.items() if np.isfinite(v)}, (ref,), result)
+
+
+def _listed(place: Place) -> dict[str, Any]:
+    return {"name": place.name, "T_level_camera": place.T_level_camera.tolist()}
+
+
+def _repeats(T: Transform | None, used: Sequence[_Earlier]) -> str:
+    if T is None:
+        return ""
+    same = [e.viewpoint for e in used if e.T_scene_camera is not None and _same(e.T_scene_camera, T)]
+    return f"it repeats {same[0]}" if same else ""
+
+
+def _same(a: Transform, b: Transform) -> bool:
+    return same_view(a, b, _SAME_M, _SAME_RAD)
+
+
+def _totals(context: JobContext, good: Sequence[_Earlier], surface: CoverageSurface | None) -> dict[str, float]:
+    """What the used images come to."""
+    arguments = context.arguments
+    if "spheres_m" not in arguments:
+        cells = [e.cells for e in good if e.cells.size]
+        return {"coverage": float(np.mean(np.sum(cells, axis=0) > 0)) if cells else 0.0}
+    measures: dict[str, float] = {}
+    present = _present(context, good, surface)
+    error_m = present.error_m()
+    if np.isfinite(error_m):
+        measures["predicted_target_error_mm"] = 1e3 * error_m
+    if surface is not None:
+        measures["specimen_coverage"] = covered_fraction([e.seen for e in good], present.min_views)
+    return measures
+
+
+def _present(context: JobContext, good: Sequence[_Earlier], surface: CoverageSurface | None) -> Present:
+    """The images as measurements of the scan's pose, whose cameras structure from motion will place."""
+    arguments = context.arguments
+    spheres = np.array(arguments["spheres_m"])
+    sigma_m, sigma_rad = float(arguments["pose_sigma_m"]), float(arguments["pose_sigma_rad"])
+    targets = spheres if surface is None else surface.points_m[:: max(1, len(surface.points_m) // 200)]
+    points = 0 if surface is None else len(surface.points_m)
+    seen_by = np.array([e.seen for e in good], dtype=np.int64).reshape(len(good), points)
+    return Present(
+        tuple(e.information for e in good),
+        np.diag([sigma_m**2 / 3] * 3 + [sigma_rad**2 / 3] * 3),
+        targets - spheres.mean(axis=0),
+        seen_by.sum(axis=0),
+        int(arguments["limits"]["min_views"]),
+    )
+
+
+def _way_on(
+    context: JobContext,
+    mine: _Earlier,
+    earlier: Sequence[_Earlier],
+    good: Sequence[_Earlier],
+    places: Sequence[Place],
+    done: set[str],
+    measures: Mapping[str, float],
+    surface: CoverageSurface | None,
+    camera: CameraModel,
+) -> tuple[str, Place | None]:
+    """Words that lead to the next place, and the place; the first words again for a camera that got lost."""
+    if mine.T_scene_camera is None or mine.T_scene_level is None:
+        lost = 0
+        for view in reversed(earlier):
+            if view.T_scene_camera is not None:
+                break
+            lost += 1
+        return (str(context.arguments["first_words"]) if lost >= _LOST_AFTER else AGAIN), None
+    here = inverse(mine.T_scene_level) @ mine.T_scene_camera
+    left = [place for place in places if place.name not in done]
+    target = nearest(left, here) if left else None
+    if target is None and "spheres_m" in context.arguments:
+        target = _informative(context, mine.T_scene_level, good, surface, camera)
+    if target is None:
+        target = max(places, key=lambda place: float(np.linalg.norm(place.T_level_camera[:3, 3] - here[:3, 3])))
+    return words(here, target.T_level_camera) or "stay there and take it again", target
+
+
+def _informative(
+    context: JobContext,
+    T_scene_level: Transform,
+    good: Sequence[_Earlier],
+    surface: CoverageSurface | None,
+    camera: CameraModel,
+) -> Place | None:
+    """Of a denser hemisphere, the view that helps most once every planned place has its image."""
+    arguments = context.arguments
+    spheres, radius_m = np.array(arguments["spheres_m"]), float(arguments["radius_m"])
+    limits = CoverageLimits(**arguments["limits"])
+    taken = [inverse(T_scene_level) @ e.T_scene_camera for e in good if e.T_scene_camera is not None]
+    distance_m = float(np.median([spot["distance_m"] for spot in arguments["places"]]))
+    places: dict[str, Place] = {}
+    candidates: list[Candidate] = []
+    typical = (_TYPICAL_PX / camera.fx) ** 2 * np.eye(3)
+    for tilt in _DENSER_TILTS_DEG:
+        for azimuth in _DENSER_AZIMUTHS_DEG:
+            name = f"t{tilt:02.0f}{azimuth:+04.0f}"
+            place = place_at(
+                name,
+                tilt_deg=tilt,
+                azimuth_deg=azimuth,
+                distance_m=distance_m,
+                walk_round=True,
+                aim_m=(0.0, 0.0, 0.0),
+            )
+            if covered([place], taken, 8.0):
+                continue
+            T = T_scene_level @ place.T_level_camera
+            visible = expected_spheres(inverse(T), spheres, radius_m, camera)
+            mask = np.zeros(0, dtype=bool) if surface is None else seen(surface, T[:3, 3], limits, T, camera)
+            information = predicted_information(T, spheres[visible], radius_m, spheres.mean(axis=0), typical)
+            candidates.append(Candidate(name, information, mask))
+            places[name] = place
+    found = next_best_views(
+        _present(context, good, surface),
+        candidates,
+        limit_m=float(arguments["limit_m"]),
+        min_coverage=float(arguments["min_coverage"]),
+        at_most=1,
+    )
+    return places[found[0].name] if found else None
+
+
+def _places(listed: Sequence[Mapping[str, Any]]) -> list[Place]:
+    return [place_at(**spot) for spot in listed]
+
+
+def _surface(context: JobContext) -> CoverageSurface | None:
+    sha256 = context.arguments.get("surface")
+    if sha256 is None:
+        return None
+    with np.load(context.input(sha256), allow_pickle=False) as arrays:
+        return CoverageSurface(**{name: arrays[name] for name in arrays.files})
+
+
+def _visible(
+    context: JobContext, surface: CoverageSurface | None, T: Transform | None, camera: CameraModel
+) -> NDArray[np.bool_]:
+    if surface is None or T is None:
+        return np.zeros(0 if surface is None else len(surface.points_m), dtype=bool)
+    return seen(surface, T[:3, 3], CoverageLimits(**context.arguments["limits"]), T, camera)
+
+
+def _read(context: JobContext, sha256: str, surface: CoverageSurface | None) -> _Earlier:
+    data = context.input_json(sha256)
+    points = 0 if surface is None else len(surface.points_m)
+    bits = np.unpackbits(np.frombuffer(base64.b64decode(data["seen"]), np.uint8))
+    T, level = (None if data[key] is None else np.array(data[key]) for key in ("T_scene_camera", "T_scene_level"))
+    visible = bits[:points].astype(bool)
+    if len(bits) < points:  # looked at before the surface was ready
+        visible = _visible(context, surface, T, context.camera())
+    cells = np.array(data["cells"], dtype=np.int64)
+    return _Earlier(data["viewpoint"], bool(data["used"]), T, level, np.array(data["information"]), visible, cells)
