@@ -22,6 +22,7 @@ _DRAWINGS_BY_KIND = {
     "layout_check": "layout_photo",
     "calibration": "board",
     "viewpoint_capture": "stations",
+    "manual_capture": "camera",
     "scan_import": "scan_path",
     "timed_application": "spray",
     "ct_import": "transport",
@@ -98,6 +99,8 @@ def will_happen(step: Step, now: StepState) -> tuple[str, str]:  # noqa: PLR0911
             what = count(left, "image") + (" of the board" if step.kind == "calibration" else "")
             where = f" at {station_of(step)}" if station_of(step) else ""
             return f"Confirm: the robot takes {what}{where}", "The robot moves. Everybody stays outside of its reach."
+        case "manual_capture":
+            return "Confirm: begin to take images by hand", "Nothing moves. The screen says where to hold the camera."
         case "layout_check":
             photographs = int(getattr(step.params, "photographs", 1))
             return f"Confirm: the camera takes {count(photographs, 'photograph')}", "Nothing moves."

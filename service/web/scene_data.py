@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.compute.budget.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
-from service.core.model import ArtefactRef
+from service.core.model import ArtefactRef, ViewpointCaptured
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
 from service.evidence import RunLog
 from service.web.pictures import cached
@@ -174,7 +174,7 @@ def _planned(log: RunLog) -> SceneNow:
     cameras: dict[str, Transform] = {}
     if mount is not None:
         T_flange_camera = np.array(mount)
-        mine = [c for c in captured if c.station == station]
+        mine = [c for c in captured if c.station == station and isinstance(c, ViewpointCaptured)]
         cameras = {c.viewpoint: np.array(c.T_base_flange) @ T_flange_camera for c in mine}
     planned = {name: T for name, there, T in to_come if there == station}
     missing = ["Spheres and specimen: nothing has been registered with the images yet."]

@@ -1,0 +1,106 @@
+"""The page of a capture by hand: words, verdicts, hemisphere, and the buttons that release and end."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Generator, Mapping
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.core.model import CaptureAsked
+from tests.support.bench_run import Bench
+from tests.support.web import Browser, WebSite, web_site
+from tests.test_manual_capture import STEP, held_run
+
+
+class _LeftError(Exception):
+    """The runner's process has ended in the middle."""
+
+
+@pytest.fixture
+def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[tuple[WebSite, Browser, Bench]]:
+    """A run in which four images were taken, the second one blurred."""
+    with web_site(tmp_path) as site:
+        bench, person = held_run(site.begin_run, monkeypatch, tmp_path, {2: "blurred"}, STEP)
+        serve = bench.operator.on_show
+
+        def until_four(what: str) -> None:
+            serve(what)
+            if person.presses == 5:
+                raise _LeftError
+
+        bench.operator.on_show = until_four
+        with contextlib.suppress(_LeftError):
+            bench.run()
+        browser = site.browser("technician")
+        site.take_control(bench.run_id, browser)
+        yield site, browser, bench
+
+
+def last_answer(bench: Bench) -> Mapping[str, Any]:
+    """What the worker said of the last image."""
+    jobs = [job for job in bench.state().steps["capture"].jobs.values() if job.kind == "hand_view"]
+    return max(jobs, key=lambda job: job.enqueued_seq).result
+
+
+def words(html: str) -> str:
+    """What a page says, without its tags."""
+    return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", " ", html)))
+
+
+def test_the_page_says_where_to_go_and_what_became_of_the_images(
+    shown: tuple[WebSite, Browser, Bench],
+) -> None:
+    _, browser, bench = shown
+    answer = browser.get(f"/runs/{bench.run_id}/held")
+    assert answer.status_code == 200
+    page = words(answer.text)
+    last = [line for line in bench.operator.told if line.startswith("next: ")][-1].removeprefix("next: ")
+    assert last[1:] in page
+    assert "not used blurred" in page
+    done = [spot for spot in last_answer(bench)["places"] if spot["done"]]
+    assert f"{len(done)} of 7" in page
+    assert "Release the shutter" in page
+    assert answer.text.count("sym-done") == len(done) >= 2
+    assert "way-arrow" in answer.text
+
+
+def test_the_buttons_ask_the_step(shown: tuple[WebSite, Browser, Bench]) -> None:
+    _, browser, bench = shown
+    for what in ("release", "finish"):
+        answer = browser.send_form(f"/runs/{bench.run_id}/held", step="capture", attempt=1, what=what)
+        assert answer.status_code == 303
+    assert [asked.what for asked in bench.payloads(CaptureAsked)] == ["release", "finish"]
+    assert bench.state().steps["capture"].asked == ("release", "finish")
+
+
+def test_who_does_not_control_the_run_sees_no_buttons_and_may_not_press_them(
+    shown: tuple[WebSite, Browser, Bench],
+) -> None:
+    site, _, bench = shown
+    auditor = site.browser("auditor")
+    assert "Release the shutter" not in auditor.get(f"/runs/{bench.run_id}/held").text
+    answer = auditor.send_form(f"/runs/{bench.run_id}/held", step="capture", attempt=1, what="release")
+    assert answer.status_code == 403
+    supervisor = site.browser("supervisor")
+    answer = supervisor.send_form(f"/runs/{bench.run_id}/held", step="capture", attempt=1, what="release")
+    assert answer.status_code in (403, 409)
+    assert bench.payloads(CaptureAsked) == []
+
+
+def test_a_step_that_takes_no_images_now_refuses(shown: tuple[WebSite, Browser, Bench]) -> None:
+    _, browser, bench = shown
+    answer = browser.send_form(f"/runs/{bench.run_id}/held", step="capture", attempt=2, what="release")
+    assert answer.status_code == 409
+    assert bench.payloads(CaptureAsked) == []
+
+
+def test_parts_of_the_page_come_alone(shown: tuple[WebSite, Browser, Bench]) -> None:
+    _, browser, bench = shown
+    answer = browser.get(f"/runs/{bench.run_id}/held/parts/way,overlay,image,plan")
+    assert answer.status_code == 200
+    assert answer.text.count("<template") == 4
