@@ -2,22 +2,39 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
 from service.core.decide import advance, fold
 from service.core.errors import ComputeError, IntegrityError
-from service.core.model import ArtefactRef, Event, Payload, View
-from service.core.protocol import Protocol
+from service.core.job_keys import arguments_name, job_key
+from service.core.model import ArtefactRef, Event, Payload, RunStarted, View
+from service.core.protocol import Protocol, parse_protocol
 from service.core.run_state import JobState, RunState
+from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
+from service.steps.time_left import Left, missing_results
 from service.store.leases import RunLease
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
+
+
+def recorded_root(store: Store, run_id: str) -> RunStarted:
+    """The first event of a run. Raises IntegrityError where it is of another kind."""
+    root = store.first_event(run_id).payload
+    if not isinstance(root, RunStarted):
+        raise IntegrityError("the run's first event is not run_started", where=run_id)
+    return root
+
+
+def recorded_protocol(store: Store, root: RunStarted) -> Protocol:
+    """The protocol as it was when a run began, from the evidence. Raises IntegrityError, ProtocolError."""
+    content = store.artefact_path(root.protocol.sha256, verify=True).read_bytes()
+    return parse_protocol(content, params_models(), name=root.protocol.original_name).protocol
 
 
 @dataclass
@@ -45,6 +62,13 @@ class RunLog:
         """The valid captures of a step's current attempt, in order."""
         payloads = (self.events[seq - 1].payload for seq in sorted(self.refresh().steps[step_id].captured.values()))
         return tuple(payload for payload in payloads if isinstance(payload, View))
+
+
+def results_to_come(log: RunLog) -> list[Left]:
+    """What was planned for a registration and has not arrived, with the time left; empty when all has."""
+    started = log.store.jobs_started(log.run_id)
+    cores = os.cpu_count() or 1
+    return missing_results(log.protocol, log.refresh(), started, datetime.now(UTC).isoformat(), cores)
 
 
 @dataclass
@@ -86,7 +110,7 @@ class StepEvidence:
         """
         keys = [self._key(request) for request in requests]
         jobs = [
-            NewJob(kind=r.kind, step=self.step, attempt=self.attempt, idempotency_key=key, arguments=r.arguments)
+            NewJob(r.kind, self.step, self.attempt, key, r.arguments, priority=r.priority)
             for r, key in zip(requests, keys, strict=True)
         ]
         self.log.store.record(self.log.run_id, [], actor="runner", jobs=jobs, lease=self.lease)
@@ -110,9 +134,9 @@ class StepEvidence:
 
     def enqueue(self, request: JobRequest, name: str) -> None:
         """See service.steps.context.Evidence."""
-        key = self._named_key(request.kind, name)
+        key = job_key(self.log.refresh(), self.step, request.kind, name)
         if all(job.idempotency_key != key for job in self.jobs(self.step)):
-            job = NewJob(request.kind, self.step, self.attempt, key, request.arguments)
+            job = NewJob(request.kind, self.step, self.attempt, key, request.arguments, priority=request.priority)
             self.log.store.record(self.log.run_id, [], actor="runner", jobs=[job], lease=self.lease)
 
     def asked(self) -> tuple[Literal["release", "finish"], ...]:
@@ -124,17 +148,10 @@ class StepEvidence:
         jobs = self.log.refresh().steps[step_id].jobs.values()
         return tuple(sorted(jobs, key=lambda job: job.enqueued_seq))
 
+    def state(self) -> RunState:
+        """See service.steps.context.Evidence."""
+        return self.log.refresh()
+
     def _key(self, request: JobRequest) -> str:
-        """The same for the same work: after a restart or a retry its result is used, not computed again.
-
-        A redo of the step begins a new generation; a job that has failed is tried anew when the step is repeated.
-        """
-        arguments = hashlib.sha256(json.dumps(request.arguments, sort_keys=True).encode()).hexdigest()[:16]
-        return self._named_key(request.kind, arguments)
-
-    def _named_key(self, kind: str, name: str) -> str:
-        state = self.log.refresh()
-        generation = sum(past.step == self.step and past.viewpoint is None for past in state.superseded)
-        key = f"{self.step}/{generation}/{kind}/{name}/"
-        jobs = state.steps[self.step].jobs.values()
-        return key + str(sum(job.idempotency_key.startswith(key) and job.status == "failed" for job in jobs))
+        """The same for the same work: after a restart or a retry its result is used, not computed again."""
+        return job_key(self.log.refresh(), self.step, request.kind, arguments_name(request.arguments))

@@ -5,12 +5,12 @@ from __future__ import annotations
 from ipaddress import ip_address
 from pathlib import Path
 
-from service.core.errors import ConfigurationError, IntegrityError
+from service.core.errors import ConfigurationError
 from service.core.model import RunStarted
-from service.core.protocol import LoadedProtocol, Protocol, parse_protocol
+from service.core.protocol import LoadedProtocol, Protocol
+from service.evidence import recorded_protocol, recorded_root
 from service.rig import Rig, load_rig
 from service.runner import software_versions
-from service.steps import params_models
 from service.store.records import NewArtefact
 from service.store.store import Store
 from service.store.timestamping import Authority
@@ -46,11 +46,8 @@ def start_run(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, 
 
 def recorded_run(store: Store, run_id: str) -> tuple[Protocol, RunStarted]:
     """The protocol as it was when the run began, from the evidence; and the run's root."""
-    root = store.events(run_id)[0].payload
-    if not isinstance(root, RunStarted):
-        raise IntegrityError("the run's first event is not run_started", where=run_id)
-    content = store.artefact_path(root.protocol.sha256, verify=True).read_bytes()
-    return parse_protocol(content, params_models(), name=root.protocol.original_name).protocol, root
+    root = recorded_root(store, run_id)
+    return recorded_protocol(store, root), root
 
 
 def recorded_rig(store: Store, root: RunStarted) -> Rig:

@@ -13,7 +13,7 @@ _ROW = 62
 _MARGIN = 8
 DRAWN = 70  # nodes; a larger graph is read in the list
 # What helps during the capture and leads to no result: among all else it would hide what does.
-_ASIDE = frozenset({"live_view", "live_summary", "coverage_points"})
+_ASIDE = frozenset({"live_view", "live_summary", "coverage_points", "features", "match"})
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,8 @@ DEFAULT_KINDS = (
     "ct_surface",
     "locate_spheres",
     "layout",
+    "features",
+    "match",
     "structure_from_motion",
     "hybrid",
     "detect_spheres",

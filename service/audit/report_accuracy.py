@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.audit.report_blocks import Cell, Column, Heading, Paragraph, Section, Table
+from service.audit.report_blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
 from service.audit.report_words import mm, words
 from service.core.dependence import depends_on
 from service.dataset.summary import RunSummary
@@ -42,7 +42,7 @@ def result_sentence(summary: RunSummary) -> Cell:
     error_mm = float(row["mean_radial_error_mm"])
     within = error_mm <= limit_mm
     simulated = " These are figures of a simulated rig." if summary.root.simulated else ""
-    total_mm = summary.result("evaluation")["budgets"].get(best, {}).get("total_mm")
+    total_mm = summary.budgets().get(best, {}).get("total_mm")
     budget = "" if total_mm is None else f", {total_mm:.3f} mm with the scan's own error"
     on = {"control spheres": "control spheres, which took no part in the registration,"}
     return Cell(
@@ -95,7 +95,8 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
         best = row["poses"] == summary.best()
         if best:
             strong.add(number)
-        named = row["poses"] + (" (best)" if best else "")
+        late = f" ({row['late']})" if row["late"] else ""
+        named = row["poses"] + (" (best)" if best else late)
         texts: list[Cell | str] = [
             f"{named}: {_SOURCES.get(row['source'], words(row['source']))}",
             str(row["resolution"]).replace(" ", "\N{NO-BREAK SPACE}"),
@@ -108,14 +109,23 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
         if true_error_mm is not None:
             texts.append(mm(true_error_mm.get(row["poses"])))
         shown.append(tuple(texts))
+    later = summary.better_later()
     on = rows[0]["evaluated_on"]
     explained = (
         f"Measured on {on}. The radial error is how far the sphere seen by the camera lies from the sphere of the "
         "scan, across the line of sight; the reprojection error is the same in the image. The paper's figures are of "
         "real images at its own widths; reprojection errors compare only at the same width."
     )
-    accepted = tuple(Paragraph(text, "attention") for text in rests_on(summary))
-    return Section(title, (*accepted, Table(tuple(columns), tuple(shown), frozenset(strong)), Paragraph(explained)))
+    blocks: list[Block] = [Paragraph(text, "attention") for text in rests_on(summary)]
+    blocks += [Table(tuple(columns), tuple(shown), frozenset(strong)), Paragraph(explained)]
+    if later is not None:
+        blocks.append(
+            Paragraph(
+                f"{later['poses']} came after the evaluation was made and has the smaller error, "
+                f"{later['mean_radial_error_mm']:.3f} mm. What was signed and released is {summary.best()}."
+            )
+        )
+    return Section(title, tuple(blocks))
 
 
 def _paper(row: Mapping[str, Any]) -> str:
@@ -132,7 +142,7 @@ def _paper(row: Mapping[str, Any]) -> str:
 def budget_section(summary: RunSummary) -> Section | None:
     """Source by source, and what independent measurements say of it; None without an evaluation."""
     best = summary.best()
-    budget: Mapping[str, Any] | None = summary.result("evaluation").get("budgets", {}).get(best)
+    budget: Mapping[str, Any] | None = summary.budgets().get(best or "")
     if budget is None:
         return None
     contributions = [

@@ -109,7 +109,7 @@ def _scene(summary: RunSummary) -> Scene | None:
     # plotly and the decimation are only for this: the PDF need not wait for them.
     from service.dataset import scene_view  # noqa: PLC0415
 
-    best, registrations = summary.best(), summary.result("registration").get("registrations", {})
+    best, registrations = summary.best(), summary.registrations()
     spheres = summary.result("scan_import").get("spheres_m")
     if best not in registrations or spheres is None or not summary.artefacts("scan_mesh"):
         return None

@@ -102,7 +102,7 @@ def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
     photographs = {capture.viewpoint: capture.artefacts[0].sha256 for capture in summary.captures()}
     centre_scan_m = np.array(summary.result("scan_import")["spheres_m"]).mean(axis=0)
     errors: dict[str, float] = {}
-    for source, registration in summary.result("registration")["registrations"].items():
+    for source, registration in summary.registrations().items():
         cameras: Mapping[str, Any] = registration["T_scan_camera"]
         estimated = np.array([cameras[name] for name in cameras])
         true = np.array([T_scan_world @ T_world_camera[photographs[name]] for name in cameras])

@@ -29,12 +29,14 @@ from service.cli.common import (
 )
 from service.cli.hands import SimulatedHands
 from service.cli.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
+from service.cli.waiting import wait_for_results
 from service.core.actions import VERBS, record_to_sign, refuse
 from service.core.errors import ConfigurationError
 from service.core.fold import fold
 from service.core.model import ActionRefused, OperatorAction
 from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState
+from service.evidence import RunLog, results_to_come
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.people import People
 from service.people.proof import identity_for
@@ -53,6 +55,7 @@ from service.steps import params_models
 from service.steps.live import describe_view
 from service.steps.preview import preview_plans
 from service.store.store import Store
+from service.store.timestamping import stamp_end
 
 RigOption = Annotated[Path, typer.Option("--rig", help="The rig file: devices and stations of this site.")]
 OperatorOption = Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")]
@@ -179,9 +182,10 @@ def status_command(
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)
-        state = fold(protocol, store.events(run_id))
+        log = RunLog(store, run_id, protocol)
+        state, missing = log.state, [left.text for left in results_to_come(log)]
     if json:
-        print_json(status_record(run_id, state))
+        print_json(status_record(run_id, state) | {"still_to_come": missing})
         return
     table = Table(title=f"Run {run_id}: {state.status}", title_justify="left")
     for heading in ("step", "state", "attempt", "views", "gates"):
@@ -195,6 +199,8 @@ def status_command(
     live = [job for job in state.step.jobs.values() if job.kind == "live_view" and job.status != "enqueued"]
     for job in live[-3:]:
         console.print(escape(describe_view(job)))
+    for line in missing:
+        console.print(f"still to come: {escape(line)}")
     for deviation in state.deviations:
         if not deviation.is_note:
             console.print(f"deviation: {escape(deviation.text)}")
@@ -263,12 +269,20 @@ def drive(
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _worker(data, wanted=worker):
-            return Runner(store, run_id, protocol, station, operator, time_stamp_authority(rig)).run()
+            authority = time_stamp_authority(rig)
+            try:
+                state = Runner(store, run_id, protocol, station, operator, authority).run()
+            finally:
+                reporter.end()
+                display.clear()
+                operator.close()
+                station.close()
+            if worker and state.status == "completed":
+                wait_for_results(store, run_id, protocol, display)
+                stamp_end(store, run_id, authority)
+                state = fold(protocol, store.events(run_id))
+            return state
     finally:
-        reporter.end()
-        display.clear()
-        operator.close()
-        station.close()
         signal.signal(signal.SIGTERM, before)
 
 

@@ -115,8 +115,10 @@ def _void(state: RunState, event: Event) -> RunState:
     return replace(state, overtaken=(*state.overtaken, event.seq))
 
 
-def _is_void(state: RunState, event: Event, step: str, attempt: int) -> bool:
+def _is_void(state: RunState, event: Event, step: str, attempt: int, *, when_completed: bool = False) -> bool:
     """Whether an operator's redo, skip or abort came between the work and its record.
+
+    `when_completed`: work that may still be recorded when the run is completed.
 
     The web and the command line append actions while the runner works, so such events are in order; they stay in
     the evidence without effect. Raises IntegrityError for work that was never due.
@@ -124,7 +126,8 @@ def _is_void(state: RunState, event: Event, step: str, attempt: int) -> bool:
     if step not in state.steps:
         raise _impossible(event, f"the protocol has no step {step!r}")
     there = state.steps[step]
-    if attempt < there.attempt or state.terminal or (there.skipped and attempt == there.attempt):
+    ended = state.status == "aborted" if when_completed else state.terminal
+    if attempt < there.attempt or ended or (there.skipped and attempt == there.attempt):
         return True
     if attempt > there.attempt:
         raise _impossible(event, f"attempt {attempt} of {step} has not begun; it is at {there.attempt}")
@@ -185,7 +188,8 @@ def _run_completed(protocol: Protocol, state: RunState, event: Event, p: RunComp
         if state.status == "aborted" or redone_just_before:
             return _void(state, event)
         raise _impossible(event, f"the run is {state.status} at {state.current}, {state.phase}")
-    return replace(_system(protocol, state, event, "advance"), completed_sha256=event.sha256)
+    completed = _system(protocol, state, event, "advance")
+    return replace(completed, completed_sha256=event.sha256, ended_utc=event.at_utc)
 
 
 def _run_aborted(protocol: Protocol, state: RunState, event: Event, p: RunAborted) -> RunState:
@@ -316,12 +320,22 @@ def _step_passed(protocol: Protocol, state: RunState, event: Event, p: StepPasse
 
 
 def _job_enqueued(protocol: Protocol, state: RunState, event: Event, p: JobEnqueued) -> RunState:
-    if _is_void(state, event, p.step, p.attempt):
+    # What follows from a result that arrives after the run's end is computed all the same.
+    if _is_void(state, event, p.step, p.attempt, when_completed=True):
         return _void(state, event)
     jobs = state.steps[p.step].jobs
     if p.job in jobs:
         raise _impossible(event, f"job {p.job} is enqueued already")
-    job = JobState(p.job, p.job_kind, p.attempt, event.seq, p.idempotency_key, p.arguments)
+    job = JobState(
+        p.job,
+        p.job_kind,
+        p.attempt,
+        event.seq,
+        p.idempotency_key,
+        p.arguments,
+        priority=p.priority,
+        enqueued_utc=event.at_utc,
+    )
     return change(state, p.step, jobs={**jobs, p.job: job})
 
 
@@ -334,9 +348,11 @@ def _job_ended(protocol: Protocol, state: RunState, event: Event, p: JobFinished
     if job.status == "finished":  # a second worker after a lost lease: the first answer counts
         return _void(state, event)
     if isinstance(p, JobFinished):
-        job = replace(job, status="finished", measures=p.measures, artefacts=p.artefacts, result=p.result)
+        done = {"measures": p.measures, "artefacts": p.artefacts, "result": p.result}
+        job = replace(job, status="finished", duration_s=p.duration_s, late_s=p.late_s, **done)
     else:
         job = replace(job, status="failed", error=p.error, message=p.message)
+    job = replace(job, ended_utc=event.at_utc)
     return change(state, p.step, jobs={**state.steps[p.step].jobs, p.job: job})
 
 

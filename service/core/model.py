@@ -298,6 +298,7 @@ class JobFinished(Record):
     artefacts: tuple[ArtefactRef, ...] = ()
     result: dict[str, Any] = Field(default_factory=dict)
     duration_s: float
+    late_s: float | None = None  # after the specimen's release, or the run's end where nothing is released
 
 
 class JobFailed(Record):

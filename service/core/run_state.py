@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from service.core.lifecycle import Phase
 from service.core.model import ArtefactRef, GateVerdict
+from service.core.priorities import WAITED
 
 # What a step shows as its progress while a person takes the images: the camera is idle, and shows its live view.
 WAITING_FOR_HAND = "waiting for the next image"
@@ -42,6 +43,11 @@ class JobState:
     result: Mapping[str, Any] = field(default_factory=dict[str, Any])
     error: str = ""
     message: str = ""
+    priority: int = WAITED
+    enqueued_utc: str = ""
+    ended_utc: str = ""
+    duration_s: float = 0.0
+    late_s: float | None = None  # after the specimen's release, or the run's end; None: in time
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,6 +208,7 @@ class RunState:
     people: frozenset[str] = frozenset()  # who took part: started it, controlled it, acted on it
     controller: str = ""  # who has control of it on a screen
     corrections: tuple[Correction, ...] = ()
+    ended_utc: str = ""  # of run_completed or run_aborted
     completed_sha256: str = ""  # of the run_completed event: what a release binds
     released_by: str = ""
 

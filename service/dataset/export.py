@@ -34,7 +34,7 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
         )
     images = folder / "images"
     images.mkdir(parents=True)
-    registered = summary.result("registration")["registrations"][best]
+    registered = summary.registrations()[best]
     calibrated = next(s.result for s in summary.state.steps.values() if s.result.get("camera"))
     camera = CameraModel.from_record(calibrated["camera"])
     poses: dict[str, Transform] = {}
@@ -50,6 +50,7 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
     write_camera_json(folder / "camera.json", camera)
     write_poses_csv(folder / "poses.csv", poses)
     write_transforms_json(folder / "transforms.json", camera, {f"images/{name}": T for name, T in poses.items()})
+    later = summary.better_later()
     vertices_m, faces = summary.scan_mesh()
     trimesh.Trimesh(vertices_m, faces, process=False).export(folder / "mesh.ply")
     description = {
@@ -63,6 +64,7 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
         "pose_source": best,
         "evaluation": list(summary.table()),
         "accepted_gates": [gate.text for gate in accepted_gates(summary.protocol, summary.state)],
+        "arrived_later_and_better": None if later is None else later["poses"],
         "deviations": [d.text for d in summary.state.deviations if not d.is_note],
         "head_of_chain_sha256": summary.events[-1].sha256,
         "image_sha256": sources,

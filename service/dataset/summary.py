@@ -14,6 +14,14 @@ from service.core.fold import fold
 from service.core.geometry import Array
 from service.core.model import ArtefactRef, Event, JobFinished, RunStarted, View
 from service.core.protocol import Protocol
+from service.core.registered import (
+    better_later,
+    budgets,
+    evaluated,
+    last_result,
+    own_registration,
+    registrations,
+)
 from service.core.run_state import RunState
 from service.store.store import Store
 
@@ -39,17 +47,27 @@ class RunSummary:
 
     def result(self, kind: str) -> Mapping[str, Any]:
         """The Result of the last passed step of a kind; empty if there is none."""
-        results = [self.state.steps[s.id].result for s in self.protocol.steps if s.kind == kind]
-        return next((result for result in reversed(results) if result), {})
+        return last_result(self.protocol, self.state, kind)
+
+    def registrations(self) -> Mapping[str, Mapping[str, Any]]:
+        """Every registration by its name, those that arrived after the step's decision included."""
+        return registrations(self.protocol, self.state)
 
     def table(self) -> Sequence[Mapping[str, Any]]:
-        """The paper's table: errors on the control spheres for each source of poses."""
-        return self.result("evaluation").get("table", ())
+        """The paper's table: errors on the control spheres for each source of poses, whenever it arrived."""
+        return evaluated(self.protocol, self.state)
+
+    def budgets(self) -> Mapping[str, Mapping[str, Any]]:
+        """The error budget of each registration that was evaluated."""
+        return budgets(self.protocol, self.state)
 
     def best(self) -> str | None:
-        """The source of poses with the smallest mean radial error."""
-        rows = self.table()
-        return min(rows, key=lambda row: row["mean_radial_error_mm"])["poses"] if rows else None
+        """The run's own registration: the best of those that the evaluation step judged; see core/registered.py."""
+        return own_registration(self.protocol, self.state)
+
+    def better_later(self) -> Mapping[str, Any] | None:
+        """The row of a registration that arrived after the evaluation and is better than the run's own."""
+        return better_later(self.protocol, self.state)
 
     def captures(self) -> Iterable[View]:
         """Every valid capture, in order, calibration included."""

@@ -11,6 +11,7 @@ from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox,
 from service.core.decide import RunState, StepState
 from service.core.errors import OrthocaptureError
 from service.core.model import ArtefactRef, Payload, Record, StepNote, View
+from service.core.priorities import WAITED
 from service.core.protocol import Protocol as LabProtocol
 from service.core.protocol import Step
 from service.core.run_state import JobState
@@ -84,6 +85,7 @@ class JobRequest:
 
     kind: str
     arguments: Mapping[str, Any]
+    priority: int = WAITED
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +134,10 @@ class Evidence(Protocol):
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
         """The jobs of a step, as they stand at this moment, in the order in which they were enqueued."""
+        ...
+
+    def state(self) -> RunState:
+        """The run as it stands at this moment."""
         ...
 
 

@@ -1,4 +1,7 @@
-"""Step kind `evaluation`: the paper's errors on the control spheres, for each source of camera poses."""
+"""Step kind `evaluation`: the paper's errors on the control spheres, for each source of camera poses.
+
+It judges the registrations that are there; one that arrives later is evaluated then (service/steps/sources.py).
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import Any
 from service.core.model import Record
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, result_of
+from service.steps.sources import registration_ways
 
 
 class Params(Record):
@@ -27,14 +31,17 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Let the worker evaluate every registration on the control captures."""
-    registration = result_of(context, params.registration)
+    """Let the worker evaluate every registration that has arrived on the control captures."""
+    registrations = dict(result_of(context, params.registration)["registrations"])
+    found = registration_ways(context.protocol, context.run, context.protocol.step(params.registration))
+    if found is not None:
+        registrations |= {name: dict(job.result) for name, job in found.arrived.items()}
     (answer,) = context.evidence.run_jobs(
         JobRequest(
             "evaluate",
             {
                 "images": captured_images(context, params.images_of),
-                "registrations": registration["registrations"],
+                "registrations": registrations,
                 "scan": result_of(context, params.scan),
                 "control_scan": None if params.control_scan is None else result_of(context, params.control_scan),
                 "ct": None if params.ct is None else result_of(context, params.ct),

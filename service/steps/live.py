@@ -12,6 +12,7 @@ from pydantic import Field
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.gates import limits as gate_text
 from service.core.model import Record, View
+from service.core.priorities import LIVE
 from service.core.protocol import Gate
 from service.core.run_state import JobState
 from service.steps.context import JobRequest, StepContext
@@ -80,7 +81,7 @@ class LiveAnalysis:
         analysis = cls(context, params, shared)
         if not any(job.kind == "coverage_points" for job in analysis._jobs("coverage_points")):
             arguments = {"mesh": mesh, "limits": limits, **{k: shared[k] for k in ("spheres_m", "radius_m")}}
-            context.evidence.enqueue(JobRequest("coverage_points", arguments), "specimen")
+            context.evidence.enqueue(JobRequest("coverage_points", arguments, LIVE), "specimen")
         analysis.told = {job.job for job in analysis._jobs("live_view") if job.status != "enqueued"}
         return analysis
 
@@ -100,7 +101,7 @@ class LiveAnalysis:
             hand_eye = hand_eye_of(self.context, self.params.hand_eye, [capture.station])
             earlier = [job.artefacts[0].sha256 for job in self._finished()]
             arguments = {**self.shared, **hand_eye, "image": image, "surface": self._surface(), "earlier": earlier}
-            self.context.evidence.enqueue(JobRequest("live_view", arguments), sha256)
+            self.context.evidence.enqueue(JobRequest("live_view", arguments, LIVE), sha256)
         self._tell()
 
     def summary(self, station: str, candidates: Sequence[tuple[Viewpoint, float]]) -> dict[str, float]:

@@ -8,6 +8,7 @@ from service.compute.planning.motion_plan import Order
 from service.core.model import Record
 from service.steps.capture import capture_viewpoints
 from service.steps.context import StepContext, StepKind, StepOutcome
+from service.steps.front_end import EarlyFeatures
 from service.steps.live import Live, LiveAnalysis
 from service.steps.optics import departing_images, optics_departures
 from service.steps.planning import feasible_extra, plan_step
@@ -47,13 +48,20 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     nominal = context.devices.nominal_T_flange_camera()
     there = {capture.viewpoint for capture in context.evidence.captures(context.step.id)}
     planned = plan_step(context, [v for v in plan if v.name not in there], nominal, params.order)
+    features = EarlyFeatures.begin(context, plan)
+
+    def look() -> None:
+        for begun in (live, features):
+            if begun is not None:
+                begun.look()
+
     totals = capture_viewpoints(
         context,
         [*planned.viewpoints, *(v for v in plan if v.name in there)],
         nominal,
         image_kind="image" if params.purpose == "dataset" else "control_image",
         refused=planned.refused,
-        on_captured=(lambda: None) if live is None else live.look,
+        on_captured=look,
     )
     measures = totals.measures()
     departures = optics_departures(context)

@@ -82,6 +82,12 @@ def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> 
     return connection.execute(statement).scalar_one()
 
 
+def started(connection: Connection, run_id: str) -> dict[str, str]:
+    """When each job that is being computed was begun, by its name."""
+    running = select(jobs.c.job_id, jobs.c.started_utc).where(jobs.c.run_id == run_id, jobs.c.state == "running")
+    return {row.job_id: row.started_utc for row in connection.execute(running)}
+
+
 def claim(
     connection: Connection,
     clock: Clock,

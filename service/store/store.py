@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -18,7 +18,7 @@ from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, 
 from service.store.checkpoints import read_checkpoints, read_timestamps
 from service.store.database import Database, database_path, open_database
 from service.store.errors import UnknownRunError
-from service.store.events import ROOT, append, read_events
+from service.store.events import ROOT, append, read_events, to_event
 from service.store.leases import RunLease, acquire, check_lease, held_runs, is_held
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
 from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock, utc_text
@@ -232,6 +232,15 @@ class Store:
             self._require_run(connection, run_id)
             return read_events(connection, run_id, after_seq)
 
+    def first_event(self, run_id: str) -> Event:
+        """The event that a run begins with, without reading the others. Raises IntegrityError where it is missing."""
+        with self._database.reading() as connection:
+            self._require_run(connection, run_id)
+            row = connection.execute(select(events).where(events.c.run_id == run_id, events.c.seq == 1)).one_or_none()
+        if row is None:
+            raise IntegrityError("the run has no first event", where=run_id)
+        return to_event(row)
+
     def head(self, run_id: str) -> int:
         """Number of a run's last event."""
         with self._database.reading() as connection:
@@ -283,6 +292,11 @@ class Store:
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return queue.read_jobs(connection, run_id)
+
+    def jobs_started(self, run_id: str) -> dict[str, str]:
+        """When each job of a run that is being computed was begun (UTC), by the job's name."""
+        with self._database.reading() as connection:
+            return queue.started(connection, run_id)
 
     def enqueue_job(self, run_id: str, job: NewJob, *, actor: str) -> Job:
         """Enqueue a job, or return the one that has its key already."""
@@ -336,8 +350,21 @@ class Store:
         duration_s: float,
         result: Mapping[str, Any] | None = None,
         artefacts: Sequence[NewArtefact] = (),
+        late_s: float | None = None,
+        follow: tuple[int, Callable[[Sequence[Event]], Sequence[NewJob]]] | None = None,
     ) -> Event:
-        """Append JobFinished with its artefacts and close the job. Raises LeaseLostError."""
+        """Append JobFinished with its artefacts and close the job. Raises LeaseLostError.
+
+        Args:
+            job: as it was claimed.
+            measures: numbers of the answer.
+            duration_s: of the computation.
+            result: plain data of the answer.
+            artefacts: files of the answer.
+            late_s: how long after the specimen's release it arrives; None: in time.
+            follow: a sequence number, and what is asked, with all events after it, for the jobs that follow from
+                them; they are enqueued in the same transaction, so that no crash comes between.
+        """
         payload = JobFinished(
             job=job.job_id,
             job_kind=job.kind,
@@ -348,10 +375,15 @@ class Store:
             artefacts=tuple(artefact.ref for artefact in artefacts),
             result=dict(result or {}),
             duration_s=duration_s,
+            late_s=late_s,
         )
         with self._database.writing() as connection:
             event = queue.finish(connection, self._clock, job, payload)
             insert_artefacts(connection, self._folder, [event], artefacts)
+            if follow is not None:
+                after_seq, following = follow
+                new = following(read_events(connection, job.run_id, after_seq))
+                queue.enqueue(connection, self._clock, self._ids, job.run_id, new, actor=job.worker or "worker")
         return event
 
     def fail_job(self, job: Job, error: Exception, *, retry: bool) -> list[Event]:

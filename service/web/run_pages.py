@@ -12,6 +12,8 @@ from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
 from service.core.dependence import accepted_gates
+from service.core.registered import evaluated
+from service.evidence import results_to_come
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Person
@@ -56,8 +58,8 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         _looker(site, person, run_id),
         driven=site.launcher.driven(run_id),
         show=step,
+        to_come=[left.text for left in results_to_come(log)],
     )
-    results = [log.state.steps[s.id].result for s in log.protocol.steps if s.kind == "evaluation"]
     return {
         "view": view,
         "looking_back": bool(step) and view.shown.id != view.current,
@@ -65,7 +67,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         "drawing": drawing(view.shown.drawing),
         "now_utc": datetime.now(UTC).isoformat(),
         "depends": accepted_gates(log.protocol, log.state),
-        "result_table": next((result["table"] for result in reversed(results) if result.get("table")), ()),
+        "result_table": evaluated(log.protocol, log.state),
     }
 
 

@@ -13,6 +13,7 @@ from service.core.decide import AskOperator, decide
 from service.core.dependence import AcceptedGate, dependent_steps, depends_on
 from service.core.model import Event, OperatorVerb
 from service.core.protocol import Protocol, Step
+from service.core.registered import evaluated
 from service.core.run_state import Deviation, RunState
 from service.monitor.snapshot import Snapshot
 from service.web.run_figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
@@ -201,16 +202,20 @@ class RunView:
     working: tuple[str, int, int]
     deviations: tuple[Deviation, ...]
     news: tuple[tuple[str, str], ...]
+    to_come: tuple[str, ...]  # results that are still being computed, with the time left
     pedal_armed: bool
     stop_reason: str
     operator: str
     released_by: str
 
 
-def run_view(log: Recorded, snapshot: Snapshot, looker: Looker, *, driven: bool, show: str = "") -> RunView:
+def run_view(
+    log: Recorded, snapshot: Snapshot, looker: Looker, *, driven: bool, show: str = "", to_come: Sequence[str] = ()
+) -> RunView:
     """The page of a run that has begun.
 
     Args:
+        to_come: what is still being computed, in words.
         driven: whether a living process drives the run.
         show: step to look at; the current one when it is "" or unknown.
     """
@@ -245,6 +250,7 @@ def run_view(log: Recorded, snapshot: Snapshot, looker: Looker, *, driven: bool,
         working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
         deviations=tuple(reversed(state.deviations)),
         news=tuple((m.at_utc, m.text) for m in reversed(snapshot.messages)),
+        to_come=tuple(to_come),
         pedal_armed=snapshot.pedal_armed,
         stop_reason=state.stop_reason,
         operator=state.operator,
@@ -313,7 +319,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
         skipped=now.skipped,
         started_utc=now.started_utc,
         ended_utc=now.ended_utc,
-        table=now.result.get("table", ()) if step.kind == "evaluation" else (),
+        table=evaluated(protocol, state) if step.kind == "evaluation" and now.result else (),
         depends=depends_on(protocol, state, step.id),
     )
 

@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 from service.compute.budget.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.model import ArtefactRef, ViewpointCaptured
+from service.core.registered import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
 from service.evidence import RunLog
 from service.web.pictures import cached
 from service.web.planned import nominal_T_flange_camera, planned_poses, station_of
 from service.web.spheres import Registered, Sphere, best_registration, ct_spheres, result_of_kind, scan_spheres
 from service.web.viewpoints import captures_of
+
+_WITH_STATIONS = ("hybrid", "robot_corrected", "robot")  # sources that tell where each station's base stood
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,10 +103,10 @@ def _registered(log: RunLog, registered: Registered) -> SceneNow:
 
 def _bases(log: RunLog, record: Mapping[str, Any]) -> tuple[dict[str, Transform], list[str]]:
     """T_scan_base by station: from this registration, or from one of the same run that keeps the stations apart."""
-    registrations = result_of_kind(log, "registration")[1]["registrations"]
-    known = [record, *(registrations[n] for n in ("hybrid", "robot_corrected", "robot") if n in registrations)]
+    known_registrations = registrations(log.protocol, log.state)
+    known = [record, *(known_registrations[n] for n in _WITH_STATIONS if n in known_registrations)]
     for candidate in known:
-        if candidate["poses"] in ("hybrid", "robot_corrected", "robot"):
+        if candidate["poses"] in _WITH_STATIONS:
             T_scan_world = inverse(np.array(candidate["T_world_scan"]))
             return {name: T_scan_world @ np.array(T) for name, T in candidate["T_world_station"].items()}, []
     return {}, ["Robot bases: the poses come from the images alone, which do not tell where the robots stood."]

@@ -12,6 +12,7 @@ import numpy as np
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply
+from service.core.registered import own_registration, registrations
 from service.evidence import RunLog
 
 SphereKind = Literal["registration", "control", "sphere"]
@@ -30,7 +31,7 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True)
 class Registered:
-    """The registration that pages show: the best one by the evaluation, or by its own prediction before that."""
+    """The registration that pages show: the run's own, or before that the best one by its own prediction."""
 
     name: str
     record: Mapping[str, Any]
@@ -48,17 +49,14 @@ def result_of_kind(log: RunLog, kind: str) -> tuple[str, Mapping[str, Any]]:
 
 def best_registration(log: RunLog) -> Registered | None:
     """None before there is one."""
-    step, result = result_of_kind(log, "registration")
-    records: Mapping[str, Mapping[str, Any]] = result.get("registrations", {})
+    step, _ = result_of_kind(log, "registration")
+    records = registrations(log.protocol, log.state)
     full = {name: record for name, record in records.items() if record.get("full_camera") is None}
     if not full:
         return None
-    table = result_of_kind(log, "evaluation")[1].get("table", ())
-    rows = [row for row in table if row["poses"] in full]
-    if rows:
-        name = str(min(rows, key=lambda row: row["mean_radial_error_mm"])["poses"])
-    else:
-        name = min(full, key=lambda n: float(np.trace(np.array(full[n]["covariance"])[:3, :3])))
+    own = own_registration(log.protocol, log.state)
+    predicted = sorted(full, key=lambda n: float(np.trace(np.array(full[n]["covariance"])[:3, :3])))
+    name = own if own in full else predicted[0]
     return Registered(name, full[name], step)
 
 

@@ -13,13 +13,17 @@ from collections.abc import Callable, Mapping
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
 from service.core.priorities import Lane
 from service.store.errors import LeaseLostError
-from service.store.records import Job, NewArtefact
+from service.store.records import Job
 from service.store.store import Store
 from service.worker.job import Handler, JobAnswer, JobContext
+
+if TYPE_CHECKING:
+    from service.worker.following import Following
 
 _log = logging.getLogger(__name__)
 _LEASE_S = 30.0
@@ -30,6 +34,8 @@ _MODULES = {
     "ct_surface": "surfaces",
     "locate_spheres": "surfaces",
     "layout": "layout",
+    "features": "front_end",
+    "match": "front_end",
     "structure_from_motion": "poses",
     "hybrid": "poses",
     "detect_spheres": "registering",
@@ -77,6 +83,7 @@ def work(
         finished: told after each job.
     """
     name = f"worker {socket.gethostname()}:{os.getpid()}"
+    following: Following | None = None
     done = 0
     while not stop():
         job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS), lane=lane)
@@ -85,13 +92,21 @@ def work(
                 return done
             time.sleep(_POLL_S)
             continue
-        _do(store, job, progress)
+        following = following or _following(store)
+        _do(store, job, progress, following)
         done += 1
         finished()
     return done
 
 
-def _do(store: Store, job: Job, progress: Callable[[str, int, int], None]) -> None:
+def _following(store: Store) -> Following:
+    """Imported at the first job, as the job's function is."""
+    from service.worker.following import Following  # noqa: PLC0415 - all step kinds come with it, which takes a second
+
+    return Following(store)
+
+
+def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], following: Following) -> None:
     started_s = time.monotonic()
     answer = JobAnswer({})
     attempt = _Attempt(store, job)
@@ -101,15 +116,9 @@ def _do(store: Store, job: Job, progress: Callable[[str, int, int], None]) -> No
     try:
         if attempt.error is not None:
             store.fail_job(job, attempt.error, retry=_worth_another_try(attempt.error))
+            following.seal(job.run_id)
             return
-        rows = [NewArtefact(ref=r, device="worker", step=job.step, attempt=job.attempt) for r in answer.artefacts]
-        store.finish_job(
-            job,
-            measures=answer.measures,
-            duration_s=time.monotonic() - started_s,
-            result=answer.result,
-            artefacts=rows,
-        )
+        following.finish(job, answer, time.monotonic() - started_s)
     except LeaseLostError:
         _log.warning("job %s was taken over by another worker; its result stands", job.job_id)
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,11 @@ import numpy as np
 from service.compute.markers.archive import outline_from_record
 from service.compute.poses.hybrid import HybridPoses, hybrid_poses
 from service.compute.poses.pose_covariance import blocks
-from service.compute.poses.sfm import SfmModel, reconstruct
-from service.compute.poses.sfm_options import SfmOptions
+from service.compute.poses.sfm import SfmModel, reconstruct, reconstruct_from
+from service.compute.poses.sfm_options import Mapper, SfmOptions
 from service.compute.poses.tracks import Tracks
 from service.core.geometry import Array
+from service.worker.front_end import read_features, read_matches
 from service.worker.job import JobAnswer, JobContext
 from service.worker.photographs import photographs
 from service.worker.robot_poses import robot_camera_poses
@@ -24,22 +26,12 @@ from service.worker.robot_poses import robot_camera_poses
 def structure_from_motion(context: JobContext) -> JobAnswer:
     """Run each wanted mapper on shared features; the robot's poses only choose which pairs are matched."""
     arguments = context.arguments
-    images = arguments["images"]
-    files = dict(zip((image["viewpoint"] for image in images), photographs(context, images), strict=True))
-    prior = {name: np.array(T) for name, T in (arguments.get("prior") or {}).items()}
     options = SfmOptions(**arguments["effort"])
+    reconstructed = _from_pieces(context, options) if "features" in arguments else _from_images(context, options)
     measures: dict[str, float] = {}
     artefacts = []
     for mapper in arguments["mappers"]:
-        model = reconstruct(
-            files,
-            context.camera(),
-            context.scratch,
-            mapper,
-            T_world_camera_prior=prior or None,
-            options=options,
-            progress=context.progress,
-        )
+        model = reconstructed(mapper)
         measures[f"{mapper}_images"] = float(model.n_registered)
         measures[f"{mapper}_missing"] = float(len(model.missing))
         measures[f"{mapper}_reprojection_px"] = model.mean_reprojection_error_px
@@ -62,6 +54,36 @@ def structure_from_motion(context: JobContext) -> JobAnswer:
         name = f"{mapper}_tracks.npz"
         artefacts.append(context.keep_bytes(packed, kind="sfm_tracks", media_type=media_type, name=name))
     return JobAnswer(measures, tuple(artefacts))
+
+
+def _from_pieces(context: JobContext, options: SfmOptions) -> Callable[[Mapper], SfmModel]:
+    features = read_features(context)
+    matches = read_matches(context, features)
+    return partial(
+        reconstruct_from,
+        features,
+        matches,
+        context.camera(),
+        context.scratch,
+        options=options,
+        progress=context.progress,
+    )
+
+
+def _from_images(context: JobContext, options: SfmOptions) -> Callable[[Mapper], SfmModel]:
+    """All at once, as runs were recorded before features and matches were jobs of their own."""
+    images = context.arguments["images"]
+    files = dict(zip((image["viewpoint"] for image in images), photographs(context, images), strict=True))
+    prior = {name: np.array(T) for name, T in (context.arguments.get("prior") or {}).items()}
+    return partial(
+        reconstruct,
+        files,
+        context.camera(),
+        context.scratch,
+        T_world_camera_prior=prior or None,
+        options=options,
+        progress=context.progress,
+    )
 
 
 def hybrid(context: JobContext) -> JobAnswer:

@@ -1,0 +1,44 @@
+"""At the end of a run: the results that are still being computed, with the time left, until all have arrived."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from service.cli.operators import Display
+from service.core.protocol import Protocol
+from service.evidence import RunLog, results_to_come
+from service.steps.time_left import duration_words
+from service.store.store import Store
+
+_LOOK_S = 0.5
+
+
+def wait_for_results(
+    store: Store, run_id: str, protocol: Protocol, display: Display, wait: Callable[[float], None] = time.sleep
+) -> None:
+    """Show what is still computed until nothing is; Ctrl-C leaves it to another worker, and loses nothing."""
+    log = RunLog(store, run_id, protocol)
+    pending = [one for one in results_to_come(log) if not one.failed]
+    if not pending or not store.open_jobs(run_id):
+        return
+    display.tell("The run is complete. Results for comparison are still being computed; Ctrl-C leaves them for later")
+    seen: set[str] = set()
+    total = len(pending)
+    try:
+        while store.open_jobs(run_id):
+            left = results_to_come(log)
+            for one in left:
+                if one.failed and one.name not in seen:
+                    seen.add(one.name)
+                    display.tell(one.text)
+            pending = [one for one in left if not one.failed]
+            last_s = max((one.seconds for one in pending), default=0.0)
+            names = ", ".join(one.name for one in pending[:3]) + (" …" if len(pending) > 3 else "")
+            display.show(f"{names or 'computing'}: about {duration_words(last_s)} left", total - len(pending), total)
+            wait(_LOOK_S)
+    except KeyboardInterrupt:
+        data = store.database_path.parent
+        display.tell(f"Left for later: `orthocapture worker --data {data} --until-idle` computes what is missing")
+    finally:
+        display.clear()

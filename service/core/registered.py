@@ -1,0 +1,93 @@
+"""The registrations of a run and their evaluations, whenever they arrived, and which of them is the run's own.
+
+The run's own registration is the one with the smallest error on the control spheres among those that the
+evaluation step judged: that is what was signed, and by what the specimen was released. One that arrives later may be
+better; it is reported beside it and does not take its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from service.core.arrival import late_words
+from service.core.priorities import lane_of
+from service.core.protocol import Protocol
+from service.core.run_state import JobState, RunState
+
+Row = Mapping[str, Any]
+
+
+def last_result(protocol: Protocol, state: RunState, kind: str) -> Mapping[str, Any]:
+    """The Result of the last step of a kind that has one; empty if there is none."""
+    results = (state.steps[step.id].result for step in reversed(protocol.steps) if step.kind == kind)
+    return next((result for result in results if result), {})
+
+
+def registration_name(record: Mapping[str, Any]) -> str:
+    """`colmap`, or `colmap_1920x1080` of images reduced to that size."""
+    if record.get("full_camera") is None:
+        return str(record["poses"])
+    camera = record["camera"]
+    return f"{record['poses']}_{int(camera['width'])}x{int(camera['height'])}"
+
+
+def registrations(protocol: Protocol, state: RunState) -> dict[str, Mapping[str, Any]]:
+    """Every registration by its name: those of the step's result, then those that came after it."""
+    found = dict(last_result(protocol, state, "registration").get("registrations", {}))
+    for job in _finished(protocol, state, "registration", "register") if found else ():
+        found.setdefault(registration_name(job.result), job.result)
+    return found
+
+
+def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
+    """The paper's table, whenever a row arrived; `late` of a row is "" where it came before the release."""
+    rows: list[Row] = [{**row, "late": ""} for row in _signed_rows(protocol, state)]
+    known = {row["poses"] for row in rows}
+    for job in _later_evaluations(protocol, state) if rows else ():
+        late = "" if job.late_s is None else late_words(job.late_s)
+        rows += [{**row, "late": late} for row in job.result["table"] if row["poses"] not in known]
+    return rows
+
+
+def budgets(protocol: Protocol, state: RunState) -> dict[str, Mapping[str, Any]]:
+    """The error budget of each registration."""
+    found = dict(last_result(protocol, state, "evaluation").get("budgets", {}))
+    for job in _later_evaluations(protocol, state):
+        found = {**job.result["budgets"], **found}
+    return found
+
+
+def own_registration(protocol: Protocol, state: RunState) -> str | None:
+    """The name of the run's own registration (see above); None before the evaluation."""
+    rows = _signed_rows(protocol, state)
+    return str(min(rows, key=_error_mm)["poses"]) if rows else None
+
+
+def better_later(protocol: Protocol, state: RunState) -> Row | None:
+    """The best of those that came after the evaluation, where it is better than the run's own."""
+    own = own_registration(protocol, state)
+    rows = evaluated(protocol, state)
+    best = min(rows, key=_error_mm, default=None)
+    signed = {row["poses"] for row in _signed_rows(protocol, state)}
+    return best if own is not None and best is not None and best["poses"] not in signed else None
+
+
+def _signed_rows(protocol: Protocol, state: RunState) -> list[Row]:
+    return list(last_result(protocol, state, "evaluation").get("table", ()))
+
+
+def _error_mm(row: Row) -> float:
+    return float(row["mean_radial_error_mm"])
+
+
+def _later_evaluations(protocol: Protocol, state: RunState) -> list[JobState]:
+    jobs = _finished(protocol, state, "evaluation", "evaluate")
+    return [job for job in jobs if lane_of(job.priority) == "background"]
+
+
+def _finished(protocol: Protocol, state: RunState, step_kind: str, job_kind: str) -> Iterator[JobState]:
+    for step in protocol.steps:
+        if step.kind == step_kind:
+            jobs = state.steps[step.id].jobs.values()
+            yield from (job for job in jobs if job.kind == job_kind and job.status == "finished")

@@ -1,0 +1,73 @@
+"""What follows from a finished job: the jobs that it made possible, and a signature where the run has ended."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from functools import partial, reduce
+
+from service.core.arrival import late_s
+from service.core.errors import OrthocaptureError, StoreError
+from service.core.fold import advance
+from service.core.model import Event
+from service.evidence import RunLog, recorded_protocol, recorded_root
+from service.steps.sources import due
+from service.store.records import Job, NewArtefact, NewJob
+from service.store.signing import checkpoint
+from service.store.store import Store
+from service.worker.job import JobAnswer
+
+_log = logging.getLogger(__name__)
+
+
+class Following:
+    """The runs that a worker has jobs of, each read as far as it went when the last of them ended."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._logs: dict[str, RunLog | None] = {}
+
+    def finish(self, job: Job, answer: JobAnswer, duration_s: float) -> None:
+        """Record an answer, and in the same transaction enqueue what it makes possible. Raises LeaseLostError.
+
+        An answer that arrives when the run has ended is signed at once: nobody else would.
+        """
+        log = self._log_of(job.run_id)
+        late: float | None = None
+        follow: tuple[int, Callable[[Sequence[Event]], Sequence[NewJob]]] | None = None
+        if log is not None:
+            state, protocol = log.refresh(), log.protocol
+            late = late_s(protocol, state, datetime.now(UTC).isoformat())
+            follow = state.seq, lambda events: due(protocol, reduce(partial(advance, protocol), events, state))
+        self._store.finish_job(
+            job,
+            measures=answer.measures,
+            duration_s=duration_s,
+            result=answer.result,
+            artefacts=[NewArtefact(r, "worker", job.step, job.attempt) for r in answer.artefacts],
+            late_s=late,
+            follow=follow,
+        )
+        self.seal(job.run_id)
+
+    def seal(self, run_id: str) -> None:
+        """Sign the end of a run that is over and that nobody drives. A key that cannot be used is told, no more."""
+        log = self._log_of(run_id)
+        if log is None or not log.refresh().terminal or self._store.driven(run_id):
+            return
+        try:
+            checkpoint(self._store, run_id)
+        except StoreError as error:
+            _log.warning("the record of %s could not be signed: %s", run_id, error)
+
+    def _log_of(self, run_id: str) -> RunLog | None:
+        """None for a run whose protocol this version cannot read: its jobs are done, and nothing follows."""
+        if run_id not in self._logs:
+            try:
+                protocol = recorded_protocol(self._store, recorded_root(self._store, run_id))
+                self._logs = {run_id: RunLog(self._store, run_id, protocol)}
+            except OrthocaptureError as error:
+                _log.warning("what follows from the jobs of %s cannot be told: %s", run_id, error)
+                self._logs = {run_id: None}
+        return self._logs[run_id]
