@@ -61,6 +61,22 @@ class OpticsSection(Record):
     blur_um: Annotated[float, Field(gt=0)] = 45.0  # circle of confusion on the sensor, 12 px of 3.76 µm
 
 
+class LensSection(Record):
+    """What is engraved on the lens and stated of the sensor: from this the first board images are planned."""
+
+    focal_length_mm: Annotated[float, Field(gt=0)]
+    sensor_width_mm: Annotated[float, Field(gt=0)]
+    image_px: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]  # width and height of the photographs
+    focus_distance_m: Annotated[float, Field(gt=0.05)] | None = None  # from the camera; None: the lens hardly extends
+    tolerance: Annotated[float, Field(gt=0, lt=0.5)] = 0.025  # of the focal length, relative
+
+    def focal_px(self, width_px: int) -> float:
+        """Focal length in pixels of images of this width: the lens extends when it is focused near."""
+        f_m = self.focal_length_mm / 1e3
+        extended = 1.0 if self.focus_distance_m is None else self.focus_distance_m / (self.focus_distance_m - f_m)
+        return self.focal_length_mm * extended / self.sensor_width_mm * width_px
+
+
 class TimestampSection(Record):
     """A time-stamp authority (RFC 3161) asked at the end of every run; without its answer the run ends too."""
 
@@ -81,6 +97,7 @@ class RigSection(Record):
     payload: PayloadSection | None = None
     collision: CollisionSection = CollisionSection()
     optics: OpticsSection | None = None  # None: depth of field is not judged
+    lens: LensSection | None = None  # needed where the software plans the board poses
     timestamp: TimestampSection | None = None  # None: nobody outside is asked
 
 

@@ -25,7 +25,7 @@ from drivers.interfaces import (
 )
 from drivers.plugin import DriverConfig, DriverSpec
 from service.core.errors import ConfigurationError
-from service.rig import CollisionSection, OpticsSection, Rig
+from service.rig import CollisionSection, LensSection, OpticsSection, Rig
 from service.steps.context import StationLayout
 
 GROUP = "orthocapture.drivers"
@@ -127,6 +127,10 @@ class Station:
     def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
         """What the rig file says of the arm's surroundings and of the lens."""
         return self.rig.section.collision, self.rig.section.optics
+
+    def lens(self) -> LensSection | None:
+        """Focal length and sensor as the rig file states them."""
+        return self.rig.section.lens
 
     def reopen(self, device: Device) -> None:
         """Close and open again, after a link dropped."""

@@ -176,12 +176,18 @@ class _Rig:
             "T_flange_camera_nominal": nominal_hand_eye().tolist(),
             "payload": {"mass_kg": 1.6, "centre_of_gravity_m": [0.0, 0.0, 0.08]},
             "collision": {"arm": ARM_MODEL.name},
+            "lens": self._lens(),
         }
 
     def _exposure_s(self) -> float:
         """How long a picture may take: this camera computes what it sees, up to some seconds a megapixel."""
         megapixels = self.args.image_width**2 * 2 / 3 / 1e6
         return round(40.0 + 4.0 * megapixels, 0)
+
+    def _lens(self) -> dict[str, Any]:
+        """As it is engraved on the lens and stated by the camera's maker; the true lens differs by a percent or so."""
+        lens = self.scene.camera_intrinsics(self.args.image_width)
+        return {"focal_length_mm": 50.0, "sensor_width_mm": 35.7, "image_px": [lens.width, lens.height]}
 
     def _station(self, index: int, name: str) -> dict[str, Any]:
         T_base_world = inverse(self.scene.T_world_base[name])

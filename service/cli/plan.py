@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,12 +14,12 @@ from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, pr
 from service.cli.run import next_best_views
 from service.core.errors import ConfigurationError
 from service.core.fold import fold
-from service.core.protocol import load_protocol
+from service.core.protocol import Step, load_protocol
 from service.rig import load_rig
 from service.runs import recorded_run
 from service.station import layout_of
-from service.steps import params_models
-from service.steps.preview import preview_plans
+from service.steps import calibration, params_models
+from service.steps.preview import BoardPreview, preview_board_poses, preview_plans
 from service.store.store import Store
 
 plan_app = typer.Typer(no_args_is_help=True, help="Plan viewpoints: before a capture, and while one runs.")
@@ -31,7 +32,7 @@ def show_command(
     step: Annotated[str | None, typer.Option("--step", help="This capture step alone.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Which viewpoints the arm can take, in which order, and how long it takes. Needs no device."""
+    """Which viewpoints the arm can take, in which order, in what time; what board images will tell. No device."""
     with reporting_errors(json):
         loaded = load_protocol(protocol, params_models())
         rig_file = load_rig(rig)
@@ -41,9 +42,14 @@ def show_command(
             plans = preview_plans(loaded.protocol, one, rig_file, lambda station: layout_of(rig_file, station))
             if plans:
                 answers[one.id] = [dict(plan.record) | {"text": plan.text} for plan in plans]
+            board = preview_board_poses(loaded.protocol, one, rig_file, lambda station: layout_of(rig_file, station))
+            if board is not None:
+                answers[one.id] = [_board_record(one, board)]
         if not answers:
             raise ConfigurationError(
-                "there is nothing to plan", where=str(protocol), remedy="Name a step of kind viewpoint_capture"
+                "there is nothing to plan",
+                where=str(protocol),
+                remedy="Name a step of kind viewpoint_capture or calibration",
             )
     if json:
         print_json(answers)
@@ -51,6 +57,24 @@ def show_command(
     for name, plans in answers.items():
         for plan in plans:
             console.print(f"{name}, {plan['station']}: {escape(plan['text'])}")
+            if "prediction" in plan:
+                console.print(_coverage_text(plan["prediction"]["coverage_map"]), highlight=False)
+
+
+def _board_record(step: Step, board: BoardPreview) -> dict[str, Any]:
+    station = step.params_as(calibration.Params).board_poses
+    return {
+        "station": "" if station is None else station.station,
+        "text": board.text,
+        "prediction": dict(board.prediction),
+        "poses": board.T_base_camera.round(6).tolist(),
+    }
+
+
+def _coverage_text(counts: Sequence[Sequence[int]]) -> str:
+    """Corners expected in each cell of the image, row by row; a dot where none will be."""
+    width = max(len(str(n)) for row in counts for n in row)
+    return "\n".join("    " + " ".join((str(n) if n else "·").rjust(width) for n in row) for row in counts)
 
 
 @plan_app.command("next")

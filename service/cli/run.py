@@ -53,7 +53,7 @@ from service.runs import (
 from service.station import Station, layout_of
 from service.steps import params_models
 from service.steps.live import describe_view
-from service.steps.preview import preview_plans
+from service.steps.preview import preview_board_poses, preview_plans
 from service.store.store import Store
 from service.store.timestamping import stamp_end
 
@@ -299,9 +299,10 @@ def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
     """What a capture step is going to do, for the person who is asked to release it."""
     try:
         plans = preview_plans(protocol, protocol.step(step), rig, partial(layout_of, rig))
+        board = preview_board_poses(protocol, protocol.step(step), rig, partial(layout_of, rig))
     except ConfigurationError as error:
         return str(error)
-    return "; ".join(plan.text for plan in plans)
+    return "; ".join([plan.text for plan in plans] + ([board.text] if board is not None else []))
 
 
 @contextmanager

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Any, Literal, Self
 
+import numpy as np
+from pydantic import model_validator
+
+from service.compute.calibration.board import Board
 from service.core.errors import ConfigurationError
 from service.core.model import Record
-from service.steps.capture import capture_viewpoints
-from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.board_capture import BoardCapture, board_arguments
+from service.steps.board_mend import mend_calibration
+from service.steps.board_plan import BoardPoses
+from service.steps.context import JobRequest, JobResult, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, result_of
 from service.steps.optics import departing_images, optics_departures
 from service.steps.viewpoints import ViewpointSet, plan_viewpoints
@@ -17,9 +24,16 @@ class Params(Record):
     """Which board images, and what is computed from them."""
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]
-    viewpoints: tuple[ViewpointSet, ...] = ()
+    board_poses: BoardPoses | None = None  # planned by the software
+    viewpoints: tuple[ViewpointSet, ...] = ()  # or: as listed here
     images_of: str | None = None  # use the images of this earlier calibration step instead of new ones
     intrinsics_of: str | None = None  # hand-eye alone: the step that solved the intrinsics
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.board_poses is not None and (self.viewpoints or self.images_of is not None):
+            raise ValueError("a calibration needs one of board_poses, viewpoints and images_of, not two")
+        return self
 
 
 class Result(Record):
@@ -34,49 +48,96 @@ class Result(Record):
 
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
-    """Capture the board, then let the worker solve."""
+    """Capture the board and let the worker solve; what falls short is answered with the views that would mend it."""
+    board = board_of_protocol(context)
+    camera = _camera(context, params)
     measures: dict[str, float] = {}
-    source = params.images_of or context.step.id
+    capture = None
     if params.images_of is None:
-        plan = [
-            viewpoint
-            for viewpoint_set in params.viewpoints
-            for viewpoint in plan_viewpoints(viewpoint_set, context.devices.layout(viewpoint_set.station))
-        ]
-        nominal = context.devices.nominal_T_flange_camera()
-        measures |= capture_viewpoints(context, plan, nominal, image_kind="board_image").measures()
+        capture = _board_capture(context, params, board, camera)
+        measures |= capture.take()
         departures = optics_departures(context)
         if departures is not None:
             measures["optics_departures"] = float(departing_images(departures))
-    camera = None
-    if "intrinsics" not in params.solve:
-        if params.intrinsics_of is None:
-            raise ConfigurationError(
-                "hand-eye needs intrinsics", where=f"step {context.step.id}", remedy="Name the step in intrinsics_of"
-            )
-        camera = result_of(context, params.intrinsics_of)["camera"]
+    answer = _solve(context, params, board, camera, capture)
+    images = captured_images(context, [params.images_of or context.step.id])
+    robots = {context.devices.layout(image["station"]).robot for image in images if image["station"]}
+    result = Result.model_validate({**answer.result, "robots": sorted(robots)})
+    measures |= answer.measures
+    if capture is not None:
+        mend_calibration(context, capture, measures)
+    return StepOutcome(measures, answer.artefacts, result.model_dump(mode="json"))
+
+
+def board_of_protocol(context: StepContext) -> Board:
+    """The protocol's board. Raises ConfigurationError if it describes none."""
     board = context.protocol.board
     if board is None:
         raise ConfigurationError(
             "the protocol describes no calibration board", where=context.protocol.id, remedy="Add a section `board`"
         )
-    images = captured_images(context, [source])
-    (answer,) = context.evidence.run_jobs(
-        JobRequest(
-            "calibrate",
-            {
-                "solve": list(params.solve),
-                "images": images,
-                "columns": board.columns,
-                "rows": board.rows,
-                "square_m": board.square_mm / 1000,
-                "camera": camera,
-            },
+    return Board(board.columns, board.rows, board.square_mm / 1000)
+
+
+def _camera(context: StepContext, params: Params) -> Mapping[str, float] | None:
+    """Intrinsics of an earlier step, where this one does not solve them."""
+    if "intrinsics" in params.solve:
+        return None
+    if params.intrinsics_of is None:
+        raise ConfigurationError(
+            "hand-eye needs intrinsics", where=f"step {context.step.id}", remedy="Name the step in intrinsics_of"
         )
+    return result_of(context, params.intrinsics_of)["camera"]
+
+
+def _board_capture(
+    context: StepContext, params: Params, board: Board, camera: Mapping[str, float] | None
+) -> BoardCapture:
+    given = tuple(
+        viewpoint
+        for viewpoint_set in params.viewpoints
+        for viewpoint in plan_viewpoints(viewpoint_set, context.devices.layout(viewpoint_set.station))
     )
-    robots = {context.devices.layout(image["station"]).robot for image in images if image["station"]}
-    result = Result.model_validate({**answer.result, "robots": sorted(robots)})
-    return StepOutcome({**measures, **answer.measures}, answer.artefacts, result.model_dump(mode="json"))
+    wanted = params.board_poses or _as_board_poses(params.viewpoints)
+    return BoardCapture(context, wanted, board, params.solve, given, camera, params.intrinsics_of)
+
+
+def _as_board_poses(sets: tuple[ViewpointSet, ...]) -> BoardPoses:
+    """What replacements of listed viewpoints are planned by."""
+    arcs = [arc for one in sets for arc in one.arcs]
+    offset = sets[-1].aim_offset_m[2]
+    return BoardPoses(
+        station=sets[-1].station,
+        prefix=sets[-1].prefix,
+        count=max(4, sum(one.count for one in sets)),
+        tilts_deg=tuple(sorted({arc.tilt_deg for arc in arcs})),
+        distances_m=(float(np.median([arc.distance_m for arc in arcs])),),
+        above_scene_m=offset,
+    )
+
+
+def _solve(
+    context: StepContext,
+    params: Params,
+    board: Board,
+    camera: Mapping[str, float] | None,
+    capture: BoardCapture | None,
+) -> JobResult:
+    images = captured_images(context, [params.images_of or context.step.id])
+    arguments: dict[str, Any] = {
+        "solve": list(params.solve),
+        "images": images,
+        **board_arguments(board),
+        "camera": None if camera is None else dict(camera),
+    }
+    if capture is not None:
+        looks = {look.capture.artefacts[0].sha256: look for look in capture.looks()}
+        corners = [looks[image["sha256"]].corners_sha256 if image["sha256"] in looks else None for image in images]
+        arguments["corners"] = corners
+        known = capture.known
+        arguments["known"] = known.record() if known is not None and known.measured >= 3 and None in corners else None
+    (answer,) = context.evidence.run_jobs(JobRequest("calibrate", arguments))
+    return answer
 
 
 KIND = StepKind("calibration", Params, Result, execute, moves_robot=True)

@@ -15,7 +15,7 @@ from service.core.priorities import WAITED
 from service.core.protocol import Protocol as LabProtocol
 from service.core.protocol import Step
 from service.core.run_state import JobState
-from service.rig import CollisionSection, OpticsSection
+from service.rig import CollisionSection, LensSection, OpticsSection
 from service.store.records import NewArtefact
 
 P = TypeVar("P", bound=Record)
@@ -68,6 +68,10 @@ class Devices(Protocol):
 
     def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
         """What the arm must keep clear of, and the lens where it is described."""
+        ...
+
+    def lens(self) -> LensSection | None:
+        """Focal length and sensor as the rig file states them."""
         ...
 
     def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:

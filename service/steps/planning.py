@@ -44,9 +44,18 @@ class StepPlan:
 
 
 def plan_step(
-    context: StepContext, viewpoints: Sequence[Viewpoint], T_flange_camera: Transform, order: Order
+    context: StepContext,
+    viewpoints: Sequence[Viewpoint],
+    T_flange_camera: Transform,
+    order: Order,
+    *,
+    sharp_at_m: Array | None = None,
 ) -> StepPlan:
-    """Plan from where the arm stands now, and record the plan. An arm without known kinematics is not checked."""
+    """Plan from where the arm stands now, and record the plan. An arm without known kinematics is not checked.
+
+    Args:
+        sharp_at_m: (N, 3) points that must be sharp, base frame; None: the specimen.
+    """
     collision, optics = context.devices.surroundings()
     plans: list[StepPlan] = []
     for station in dict.fromkeys(v.station for v in viewpoints):
@@ -61,9 +70,10 @@ def plan_step(
         layout = context.devices.layout(station)
         plans.append(
             plan_station(
-                mine, T_flange_camera, layout, model, collision, optics, context.protocol.motion, start, order
+                mine, T_flange_camera, layout, model, collision, optics, context.protocol.motion, start, order,
+                sharp_at_m=sharp_at_m,
             )
-        )
+        )  # fmt: skip
     whole = StepPlan(
         tuple(v for plan in plans for v in plan.viewpoints),
         {name: reason for plan in plans for name, reason in plan.refused.items()},
@@ -87,9 +97,13 @@ def plan_station(
     motion: Motion,
     start_rad: Array,
     order: Order,
+    *,
+    sharp_at_m: Array | None = None,
 ) -> StepPlan:
     """The same for one station and a known arm, without a device."""
-    situation = situation_of(T_flange_camera, layout, model, collision, optics, motion, start_rad)
+    situation = situation_of(
+        T_flange_camera, layout, model, collision, optics, motion, start_rad, sharp_at_m=sharp_at_m
+    )
     answer = plan_motion([(v.name, v.T_base_camera) for v in viewpoints], situation, order)
     stations = {v.name: v.station for v in viewpoints}
     planned = tuple(
@@ -132,6 +146,8 @@ def situation_of(
     optics: OpticsSection | None,
     motion: Motion,
     start_rad: Array,
+    *,
+    sharp_at_m: Array | None = None,
 ) -> Situation:
     """Arm, surroundings and optics of a station as the planner takes them."""
     centre = np.array(layout.scene_centre_m)
@@ -157,7 +173,7 @@ def situation_of(
         speed_rad_s=motion.speed_rad_s,
         acceleration_rad_s2=motion.acceleration_rad_s2,
         sharp=sharp,
-        must_be_sharp_m=apply(T_base_specimen, corners),
+        must_be_sharp_m=apply(T_base_specimen, corners) if sharp_at_m is None else sharp_at_m,
         pause_s=motion.dwell_s + _EXPOSURE_S,
     )
 

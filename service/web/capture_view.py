@@ -81,7 +81,11 @@ class Redo:
 
 def capture_steps(protocol: Protocol) -> list[Step]:
     """The steps that take images with the robot."""
-    return [step for step in protocol.steps if getattr(step.params, "viewpoints", ())]
+    return [
+        step
+        for step in protocol.steps
+        if getattr(step.params, "viewpoints", ()) or getattr(step.params, "board_poses", None) is not None
+    ]
 
 
 def step_to_show(log: RunLog, wanted: str) -> Step | None:
@@ -183,7 +187,11 @@ def _board(log: RunLog, step: Step, capture: Capture) -> Verdict:
     why = {entry["image"]: entry["reason"] for entry in intrinsics.get("excluded", ())}
     why = dict.fromkeys(details.get("views_without_board", ()), "no board was found in it") | why
     name = capture.payload.viewpoint
-    if name in why:
+    for job in log.state.steps[step.id].jobs.values():  # looked at as it arrived
+        unseen = job.kind == "board_view" and job.status == "finished" and not job.result.get("seen")
+        if unseen and job.arguments["image"]["sha256"] == capture.sha256:
+            why[name] = str(job.result.get("reason", "")) + " (another pose was taken instead)"
+    if name in why and name not in intrinsics.get("images", ()):
         return Verdict("Board", False, "Not used", why[name])
     if name not in intrinsics.get("images", ()):
         return Verdict("Board", None, "not looked at yet", "the board is searched for once all images are taken")

@@ -6,7 +6,9 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import yaml
 
 from service.core.geometry import Transform
@@ -53,11 +55,19 @@ def station_of(log: RunLog, name: str) -> Station | None:
 def planned_poses(log: RunLog, step: Step) -> tuple[Viewpoint, ...]:
     """Those of the protocol, then those that an attempt of the step has suggested."""
     sets: tuple[ViewpointSet, ...] = getattr(step.params, "viewpoints", ())
+    board: Any = getattr(step.params, "board_poses", None)
     out: list[Viewpoint] = []
     for viewpoint_set in sets:
         station = station_of(log, viewpoint_set.station)
         if station is not None:
             out += plan_viewpoints(viewpoint_set, station.layout)
+    for note in log.state.steps[step.id].notes:
+        if note.note == "board_poses":
+            station_name = str(board.station if board is not None else next(iter(sets)).station)
+            out += [
+                Viewpoint(str(pose["viewpoint"]), station_name, np.array(pose["T_base_camera"]))
+                for pose in note.data["poses"]
+            ]
     notes = [note for note in log.state.steps[step.id].notes if note.note == "suggested_viewpoints"]
     wanted = {str(view["viewpoint"]) for note in notes for view in note.data["viewpoints"]}
     for viewpoint_set in sets[-1:]:

@@ -76,14 +76,19 @@ def sentence(text: str) -> str:
 
 def planned_views(step: Step) -> int:
     """How many images the protocol plans in a step."""
-    sets: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
-    return sum(int(one.count) for one in sets)
+    return sum(int(one.count) for one in _sets(step))
+
+
+def _sets(step: Step) -> tuple[Any, ...]:
+    """Sets of viewpoints, or the board poses that the software plans: each has a count and a station."""
+    planned = getattr(step.params, "board_poses", None)
+    listed: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
+    return listed if planned is None else (*listed, planned)
 
 
 def station_of(step: Step) -> str:
     """`station 1` of a capture step; "" for others."""
-    sets: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
-    return " and ".join(dict.fromkeys(str(one.station).replace("_", " ") for one in sets))
+    return " and ".join(dict.fromkeys(str(one.station).replace("_", " ") for one in _sets(step)))
 
 
 def count(amount: int, one: str, many: str = "") -> str:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from service.compute.calibration.board import Board
-from service.compute.calibration.board_images import UsableViews, find_boards, usable_views
+from service.compute.calibration.board_images import UsableViews, usable_views
 from service.compute.calibration.hand_eye import calibrate_hand_eye
 from service.compute.calibration.hand_eye_record import board_corners, hand_eye_record
 from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_view
@@ -18,6 +17,7 @@ from service.compute.calibration.kinematics import matching_arm
 from service.compute.calibration.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.calibration.validation import MIN_VIEWS_TO_VALIDATE, calibration_warnings, cross_validate
 from service.compute.camera_model import CameraModel
+from service.worker.board_views import board_of, boards_of
 from service.worker.job import JobAnswer, JobContext
 
 
@@ -26,18 +26,17 @@ def calibrate(context: JobContext) -> JobAnswer:
     arguments = context.arguments
     images = arguments["images"]
     names = [image["viewpoint"] for image in images]
-    board = Board(int(arguments["columns"]), int(arguments["rows"]), float(arguments["square_m"]))
-    found = find_boards(
-        [context.input(image["sha256"]) for image in images],
-        board,
-        workers=os.cpu_count() or 1,
-        progress=lambda done, total: context.progress("board images", done, total),
-    )
+    board = board_of(arguments)
+    found, parts = boards_of(context, board)
     usable = usable_views(found)
     seen = usable.indices
     missed = [names[k] for k in usable.excluded]
     measures: dict[str, float] = {"views": float(len(seen)), "views_without_board": float(len(missed))}
     details: dict[str, Any] = {"views_without_board": missed}
+    if arguments.get("known") is not None:
+        measures["views_partial"] = float(len(parts))
+        details["partial_views"] = {names[k]: count for k, count in parts.items()}
+        details["reasons"] = {names[k]: reason for k, reason in usable.excluded.items()}
     if "intrinsics" in arguments["solve"]:
         camera, intrinsics_measures, details["intrinsics"] = _intrinsics(usable, board, names)
         measures |= intrinsics_measures

@@ -31,6 +31,7 @@ _POLL_S = 0.2
 
 _MODULES = {
     "calibrate": "calibrate",
+    "board_view": "board_views",
     "ct_surface": "surfaces",
     "locate_spheres": "surfaces",
     "layout": "layout",

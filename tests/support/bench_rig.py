@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import DeviceUnavailableError, UnreachablePoseError
 from drivers.interfaces import (
@@ -39,7 +40,7 @@ from service.core.geometry import Array, Transform, from_rotation_vector, to_rot
 from service.core.model import OperatorAction
 from service.core.run_state import RunState
 from service.monitor.snapshot import Doing
-from service.rig import CollisionSection, OpticsSection
+from service.rig import CollisionSection, LensSection, OpticsSection
 from service.steps.context import StationLayout
 
 TRAVEL_S = 0.02
@@ -149,12 +150,20 @@ class BenchArm:
         return RobotSample(at_s - 100.0, at_s, joints, zeros, zeros, pose, 0.0, self.safety)
 
 
+def numbered(exposure: int) -> NDArray[np.uint8]:
+    """A small picture with a number."""
+    picture = np.full((40, 60, 3), 255, dtype=np.uint8)
+    cv2.putText(picture, str(exposure), (5, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (0, 0, 0))
+    return picture
+
+
 @dataclass
 class BenchCamera:
     """A camera that writes a small real JPEG, another one each time."""
 
     on_capture: Callable[[int], None] = _nothing  # called with the exposure's number; may raise, as a camera fails
     exif: Callable[[CameraSettings], CameraSettings] = lambda applied: applied
+    picture: Callable[[int], NDArray[np.uint8]] = numbered  # of the exposure's number
     connected: bool = False
     opened: int = 0
     exposures: int = 0
@@ -191,8 +200,7 @@ class BenchCamera:
             raise
         if not self.connected or self.applied is None:
             raise DeviceUnavailableError("the camera is not connected or was not set", where="camera")
-        picture = np.full((40, 60, 3), 255, dtype=np.uint8)
-        cv2.putText(picture, str(self.exposures), (5, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (0, 0, 0))
+        picture = self.picture(self.exposures)
         path = folder / f"DSC{self.exposures:05d}.JPG"
         assert cv2.imwrite(str(path), picture)
         data = path.read_bytes()
@@ -282,6 +290,9 @@ class BenchRig:
 
     def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
         return CollisionSection(), None
+
+    def lens(self) -> LensSection | None:
+        return LensSection(focal_length_mm=50, sensor_width_mm=35.7, image_px=(900, 600))
 
     def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
         self._on_open = on_open

@@ -236,6 +236,22 @@ def adjust(
     return Adjustment(camera_of(theta, size), theta, poses, state, scale)
 
 
+def linearised(boards: Array, points: Array, camera: CameraModel, parameters: int) -> Adjustment:
+    """The equations that boards T_camera_board (N, 4, 4) would have if their points (K, 3) were seen as expected.
+
+    Residuals are nothing, corners count 1 px: what images will tell can be judged before they are taken.
+    """
+    poses = np.array([np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]]) for T in boards])
+    theta = parameters_of(camera, parameters)
+    every = np.arange(len(points))
+    views = [
+        BoardView(every, project_with_jacobian(points, pose, camera_of(theta, (camera.width, camera.height)))[0])
+        for pose in poses
+    ]
+    equations, _, _ = _linearise(views, points, theta, poses, (camera.width, camera.height))
+    return Adjustment(camera, theta, poses, equations, 1.0)
+
+
 def _pose_step(view: ViewEquations, step: Array) -> Array:
     return view.compensation[:, :-1] @ step + view.compensation[:, -1]
 

@@ -157,7 +157,7 @@ def _find_checkerboard(image: Grey, columns: int, rows: int) -> tuple[Array, NDA
     between the first corners of the first two rows is dark.
     """
     found = _search_checkerboard(image, columns, rows)
-    corners, good = _refine(image, found, _half_window(_grid_spacing(found.reshape(rows, columns, 2)), _REACH))
+    corners, good = refine_corners(image, found, half_window(_grid_spacing(found.reshape(rows, columns, 2)), _REACH))
     if np.count_nonzero(good) < 0.8 * len(good):
         raise ComputeError("corners of the board drifted while they were refined", remedy="take a sharper image")
     if (columns + rows) % 2 and not _first_square_is_dark(image, corners.reshape(rows, columns, 2)):
@@ -208,7 +208,7 @@ def _grid_spacing(grid: Array) -> float:
     )
 
 
-def _refine(image: Grey, found: Array, half: int) -> tuple[Array, NDArray[np.bool_]]:
+def refine_corners(image: Grey, found: Array, half: int) -> tuple[Array, NDArray[np.bool_]]:
     """Corners (N, 2) at full size, and which of them stayed near and have their whole window in the image.
 
     A corner is the point whose directions to all pixels of the window are normal to their gradients.
@@ -233,7 +233,8 @@ def _refine(image: Grey, found: Array, half: int) -> tuple[Array, NDArray[np.boo
     return corners, whole & near
 
 
-def _half_window(spacing_px: float, reach: float) -> int:
+def half_window(spacing_px: float, reach: float) -> int:
+    """Half the side of the window in which a corner is refined, px; `reach` as of the board."""
     return int(np.clip(reach * spacing_px, 2, _MAX_HALF))
 
 
@@ -275,7 +276,7 @@ def _charuco_view(image: Grey, board: Board, indices: NDArray[np.int64], corners
     part = np.asarray(grid, dtype=np.float64)[row.min() : row.max() + 1, column.min() : column.max() + 1]
     if min(part.shape[:2]) < 2:
         raise ComputeError("only one row of the ChArUco board is seen", remedy="more of the board must be visible")
-    refined, good = _refine(image, corners, _half_window(_grid_spacing(part), board.reach()))
+    refined, good = refine_corners(image, corners, half_window(_grid_spacing(part), board.reach()))
     return BoardView(indices[good], refined[good])
 
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from service.compute.calibration.adjustment import project_with_jacobian
+from service.compute.calibration.adjustment import Adjustment, project_with_jacobian
+from service.compute.calibration.board import Board, BoardView
 from service.compute.calibration.intrinsics import IntrinsicsResult
+from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Array
 
@@ -40,6 +42,27 @@ class ProjectionUncertainty:
     centre_mm: float
     worst_mm: float
     rms_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Determined:
+    """A camera as board images determine it: what the uncertainty of its projection follows from.
+
+    Attributes:
+        camera: of the first `len(covariance)` parameters.
+        board: seen.
+        corners: (N) what of it.
+        adjustment: the equations at the solution.
+        covariance: (P, P) of the parameters.
+        variance: of one coordinate of a corner, px².
+    """
+
+    camera: CameraModel
+    board: Board
+    corners: tuple[BoardView, ...]
+    adjustment: Adjustment
+    covariance: Array
+    variance: float
 
 
 def board_distance_m(result: IntrinsicsResult) -> float:
@@ -74,6 +97,15 @@ def projection_uncertainty(
     Raises:
         DataError: the distance is not positive.
     """
+    variance = result.sigma_corner_px**2 * result.inflation
+    known = Determined(result.camera, result.board, result.corners, result.adjustment, result.covariance, variance)
+    return uncertainty_of(known, distance_m, columns=columns, rows=rows)
+
+
+def uncertainty_of(
+    result: Determined, distance_m: float, *, columns: int = 24, rows: int = 16
+) -> ProjectionUncertainty:
+    """The same for a camera that is determined by any images, those of a plan included."""
     if not 0 < distance_m < np.inf:
         raise DataError(f"a distance of {distance_m} m is not in front of the camera")
     K, noise = _implied_motion(result)
@@ -88,7 +120,7 @@ def projection_uncertainty(
     _, by_pose, by_camera = project_with_jacobian(points, np.zeros(6), camera)
     # At a zero rvec OpenCV's derivatives by rvec and tvec are those of a small turn and shift of the points.
     J_motion = np.column_stack([by_pose[:, 3:], by_pose[:, :3]]).reshape(-1, 2, 6)
-    J_camera = by_camera[:, : len(result.parameters)].reshape(-1, 2, len(result.parameters))
+    J_camera = by_camera[:, : len(result.covariance)].reshape(-1, 2, len(result.covariance))
     A = J_camera + J_motion @ K
     covariance = A @ result.covariance @ A.swapaxes(1, 2) + J_motion @ noise @ J_motion.swapaxes(1, 2)
     sigma_px = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
@@ -111,18 +143,19 @@ def projection_uncertainty(
     )
 
 
-def _implied_motion(result: IntrinsicsResult) -> tuple[Array, Array]:
+def _implied_motion(result: Determined) -> tuple[Array, Array]:
     """K (6, P), and the covariance (6, 6) of what the poses' own noise adds; motion (d, w), metres and radians.
 
     What stood at p before a board from the camera stands at p + d + w x p after parameters and poses have changed.
     """
     board = result.board.points()
-    count = len(result.parameters)
+    count = len(result.covariance)
     normal = np.zeros((6, 6))
     by_parameters = np.zeros((6, count))
     spread = np.zeros((6, 6))
+    boards = result.adjustment.T_camera_board()
     for k, (view, corners) in enumerate(zip(result.adjustment.views, result.corners, strict=True)):
-        T = result.T_camera_board[k]
+        T = boards[k]
         points = board[corners.indices] @ T[:3, :3].T + T[:3, 3]
         M = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), -_cross_matrices(points)], axis=2).reshape(-1, 6)
         L = _point_by_pose(board[corners.indices], result.adjustment.poses[k])
@@ -131,8 +164,7 @@ def _implied_motion(result: IntrinsicsResult) -> tuple[Array, Array]:
         by_parameters += pull @ view.compensation[:, :-1]
         spread += pull @ np.linalg.solve(view.pose_normal, pull.T)
     H = np.linalg.inv(normal)
-    variance = result.sigma_corner_px**2 * result.inflation
-    return H @ by_parameters, variance * H @ spread @ H
+    return H @ by_parameters, result.variance * H @ spread @ H
 
 
 def _cross_matrices(points: Array) -> Array:

@@ -88,7 +88,7 @@ def plan_motion(views: Sequence[tuple[str, Transform]], situation: Situation, or
     total = 0.0
     for i in sequence:
         blocked = _blocked(here, able[i].joints_rad, situation)
-        others = _able_postures(able[i].T_base_camera, situation)[1:] if blocked else []
+        others = able_postures(able[i].T_base_camera, situation)[1:] if blocked else []
         free = next((q for q in others if not _blocked(here, q, situation)), None)
         if free is not None:
             able[i], blocked = replace(able[i], joints_rad=free), ""
@@ -173,14 +173,14 @@ def _length(path: Sequence[int], times_s: Array) -> float:
 
 
 def _place(name: str, T_base_camera: Transform, situation: Situation) -> PlannedView:
-    able = _able_postures(T_base_camera, situation)
+    able = able_postures(T_base_camera, situation)
     if able:
         return PlannedView(name, T_base_camera, "feasible", joints_rad=able[0])
     nearest = next(iter(_postures(T_base_camera, situation)), None)
     reason = infeasible_reason(T_base_camera, nearest, situation)
     for nudge in _NUDGES_DEG:
         turned = turned_about_scene(T_base_camera, situation.centre_m, float(np.radians(nudge)))
-        able = _able_postures(turned, situation)
+        able = able_postures(turned, situation)
         if able:
             return PlannedView(name, turned, "nudged", reason, nudge, able[0])
     return PlannedView(name, T_base_camera, "refused", reason)
@@ -202,7 +202,8 @@ def _postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
     return [found[i] for i in np.argsort(np.sum((found - start) ** 2, axis=1), kind="stable")]
 
 
-def _able_postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
+def able_postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
+    """Joints (6,) that reach a pose, clear of everything, the scene sharp; those nearest to the arm's own first."""
     found = _postures(T_base_camera, situation)
     if not found or _blurred(T_base_camera, situation):
         return []

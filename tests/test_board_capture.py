@@ -1,0 +1,122 @@
+"""Calibration on a bench whose camera photographs a board: planned to succeed, images replaced, shortfalls mended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.core.model import GatesEvaluated, StepNote, StepRetried
+from service.store.store import Store
+from tests.support.bench_rig import answer
+from tests.support.bench_run import Bench, begin_run
+from tests.support.board_bench import MOUNT, PROTOCOL, Picture, board_room
+
+
+@pytest.fixture
+def begin(tmp_path: Path) -> Generator[Callable[[str], Bench]]:
+    with Store.open(tmp_path / "data") as store:
+        yield lambda text: begin_run(store, text, tmp_path)
+
+
+def plans(bench: Bench) -> list[dict[str, Any]]:
+    return [dict(note.data) for note in bench.payloads(StepNote) if note.note == "board_poses"]
+
+
+def names(plan: dict[str, Any]) -> list[str]:
+    return [pose["viewpoint"] for pose in plan["poses"]]
+
+
+def test_planned_poses_pass_at_the_first_attempt_without_a_cut_board(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL)
+    room = board_room(bench)
+    state = bench.run()
+    assert state.status == "completed", [q.text for q in bench.operator.asked]
+    assert not bench.payloads(StepRetried)
+    assert room.cut == []
+    found = plans(bench)
+    assert [plan["why"] for plan in found] == ["first", "start", "rest"]
+    assert len(bench.captured()) == sum(len(plan["poses"]) for plan in found) == 14
+    measures = state.steps["calibration"].measures
+    assert measures["boards_unseen"] == 0
+    predicted = found[-1]["prediction"]
+    assert measures["coverage"] >= predicted["coverage"] - 0.05
+    mount = np.array(state.steps["calibration"].result["T_flange_camera"])
+    assert np.linalg.norm((mount - MOUNT)[:3, 3]) < 1e-3
+    bench.must_verify()
+
+
+def test_images_without_a_board_are_replaced_in_the_same_attempt(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL)
+    room = board_room(bench)
+
+    def spoil(exposure: int, picture: Picture) -> Picture:
+        if exposure == 3:
+            return np.zeros_like(picture)
+        if exposure == 9:
+            return np.full_like(picture, 90)
+        return picture
+
+    room.spoil = spoil
+    state = bench.run()
+    assert state.status == "completed"
+    assert not bench.payloads(StepRetried)
+    captured = bench.captured()
+    replaced = [plan for plan in plans(bench) if plan["why"] == "replacement"]
+    assert sum(len(plan["poses"]) for plan in replaced) == 2
+    reasons = {name: why for plan in replaced for name, why in plan["instead_of"].items()}
+    assert set(reasons) == {captured[2], captured[8]}
+    assert reasons[captured[2]] == "the image is black"
+    assert "no board" in reasons[captured[8]]
+    assert len(captured) == 16
+    assert state.steps["calibration"].measures["views"] == 14
+    assert any(f"{captured[2]}: not used" in line for line in bench.operator.told)
+
+
+def test_a_shortfall_is_mended_by_further_poses_and_all_others_are_kept(begin: Callable[[str], Bench]) -> None:
+    few = PROTOCOL.replace("count: 14, coverage: 1.0", "count: 6, coverage: 0.3").replace(
+        "views, min: 14", "views, min: 9"
+    )
+    bench = begin(few)
+    board_room(bench)
+    asked: list[str] = []
+
+    def mend(question: Any, _state: Any) -> Any:
+        asked.append(question.text)
+        return answer(question, "confirm")
+
+    bench.script("calibration", "recovery", mend, mend)
+    state = bench.run()
+    assert state.status == "completed"
+    mends = [plan for plan in plans(bench) if plan["why"] == "mend"]
+    assert len(mends) == len(asked) >= 1
+    assert "coverage" in asked[0]
+    assert f"Confirm to take {len(mends[0]['poses'])} more images of the board" in asked[0]
+    captured = bench.captured()
+    assert len(set(captured)) == len(captured), "nothing is taken twice"
+    assert sorted(captured[6:]) == sorted(name for plan in mends for name in names(plan))
+    first, *_, last = bench.payloads(GatesEvaluated)
+    assert not first.passed
+    assert last.passed
+
+
+def test_the_board_on_its_other_side_stops_after_a_few_images(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL)
+    room = board_room(bench)
+    room.spoil = lambda exposure, picture: np.zeros_like(picture) if exposure <= 4 else picture
+    texts: list[str] = []
+
+    def uncover(question: Any, _state: Any) -> Any:
+        texts.append(question.text)
+        return answer(question, "confirm")
+
+    bench.script("calibration", "recovery", uncover)
+    state = bench.run()
+    assert state.status == "completed"
+    assert len(texts) == 1
+    assert "the first images show no board" in texts[0]
+    assert "the image is black" in texts[0]
+    bench.must_verify()
