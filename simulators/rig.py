@@ -185,7 +185,7 @@ class _Rig:
         return round(40.0 + 4.0 * megapixels, 0)
 
     def _lens(self) -> dict[str, Any]:
-        """As it is engraved on the lens and stated by the camera's maker; the true lens differs by a percent or so."""
+        """As engraved on the lens and stated by the camera's maker; the true lens differs by a percent or so."""
         lens = self.scene.camera_intrinsics(self.args.image_width)
         return {"focal_length_mm": 50.0, "sensor_width_mm": 35.7, "image_px": [lens.width, lens.height]}
 

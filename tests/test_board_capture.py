@@ -76,6 +76,7 @@ def test_images_without_a_board_are_replaced_in_the_same_attempt(begin: Callable
     assert any(f"{captured[2]}: not used" in line for line in bench.operator.told)
 
 
+@pytest.mark.slow
 def test_a_shortfall_is_mended_by_further_poses_and_all_others_are_kept(begin: Callable[[str], Bench]) -> None:
     few = PROTOCOL.replace("count: 14, coverage: 1.0", "count: 6, coverage: 0.3").replace(
         "views, min: 14", "views, min: 9"
@@ -103,6 +104,7 @@ def test_a_shortfall_is_mended_by_further_poses_and_all_others_are_kept(begin: C
     assert last.passed
 
 
+@pytest.mark.slow
 def test_the_board_on_its_other_side_stops_after_a_few_images(begin: Callable[[str], Bench]) -> None:
     bench = begin(PROTOCOL)
     room = board_room(bench)

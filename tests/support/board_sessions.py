@@ -13,9 +13,12 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board import Board
+from service.compute.calibration.board_design import Aims
 from service.compute.calibration.reprojection import BoardCorners
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
+from service.rig import LensSection
+from service.steps.board_plan import BoardPoses, Planner, nominal_board, nominal_camera, preview_board
 from service.steps.context import StationLayout
 from service.steps.viewpoints import ViewpointSet, flange_target, plan_viewpoints
 from simulators.arm import ARM_MODEL
@@ -55,7 +58,12 @@ def plan(scene: Scene, protocol: str, *steps: str) -> list[Shot]:
     by_id = {step["id"]: step for step in text["steps"]}
     shots: list[Shot] = []
     for step in steps:
-        for record in by_id[step]["params"]["viewpoints"]:
+        params = by_id[step]["params"]
+        if "board_poses" in params:
+            shots += planned_board_shots(
+                scene, BoardPoses.model_validate(_tuples(params["board_poses"])), params["solve"]
+            )
+        for record in params.get("viewpoints", ()):
             wanted = ViewpointSet.model_validate(record)
             layout = _layout(scene, wanted.station)
             for viewpoint in plan_viewpoints(wanted, layout):
@@ -63,6 +71,25 @@ def plan(scene: Scene, protocol: str, *steps: str) -> list[Shot]:
                 if q is not None:
                     shots.append(Shot(wanted.station, q))
     return shots
+
+
+def _tuples(record: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in record.items()}
+
+
+def planned_board_shots(scene: Scene, wanted: BoardPoses, solve: Sequence[str]) -> list[Shot]:
+    """The board images of a calibration as the software plans them when camera, mount and board are as stated."""
+    board, layout, mount = Board(16, 23, 0.015), _layout(scene, wanted.station), nominal_hand_eye()
+    lens = LensSection(focal_length_mm=50, sensor_width_mm=35.7, image_px=(4752, 3168))
+    known = nominal_board(wanted, board, layout, mount, *nominal_camera(lens))
+
+    def joints(T_base_camera: Array) -> Array | None:
+        return joints_for(ARM_MODEL, flange_target(T_base_camera, mount), _NEAR)
+
+    aims = Aims("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
+    planner = Planner(wanted, board, aims, np.array(layout.approach), mount, lambda T: joints(T) is not None)
+    found = [joints(T) for T in preview_board(planner, known).T_base_camera]
+    return [Shot(wanted.station, q) for q in found if q is not None]
 
 
 def _layout(scene: Scene, station: str) -> StationLayout:

@@ -22,6 +22,7 @@ from service.core.geometry import Array, Transform, apply, inverse
 _FEWEST = 24  # corners
 _FEWEST_LINES = 3  # rows, and columns
 _NEAR = 0.25  # of a square: by so much the board may lie elsewhere; from half a square on a corner has another name
+_DOUBT, _DRAWS = 0.5, 32
 _CONTRAST = 0.25  # least difference of dark and bright squares at a corner, over that of the whole board
 _OUTLIER = 4.0  # times the median distance from the fit
 _OUTLIER_FLOOR_PX = 0.3
@@ -49,13 +50,15 @@ def find_part(image: Grey, board: Board, known: BoardKnowledge, T_base_camera: T
     expected = known.camera.project(points)
     grid = expected.reshape(board.rows, board.columns, 2)
     spacing = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=2)))
+    if _doubt_px(board, known, T_base_camera) > _DOUBT * spacing:
+        raise ComputeError("camera, mount and board are not known to half a square yet")
     half = half_window(spacing, board.reach())
     inside = ((expected > half + 1) & (expected < np.array(image.shape[::-1]) - 2 - half)).all(axis=1)
     which = np.flatnonzero(inside)
     if len(which) < _FEWEST:
         raise _too_little(len(which))
     found, good = refine_corners(image, expected[which], half)
-    good &= _crossings(image, grid, which, found)
+    good &= _crossings(image, grid, which, found, dark_first=(board.columns + board.rows) % 2 == 1)
     which, found = which[good], found[good]
     if len(which) < _FEWEST:
         raise _too_little(len(which))
@@ -104,8 +107,27 @@ def _too_little(count: int) -> ComputeError:
     return ComputeError(f"only {count} corners of the board can be seen", remedy="more of the board must be visible")
 
 
-def _crossings(image: Grey, grid: Array, which: NDArray[np.int64], found: Array) -> NDArray[np.bool_]:
-    """(M,) corners where two dark squares meet two bright ones, as everywhere on the board."""
+def _doubt_px(board: Board, known: BoardKnowledge, T_base_camera: Transform) -> float:
+    """How far the corners may lie from where they are expected, px: the largest of some draws of what is possible."""
+    hands, boards, _, _ = known.draws(_DRAWS)
+    flange = T_base_camera @ inverse(known.T_flange_camera)
+    ends = board.points()[[0, board.columns - 1, -board.columns, -1]]
+    expected = known.camera.project(apply(inverse(T_base_camera) @ known.T_base_board, ends))
+    off = [
+        np.linalg.norm(known.camera.project(apply(inverse(flange @ X) @ B, ends)) - expected, axis=1).mean()
+        for X, B in zip(hands, boards, strict=True)
+    ]
+    return float(np.max(off))
+
+
+def _crossings(
+    image: Grey, grid: Array, which: NDArray[np.int64], found: Array, *, dark_first: bool
+) -> NDArray[np.bool_]:
+    """(M,) corners where two dark squares meet two bright ones, as everywhere on the board.
+
+    With `dark_first` the board is of the kind whose first square is dark (`find_board` numbers it so): a grid that is
+    off by one square has the wrong colours.
+    """
     columns = grid.shape[1]
     step_x, step_y = np.gradient(grid, axis=1).reshape(-1, 2)[which], np.gradient(grid, axis=0).reshape(-1, 2)[which]
 
@@ -118,6 +140,8 @@ def _crossings(image: Grey, grid: Array, which: NDArray[np.int64], found: Array)
     difference = (first[0] + first[1] - second[0] - second[1]) / 2
     difference = difference * np.where((which // columns + which % columns) % 2, -1, 1)
     usual = float(np.median(difference))
+    if dark_first and usual > 0:
+        return np.zeros(len(which), dtype=np.bool_)
     alike = np.maximum(np.abs(first[0] - first[1]), np.abs(second[0] - second[1])) < np.abs(difference)
     return (difference * np.sign(usual) > _CONTRAST * abs(usual)) & alike & (abs(usual) > 8)
 
