@@ -33,10 +33,10 @@ from service.core.geometry import Array, Transform, inverse, look_at, transform
 from service.core.protocol import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
-from service.steps import calibration, params_models, viewpoint_capture
+from service.steps import params_models, viewpoint_capture
 from service.steps.context import StationLayout
 from service.steps.planning import situation_of, usual_posture
-from service.steps.preview import preview_plans
+from service.steps.preview import preview_board_poses, preview_plans
 from service.steps.viewpoints import denser_viewpoints, plan_viewpoints
 
 PROTOCOL = Path(__file__).parents[1] / "protocols" / "exvivo_spine.yaml"
@@ -124,7 +124,7 @@ def test_every_viewpoint_of_the_papers_protocol_is_within_reach_and_touches_noth
     protocol = load_protocol(PROTOCOL, params_models()).protocol
     count = 0
     for step in protocol.steps:
-        if not isinstance(step.params, viewpoint_capture.Params | calibration.Params):
+        if not isinstance(step.params, viewpoint_capture.Params):
             continue
         for one in step.params.viewpoints:
             for view in plan_viewpoints(one, LAYOUT):
@@ -132,7 +132,7 @@ def test_every_viewpoint_of_the_papers_protocol_is_within_reach_and_touches_noth
                 joints = nearest_posture(ARM, target, situation.start_rad)
                 assert infeasible_reason(view.T_base_camera, joints, situation) == "", view.name
                 count += 1
-    assert count == 244
+    assert count == 124
 
 
 def test_the_way_between_the_papers_viewpoints_is_free_and_shorter_than_as_listed(situation: Situation) -> None:
@@ -252,3 +252,33 @@ def test_a_person_sees_the_plan_before_confirming(tmp_path: Path) -> None:
     (plan,) = preview_plans(protocol, protocol.step("control_capture_2"), rig, partial(layout_of, rig))
     assert plan.text.startswith("8 of 8 viewpoints, about ")
     assert preview_plans(protocol, protocol.step("fixation"), rig, partial(layout_of, rig)) == ()
+
+
+@pytest.mark.parametrize("step", ["intrinsics", "hand_eye"])
+def test_the_papers_board_images_are_planned_from_files_alone(tmp_path: Path, step: str) -> None:
+    lens = "lens: {focal_length_mm: 50, sensor_width_mm: 35.7, image_px: [1920, 1280]}\n"
+    (tmp_path / "rig.yaml").write_text(RIG + "collision: {arm: UR10e}\n" + lens)
+    words = ("plan", "show", str(PROTOCOL), "--rig", str(tmp_path / "rig.yaml"), "--step", step)
+    done = CliRunner().invoke(app, [*words, "--json"], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    (plan,) = json.loads(done.stdout)[step]
+    count = {"intrinsics": 90, "hand_eye": 30}[step]
+    assert len(plan["poses"]) == count
+    assert plan["text"].startswith(f"{count} of {count} board poses; predicted coverage ")
+    predicted = plan["prediction"]
+    assert len(predicted["coverage_map"]) == 8
+    if step == "intrinsics":
+        assert predicted["coverage"] >= 0.95
+        assert predicted["uncertainty_mm"] < 0.05
+        assert predicted["tilt_deg"] > 33
+    else:
+        assert predicted["hand_eye_sigma_mm"] < 0.5
+        assert predicted["rotation_spread_deg"] > 90
+    printed = CliRunner().invoke(app, [*words])
+    assert f"{count} of {count} board poses" in printed.output
+
+
+def test_a_step_without_a_board_has_no_board_poses(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(RIG + "collision: {arm: UR10e}\n")
+    rig, protocol = load_rig(tmp_path / "rig.yaml"), load_protocol(PROTOCOL, params_models()).protocol
+    assert preview_board_poses(protocol, protocol.step("fixation"), rig, partial(layout_of, rig)) is None
