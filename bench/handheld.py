@@ -33,9 +33,16 @@ def main(words: Sequence[str] | None = None) -> int:
     stem = options.results / f"handheld-{options.date}"
     scenes: list[dict[str, Any]] = []
     text = ""
+    options.results.mkdir(parents=True, exist_ok=True)
     for seed in options.scenes:
         print(f"scene {seed} …", file=sys.stderr, flush=True)
-        scene: dict[str, Any] = {"scene": seed, "hand": run_by_hand(seed, options.image_width, options.hand)}
+        before = options.made
+        by_hand = (
+            run_by_hand(seed, options.image_width, options.hand)
+            if before is None
+            else summary(before / "data", before / "rig" / "truth.json")
+        )
+        scene: dict[str, Any] = {"scene": seed, "hand": by_hand}
         if not options.no_robot:
             scene["robot"] = run_demo(seed, options.image_width, None)
         scenes.append(scene)
@@ -53,6 +60,9 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--scenes", type=int, nargs="+", default=[7], metavar="SEED", help="seeds (7)")
     parser.add_argument("--image-width", type=int, default=1280, help="of the simulated photographs (1280)")
     parser.add_argument("--hand", default="usual", choices=("steady", "usual", "clumsy"), help="who holds the camera")
+    parser.add_argument(
+        "--made", type=Path, help="folder with data/ and rig/ of a run of one scene that was made before"
+    )
     parser.add_argument("--no-robot", action="store_true", help="leave out the demo with the robot")
     parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat(), help="today")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the two files (bench/results)")

@@ -82,7 +82,7 @@ def _shown(
     common = {"run_id": run_id, "steps": capture_view.capture_steps(log.protocol), "log": log}
     step = capture_view.step_to_show(log, wanted)
     if step is None:
-        return {**common, "step": None}
+        return {**common, "step": None, "held": any(s.kind == "manual_capture" for s in log.protocol.steps)}
     views = capture_view.views_of(log, step)
     everything = captures_of(log, step.id)
     valid = [c for c in everything if c.replaced is None]

@@ -21,6 +21,7 @@ _REACH = 190.0  # from the middle to the lowest place of the hemisphere
 _LARGEST_ARROW = 30.0  # of the overlay, whose frame is 100 wide
 _METRES_FOR_LARGEST = 0.25
 _KINDS = ("hand_view", "hand_board")
+_TOLD = ("images_used", "hemisphere_coverage", "coverage", "predicted_target_error_mm", "specimen_coverage")
 
 SpotState = Literal["done", "open", "next"]
 
@@ -165,6 +166,8 @@ def _seen(viewpoint: str, sha256: str, job: JobState | None) -> Seen:
 def _figures(step: Step, measures: Mapping[str, float]) -> tuple[tuple[str, str, str, bool | None], ...]:
     out: list[tuple[str, str, str, bool | None]] = []
     for gate in step.gates:
+        if gate.measure not in _TOLD:  # those that are measured at the end
+            continue
         value = measures.get(gate.measure)
         met = None
         if value is not None:
