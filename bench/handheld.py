@@ -121,12 +121,14 @@ def summary(data: Path, truth: Path) -> dict[str, Any]:
 def as_markdown(record: Mapping[str, Any]) -> str:
     """The record as a person reads it."""
     computer = record["machine"]
+    beside = any("robot" in scene for scene in record["scenes"])
+    robot = " The robot's rows are those of the demo (22 images) on the same scene." if beside else ""
     lines = [
         f"# Accuracy of the capture by hand, {record['date']}",
         "",
         f"Commit {record['commit']}; {computer['processor']}, {computer['cores']} cores, {computer['memory_gb']} GB, "
         f"{computer['system']}, Python {computer['python']}; photographs {record['image_width']} px wide; simulated "
-        f"hand: {record['hand']}. The robot's rows are those of the demo (22 images) on the same scene.",
+        f"hand: {record['hand']}.{robot}",
         "",
         "The true error is the registration's displacement at the scene's centre against the simulator's record.",
         "",
