@@ -7,15 +7,13 @@ import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Callable
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from service.compute.poses.sfm_options import Progress
 from service.core.errors import ComputeError, OrthocaptureError
-
-Told = Callable[[int, int], None]  # done, total (0: unknown)
 
 
 def _child(log: str, seed: int, pipe: Connection) -> None:
@@ -44,7 +42,7 @@ class ColmapProcess:
     ) -> None:
         self.close()
 
-    def run(self, task: str, job: dict[str, Any], *, timeout_s: float, told: Told | None = None) -> Any:
+    def run(self, task: str, job: dict[str, Any], *, timeout_s: float, progress: Progress | None = None) -> Any:
         """What `task` (see sfm_process) makes of the job.
 
         Raises:
@@ -52,7 +50,7 @@ class ColmapProcess:
             OrthocaptureError: whatever the task itself raises.
         """
         try:
-            answer = self._answer(task, job, time.monotonic() + timeout_s, told)
+            answer = self._answer(task, job, time.monotonic() + timeout_s, progress)
         except (EOFError, BrokenPipeError, ConnectionResetError):
             tail = self._tail()
             self.close()
@@ -72,7 +70,9 @@ class ColmapProcess:
             raise value
         raise ComputeError(f"COLMAP failed during {task}: {value}", where=str(self._log), remedy="see its log")
 
-    def _answer(self, task: str, job: dict[str, Any], deadline: float, told: Told | None) -> tuple[str, Any] | None:
+    def _answer(
+        self, task: str, job: dict[str, Any], deadline: float, progress: Progress | None
+    ) -> tuple[str, Any] | None:
         """The child's last word on the task; None: it took too long."""
         pipe = self._started()
         pipe.send((task, job))
@@ -80,8 +80,8 @@ class ColmapProcess:
             kind, value = pipe.recv()
             if kind != "progress":
                 return kind, value
-            if told is not None:
-                told(*value)
+            if progress is not None:
+                progress(*value)
         return None
 
     def close(self) -> None:

@@ -36,7 +36,7 @@ class SfmModel:
     """The largest reconstructed model, in its own frame `world` and its own unit (not metric).
 
     Attributes:
-        mapper: which mapper made it.
+        mapper: which mapper made it; that of `triangulated` is in metres, in the frame of the poses given.
         T_world_camera: pose of each registered image.
         tracks: triangulated points and their observations; images in the order of T_world_camera.
         camera: as given, or refined.
@@ -99,9 +99,9 @@ def reconstruct(
         images: file of each image by name, or files whose names are unique.
         camera: calibrated at the images' size; held fixed unless the options refine it.
         workspace: folder for features, matches, the models and COLMAP's logs; made if missing.
-        mapper: COLMAP's incremental mapper or the global one (GLOMAP).
+        mapper: COLMAP's incremental mapper, the global one (GLOMAP), or `triangulated` from the prior.
         T_world_camera_prior: rough poses in one frame (from the robot) that choose the pairs to match; images
-            that it misses are matched with all others. Not used for anything else.
+            that it misses are matched with all others. Not used for anything else, but where `triangulated` starts.
         stations: where poses of the prior are in several frames, the frame of each image.
         options: settings.
         progress: told (stage, done, total) now and then; stages extract, match and those of `reconstruct_from`.
@@ -119,7 +119,16 @@ def reconstruct(
     with FrontEnd(camera, settings, processes=settings.threads, log=workspace / "colmap_front.log") as front:
         features = _features(files, camera, settings, workspace, front, seconds, progress)
         matches = _matches(features, pairs, camera, settings, workspace, front, seconds, progress)
-    model = reconstruct_from(features, matches, camera, workspace, mapper, options=settings, progress=progress)
+    model = reconstruct_from(
+        features,
+        matches,
+        camera,
+        workspace,
+        mapper,
+        T_world_camera_start=T_world_camera_prior if mapper == "triangulated" else None,
+        options=settings,
+        progress=progress,
+    )
     return dataclasses.replace(model, seconds={**seconds, **model.seconds})
 
 
@@ -130,6 +139,7 @@ def reconstruct_from(
     workspace: Path,
     mapper: Mapper = "incremental",
     *,
+    T_world_camera_start: Mapping[str, Transform] | None = None,
     options: SfmOptions | None = None,
     progress: Progress | None = None,
 ) -> SfmModel:
@@ -143,9 +153,16 @@ def reconstruct_from(
         matches: of the pairs that count (`pairs_of` the images); pairs of images without features are left out.
         camera: calibrated at the images' size; held fixed unless the options refine it.
         workspace: folder for the model and COLMAP's log; made if missing.
-        mapper: COLMAP's incremental mapper or the global one (GLOMAP).
+        mapper: where the poses to begin with come from: COLMAP's incremental mapper or the global one (GLOMAP), both
+            from the images alone; or `triangulated`, T_world_camera_start. All tracks are triangulated from these
+            poses, and poses and points adjusted together.
+        T_world_camera_start: for `triangulated`: metric poses of the images in one frame, from the corrected robot,
+            good to a few millimetres and a degree. They are where the adjustment begins, and give the model its frame
+            and scale: a similarity lays the adjusted camera positions over these. They do not hold single poses, so
+            their noise does not come back. Images without a pose, or that share nothing with the others, are missing.
         options: settings.
-        progress: told ("map", done, total) now and then; total 0 where COLMAP does not tell how far it is.
+        progress: told ("map", done, total) and ("adjust", done, total) now and then; total 0 where COLMAP does not
+            tell how far it is.
 
     Raises:
         DataError: an image's features are those of another size than the camera's.
@@ -154,6 +171,8 @@ def reconstruct_from(
     settings = options or SfmOptions()
     names = sorted(features)
     _check_count(len(names))
+    if mapper == "triangulated" and not T_world_camera_start:
+        raise ComputeError("triangulation needs poses to begin with", remedy="give T_world_camera_start")
     for name in names:
         if (features[name].width, features[name].height) != (camera.width, camera.height):
             raise DataError(
@@ -174,19 +193,12 @@ def reconstruct_from(
         "camera": dataclasses.asdict(camera),
         "options": dataclasses.asdict(settings),
         "pixels": [features[name].pixels for name in names],
+        "start": [None if T_world_camera_start is None else T_world_camera_start.get(name) for name in names],
         "matches": [(index[m.first], index[m.second], m.features, m.configuration, m.matrices) for m in used],
     }
-    report: Progress = progress or (lambda _stage, _done, _total: None)
     start = time.monotonic()
-    report("map", 0, len(names))
     with ColmapProcess(seed=settings.seed, log=workspace / f"colmap_{mapper}.log") as child:
-        outcome = child.run(
-            "map",
-            job,
-            timeout_s=settings.timeout_s,
-            told=lambda done, total: report("map", min(done, total), total),
-        )
-    report("map", len(names), len(names))
+        outcome = child.run("map", job, timeout_s=settings.timeout_s, progress=progress)
     return _model(outcome, names, mapper, workspace, {"map": time.monotonic() - start})
 
 

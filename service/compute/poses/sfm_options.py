@@ -8,7 +8,7 @@ from typing import Literal
 
 from service.compute.camera_model import CameraModel
 
-Mapper = Literal["incremental", "global"]
+Mapper = Literal["incremental", "global", "triangulated"]
 Refine = Literal["nothing", "principal_point", "intrinsics"]
 Progress = Callable[[str, int, int], None]  # stage, done, total (total 0: unknown)
 

@@ -18,31 +18,29 @@ from service.compute.images import read_grey
 from service.compute.poses.colmap_convention import from_colmap_pixels, to_colmap_camera, to_colmap_pixels
 from service.compute.poses.features import match_descriptors
 from service.compute.poses.sfm_mapping import map_images
-from service.compute.poses.sfm_options import reduction
+from service.compute.poses.sfm_options import Progress, reduction
 from service.core.errors import DataError, OrthocaptureError
 from service.core.geometry import Array
-
-Told = Callable[[int, int], None]
 
 
 def main(log: str, seed: int, pipe: Connection) -> None:
     """Entry point: take (task, job) until the other end is closed.
 
-    Answers ("progress", (done, total)) meanwhile, and ("result", value) or ("error", what) at the end of each.
+    Answers ("progress", (stage, done, total)) meanwhile, and ("result", value) or ("error", what) at the end of each.
     """
     handle = os.open(Path(log), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(handle, 1)
     os.dup2(handle, 2)
     pycolmap.logging.logtostderr = True
     cv2.setNumThreads(1)
-    tasks: dict[str, Callable[[dict[str, Any], Told], Any]] = {
+    tasks: dict[str, Callable[[dict[str, Any], Progress], Any]] = {
         "extract": _extract,
         "match": _match,
         "map": map_images,
     }
 
-    def told(done: int, total: int) -> None:
-        pipe.send(("progress", (done, total)))
+    def progress(stage: str, done: int, total: int) -> None:
+        pipe.send(("progress", (stage, done, total)))
 
     while True:
         try:
@@ -51,7 +49,7 @@ def main(log: str, seed: int, pipe: Connection) -> None:
             return
         pycolmap.set_random_seed(seed)
         try:
-            answer = ("result", tasks[task](job, told))
+            answer = ("result", tasks[task](job, progress))
         except OrthocaptureError as error:
             answer = ("error", error)
         except (RuntimeError, ValueError, OSError) as error:  # what pycolmap raises
@@ -59,7 +57,7 @@ def main(log: str, seed: int, pipe: Connection) -> None:
         pipe.send(answer)
 
 
-def _extract(job: dict[str, Any], _told: Told) -> dict[str, Any]:
+def _extract(job: dict[str, Any], _progress: Progress) -> dict[str, Any]:
     options, camera = job["options"], job["camera"]
     image = read_grey(Path(job["file"]))
     size = (image.shape[1], image.shape[0])
@@ -94,7 +92,7 @@ def _extract(job: dict[str, Any], _told: Told) -> dict[str, Any]:
     }
 
 
-def _match(job: dict[str, Any], _told: Told) -> dict[str, Any]:
+def _match(job: dict[str, Any], _progress: Progress) -> dict[str, Any]:
     """Matches by appearance alone, then those that agree with one epipolar geometry."""
     options = job["options"]
     matches = match_descriptors(*job["descriptors"])
