@@ -170,8 +170,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         f"# Camera poses, {record['date']}",
         "",
         f"Commit {record['commit']}; effort {record['effort']}, {record['views']} images {record['width']} px wide, "
-        "calibrated camera held. Camera positions of triangulated, colmap and glomap after a similarity, of the others "
-        "after a rigid alignment. CPU-s of mapping: of one source alone, features and matches being there.",
+        "calibrated camera held. Camera positions of triangulated, colmap and glomap after a similarity, of the "
+        "others after a rigid alignment. CPU-s of mapping: of one source alone, features and matches being there.",
         "",
         f"| scene | poses | {' | '.join(heading for _, heading in COLUMNS)} |",
         "|---:|---|" + "---:|" * len(COLUMNS),
