@@ -84,6 +84,15 @@ def test_the_focal_position_is_read_and_moved_by_hand_in_manual_focus_only(camer
     assert near == 53.0
 
 
+def test_an_empty_value_is_refused_and_the_link_goes_on(camera: RunningCamera) -> None:
+    """What libgphoto2 sends for `capturetarget` by its name is a data phase of nothing."""
+    words = (["set", "capturetarget", "card+sdram"], ["value", "cameramodel"], ["set", "iso", "200"])
+    refused, model, seconds = vendor_session(camera.gphoto_port, *words)
+    assert refused["error"] < 0
+    assert model == "ILCE-7RM5"
+    assert isinstance(seconds, float)
+
+
 def test_a_value_that_is_not_offered_is_refused_and_nothing_changes(camera: RunningCamera) -> None:
     # The client reads a setting from its cache for two seconds.
     words = (["set", "iso", "100"], ["set", "iso", "123"], ["sleep", 2.2], ["value", "iso"])

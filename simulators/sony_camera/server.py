@@ -190,6 +190,8 @@ class CameraServer:
         if kind is not PacketType.START_DATA:
             raise codec.CodecError(f"{kind.name} where data should start")
         announced, data = codec.parse_start_data(body), bytearray()
+        if announced == 0:
+            return b""  # libgphoto2 sends no End_Data behind the announcement of nothing
         while True:
             kind, body = _receive_packet(link)
             if kind not in (PacketType.DATA, PacketType.END_DATA):

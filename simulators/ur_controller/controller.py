@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from dataclasses import dataclass, field
 from enum import IntEnum
 
@@ -17,6 +18,7 @@ from simulators.ur_controller.motion import Motion, MotionError
 _LOG = logging.getLogger(__name__)
 
 PROTECTIVE_UNLOCK_S = 5.0
+HISTORY_CYCLES = 4096  # of joints that programs may ask for
 RING_FREQUENCY_HZ, RING_DECAY_S, RING_AMPLITUDE_S2 = 12.0, 0.06, 4e-5  # the arm swings a little when it stops
 
 
@@ -97,6 +99,7 @@ class Controller:
         self.T_base_flange = kinematics.forward(model, joints)
         self.tcp_pose, self.target_tcp_pose = np.zeros(6), np.zeros(6)
         self.tcp_speed = np.zeros(6)
+        self._history: deque[Array] = deque([joints.copy()], maxlen=HISTORY_CYCLES)
         self.generation = 0  # rises whenever anything but the clock changed
         self.motion: Motion | None = None
         self._stopped_at_s = -math.inf
@@ -118,6 +121,7 @@ class Controller:
             self._move(dt_s)
         elif self._ring is not None:
             self._swing()
+        self._history.append(self.actual_q)
 
     def _move(self, dt_s: float) -> None:
         assert self.motion is not None
@@ -129,6 +133,9 @@ class Controller:
             return
         if self.motion.done and np.any(self.target_qdd):
             self._ring = (self.time_s, -RING_AMPLITUDE_S2 * self.target_qdd)
+        if not self.within_limits(self.motion.q):
+            self.protective_stop("a joint reached its limit")
+            return
         self.target_q = self.motion.q
         self.target_qd, self.target_qdd = self.motion.qd * scale, self.motion.qdd * scale
         self.actual_q, self.actual_qd = self.target_q, self.target_qd
@@ -222,6 +229,21 @@ class Controller:
     def within_limits(self, q: Array) -> bool:
         """All joints within ±360°."""
         return bool(np.all(np.isfinite(q)) and np.max(np.abs(q)) <= kinematics.JOINT_LIMIT_RAD + 1e-9)
+
+    def joints_ago(self, cycles: int) -> Array:
+        """Measured joints so many cycles ago, the oldest known at most."""
+        return self._history[-1 - min(max(cycles, 0), len(self._history) - 1)]
+
+    def jacobian(self, q: Array) -> Array:
+        """Of the tool centre point in the base frame (6, 6), for joints q."""
+        chain = kinematics.frames(self.model, q)
+        return kinematics.jacobian(chain, (chain[6] @ kinematics.from_pose(self.tcp_pose_m))[:3, 3])
+
+    def jacobian_rate(self) -> Array:
+        """Its time derivative (6, 6) at the present joint speeds, by a central difference."""
+        step = 1e-5
+        ahead, behind = self.actual_q + step * self.actual_qd, self.actual_q - step * self.actual_qd
+        return (self.jacobian(ahead) - self.jacobian(behind)) / (2 * step)
 
     def inverse(self, pose: Array, near: Array) -> Array | None:
         """Joints that bring the tool centre point to a pose."""

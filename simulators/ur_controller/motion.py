@@ -11,6 +11,7 @@ import numpy as np
 from simulators.ur_controller import kinematics
 from simulators.ur_controller.kinematics import Array, Model
 
+MAX_JOINT_SPEED_RAD_S = 6.3  # twice what the fastest joints are rated for
 MAX_JOINT_STEP_RAD = 0.35  # in one cycle of a straight motion: the posture flipped
 
 
@@ -171,6 +172,8 @@ class Speed:
             if abs(float(np.linalg.det(J))) < 1e-5:
                 raise MotionError("the tool velocity leads through a singularity")
             goal = np.linalg.solve(J, self.target)
+            if np.max(np.abs(goal)) > MAX_JOINT_SPEED_RAD_S:
+                raise MotionError("the tool velocity asks too much of a joint")
         # speedL's acceleration is the tool's; joints get a generous share of it.
         step = max(self.acceleration, 1e-6) * dt_s * (4.0 if self._tool else 1.0)
         qd = self.qd + np.clip(goal - self.qd, -step, step)
