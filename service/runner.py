@@ -29,6 +29,7 @@ from service.core.decide import (
     evaluate_gates,
 )
 from service.core.errors import OrthocaptureError, StoreError
+from service.core.gates import describe
 from service.core.model import (
     ActionRefused,
     DeviceOpened,
@@ -161,12 +162,13 @@ class Runner:
                     self.operator.prepare(step, attempt)
                     self._append(StepStarted(step=step, attempt=attempt))
                 self._execute(step, attempt)
-            case EvaluateGates(step, attempt, measures):
-                verdicts = evaluate_gates(self.protocol.step(step), attempt, measures, state.skipped)
+            case EvaluateGates(step, attempt, measures, uncertainties):
+                verdicts = evaluate_gates(self.protocol.step(step), attempt, measures, state.skipped, uncertainties)
                 self._append(verdicts)
-                failed = [v for v in verdicts.verdicts if not v.passed]
-                for verdict in failed:
-                    self.operator.tell(f"{step}: {verdict.measure} = {verdict.value} is outside its limits")
+                for verdict in verdicts.verdicts:
+                    if not verdict.passed:
+                        how = "not decided" if verdict.undecided else "outside its limits"
+                        self.operator.tell(f"{step}: {describe(verdict)}: {how}")
             case Accept(step, attempt):
                 self._append(StepPassed(step=step, attempt=attempt))
                 self._seal()
@@ -285,6 +287,7 @@ class Runner:
                 measures={name: float(value) for name, value in outcome.measures.items()},
                 artefacts=outcome.artefacts,
                 result=dict(outcome.result),
+                uncertainties=dict(outcome.uncertainties),
             )
         )
 

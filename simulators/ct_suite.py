@@ -18,7 +18,7 @@ from simulators.ct_volume import Grid, grid_around, voxelise
 from simulators.faults import FaultPlan
 from simulators.geometry import Array, from_euler, inverse
 from simulators.serve import SimulatorError, Termination, announce
-from simulators.world import Scene
+from simulators.world import Scene, parse_moved
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +28,9 @@ RESCALE_INTERCEPT = -1024
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--scene", type=int, required=True, metavar="SEED", help="seed of the scene")
+    parser.add_argument(
+        "--moved", type=parse_moved, default=(), metavar="JSON", help="registration spheres moved: [[index, x, y, z]]"
+    )
     parser.add_argument("--folder", type=Path, required=True, help="where the series is delivered")
     parser.add_argument("--once", action="store_true", help="end after one series")
     parser.add_argument("--voxel-mm", type=float, default=0.4, help="edge of the cubic voxels")
@@ -51,7 +54,7 @@ def serve(args: argparse.Namespace) -> None:
     if args.voxel_mm <= 0:
         raise SimulatorError("--voxel-mm must be positive")
     args.folder.mkdir(parents=True, exist_ok=True)
-    scene = Scene.generate(args.scene)
+    scene = Scene.generate(args.scene, args.moved)
     announce(**_scan(scene, args))
     while not args.once and not termination.wait(0.2):
         if asked:

@@ -13,7 +13,7 @@ from simulators.geometry import Array, Array32, Bools, Bytes, Ints, inverse
 from simulators.intrinsics import Intrinsics
 from simulators.overlays import Frame, draw_calibration_board, draw_sphere
 from simulators.surfaces import Surfaces
-from simulators.world import NOMINAL_LUX, RADIUS_M, Scene
+from simulators.world import NOMINAL_LUX, RADIUS_M, Moved, Scene
 
 TILE_PIXELS = 500_000
 HALO = 4  # rows beyond a tile, so that edges and the lens' blur do not see its border
@@ -33,6 +33,7 @@ class View:
     T_world_camera: Array
     intrinsics: Intrinsics
     seed: int
+    moved: Moved
     spray: bool
     control_spheres: bool
     T_world_board: Array | None
@@ -47,6 +48,7 @@ class View:
             T_world_camera=np.array(view["T_world_camera"], dtype=np.float64),
             intrinsics=Intrinsics(**view["intrinsics"]).scaled(width),
             seed=int(scene["seed"]),
+            moved=tuple((int(i), float(x), float(y), float(z)) for i, x, y, z in scene.get("moved", ())),
             spray=bool(scene.get("spray", False)),
             control_spheres=bool(scene.get("control_spheres", False)),
             T_world_board=None if board is None else np.array(board, dtype=np.float64),
@@ -71,14 +73,15 @@ class Renderer:
         """A small RGB frame at the reference exposure, as live view shows."""
         return self._rendered(View.from_json(view, min(PREVIEW_WIDTH, self.image_width)), REFERENCE, 0)
 
-    def surfaces(self, seed: int) -> Surfaces:
-        """The scene's surfaces, built at the first call for a seed."""
-        if self._surfaces is None or self._surfaces.scene.seed != seed:
-            self._surfaces = Surfaces(Scene.generate(seed), self._texture_size)
+    def surfaces(self, seed: int, moved: Moved = ()) -> Surfaces:
+        """The scene's surfaces, built at the first call for a seed, and again when a sphere was moved."""
+        now = None if self._surfaces is None else (self._surfaces.scene.seed, self._surfaces.scene.moved)
+        if self._surfaces is None or now != (seed, moved):
+            self._surfaces = Surfaces(Scene.generate(seed, moved), self._texture_size)
         return self._surfaces
 
     def _rendered(self, view: View, settings: Mapping[str, float], seed: int) -> Bytes:
-        surfaces = self.surfaces(view.seed)
+        surfaces = self.surfaces(view.seed, view.moved)
         lens = view.intrinsics
         gain = view.light_lux / NOMINAL_LUX / WHITE
         gain *= (

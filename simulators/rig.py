@@ -59,16 +59,21 @@ class _Rig:
         self.termination = termination
         self.folder: Path = args.dir.resolve()
         self.faults: FaultPlan = args.faults
-        self.scene = Scene.generate(args.scene)
+        scene = Scene.generate(args.scene)
         self.arms = () if args.hand else ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
         self.children: dict[str, subprocess.Popen[str]] = {}
-        self.world = World(self.scene, args.image_width, self.arms, self._start_joints(), camera_held=bool(args.hand))
+        self.world = World(scene, args.image_width, self.arms, _start_joints(scene), camera_held=bool(args.hand))
         self.hand = args.hand and Hand(
             args.hand, args.scene, self.world.hold, self.world.press_shutter, SCENE_CENTRE_M.copy()
         )
         self.server = WorldServer(self.world, self._act)
         self._deliveries = threading.Lock()
         self._truth: dict[str, Any] = {}
+
+    @property
+    def scene(self) -> Scene:
+        """The scene as it is now."""
+        return self.world.scene
 
     # --- life ---
 
@@ -144,16 +149,6 @@ class _Rig:
         stem, _, last = first.rpartition(".")
         return [first, f"{stem}.{int(last) + 1}"][: len(self.arms)]
 
-    def _start_joints(self) -> Array:
-        """The camera above the scene at station 1, looking down."""
-        eye = SCENE_CENTRE_M + np.array([0.0, -0.1, 0.62])
-        T_world_camera = look_at(eye, SCENE_CENTRE_M, np.array([0.0, 1.0, 0.0]))
-        T_base_flange = inverse(self.scene.T_world_base[STATIONS[0]]) @ T_world_camera @ inverse(nominal_hand_eye())
-        q = solve_joints(ARM_MODEL, T_base_flange, _ELBOW_UP)
-        if q is None:
-            raise SimulatorError("the arm does not reach the scene")
-        return q
-
     def _rig_file(self, gphoto_port: str, hosts: list[str]) -> dict[str, Any]:
         robots = {arm: {"driver": "ur", "host": host} for arm, host in zip(self.arms, hosts, strict=True)}
         rig: dict[str, Any] = {
@@ -208,13 +203,13 @@ class _Rig:
                 "T_flange_camera": self.scene.T_flange_camera.tolist(),
                 "T_world_base": {name: T.tolist() for name, T in self.scene.T_world_base.items()},
                 "arm_dh_deltas": self.scene.arm.dh_deltas.tolist(),
-                "registration_m": self.scene.registration_m.tolist(),
                 "control_m": self.scene.control_m.tolist(),
                 "radius_m": self.scene.radius_m,
                 "intrinsics": self.scene.camera_intrinsics(self.args.image_width).to_json(),
                 "scans": [],
                 "ct": [],
             }
+        self._truth |= {"registration_m": self.scene.registration_m.tolist(), "moved": self.scene.moved}
         (self.folder / "truth.json").write_text(json.dumps(self._truth, indent=1))
 
     # --- hands ---
@@ -229,6 +224,11 @@ class _Rig:
                 return {"ok": True}
             case "ct_scan":
                 return self._deliver("ct", "ct", ["--voxel-mm", str(self.args.ct_voxel_mm)])
+            case "move_sphere":
+                answer = self.world.act(request)
+                with self._deliveries:
+                    self._write_truth()
+                return answer
             case _:
                 return self.world.act(request)
 
@@ -237,7 +237,8 @@ class _Rig:
         spheres = "--control-spheres" if self.world.control_spheres else "--no-control-spheres"
         command = [
             sys.executable, "-m", "simulators", simulator, "--scene", str(self.scene.seed), "--once", "--with-parent",
-            "--folder", str(self.folder / folder), spheres, *options, "--faults", self.faults.to_json(),
+            "--folder", str(self.folder / folder), spheres, "--moved", json.dumps(self.scene.moved), *options,
+            "--faults", self.faults.to_json(),
         ]  # fmt: skip
         with self._deliveries:
             answer = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
@@ -251,6 +252,17 @@ class _Rig:
             self._truth["scans" if simulator == "scanner" else "ct"].append(report.pop("truth"))
             self._write_truth()
         return {"ok": True, **report}
+
+
+def _start_joints(scene: Scene) -> Array:
+    """The camera above the scene at station 1, looking down."""
+    eye = SCENE_CENTRE_M + np.array([0.0, -0.1, 0.62])
+    T_world_camera = look_at(eye, SCENE_CENTRE_M, np.array([0.0, 1.0, 0.0]))
+    T_base_flange = inverse(scene.T_world_base[STATIONS[0]]) @ T_world_camera @ inverse(nominal_hand_eye())
+    q = solve_joints(ARM_MODEL, T_base_flange, _ELBOW_UP)
+    if q is None:
+        raise SimulatorError("the arm does not reach the scene")
+    return q
 
 
 def _ready_line(process: subprocess.Popen[str], name: str, folder: Path) -> dict[str, Any]:

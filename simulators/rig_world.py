@@ -11,12 +11,27 @@ from typing import Any, cast
 
 import numpy as np
 
-from simulators.geometry import Array, look_at
+from simulators.geometry import Array, apply, inverse, look_at
 from simulators.hand import Press
-from simulators.world import STATIONS, Scene
+from simulators.world import RADIUS_M, STATIONS, Scene
 
-# Where the technician holds the camera for an overview: nearly above the scene, so that no sphere hides another.
-HELD_CAMERA = look_at(np.array([0.06, -0.17, 0.78]), np.array([0.0, 0.0, 0.05]), np.array([0.0, 1.0, 0.0]))
+# Where the technician holds the camera: nearly above the scene, so that no sphere hides another; and, for a further
+# photograph, on the side of one of that picture's edges, as high as lets every sphere be in the picture.
+_HELD_EYES_M = {
+    "above": (0.06, -0.17, 0.78),
+    "left": (-0.36, -0.06, 0.74),
+    "right": (0.36, -0.07, 0.76),
+    "near": (0.05, -0.40, 0.72),
+    "far": (-0.04, 0.33, 0.76),
+}
+_SCENE_M = np.array([0.0, 0.0, 0.05])
+HELD_CAMERAS = {
+    side: look_at(np.array(eye), _SCENE_M, np.array([0.0, 1.0, 0.0])) for side, eye in _HELD_EYES_M.items()
+}
+_POINTED_AT = 1.5  # radii around a sphere's centre in the picture: who points there means this sphere
+_HEIGHTS_M = (0.028, 0.150)  # of a sphere's centre on the posts that there are
+_TABLE_M = (0.215, 0.150)  # half: posts stand on the board
+_ROOM_M = 2.3 * RADIUS_M  # between two centres
 
 _LONGEST_WAIT_S = 1.0
 
@@ -37,7 +52,7 @@ class World:
     board_placed: bool = False
     pedal_presses: int = 0
     camera_held: bool = False  # in the technician's hands, instead of on the arm
-    T_world_held: Array = field(default_factory=HELD_CAMERA.copy)  # where he holds it
+    T_world_held: Array = field(default_factory=HELD_CAMERAS["above"].copy)  # where he holds it
     shutter_presses: int = 0  # of the camera's own button
     press: Press = field(default_factory=Press)  # the last one
     station: str = STATIONS[0]
@@ -71,6 +86,7 @@ class World:
                 "intrinsics": self.scene.camera_intrinsics(self.image_width).to_json(),
                 "scene": {
                     "seed": self.scene.seed,
+                    "moved": self.scene.moved,
                     "spray": self.spray,
                     "control_spheres": self.control_spheres,
                     "board": None if board is None else board.tolist(),
@@ -120,8 +136,15 @@ class World:
                     self.spray = True
                 case "mount_camera" if not self.arms:
                     return {"ok": False, "error": "there is no arm to mount the camera on"}
-                case "hold_camera" | "mount_camera":
-                    self.camera_held = action == "hold_camera"
+                case "mount_camera":
+                    self.camera_held = False
+                case "hold_camera":
+                    side = str(request.get("side", "above"))
+                    if side not in HELD_CAMERAS:
+                        return {"ok": False, "error": f"no side {side!r}; {', '.join(HELD_CAMERAS)}"}
+                    self.camera_held, self.T_world_held = True, HELD_CAMERAS[side]
+                case "move_sphere":
+                    return self._move_sphere(request)
                 case "press_shutter":
                     self.press = Press()
                     self.shutter_presses += 1
@@ -130,6 +153,33 @@ class World:
                     self.pedal_presses += 1
                 case _:
                     return {"ok": False, "error": f"hands cannot do {action!r}"}
+        return {"ok": True}
+
+    def _move_sphere(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Follow an arrow in the picture of the held camera: the sphere that it begins at goes along the table.
+
+        `from` and `to` are parts (2,) of the picture's width and height, `higher_m` is how much higher it is to be.
+        """
+        if not self.camera_held:
+            return {"ok": False, "error": "there is no picture to point at: the camera is on the arm"}
+        lens = self.scene.camera_intrinsics(self.image_width)
+        size = np.array([lens.width, lens.height])
+        start, end = (size * np.array(request[name], dtype=np.float64) for name in ("from", "to"))
+        T_world_camera = self.T_world_held
+        centres = apply(inverse(T_world_camera), self.scene.registration_m)
+        away_px = np.linalg.norm(lens.project(centres) - start, axis=1)
+        index = int(np.argmin(away_px))
+        if away_px[index] > _POINTED_AT * lens.fx * RADIUS_M / centres[index, 2]:
+            return {"ok": False, "error": "there is no registration sphere where the arrow begins"}
+        place = self.scene.registration_m[index].copy()
+        origin, direction = T_world_camera[:3, 3], T_world_camera[:3, :3] @ lens.rays(end)
+        place[:2] = (origin + direction * (place[2] - origin[2]) / direction[2])[:2]
+        place[2] += float(request.get("higher_m", 0.0))
+        place = np.clip(place, [-_TABLE_M[0], -_TABLE_M[1], _HEIGHTS_M[0]], [*_TABLE_M, _HEIGHTS_M[1]])
+        others = np.concatenate([np.delete(self.scene.registration_m, index, axis=0), self.scene.control_m])
+        if np.linalg.norm(others - place, axis=1).min() < _ROOM_M:
+            return {"ok": False, "error": "another sphere is in the way"}
+        self.scene = self.scene.with_sphere_at(index, place)
         return {"ok": True}
 
 

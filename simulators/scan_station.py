@@ -22,7 +22,7 @@ from simulators.geometry import Array, Ints, apply, inverse, transform
 from simulators.parts import Part, sphere_mesh, vertex_normals
 from simulators.scan_formats import encode
 from simulators.serve import SimulatorError, Termination, announce
-from simulators.world import RADIUS_M, Scene
+from simulators.world import RADIUS_M, Scene, parse_moved
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +46,9 @@ class Scan:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--scene", type=int, required=True, metavar="SEED", help="seed of the scene")
+    parser.add_argument(
+        "--moved", type=parse_moved, default=(), metavar="JSON", help="registration spheres moved: [[index, x, y, z]]"
+    )
     parser.add_argument("--folder", type=Path, required=True, help="where to export to")
     parser.add_argument("--once", action="store_true", help="end after one export")
     parser.add_argument("--spray", action="store_true", help="the specimen is coated with scanning spray")
@@ -72,7 +75,7 @@ def serve(args: argparse.Namespace) -> None:
     signal.signal(signal.SIGUSR1, ask)
     folder: Path = args.folder
     folder.mkdir(parents=True, exist_ok=True)
-    scene = Scene.generate(args.scene)
+    scene = Scene.generate(args.scene, args.moved)
     _export(scene, args, announce_it=True)
     while not args.once and not termination.wait(0.2):
         if asked:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,6 +26,13 @@ BOARD_SQUARE_M = 0.015
 SCENE_CENTRE_M = np.array([0.0, 0.0, 0.05])
 STATIONS = ("station_1", "station_2")
 NOMINAL_LUX = 45_000.0
+
+Moved = tuple[tuple[int, float, float, float], ...]  # registration spheres: index and centre (m, world)
+
+
+def parse_moved(text: str) -> Moved:
+    """What `--moved` takes: JSON [[index, x, y, z], …]."""
+    return tuple((int(index), float(x), float(y), float(z)) for index, x, y, z in json.loads(text))
 
 
 def nominal_hand_eye() -> Array:
@@ -48,6 +56,7 @@ class Scene:
     lamp_m: Array
     light_lux: float
     temperature_c: float
+    moved: Moved = ()
 
     @property
     def radius_m(self) -> float:
@@ -55,8 +64,24 @@ class Scene:
         return RADIUS_M
 
     @classmethod
-    def generate(cls, seed: int) -> Scene:
-        """The scene of this seed, the same on every machine and in every process."""
+    def generate(cls, seed: int, moved: Moved = ()) -> Scene:
+        """The scene of this seed, the same on every machine and in every process, with spheres moved elsewhere."""
+        scene = cls._as_set_up(seed)
+        for index, *centre in moved:
+            scene = scene.with_sphere_at(int(index), np.array(centre))
+        return scene
+
+    def with_sphere_at(self, index: int, centre_m: Array) -> Scene:
+        """A registration sphere on its post at another place, centre (3,) in the world."""
+        centres, feet = self.registration_m.copy(), self.foot_m.copy()
+        feet[index, :2] += centre_m[:2] - centres[index, :2]
+        centres[index] = centre_m
+        others = tuple(entry for entry in self.moved if entry[0] != index)
+        x, y, z = (float(v) for v in centre_m)
+        return replace(self, registration_m=centres, foot_m=feet, moved=(*others, (index, x, y, z)))
+
+    @classmethod
+    def _as_set_up(cls, seed: int) -> Scene:
         rng = np.random.default_rng([seed, 0x5CE11E])
         specimen = Specimen.generate(rng)
         registration, feet = _registration_spheres(rng)

@@ -24,6 +24,7 @@ from service.core.decide import (
     redoable_steps,
 )
 from service.core.errors import IllegalTransitionError, IntegrityError
+from service.core.gates import describe
 from service.core.model import (
     ActionRefused,
     DeviceTrouble,
@@ -41,6 +42,7 @@ from service.core.model import (
     StepPassed,
     StepRetried,
     StepStarted,
+    Uncertainty,
     ViewpointFailed,
 )
 from service.core.protocol import Recovery
@@ -204,6 +206,26 @@ def test_gates(measures: dict[str, float], passed: bool) -> None:
     result = evaluate_gates(step, 1, measures)
     assert result.passed is passed
     assert [v.measure for v in result.verdicts] == ["views", "sharp"]
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "outcome"),
+    [(3.0, 4.0, "passed"), (2.0, 2.9, "failed"), (2.9, 4.0, "undecided")],
+)
+def test_a_number_with_its_uncertainty_is_judged_by_its_bounds(lower: float, upper: float, outcome: str) -> None:
+    step = toy_protocol().step("capture")
+    known = {"views": Uncertainty(sigma=0.2, lower=lower, upper=upper)}
+    result = evaluate_gates(step, 1, {"views": 3.2, "sharp": 0.5}, uncertainties=known)
+    verdict = result.verdicts[0]
+    found = "passed" if verdict.passed else "undecided" if verdict.undecided else "failed"
+    assert (found, result.passed) == (outcome, outcome == "passed")
+    assert (verdict.lower, verdict.upper, verdict.sigma) == (lower, upper, 0.2)
+    places = 2 if outcome == "failed" else 1
+    assert f"views {3.2:.{places}f} views, {lower:.{places}f} to {upper:.{places}f}, allowed" in describe(verdict)
+    without = evaluate_gates(step, 1, {"views": 3.2, "sharp": 0.5}).verdicts[0]
+    assert without.passed
+    assert without.lower is None
+    assert " to " not in describe(without)
 
 
 def test_a_gate_falls_away_with_the_step_that_would_have_made_it_measurable() -> None:

@@ -334,7 +334,9 @@ def _gates(run: RecordedRun, recomputed: Recomputed) -> Iterator[GateReplay]:
     for step_id, state in run.state.steps.items():
         measures = recomputed.measures_of(step_id, state.measures)
         if state.verdicts and measures is not None:
-            judged = evaluate_gates(run.protocol.step(step_id), state.attempt, measures, run.state.skipped)
+            judged = evaluate_gates(
+                run.protocol.step(step_id), state.attempt, measures, run.state.skipped, state.uncertainties
+            )
             if len(judged.verdicts) == len(state.verdicts):
                 yield GateReplay(step_id, state.attempt, state.verdicts, judged.verdicts)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 from service.audit.report_blocks import Cell
-from service.core.gates import limits
+from service.core.gates import bounds, limits
 from service.core.model import GateVerdict
 
 
@@ -49,12 +49,16 @@ def measured(verdict: GateVerdict) -> tuple[str, str]:
     for ending, unit in (("_mm", "mm"), ("_px", "px"), ("_deg", "°"), ("_min", "min")):
         if verdict.unit == unit:
             name = name.removesuffix(ending)
-    value = "not measured" if verdict.value is None else f"{verdict.value:.4g} {verdict.unit}".strip()
+    value = (
+        "not measured" if verdict.value is None else f"{verdict.value:.4g} {verdict.unit}".strip() + bounds(verdict)
+    )
     return words(name), value
 
 
 def judged(verdict: GateVerdict) -> Cell:
     """A word, a sign and a colour."""
+    if verdict.undecided:
+        return Cell("? undecided", "attention")
     return Cell("✓ passed", "ok") if verdict.passed else Cell("✗ failed", "stop")
 
 

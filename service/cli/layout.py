@@ -16,7 +16,10 @@ from service.compute.images import read_image
 from service.compute.markers.detect import detect_spheres
 from service.compute.poses.pose_files import read_camera_json, read_spheres_json
 from service.compute.registration.layout import LayoutReport, check_layout, layout_record
-from service.compute.registration.photo_layout import merge_places, places_from_outlines
+from service.compute.registration.layout_moves import Move, suggest_moves
+from service.compute.registration.photo_adjustment import CALIBRATED, Photograph
+from service.compute.registration.photo_layout import layout_from_photographs
+from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 
@@ -38,7 +41,7 @@ def layout_command(
         if json:
             print_json(layout_record(report))
         else:
-            _show(report, centres)
+            _show(report, centres, radius_m)
     if not report.passed:
         raise typer.Exit(1)
 
@@ -65,22 +68,27 @@ def _centres(
     if camera is None:
         raise typer.BadParameter("--photo needs --camera")
     model = read_camera_json(camera)
-    seen = [places_from_outlines(detect_spheres(read_image(path), model), radius_m) for path in photos]
-    centres, covariances, _ = merge_places(seen)
-    return centres, covariances, radius_m
+    seen = [Photograph.of(model, detect_spheres(read_image(path), model)) for path in photos]
+    found = layout_from_photographs(seen, radius_m, CALIBRATED)
+    return found.centres_m, found.covariance, radius_m
 
 
-def _show(report: LayoutReport, centres: Array) -> None:
+def _show(report: LayoutReport, centres: Array, radius_m: float) -> None:
     table = Table("sphere", "x mm", "y mm", "z mm", "margin mm")
     for number, (centre, margin) in enumerate(zip(centres, report.sphere_margins_m, strict=True)):
         shown = f"{1e3 * margin:.2f}" if np.isfinite(margin) else "more"
         table.add_row(str(number), *(f"{1e3 * v:.1f}" for v in centre), shown)
     console.print(table)
+    if report.margin.upper_m > report.margin.lower_m:
+        margin = report.margin
+        console.print(
+            f"margin {1e3 * margin.value_m:.2f} mm, {1e3 * margin.lower_m:.2f} to {1e3 * margin.upper_m:.2f}"
+        )
     seen = ", ".join(f"{k}: {1e3 * v:.1f}" for k, v in report.margin_by_count_m.items() if np.isfinite(v))
     console.print(f"least misfit in mm of a wrong assignment, by spheres seen: {seen}")
     for problem in report.problems:
         console.print(f"[bold red]to do:[/] {problem}")
-    for move in report.moves:
+    for move in _moves(centres, radius_m) if report.problems else ():
         x, y, z = 1e3 * move.by_m
         console.print(
             f"  move sphere {move.sphere} by about ({x:.0f}, {y:.0f}, {z:.0f}) mm: "
@@ -88,3 +96,12 @@ def _show(report: LayoutReport, centres: Array) -> None:
         )
     if report.passed:
         console.print("[bold green]The spheres can be told apart.[/]")
+
+
+def _moves(centres: Array, radius_m: float) -> tuple[Move, ...]:
+    """What to move; nothing where no single move helps, which the problems say as well."""
+    _, _, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
+    try:
+        return suggest_moves(centres, up=axes[2], radius_m=radius_m)
+    except ComputeError:
+        return ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from service.core.acceptance import describe_accepted
@@ -18,7 +18,7 @@ from service.core.actions import (
 from service.core.errors import IntegrityError
 from service.core.fold import advance, fold, initial_state
 from service.core.gates import describe, evaluate_gates
-from service.core.model import OperatorVerb
+from service.core.model import OperatorVerb, Uncertainty
 from service.core.protocol import Protocol
 from service.core.run_state import Deviation, JobState, Note, RunState, StepState, Superseded
 
@@ -73,11 +73,12 @@ class RunStep:
 
 @dataclass(frozen=True, slots=True)
 class EvaluateGates:
-    """Append evaluate_gates(step, attempt, measures, skipped steps)."""
+    """Append evaluate_gates(step, attempt, measures, skipped steps, uncertainties)."""
 
     step: str
     attempt: int
     measures: Mapping[str, float]
+    uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +136,7 @@ def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - 
         case "running":
             return RunStep(now.step, now.attempt, begin=False)
         case "checking":
-            return EvaluateGates(now.step, now.attempt, now.measures)
+            return EvaluateGates(now.step, now.attempt, now.measures, now.uncertainties)
         case "awaiting_operator":
             if needs_signature_now(protocol, state):
                 return _ask(protocol, state, "sign", _what_is_signed(now))
@@ -173,9 +174,11 @@ def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
         return Retry(now.step, now.attempt + 1, "the operator asked for it", 0.0)
     if now.failure is None:
         failed = "; ".join(describe(verdict) for verdict in now.verdicts if not verdict.passed)
+        outside = any(not verdict.passed and not verdict.undecided for verdict in now.verdicts)
+        found = "Outside its limits" if outside else "Not decided yet"
         # What the step itself suggests, if it knows a way: further viewpoints that would bring the numbers within.
-        advice = next((str(note.data["advice"]) for note in reversed(now.notes) if "advice" in note.data), "")
-        return _ask(protocol, state, "recovery", f"Outside its limits: {failed}" + (f". {advice}" if advice else ""))
+        advice = str(now.mend.get("advice", ""))
+        return _ask(protocol, state, "recovery", f"{found}: {failed}" + (f". {advice}" if advice else ""))
     why = f"{now.failure.error}: {now.failure.message}"
     match now.failure.recovery:
         case "retry":

@@ -272,7 +272,15 @@ def _step_measured(protocol: Protocol, state: RunState, event: Event, p: StepMea
     if _is_void_now(state, event, p.step, p.attempt):
         return _void(state, event)
     return _system(
-        protocol, state, event, "measured", measures=p.measures, artefacts=p.artefacts, result=p.result, failures=0
+        protocol,
+        state,
+        event,
+        "measured",
+        measures=p.measures,
+        artefacts=p.artefacts,
+        result=p.result,
+        uncertainties=p.uncertainties,
+        failures=0,
     )
 
 
@@ -300,7 +308,8 @@ def _step_retried(protocol: Protocol, state: RunState, event: Event, p: StepRetr
 def _gates_evaluated(protocol: Protocol, state: RunState, event: Event, p: GatesEvaluated) -> RunState:
     if _is_void_now(state, event, p.step, p.attempt):
         return _void(state, event)
-    if p != evaluate_gates(protocol.step(p.step), p.attempt, state.step.measures, state.skipped):
+    now = state.step
+    if p != evaluate_gates(protocol.step(p.step), p.attempt, now.measures, state.skipped, now.uncertainties):
         raise _impossible(event, "the verdicts do not follow from the measures and the protocol's limits")
     trigger = "gates_passed" if p.passed else "gates_failed"
     changes = {"verdicts": p.verdicts, "gates_passed": p.passed, "gates_sha256": event.sha256}

@@ -209,6 +209,14 @@ class ViewpointFailed(Record):
     skipped: bool = False  # given up, goes on with the next (a deviation)
 
 
+class Uncertainty(Record):
+    """How well a measured number is known, in the number's own unit."""
+
+    sigma: float  # standard deviation
+    lower: float  # the true number is larger with 99 %
+    upper: float  # the true number is smaller with 99 %
+
+
 class StepMeasured(Record):
     """The work of a step is done: its numbers, before any gate (running → checking)."""
 
@@ -218,6 +226,7 @@ class StepMeasured(Record):
     measures: dict[str, float]
     artefacts: tuple[ArtefactRef, ...] = ()
     result: dict[str, Any] = Field(default_factory=dict)  # the step kind's Result as plain data
+    uncertainties: dict[str, Uncertainty] = Field(default_factory=dict)  # of those measures that state one
 
 
 class StepFailed(Record):
@@ -249,6 +258,10 @@ class GateVerdict(Record):
     maximum: float | None
     unit: str
     passed: bool
+    sigma: float | None = None  # of the value, where it states its uncertainty
+    lower: float | None = None
+    upper: float | None = None
+    undecided: bool = False  # neither bound decides; `passed` is false then
 
 
 class GatesEvaluated(Record):

@@ -16,6 +16,7 @@ UNMEASURED: Mapping[str, Any] = {
     "measures": {},
     "artefacts": (),
     "result": {},
+    "uncertainties": {},
     "verdicts": (),
     "gates_passed": False,
     "gates_sha256": "",

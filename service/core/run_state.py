@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from service.core.lifecycle import Phase
-from service.core.model import ArtefactRef, GateVerdict
+from service.core.model import ArtefactRef, GateVerdict, Uncertainty
 from service.core.priorities import WAITED
 
 # What a step shows as its progress while a person takes the images: the camera is idle, and shows its live view.
@@ -100,6 +100,7 @@ class StepState:
     measures: Mapping[str, float] = field(default_factory=dict[str, float])  # of this attempt
     artefacts: tuple[ArtefactRef, ...] = ()  # of this attempt's step_measured
     result: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])
     verdicts: tuple[GateVerdict, ...] = ()
     gates_passed: bool = False
     gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds

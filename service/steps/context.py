@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox, RobotArm, Scanner, Transform
 from service.core.decide import RunState, StepState
 from service.core.errors import OrthocaptureError
-from service.core.model import ArtefactRef, Payload, Record, StepNote, View
+from service.core.model import ArtefactRef, Payload, Record, StepNote, Uncertainty, View
 from service.core.priorities import WAITED
 from service.core.protocol import Protocol as LabProtocol
 from service.core.protocol import Step
@@ -179,6 +179,7 @@ class StepOutcome:
     measures: Mapping[str, float]
     artefacts: tuple[ArtefactRef, ...] = ()
     result: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])  # of some measures
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from drivers.interfaces import CtSource
 from service.core.model import ArtefactRef, Record
 from service.steps.arrivals import keep, keep_array, keep_mesh, wait_for
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.layouts import layout_uncertainties
 
 
 class Params(Record):
@@ -60,7 +61,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         job = "ct_surface"
     (answer,) = context.evidence.run_jobs(JobRequest(job, arguments))
     result = Result.model_validate(answer.result)
-    return StepOutcome({**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"))
+    uncertainties = layout_uncertainties(result.details["layout"]) if "layout" in result.details else {}
+    return StepOutcome(
+        {**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"), uncertainties
+    )
 
 
 def _sound(ct: CtSource) -> tuple[Any, ...]:

@@ -9,6 +9,7 @@ from service.core.model import Record
 from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import result_of
+from service.steps.layouts import layout_uncertainties
 
 
 class Params(Record):
@@ -54,7 +55,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         arguments["reference_covariances_m2"] = [s["covariance_m2"] for s in reference["details"]["spheres"]]
     (answer,) = context.evidence.run_jobs(JobRequest("locate_spheres", arguments))
     result = Result.model_validate(answer.result)
-    return StepOutcome({**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"))
+    uncertainties = layout_uncertainties(result.details["layout"]) if "layout" in result.details else {}
+    return StepOutcome(
+        {**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"), uncertainties
+    )
 
 
 def _time(text: str) -> datetime:

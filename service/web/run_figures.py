@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
 
+from service.core.gates import bounds
 from service.core.model import Event, GateVerdict, SessionStarted, View
 from service.core.protocol import Gate, Protocol, Step
 from service.core.run_state import RunState, StepState
@@ -76,7 +77,10 @@ def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str],
     status, tone = (
         ("Within", "ok") if verdict.passed else ("Accepted", "attention") if accepted else ("Outside", "stop")
     )
-    return GateLine(name, number(verdict.value, gate.unit), limits, gate.why, status, tone, percent, _BAR_LIMIT)
+    if verdict.undecided and not accepted:
+        status, tone = "Not decided", "attention"
+    value = number(verdict.value, gate.unit) + bounds(verdict)
+    return GateLine(name, value, limits, gate.why, status, tone, percent, _BAR_LIMIT)
 
 
 def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event]) -> Progress:

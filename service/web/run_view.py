@@ -368,12 +368,14 @@ def _trouble(protocol: Protocol, state: RunState, decision: object) -> Trouble |
     step, now = protocol.step(state.current), state.step
     images = sum(len(there.captured) for there in state.steps.values())
     safe = f"Yes. {count(images, 'image is', 'images are')} recorded, and every result so far."
-    advice = next((str(note.data["advice"]) for note in reversed(now.notes) if "advice" in note.data), "")
+    advice = str(now.mend.get("advice", ""))
     if now.failure is not None:
         return Trouble(f"{step.title} did not work", sentence(now.failure.message), safe, advice)
     failed = [figure_line(verdict) for verdict in now.verdicts if not verdict.passed]
     if failed:
-        return Trouble(f"{step.title}: outside its limits", "; ".join(failed), safe, advice)
+        undecided = all(verdict.passed or verdict.undecided for verdict in now.verdicts)
+        found = "not decided yet" if undecided else "outside its limits"
+        return Trouble(f"{step.title}: {found}", "; ".join(failed), safe, advice)
     return Trouble(f"{step.title} cannot begin yet", decision.text, safe, advice)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from service.core.gates import bounds
 from service.core.model import GateVerdict
 from service.core.protocol import Protocol, Step
 from service.core.run_state import RunState, StepState
@@ -137,7 +138,7 @@ def irreversible_warning(protocol: Protocol, step: Step) -> str:
 def figure_line(verdict: GateVerdict) -> str:
     """One figure of what is signed."""
     return (
-        f"{measure_name(verdict.measure)} {number(verdict.value, verdict.unit)} "
+        f"{measure_name(verdict.measure)} {number(verdict.value, verdict.unit)}{bounds(verdict)} "
         f"({limit(verdict.minimum, verdict.maximum, verdict.unit)})"
     )
 

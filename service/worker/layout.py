@@ -1,40 +1,66 @@
-"""Job `layout`: photographs of the placed spheres → their places → near-symmetries."""
+"""Job `layout`: photographs of the placed spheres → their places → near-symmetries, and what to move."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
 from service.compute.images import read_image
 from service.compute.markers.detect import detect_spheres
-from service.compute.registration.layout import check_layout, layout_record
-from service.compute.registration.photo_layout import merge_places, places_from_outlines
-from service.core.errors import DataError
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.layout import (
+    REQUIRED_MARGIN_M,
+    LayoutReport,
+    check_layout,
+    layout_bounds,
+    layout_measures,
+    layout_record,
+)
+from service.compute.registration.layout_moves import innermost, suggest_moves
+from service.compute.registration.layout_words import ShownMove, show_move
+from service.compute.registration.photo_adjustment import LensPrior, Photograph
+from service.compute.registration.photo_layout import PhotoLayout, layout_from_photographs
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array
 from service.worker.job import JobAnswer, JobContext
+
+_GREEN, _YELLOW, _BLACK = (60, 220, 60), (0, 220, 255), (0, 0, 0)  # BGR
 
 
 def layout(context: JobContext) -> JobAnswer:
-    """Spheres of all photographs in one frame, judged by `check_layout`."""
+    """Spheres of all photographs in one frame, judged by `check_layout`; the last photograph shows them numbered."""
     arguments = context.arguments
     radius_m = float(arguments["radius_m"])
-    places = []
+    seen: list[tuple[CameraModel, Sequence[SphereOutline]]] = []
+    pixels = np.empty((0, 0, 3), dtype=np.uint8)
     for number, image in enumerate(arguments["images"]):
         context.progress("spheres in photographs", number, len(arguments["images"]))
         pixels = read_image(context.input(image["sha256"]))
         camera = nominal_camera(pixels.shape[1], pixels.shape[0], image["focal_mm"], arguments["sensor_width_mm"])
-        places.append(places_from_outlines(detect_spheres(pixels, camera), radius_m))
-    centres, covariances, used = merge_places(places)
-    report = check_layout(centres, covariances, radius_m=radius_m)
+        seen.append((camera, detect_spheres(pixels, camera)))
+    control, expected = int(arguments.get("control", 0)), arguments.get("expected")
+    found = layout_from_photographs([Photograph.of(c, o) for c, o in seen], radius_m, LensPrior(), expected)
+    report = check_layout(found.centres_m, found.covariance, radius_m=radius_m)
+    shown = _moves(found, report, seen[-1][0], radius_m, control)
     measures = {
-        "spheres_seen": float(len(centres)),
-        "photographs_used": float(used),
-        "layout_margin_mm": 1e3 * report.margin_m,
-        "layout_margin_sigma_mm": 1e3 * report.margin_sigma_m,
-        "layout_depth_mm": 1e3 * report.depth_m,
-        "layout_gap_deg": float(np.rad2deg(report.largest_gap_rad)),
-        "layout_problems": float(len(report.problems)),
+        "spheres_seen": float(len(found.centres_m)),
+        "photographs_used": float(found.used),
+        **layout_measures(report),
     }
-    return JobAnswer(measures, (), {"spheres_m": centres.tolist(), "details": layout_record(report)})
+    details = {
+        **layout_record(report),
+        "chi2": found.chi2,
+        "photographs": [_photograph_record(ids, o) for ids, (_, o) in zip(found.spheres, seen, strict=True)],
+        "moves": [_move_record(move, seen[-1][0]) for move in shown],
+    }
+    picture = _picture(pixels, seen[-1][0], seen[-1][1], found.spheres[-1], shown)
+    overlay = context.keep_bytes(picture, kind="layout_overlay", media_type="image/jpeg", name="layout.jpg")
+    return JobAnswer(measures, (overlay,), {"spheres_m": found.centres_m.tolist(), "details": details})
 
 
 def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: float) -> CameraModel:
@@ -50,3 +76,74 @@ def nominal_camera(width: int, height: int, focal_mm: float, sensor_width_mm: fl
         )
     focal_px = focal_mm / sensor_width_mm * width
     return CameraModel(width, height, focal_px, focal_px, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0, 0.0, 0.0)
+
+
+def _moves(
+    found: PhotoLayout, report: LayoutReport, camera: CameraModel, radius_m: float, control: int
+) -> list[ShownMove]:
+    """What to move, as the last photograph shows it; nothing where the layout is good, or no move would help."""
+    T = found.T_photo_first[-1]
+    if T is None or all(bounded.lower_m >= limit for bounded, limit in layout_bounds(report).values()):
+        return []
+    placed = found.centres_m
+    up = _up(placed)
+    try:
+        moves = suggest_moves(placed, up=up, radius_m=radius_m, fixed=innermost(placed, control))
+    except ComputeError:
+        return []
+    shown: list[ShownMove] = []
+    for move in moves:
+        shown.append(show_move(move, placed, up, T, camera, REQUIRED_MARGIN_M))
+        placed = placed.copy()
+        placed[move.sphere] += move.by_m
+    return shown
+
+
+def _up(centres: Array) -> Array:
+    """Away from the table: across the spheres' best plane, towards the camera, which looks along its z."""
+    _, _, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
+    return np.asarray(axes[2] if axes[2, 2] < 0 else -axes[2], dtype=np.float64)
+
+
+def _photograph_record(ids: NDArray[np.int64], outlines: Sequence[SphereOutline]) -> dict[str, Any]:
+    shown = zip(ids.tolist(), outlines, strict=False)
+    return {"used": bool(len(ids)), "spheres": {str(i): list(o.centre_px) for i, o in shown if i >= 0}}
+
+
+def _move_record(move: ShownMove, camera: CameraModel) -> dict[str, Any]:
+    """The places as parts of the image's width and height: as one would point at them in the picture."""
+    size = np.array([camera.width, camera.height])
+    return {
+        "words": move.words,
+        "from": (move.from_px / size).tolist(),
+        "to": (move.to_px / size).tolist(),
+        "higher_mm": 1e3 * move.higher_m,
+    }
+
+
+def _picture(
+    pixels: NDArray[np.uint8],
+    camera: CameraModel,
+    outlines: Sequence[SphereOutline],
+    ids: NDArray[np.int64],
+    moves: Sequence[ShownMove],
+) -> bytes:
+    """JPEG of the photograph with numbered spheres, and arrows where spheres are to go."""
+    picture = pixels.copy()
+    thick = max(1, round(camera.width / 900))
+    size = camera.width / 1900
+    for sphere, outline in zip(ids.tolist(), outlines, strict=False):
+        curve = np.rint(outline.captured_px(camera) * 16).astype(np.int32)
+        cv2.polylines(picture, [curve], True, _GREEN, thick, cv2.LINE_AA, shift=4)
+        if sphere < 0:
+            continue
+        x, y = (round(v) for v in outline.centre_px)
+        place = (x - round(10 * size * len(str(sphere))), y + round(10 * size))
+        for tone, width in ((_BLACK, 4 * thick), (_GREEN, 2 * thick)):
+            cv2.putText(picture, str(sphere), place, cv2.FONT_HERSHEY_SIMPLEX, size, tone, width, cv2.LINE_AA)
+    for move in moves:
+        (x0, y0), (x1, y1) = np.rint([move.from_px, move.to_px]).astype(int).tolist()
+        for tone, width in ((_BLACK, 6 * thick), (_YELLOW, 3 * thick)):
+            cv2.arrowedLine(picture, (x0, y0), (x1, y1), tone, width, cv2.LINE_AA, tipLength=0.25)
+    _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
+    return encoded.tobytes()

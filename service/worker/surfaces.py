@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.compute.registration.layout import SUBSET as LAYOUT_SUBSET
-from service.compute.registration.layout import check_layout, layout_record
+from service.compute.registration.layout import check_layout, layout_measures, layout_record
 from service.compute.surfaces.constellations import match_constellations
 from service.compute.surfaces.isosurface import surface
 from service.compute.surfaces.loop_closure import LoopClosure, close_loop
@@ -53,7 +53,7 @@ def _search(context: JobContext, vertices_m: Array, faces: Any) -> JobAnswer:
     }
     details: dict[str, Any] = {"spheres": [sphere_record(s) for s in spheres]}
     if layout is not None:
-        measures["layout_margin_mm"] = 1e3 * layout.margin_m
+        measures |= layout_measures(layout)
         details["layout"] = layout_record(layout)
     if arguments.get("reference_m") is not None:
         reference = np.array(arguments["reference_m"])

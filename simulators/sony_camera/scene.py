@@ -242,14 +242,20 @@ class WorldSource:
         return int(answer["shutter_presses"]), int(answer["iso"])
 
     def warm_up(self, stop: threading.Event, interval_s: float = 0.5) -> None:
-        """Build the renderer's scene as soon as the world answers, so that no client waits for it."""
+        """Build the renderer's scene as soon as the world answers, and anew when a sphere was moved.
+
+        So no client waits for it.
+        """
+        built: object = None
         while not stop.is_set():
             try:
                 view = self._view()
             except SimulatorError as error:
                 _LOG.debug("warming up: %s", error)
-                stop.wait(interval_s)
-                continue
-            with self._rendering:
-                self._renderer.preview(view)
-            return
+            else:
+                moved = view["scene"].get("moved", [])
+                if moved != built:
+                    with self._rendering:
+                        self._renderer.preview(view)
+                    built = moved
+            stop.wait(interval_s)

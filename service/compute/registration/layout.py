@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.compute.registration.misfits import bounded_misfits, misfits, rigid_motions
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, align_points, apply
+from service.core.geometry import Array
 
 IntArray = NDArray[np.int64]
 
@@ -24,8 +25,9 @@ LARGEST_GAP_RAD = np.deg2rad(150.0)  # between neighbouring azimuths: wider, and
 _FIRST_TOLERANCE_M = 1.0e-3
 _ROWS = 2_000_000  # combinations worked on at a time
 _MOST_MATCHES = 200_000  # a layout with so many near-symmetries needs no longer list
-_MOVE_M = 0.04  # how far a sphere is tried elsewhere
-_MOST_MOVES = 5
+_REACH_M = 3.0e-3  # misfits up to which assignments of four are judged, and carried on to more spheres
+_MOST_JUDGED = 600  # assignments whose bounds are computed, the best first
+_QUANTILE = 2.326  # of a normal distribution at the bounds' 99 %
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,18 +46,21 @@ class Confusion:
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
-    """A sphere that is better placed elsewhere.
+class Bounded:
+    """A length in metres with bounds that hold with 99 % each; all three alike where no uncertainty is known."""
 
-    Attributes:
-        sphere: its index.
-        by_m: (3,) shift in the frame of the centres.
-        margin_m: of the layout after this move and those before it.
-    """
+    value_m: float
+    lower_m: float
+    upper_m: float
 
-    sphere: int
-    by_m: Array
-    margin_m: float
+    @property
+    def sigma_m(self) -> float:
+        """The standard deviation of a normal distribution with bounds as far apart."""
+        return (self.upper_m - self.lower_m) / (2 * _QUANTILE)
+
+    def record_mm(self) -> dict[str, float]:
+        """Plain data in millimetres, as gates take it."""
+        return {"sigma": 1e3 * self.sigma_m, "lower": 1e3 * self.lower_m, "upper": 1e3 * self.upper_m}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,39 +68,41 @@ class LayoutReport:
     """How well the spheres of a layout can be told apart.
 
     Attributes:
-        margin_m: least misfit of any wrong assignment of any four spheres: what noise must stay well below.
-        margin_sigma_m: its standard deviation by the centres' uncertainties; 0 when they are not given.
+        margin: least misfit of any wrong assignment of any four spheres: what noise must stay well below.
+        margin_of_five: the same of five spheres; infinite where none was found.
         worst: the assignments that fit best, best first.
         margin_by_count_m: least misfit found when so many spheres are seen (4, 5, … all).
         sphere_margins_m: (N,) least misfit among the assignments that take this sphere for another.
-        depth_m: rms distance of the centres from their best plane.
+        depth: rms distance of the centres from their best plane.
         extent_m: rms distance of the centres from their mean.
         largest_gap_rad: between neighbouring azimuths around the mean, in the best plane.
         problems: what must be changed, in words; none: the layout passes.
-        moves: one after the other, which spheres to move and roughly where to; only sought where the margin is too
-            small.
     """
 
-    margin_m: float
-    margin_sigma_m: float
+    margin: Bounded
+    margin_of_five: Bounded
     worst: tuple[Confusion, ...]
     margin_by_count_m: dict[int, float]
     sphere_margins_m: Array
-    depth_m: float
+    depth: Bounded
     extent_m: float
     largest_gap_rad: float
     problems: tuple[str, ...]
-    moves: tuple[Move, ...]
 
     @property
     def passed(self) -> bool:
         """Whether nothing must be changed."""
         return not self.problems
 
+    @property
+    def margin_m(self) -> float:
+        """The margin without its bounds."""
+        return self.margin.value_m
+
 
 def check_layout(
     centres_m: Array,
-    covariances: Array | None = None,
+    covariance: Array | None = None,
     *,
     radius_m: float = 0.015,
     required_margin_m: float = REQUIRED_MARGIN_M,
@@ -109,8 +116,8 @@ def check_layout(
 
     Args:
         centres_m: (N, 3), N ≥ 4.
-        covariances: (N, 3, 3) of the centres, m².
-        radius_m: of the spheres; moves keep them apart.
+        covariance: (3N, 3N) m² of all centres together, or (N, 3, 3) of centres that were measured one by one.
+        radius_m: of the spheres.
         required_margin_m: misfit below which a wrong assignment of four counts as possible; give more when the
             centres are only roughly known.
 
@@ -125,12 +132,12 @@ def check_layout(
         raise ComputeError(
             f"{len(centres)} spheres have no layout to judge, {SUBSET} are needed", remedy="place more spheres"
         )
-    between = _distances(centres)
+    between = distances(centres)
     if between[~np.eye(len(centres), dtype=bool)].min() < radius_m:
         raise ComputeError("two spheres are at the same place", remedy="check the list of centres for repeats")
-    matches = _confusions(centres, beyond_m=max(2 * required_margin_m, REQUIRED_MARGIN_OF_FIVE_M))
+    joint = _joint(covariance, len(centres))
+    matches = confusions(centres, beyond_m=max(2 * required_margin_m, _REACH_M))
     order = np.argsort(matches.misfit, kind="stable")
-    margin = float(matches.misfit[order[0]])
     worst = tuple(
         Confusion(_ints(matches.seen[k]), _ints(matches.taken[k]), float(matches.misfit[k]))
         for k in _distinct(matches, order)
@@ -140,42 +147,47 @@ def check_layout(
     for column in range(SUBSET):
         chosen = moved[:, column]
         np.minimum.at(sphere_margins, matches.seen[chosen, column], matches.misfit[chosen])
+    by_count = _by_count(centres, matches, order)
+    best = order[:_MOST_JUDGED]
+    margin = _least(centres, joint, Matches(matches.seen[best], matches.taken[best], matches.misfit[best]))
+    of_five = _least(centres, joint, by_count[SUBSET + 1]) if SUBSET + 1 in by_count else _NO_BOUND
     _, singular, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
-    depth = float(singular[2] / np.sqrt(len(centres)))
-    gap = _largest_gap(centres, axes)
+    report = LayoutReport(
+        margin=margin,
+        margin_of_five=of_five,
+        worst=worst,
+        margin_by_count_m={n: float(m.misfit[0]) for n, m in by_count.items()},
+        sphere_margins_m=sphere_margins,
+        depth=_depth(centres, singular, axes, joint),
+        extent_m=float(np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1)))),
+        largest_gap_rad=_largest_gap(centres, axes),
+        problems=(),
+    )
+    return replace(report, problems=_problems(report, required_margin_m))
+
+
+def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]:
+    """What must be changed, by the values themselves: gates judge the bounds."""
     problems: list[str] = []
-    if margin < required_margin_m:
-        first = worst[0]
+    if report.margin_m < required_margin_m:
+        first = report.worst[0]
         problems.append(
             f"spheres {_names(first.spheres)} can be taken for {_names(first.taken_for)}: "
-            f"{margin * 1e3:.2f} mm apart, {required_margin_m * 1e3:.1f} mm are needed"
+            f"{report.margin_m * 1e3:.2f} mm apart, {required_margin_m * 1e3:.1f} mm are needed"
         )
-    by_count = _by_count(centres, matches, order)
-    of_five = by_count.get(SUBSET + 1, np.inf)
-    if of_five < REQUIRED_MARGIN_OF_FIVE_M:
+    if report.margin_of_five.value_m < REQUIRED_MARGIN_OF_FIVE_M:
         problems.append(
-            f"five spheres can be taken for others that are {of_five * 1e3:.2f} mm different, "
+            f"five spheres can be taken for others that are {report.margin_of_five.value_m * 1e3:.2f} mm different, "
             f"{REQUIRED_MARGIN_OF_FIVE_M * 1e3:.0f} mm are needed"
         )
-    if depth < REQUIRED_DEPTH_M:
+    if report.depth.value_m < REQUIRED_DEPTH_M:
         problems.append(
-            f"the spheres lie within {depth * 1e3:.1f} mm of a plane, {REQUIRED_DEPTH_M * 1e3:.0f} mm are needed: "
-            "set some of them higher"
+            f"the spheres lie within {report.depth.value_m * 1e3:.1f} mm of a plane, "
+            f"{REQUIRED_DEPTH_M * 1e3:.0f} mm are needed: set some of them higher"
         )
-    if gap > LARGEST_GAP_RAD:
-        problems.append(f"no sphere over {np.rad2deg(gap):.0f}° of the way around: spread them")
-    return LayoutReport(
-        margin_m=margin,
-        margin_sigma_m=0.0 if covariances is None else _sigma(worst[0], covariances),
-        worst=worst,
-        margin_by_count_m=by_count,
-        sphere_margins_m=sphere_margins,
-        depth_m=depth,
-        extent_m=float(np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1)))),
-        largest_gap_rad=gap,
-        problems=tuple(problems),
-        moves=_moves(centres, radius_m, required_margin_m) if margin < required_margin_m else (),
-    )
+    if report.largest_gap_rad > LARGEST_GAP_RAD:
+        problems.append(f"no sphere over {np.rad2deg(report.largest_gap_rad):.0f}° of the way around: spread them")
+    return tuple(problems)
 
 
 def layout_record(report: LayoutReport) -> dict[str, Any]:
@@ -184,19 +196,36 @@ def layout_record(report: LayoutReport) -> dict[str, Any]:
         "passed": report.passed,
         "problems": list(report.problems),
         "margin_mm": 1e3 * report.margin_m,
-        "margin_sigma_mm": 1e3 * report.margin_sigma_m,
+        "margin_sigma_mm": 1e3 * report.margin.sigma_m,
+        "bounds": {name: bounded.record_mm() for name, (bounded, _) in layout_bounds(report).items()},
         "margin_by_count_mm": {str(k): 1e3 * v for k, v in report.margin_by_count_m.items() if np.isfinite(v)},
         "worst": [
             {"spheres": list(c.spheres), "taken_for": list(c.taken_for), "misfit_mm": 1e3 * c.misfit_m}
             for c in report.worst
         ],
-        "depth_mm": 1e3 * report.depth_m,
+        "depth_mm": 1e3 * report.depth.value_m,
         "extent_mm": 1e3 * report.extent_m,
         "largest_gap_deg": float(np.rad2deg(report.largest_gap_rad)),
-        "moves": [
-            {"sphere": m.sphere, "by_mm": (1e3 * m.by_m).tolist(), "margin_mm": 1e3 * m.margin_m}
-            for m in report.moves
-        ],
+    }
+
+
+def layout_bounds(report: LayoutReport) -> dict[str, tuple[Bounded, float]]:
+    """The numbers of a layout that gates judge, by the name of their measure, each with what it must reach (m)."""
+    found = {
+        "layout_margin_mm": (report.margin, REQUIRED_MARGIN_M),
+        "layout_margin_of_five_mm": (report.margin_of_five, REQUIRED_MARGIN_OF_FIVE_M),
+        "layout_depth_mm": (report.depth, REQUIRED_DEPTH_M),
+    }
+    return {name: value for name, value in found.items() if np.isfinite(value[0].value_m)}
+
+
+def layout_measures(report: LayoutReport) -> dict[str, float]:
+    """The numbers of a layout, lengths in mm, by the names of their measures: alike in every step."""
+    return {
+        **{name: 1e3 * bounded.value_m for name, (bounded, _) in layout_bounds(report).items()},
+        "layout_margin_sigma_mm": 1e3 * report.margin.sigma_m,
+        "layout_gap_deg": float(np.rad2deg(report.largest_gap_rad)),
+        "layout_problems": float(len(report.problems)),
     }
 
 
@@ -204,26 +233,28 @@ def layout_record(report: LayoutReport) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Matches:
-    seen: IntArray  # (M, 4) ascending indices
-    taken: IntArray  # (M, 4)
-    misfit: Array  # (M,) metres
+class Matches:
+    """Wrong assignments: `seen` (M, n) are taken for `taken` (M, n), with these misfits (M,) in metres."""
+
+    seen: IntArray
+    taken: IntArray
+    misfit: Array
 
 
-def _confusions(centres: Array, beyond_m: float = 0.0) -> _Matches:
+def confusions(centres: Array, beyond_m: float = 0.0) -> Matches:
     """All wrong assignments of four up to a misfit of `beyond_m`, or more until there is one."""
-    between = _distances(centres)
+    between = distances(centres)
     tolerance = max(_FIRST_TOLERANCE_M, beyond_m)
     while True:
-        seen, taken = _similar(between, 2 * np.sqrt(2.0) * tolerance)
-        misfit = _misfits(centres, seen, taken)
+        seen, taken = similar(between, 2 * np.sqrt(2.0) * tolerance)
+        misfit = misfits(centres, seen, taken)
         sure = misfit <= tolerance
         if np.any(sure):
-            return _Matches(seen[sure], taken[sure], misfit[sure])
+            return Matches(seen[sure], taken[sure], misfit[sure])
         tolerance *= 2
 
 
-def _similar(between: Array, tolerance: float) -> tuple[IntArray, IntArray]:
+def similar(between: Array, tolerance: float) -> tuple[IntArray, IntArray]:
     """Quadruples (M, 4) and others (M, 4) whose six distances agree; the quadruple itself is left out."""
     n = len(between)
     seen = np.stack(np.triu_indices(n, 1), axis=1)
@@ -261,28 +292,15 @@ def _extended(between: Array, seen: IntArray, taken: IntArray, tolerance: float)
     )
 
 
-def _misfits(centres: Array, seen: IntArray, taken: IntArray) -> Array:
-    """rms (M,) after the best proper rigid motion of each assignment. Source: as `align_points`."""
-    if len(seen) == 0:
-        return np.empty(0)
-    a, b = centres[seen], centres[taken]
-    a = a - a.mean(axis=1, keepdims=True)
-    b = b - b.mean(axis=1, keepdims=True)
-    H = np.einsum("mki,mkj->mij", a, b)
-    U, S, Vt = np.linalg.svd(H)
-    S[:, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    square = np.sum(a**2, axis=(1, 2)) + np.sum(b**2, axis=(1, 2)) - 2 * S.sum(axis=1)
-    return np.sqrt(np.maximum(square, 0.0) / seen.shape[1])
-
-
-def _distances(centres: Array) -> Array:
+def distances(centres: Array) -> Array:
+    """(N, N) between all centres (N, 3)."""
     return np.linalg.norm(centres[:, None] - centres[None], axis=2)
 
 
 # --- what follows from it -------------------------------------------------------------------------------
 
 
-def _distinct(matches: _Matches, order: IntArray, most: int = 8) -> list[int]:
+def _distinct(matches: Matches, order: IntArray, most: int = 8) -> list[int]:
     """The best assignments, each pair of sets once: an assignment and its inverse fit alike."""
     chosen: list[int] = []
     known: set[frozenset[tuple[int, int]]] = set()
@@ -297,74 +315,67 @@ def _distinct(matches: _Matches, order: IntArray, most: int = 8) -> list[int]:
     return chosen
 
 
-def _by_count(centres: Array, matches: _Matches, order: IntArray) -> dict[int, float]:
-    """Least misfit with more spheres seen: the best assignments of four, carried on to the others."""
+def _by_count(centres: Array, matches: Matches, order: IntArray) -> dict[int, Matches]:
+    """The best assignments by the number of spheres seen, best first: those of four, carried on to the others."""
     n = len(centres)
-    best = dict.fromkeys(range(SUBSET, n + 1), np.inf)
-    best[SUBSET] = float(matches.misfit[order[0]])
-    for k in order[:2000]:
-        T, _ = align_points(centres[matches.taken[k]], centres[matches.seen[k]])
-        carried = apply(T, centres)
-        seen, taken = [int(i) for i in matches.seen[k]], [int(i) for i in matches.taken[k]]
-        distance = np.linalg.norm(carried[:, None] - centres[None], axis=2)
-        while len(seen) < n:
-            rows = [i for i in range(n) if i not in seen]
-            columns = [j for j in range(n) if j not in taken]
-            part = distance[np.ix_(rows, columns)]
-            i, j = np.unravel_index(int(part.argmin()), part.shape)
-            seen.append(rows[int(i)])
-            taken.append(columns[int(j)])
-            misfit = _misfits(centres, np.array([seen]), np.array([taken]))[0]
-            best[len(seen)] = min(best[len(seen)], float(misfit))
-    return best
+    seen, taken = matches.seen[order[:2000]], matches.taken[order[:2000]]
+    found = {SUBSET: Matches(seen, taken, matches.misfit[order[:2000]])}
+    R, t = rigid_motions(centres, seen, taken)
+    carried = np.einsum("mij,nj->mni", R, centres) + t[:, None]
+    distance = np.linalg.norm(carried[:, :, None] - centres[None, None], axis=3)
+    rows = np.arange(len(seen))
+    for column in range(SUBSET):
+        distance[rows, seen[:, column]] = np.inf
+        distance[rows, :, taken[:, column]] = np.inf
+    for count in range(SUBSET + 1, n + 1):
+        i, j = np.divmod(distance.reshape(len(seen), -1).argmin(axis=1), n)
+        distance[rows, i] = np.inf
+        distance[rows, :, j] = np.inf
+        seen, taken = np.concatenate([seen, i[:, None]], axis=1), np.concatenate([taken, j[:, None]], axis=1)
+        misfit = misfits(centres, seen, taken)
+        best = np.argsort(misfit, kind="stable")[:_MOST_JUDGED]
+        found[count] = Matches(seen[best], taken[best], misfit[best])
+    return found
+
+
+_NO_BOUND = Bounded(np.inf, np.inf, np.inf)
+
+
+def _least(centres: Array, joint: Array | None, matches: Matches) -> Bounded:
+    """The least misfit: at least the least of all lower bounds, at most the least of all upper ones."""
+    if joint is None:
+        least = float(matches.misfit.min())
+        return Bounded(least, least, least)
+    found = bounded_misfits(centres, joint, matches.seen, matches.taken)
+    lower, upper = float(found.lower_m.min()), float(found.upper_m.min())
+    return Bounded(float(np.clip(found.misfit_m.min(), lower, upper)), lower, upper)
+
+
+def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) -> Bounded:
+    """rms height over the best plane, with the first-order variance of a singular value."""
+    n = len(centres)
+    depth = float(singular[2] / np.sqrt(n))
+    if joint is None:
+        return Bounded(depth, depth, depth)
+    height = (centres - centres.mean(axis=0)) @ axes[2]
+    slope = np.outer(height / max(float(singular[2]), 1e-9) / np.sqrt(n), axes[2]).ravel()
+    sigma = float(np.sqrt(slope @ joint @ slope))
+    return Bounded(depth, max(depth - _QUANTILE * sigma, 0.0), depth + _QUANTILE * sigma)
+
+
+def _joint(covariance: Array | None, n: int) -> Array | None:
+    """(3N, 3N) of all centres; None where nothing is known."""
+    if covariance is None or covariance.ndim == 2:
+        return covariance
+    joint = np.zeros((n, 3, n, 3))
+    joint[np.arange(n), :, np.arange(n)] = covariance
+    return joint.reshape(3 * n, 3 * n)
 
 
 def _largest_gap(centres: Array, axes: Array) -> float:
     flat = (centres - centres.mean(axis=0)) @ axes[:2].T
     turn = np.sort(np.arctan2(flat[:, 1], flat[:, 0]))
     return float(np.max(np.diff(np.append(turn, turn[0] + 2 * np.pi))))
-
-
-def _sigma(confusion: Confusion, covariances: Array) -> float:
-    """First order: each coordinate of a misfit has the variances of both centres; rotations absorb some of it."""
-    variance = [np.trace(covariances[i]) + np.trace(covariances[j]) for i, j in _pairs(confusion)]
-    return float(np.sqrt(np.mean(variance) / 3.0 / len(variance)))
-
-
-def _pairs(confusion: Confusion) -> list[tuple[int, int]]:
-    return list(zip(confusion.spheres, confusion.taken_for, strict=True))
-
-
-def _moves(centres: Array, radius: float, required: float) -> tuple[Move, ...]:
-    """Moves, one after the other, each of which leaves the fewest confusions below the requirement."""
-    placed = centres.copy()
-    _, _, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
-    turns = np.arange(6) * (np.pi / 3) + 0.3
-    # Up, down and slantwise: a sphere that only slides in the plane of the others stays in their symmetries.
-    directions = [np.cos(t) * axes[0] + np.sin(t) * axes[1] + s * axes[2] for t in turns for s in (0.0, 0.7)]
-    directions += [axes[2], -axes[2]]
-    chosen: list[Move] = []
-    for _ in range(_MOST_MOVES):
-        seen, taken = _similar(_distances(placed), 2 * np.sqrt(2.0) * required)
-        wrong = _misfits(placed, seen, taken) < required
-        if not np.any(wrong):
-            break
-        involved = np.bincount(seen[wrong][seen[wrong] != taken[wrong]], minlength=len(placed))
-        best: tuple[int, int, Array, Array] | None = None
-        for sphere in np.argsort(-involved, kind="stable")[:2]:
-            for direction in directions:
-                trial = placed.copy()
-                trial[sphere] += _MOVE_M * direction
-                if np.min(np.delete(np.linalg.norm(trial - trial[sphere], axis=1), sphere)) < 2.5 * radius:
-                    continue
-                left = _misfits(trial, *_similar(_distances(trial), 2 * np.sqrt(2.0) * required)) < required
-                if best is None or np.count_nonzero(left) < best[0]:
-                    best = (int(np.count_nonzero(left)), int(sphere), _MOVE_M * direction, trial)
-        if best is None or best[0] >= np.count_nonzero(wrong):
-            break
-        placed = best[3]
-        chosen.append(Move(best[1], best[2], float(_confusions(placed).misfit.min())))
-    return tuple(chosen)
 
 
 def _ints(row: IntArray) -> tuple[int, ...]:
