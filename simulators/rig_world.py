@@ -134,15 +134,10 @@ class World:
                     self.control_spheres = action == "place_control_spheres"
                 case "spray":
                     self.spray = True
-                case "mount_camera" if not self.arms:
-                    return {"ok": False, "error": "there is no arm to mount the camera on"}
-                case "mount_camera":
-                    self.camera_held = False
                 case "hold_camera":
-                    side = str(request.get("side", "above"))
-                    if side not in HELD_CAMERAS:
-                        return {"ok": False, "error": f"no side {side!r}; {', '.join(HELD_CAMERAS)}"}
-                    self.camera_held, self.T_world_held = True, HELD_CAMERAS[side]
+                    return self._hold_camera(str(request.get("side", "above")))
+                case "mount_camera":
+                    return self._mount_camera()
                 case "move_sphere":
                     return self._move_sphere(request)
                 case "press_shutter":
@@ -153,6 +148,18 @@ class World:
                     self.pedal_presses += 1
                 case _:
                     return {"ok": False, "error": f"hands cannot do {action!r}"}
+        return {"ok": True}
+
+    def _hold_camera(self, side: str) -> dict[str, Any]:
+        if side not in HELD_CAMERAS:
+            return {"ok": False, "error": f"no side {side!r}; {', '.join(HELD_CAMERAS)}"}
+        self.camera_held, self.T_world_held = True, HELD_CAMERAS[side]
+        return {"ok": True}
+
+    def _mount_camera(self) -> dict[str, Any]:
+        if not self.arms:
+            return {"ok": False, "error": "there is no arm to mount the camera on"}
+        self.camera_held = False
         return {"ok": True}
 
     def _move_sphere(self, request: Mapping[str, Any]) -> dict[str, Any]:

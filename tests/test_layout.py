@@ -187,7 +187,7 @@ def test_bounds_hold_the_truth_as_often_as_they_say() -> None:
         above += margin.lower_m > truth
         below += margin.upper_m < truth
     assert above <= 3
-    assert below <= 3
+    assert below <= 6  # the least of several upper bounds
 
 
 def test_a_move_is_told_as_the_photograph_shows_it() -> None:
