@@ -32,6 +32,7 @@ from service.steps.board_plan import (
 from service.steps.capture import capture_viewpoints
 from service.steps.context import JobRequest, StepContext
 from service.steps.planning import known_arm, plan_step, situation_of, usual_posture
+from service.steps.retakes import to_take_again
 from service.steps.viewpoints import Viewpoint
 
 _MOST_FIRST = 4  # tries for a first image that shows the board
@@ -286,6 +287,7 @@ class BoardCapture:
             image_kind="board_image",
             refused=refused,
             on_captured=self._look,
+            again=to_take_again(self.context),
         )
 
     def _look(self) -> None:

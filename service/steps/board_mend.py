@@ -9,17 +9,12 @@ from service.core.gates import describe, evaluate_gates
 from service.core.model import GateVerdict
 from service.steps.board_capture import BoardCapture
 from service.steps.context import StepContext
+from service.steps.retakes import TAKEN_AGAIN
 
 _MOST = 30  # further poses in one attempt
 _AGAIN = 10  # further poses where nothing predicts how many it takes
 _AIM = 0.9  # of a limit, so that a prediction that is a little too good still suffices
 _SPARE = 0.03  # of the coverage: a corner expected in a cell may fall beside it
-#: Gates that are about images taken with other settings: the images are taken again, further poses do not help.
-_TAKEN_AGAIN = {
-    "settings_departures": "set the camera as the protocol has it",
-    "moved_during_exposure": "look for what shook the arm or its mount",
-    "optics_departures": "set zoom and focus as they were, or calibrate with them as they are now by a redo",
-}
 
 Enough = Callable[[Prediction, Prediction], bool]
 
@@ -31,8 +26,8 @@ def mend_calibration(context: StepContext, capture: BoardCapture, measures: Mapp
     if not failed:
         return
     short = "; ".join(describe(verdict) for verdict in failed)
-    again = [word for name, word in _TAKEN_AGAIN.items() if name in {v.measure for v in failed}]
-    by_poses = [verdict for verdict in failed if verdict.measure not in _TAKEN_AGAIN]
+    again = [word for name, word in TAKEN_AGAIN.items() if name in {v.measure for v in failed}]
+    by_poses = [verdict for verdict in failed if verdict.measure not in TAKEN_AGAIN]
     if by_poses:
         count, rules = _wanted(by_poses, measures)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -64,6 +64,7 @@ def capture_viewpoints(
     image_kind: str,
     refused: Mapping[str, str] = NONE_REFUSED,
     on_captured: Callable[[], None] = lambda: None,
+    again: Collection[str] = (),
 ) -> CaptureTotals:
     """Capture every viewpoint that this attempt has not captured yet, in order.
 
@@ -72,13 +73,14 @@ def capture_viewpoints(
         image_kind: artefact kind of the photographs (`image`, `board_image`, `control_image`).
         refused: viewpoints that the plan has given up, with the reason; recorded as such, not tried.
         on_captured: called after each image that is in the record; must return at once.
+        again: viewpoints whose image of an earlier attempt is to be taken again.
 
     Raises DeviceError when a viewpoint fails for good, StepInterruptedError on pause.
     """
     camera = context.devices.camera()
     wanted = wanted_settings(context)
     _apply(context, camera, wanted)
-    loop = _CaptureLoop(context, camera, viewpoints, T_flange_camera, wanted, image_kind, on_captured)
+    loop = _CaptureLoop(context, camera, viewpoints, T_flange_camera, wanted, image_kind, on_captured, set(again))
     try:
         loop.run(refused)
     finally:
@@ -109,6 +111,7 @@ class _CaptureLoop:
     wanted: CameraSettings
     image_kind: str
     on_captured: Callable[[], None]
+    again: Set[str]
     given_up: set[str] = field(init=False)
     _taken: set[str] = field(init=False, default_factory=set[str])  # in this execution, successful or not
     _held: Shot | None = field(init=False, default=None)
@@ -150,7 +153,9 @@ class _CaptureLoop:
         An image whose verdicts failed is taken again, once an execution.
         """
         captures = {capture.viewpoint: capture for capture in self.context.evidence.captures(self.context.step.id)}
-        done = {name for name, c in captures.items() if name in self._taken or all(c.verdicts.values())}
+        old = {name for name in self.again if name in captures and captures[name].attempt < self.context.attempt}
+        good = {name for name, c in captures.items() if all(c.verdicts.values())} - old
+        done = good | (self._taken & captures.keys())
         if self._held is not None:
             done.add(self._held.viewpoint.name)
         left = [v for v in self.viewpoints if v.name not in done and v.name not in self.given_up]

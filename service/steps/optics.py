@@ -32,7 +32,12 @@ def optics_departures(
         return None
     departures = compare_optics([_optics(c) for c in reference], [_optics(c) for c in mine]).departures
     if departures and not quiet:
-        context.note("images depart from the calibration", departures=[str(departure) for departure in departures])
+        context.note(
+            "images depart from the calibration",
+            departures=[str(departure) for departure in departures],
+            attempt=context.attempt,
+            viewpoints=sorted({departure.image for departure in departures}),
+        )
         context.tell(f"the lens is not as it was calibrated: {'; '.join(summary(departures))}")
     return departures
 

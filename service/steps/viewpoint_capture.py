@@ -12,6 +12,7 @@ from service.steps.front_end import EarlyFeatures
 from service.steps.live import Live, LiveAnalysis
 from service.steps.optics import departing_images, optics_departures
 from service.steps.planning import feasible_extra, plan_step
+from service.steps.retakes import advise_retakes, to_take_again
 from service.steps.viewpoints import ViewpointSet, denser_viewpoints, plan_viewpoints
 
 
@@ -62,11 +63,15 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         image_kind="image" if params.purpose == "dataset" else "control_image",
         refused=planned.refused,
         on_captured=look,
+        again=to_take_again(context),
     )
     measures = totals.measures()
     departures = optics_departures(context)
     if departures is not None:
         measures["optics_departures"] = float(departing_images(departures))
+    departing = {departure.image for departure in departures or ()}
+    refused = {c.viewpoint for c in context.evidence.captures(context.step.id) if not all(c.verdicts.values())}
+    advise_retakes(context, measures, len(departing | refused) + totals.given_up)
     if live is not None:
         taken = {viewpoint.name for viewpoint in plan}
         candidates = feasible_extra(context, [v for v in extra if v.name not in taken], nominal)

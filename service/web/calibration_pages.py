@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Path, Request
-from fastapi.responses import HTMLResponse
+from fastapi import APIRouter, Depends, Path, Query, Request
+from fastapi.responses import HTMLResponse, Response
 
 from service.core.dependence import AcceptedGate, depends_on
 from service.core.errors import IllegalTransitionError
@@ -48,6 +48,16 @@ def calibration(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
             **_advice(site, log, found),
         }
     return render(request, "calibration.html.j2", **context)
+
+
+@router.get("/runs/{run_id}/board-plan.svg", name="board_plan", dependencies=[Depends(requires("read"))])
+def board_plan(site: Here, run_id: RunId, step: Annotated[str, Query(max_length=64)]) -> Response:
+    """The board images of a calibration step as they are planned: corners over the image, and the camera's places."""
+    # The planning of poses brings scipy, which the start of the service does not wait for.
+    from service.web.board_plan_view import board_plan_of  # noqa: PLC0415
+
+    headers = {"Cache-Control": "private, no-cache"}
+    return Response(board_plan_of(site.run(run_id), step, site.data), media_type="image/svg+xml", headers=headers)
 
 
 @router.get(

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from service.core.dependence import accepted_gates
 from service.core.registered import evaluated
-from service.evidence import results_to_come
+from service.evidence import RunLog, results_to_come
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Person
@@ -65,10 +65,18 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         "looking_back": bool(step) and view.shown.id != view.current,
         "dialog": dialog,
         "drawing": drawing(view.shown.drawing),
+        "board_plan": _board_plan(log, view.shown.id),
         "now_utc": datetime.now(UTC).isoformat(),
         "depends": accepted_gates(log.protocol, log.state),
         "result_table": evaluated(log.protocol, log.state),
     }
+
+
+def _board_plan(log: RunLog, step: str) -> int:
+    """Version of the plan of a step's board images: one more than the plans that are recorded; 0 for other steps."""
+    if getattr(log.protocol.step(step).params, "board_poses", None) is None:
+        return 0
+    return 1 + sum(note.note == "board_poses" for note in log.state.steps[step].notes)
 
 
 def _looker(site: Site, person: Person, run_id: str) -> Looker:

@@ -1,0 +1,45 @@
+"""Images that a gate refuses although they are there: on a retry only those are taken again, all others are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from service.core.gates import describe, evaluate_gates
+from service.steps.context import StepContext
+
+DEPARTING = "images depart from the calibration"  # name of the note
+#: Gates that are about how images were taken, and what a person looks at before they are taken again.
+TAKEN_AGAIN: Mapping[str, str] = {
+    "viewpoints_captured": "look at why the arm could not take the viewpoints that are missing",
+    "settings_departures": "set the camera as the protocol has it",
+    "moved_during_exposure": "look for what shook the arm or its mount",
+    "optics_departures": "set zoom, focus and lens as they were for the calibration, or redo the calibration",
+}
+
+
+def to_take_again(context: StepContext) -> set[str]:
+    """Viewpoints whose images departed from the calibration's optics in an earlier attempt, and still do."""
+    notes = [note.data for note in context.state.notes if note.note == DEPARTING and "attempt" in note.data]
+    if not notes or notes[-1]["attempt"] >= context.attempt:
+        return set()
+    captures = context.evidence.captures(context.step.id)
+    departed = set(notes[-1]["viewpoints"])
+    return {c.viewpoint for c in captures if c.viewpoint in departed and c.attempt <= notes[-1]["attempt"]}
+
+
+def advise_retakes(context: StepContext, measures: Mapping[str, float], images: int) -> None:
+    """Where such a gate fails, note what a retry will do: the failed images only.
+
+    Args:
+        measures: of the capture.
+        images: how many will be taken again.
+    """
+    verdicts = evaluate_gates(context.step, context.attempt, measures, context.run.skipped).verdicts
+    failed = [verdict for verdict in verdicts if not verdict.passed and verdict.measure in TAKEN_AGAIN]
+    if not failed:
+        return
+    short = "; ".join(describe(verdict) for verdict in failed)
+    words = "; ".join(TAKEN_AGAIN[verdict.measure] for verdict in failed)
+    advice = f"{short}. First {words}. Confirm to take {images} image(s) again; all others are kept"
+    context.note("retakes", advice=advice)
+    context.tell(advice)
