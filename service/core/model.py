@@ -183,8 +183,8 @@ class ViewHeld(View):
     """One exposure of a camera in a person's hands. Where it was the image itself tells, in the worker's answer."""
 
     kind: Literal["view_held"] = "view_held"
-    # By the camera's own button, by the software for a press on a screen or the pedal, or found as a file of a card.
-    released_by: Literal["camera", "screen", "pedal", "card"]
+    # By the camera's own button, or by the software for a press on a screen or the pedal.
+    released_by: Literal["camera", "screen", "pedal"]
     arrival_monotonic_s: float
 
 

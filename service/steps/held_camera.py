@@ -1,4 +1,4 @@
-"""Images of a camera that a person holds: they come by the camera's button, a screen, the pedal, or as files."""
+"""Images of a tethered camera that a person holds, released by its button, a screen or the pedal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.store.records import NewArtefact
 
 _PATIENCE_S = 0.3  # of one look at the camera
 
-By = Literal["camera", "screen", "pedal", "card"]
+By = Literal["camera", "screen", "pedal"]
 
 
 @dataclass
