@@ -16,7 +16,7 @@ def test_the_drawing_shows_corners_over_the_image_and_the_cameras_places() -> No
     svg = board_plan_svg("90 board poses; coverage < 100 %", counts, poses, np.array([-1.0, 0.0, 0.0]))
     root = ET.fromstring(svg)
     words = [element.text for element in root.iter() if element.text]
-    assert "90 board poses; coverage < 100 %" in words
+    assert {"90 board poses", "coverage < 100 %"} <= set(words)
     assert "95" in words
     assert "–" in words, "an empty cell says so"
     assert sum(element.tag.endswith("circle") for element in root.iter()) == 3

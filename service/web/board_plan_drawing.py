@@ -10,9 +10,9 @@ import numpy as np
 
 from service.core.geometry import Array
 
-_WIDTH, _HEIGHT = 760, 330
+_WIDTH, _HEIGHT = 760, 342
 _CELL = 29
-_LEFT, _TOP = 16, 62
+_LEFT, _TOP = 16, 74
 _INK, _PAPER, _FAINT, _ACCENT = "#1d2733", "#ffffff", "#8895a3", "#1f6fb2"
 _PLAN_LEFT, _PLAN_SIZE = 430, 240
 _TICK = 12.0
@@ -31,7 +31,7 @@ def board_plan_svg(text: str, counts: Sequence[Sequence[int]], T_base_camera: Ar
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {_HEIGHT}" font-family="sans-serif">',
         f'<rect width="{_WIDTH}" height="{_HEIGHT}" rx="6" fill="{_PAPER}"/>',
-        _text(_LEFT, 24, text, 13, weight="bold"),
+        *(_text(_LEFT, 20 + 17 * k, line, 12, weight="bold") for k, line in enumerate(text.split("; ", 1))),
         _text(_LEFT, _TOP - 10, "Corners expected in each part of the image", 12),
         _text(_PLAN_LEFT, _TOP - 10, "Camera from above; the robot stands below", 12),
     ]
