@@ -127,7 +127,7 @@ def _photographed(scene: Scene, count: int, seed: int = 0) -> list[Photograph]:
     """Outlines as the detector gives them by a nominal camera, of the true lens from the technician's places."""
     rng = np.random.default_rng(seed)
     lens = scene.camera_intrinsics(1920)
-    true = CameraModel(**lens.to_json())
+    true = CameraModel.from_record(lens.to_json())
     nominal = CameraModel(1920, 1280, 2689.0, 2689.0, 959.5, 639.5)
     world = np.concatenate([scene.registration_m, scene.control_m])
     sigma = 0.05 / nominal.fx

@@ -1,0 +1,49 @@
+"""What the simulated technician can do with a photograph: hold the camera elsewhere, move the sphere he points at."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from simulators.geometry import Array, apply, inverse
+from simulators.rig_world import HELD_CAMERAS, World
+from simulators.world import Scene, parse_moved
+
+
+@pytest.fixture
+def world() -> World:
+    return World(Scene.generate(21), 1920, ("robot",), np.zeros(6))
+
+
+def _pointing_at(world: World, side: str, point_m: Array) -> list[float]:
+    lens = world.scene.camera_intrinsics(1920)
+    pixel = lens.project(apply(inverse(HELD_CAMERAS[side]), point_m))
+    return (pixel / [lens.width, lens.height]).tolist()
+
+
+def test_a_sphere_goes_where_the_arrow_in_the_photograph_points(world: World) -> None:
+    assert world.act({"action": "hold_camera", "side": "left"})["ok"]
+    before = world.scene.registration_m
+    target = before[6] + np.array([0.0, 0.015, 0.0])
+    arrow = {"from": _pointing_at(world, "left", before[6]), "to": _pointing_at(world, "left", target)}
+    assert world.act({"action": "move_sphere", **arrow, "higher_m": 0.02})["ok"]
+    after = world.scene.registration_m
+    np.testing.assert_allclose(after[6], target + np.array([0.0, 0.0, 0.02]), atol=1e-6)
+    np.testing.assert_array_equal(np.delete(after, 6, axis=0), np.delete(before, 6, axis=0))
+    moved = world.view()["scene"]["moved"]
+    again = Scene.generate(21, parse_moved(str([list(entry) for entry in moved])))
+    np.testing.assert_array_equal(again.registration_m, after)
+    np.testing.assert_allclose(again.foot_m[6, :2] - Scene.generate(21).foot_m[6, :2], [0.0, 0.015], atol=1e-6)
+
+
+def test_what_he_cannot_do_he_says(world: World) -> None:
+    arrow = {"from": [0.5, 0.5], "to": [0.6, 0.5]}
+    assert "on the arm" in world.act({"action": "move_sphere", **arrow})["error"]
+    assert "no side" in world.act({"action": "hold_camera", "side": "below"})["error"]
+    assert world.act({"action": "hold_camera"})["ok"]
+    assert "no registration sphere" in world.act({"action": "move_sphere", **arrow})["error"]
+    neighbours = world.scene.registration_m[[6, 7]]
+    here, there = (_pointing_at(world, "above", point) for point in neighbours)
+    height = float(neighbours[1, 2] - neighbours[0, 2])
+    answer = world.act({"action": "move_sphere", "from": here, "to": there, "higher_m": height})
+    assert "in the way" in answer["error"]
