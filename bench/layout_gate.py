@@ -109,11 +109,14 @@ def main() -> None:
     start = time.process_time()
     outcomes = [judge(KINDS[k % len(KINDS)], 1000 + k) for k in range(args.layouts)]
     day = datetime.datetime.now(datetime.UTC).date().isoformat()
+    rig = machine()
+    where = f"{rig['processor']}, {rig['cores']} cores"
+    seconds = (time.process_time() - start) / len(outcomes)
     head = "| layouts | good in truth | passed though bad | sent back though good | photographs, mean | undecided |"
     lines = [
         f"# The layout check on {len(outcomes)} random layouts",
         "",
-        f"{day}, {machine()['processor']}, {machine()['cores']} cores; {(time.process_time() - start) / len(outcomes):.2f} CPU-s a layout.",
+        f"{day}, {where}; {seconds:.2f} CPU-s a layout.",
         "",
         head,
         "|---|---|---|---|---|---|",
