@@ -136,7 +136,9 @@ def _photographed(scene: Scene, count: int, seed: int = 0) -> list[Photograph]:
         cones: list[Cone] = []
         for centre in apply(inverse(T_world_camera), world)[rng.permutation(len(world))]:
             cone = cone_of_sphere(centre, scene.radius_m)
-            rim = cone.rays(np.arange(24) * (np.pi / 12), np.full(24, cone.half_angle_rad))
+            rim = cone.rays(
+                np.linspace(0.0, 2 * np.pi, 24, endpoint=False).astype(np.float64), np.full(24, cone.half_angle_rad)
+            )
             rays = np.column_stack([nominal.normalise(true.project(rim)), np.ones(24)])
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
             cone = fit_cone(rays, np.ones(24), cone, 8)

@@ -29,8 +29,18 @@ from service.worker.loop import work
 from tests.support.recorded_run import record_run
 
 DEMO = Path(__file__).parents[1] / "protocols" / "demo.yaml"
-CAMERA = {"width": 1280, "height": 853, "fx": 1000.0, "fy": 1000.0, "cx": 640.0, "cy": 426.0}
-CAMERA |= {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+CAMERA = {
+    "width": 1280,
+    "height": 853,
+    "fx": 1000.0,
+    "fy": 1000.0,
+    "cx": 640.0,
+    "cy": 426.0,
+    "k1": 0.0,
+    "k2": 0.0,
+    "p1": 0.0,
+    "p2": 0.0,
+}
 IMAGES = [{"viewpoint": f"v{i}", "sha256": f"{i:064x}", "station": "station_1", "step": "c"} for i in range(4)]
 NOW = "2026-11-22T10:00:00Z"
 
