@@ -20,6 +20,7 @@ class ScanFolderConfig(DriverConfig):
 
     folder: Path = Field(description="where the scanner's software exports to")
     unit: MeshUnit = Field(default="auto", description="of the exported coordinates: mm, m, or auto (from the size)")
+    only: str = Field(default="", description="file name of the one export that counts; empty: all of them")
     stable_s: float = Field(default=10.0, ge=0, description="how long an export must stay unchanged; 10 s on a share")
 
 
@@ -57,7 +58,7 @@ class ScanFolder:
     def exports(self) -> tuple[ScanExport, ...]:
         """Complete exports that stayed unchanged for `stable_s` of this driver's observation, oldest first."""
         require_folder(self._config.folder)
-        return self._watch.poll()[0]
+        return tuple(one for one in self._watch.poll()[0] if self._config.only in ("", one.name))
 
     def pending(self) -> tuple[str, ...]:
         """What is in the folder and cannot be taken yet, with the reason."""

@@ -1,7 +1,8 @@
-"""The rig file: which devices a site has, at which stations, as validated configuration."""
+"""The rig file: which devices a site has, at which stations, validated; or what an import brought."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import yaml
 from pydantic import Field, ValidationError
 
 from service.core.errors import ConfigurationError
+from service.core.imported import ImportList
 from service.core.model import Record
 
 if TYPE_CHECKING:  # the module brings scipy, for which a web process must not wait when it starts
@@ -99,6 +101,7 @@ class RigSection(Record):
     optics: OpticsSection | None = None  # None: depth of field is not judged
     lens: LensSection | None = None  # needed where the software plans the board poses
     timestamp: TimestampSection | None = None  # None: nobody outside is asked
+    imported: ImportList | None = None  # of a run that captures nothing: what was captured earlier
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,10 +137,17 @@ def load_rig(path: Path) -> Rig:
     """Read rig.yaml; ConfigurationError names the file and the field."""
     try:
         source = path.read_bytes()
-        data: object = yaml.safe_load(source)
     except OSError as error:
         raise ConfigurationError(f"cannot read the rig file: {error.strerror}", where=str(path)) from error
-    except yaml.YAMLError as error:
+    return parse_rig(source, path)
+
+
+def parse_rig(source: bytes, path: Path) -> Rig:
+    """The same for a file's bytes, such as a recorded artefact; ConfigurationError names the file and the field."""
+    try:
+        # The list of an import is JSON, of thousands of lines, which YAML would take seconds for.
+        data: object = json.loads(source) if source.startswith(b"{") else yaml.safe_load(source)
+    except (yaml.YAMLError, json.JSONDecodeError) as error:
         raise ConfigurationError(f"the rig file is not YAML: {error}", where=str(path)) from error
     if not isinstance(data, Mapping):
         raise ConfigurationError("the rig file holds no mapping", where=str(path))

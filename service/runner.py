@@ -300,7 +300,8 @@ class Runner:
             payloads.append(DeviceTrouble(device=error.where or step_id, error=name, message=str(error)))
         payloads.append(StepFailed(step=step_id, attempt=attempt, error=name, message=str(error), recovery=policy))
         self._append(*payloads)
-        self.operator.tell(f"{step_id}: {error}. What was captured is safe")
+        kept = self._log.state.origin
+        self.operator.tell(f"{step_id}: {error}. What was {kept} is safe")
 
     def _checkpoint(self, step: str, attempt: int) -> None:
         """Called by steps wherever they may stop: keeps the lease, and notices what operators have asked for."""

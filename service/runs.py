@@ -9,7 +9,7 @@ from service.core.errors import ConfigurationError
 from service.core.model import RunStarted
 from service.core.protocol import LoadedProtocol, Protocol
 from service.evidence import recorded_protocol, recorded_root
-from service.rig import Rig, load_rig
+from service.rig import Rig, load_rig, parse_rig
 from service.runner import software_versions
 from service.store.records import NewArtefact
 from service.store.store import Store
@@ -29,7 +29,13 @@ def start_run(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, 
     protocol = store.put_bytes(
         source, kind="protocol", media_type="application/yaml", original_name=f"{loaded.protocol.id}.yaml"
     )
-    rig_ref = store.put_bytes(rig.source, kind="rig", media_type="application/yaml", original_name=str(rig.path))
+    imported = rig.section.imported is not None
+    rig_ref = store.put_bytes(
+        rig.source,
+        kind="import_list" if imported else "rig",
+        media_type="application/json" if imported else "application/yaml",
+        original_name=str(rig.path),
+    )
     payload = RunStarted(
         protocol_id=loaded.protocol.id,
         protocol_version=loaded.protocol.version,
@@ -40,6 +46,7 @@ def start_run(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, 
         auto_confirm=auto_confirm,
         operator=operator,
         software=software_versions(),
+        origin="imported" if imported else "captured",
     )
     return store.create_run(payload, operator, [NewArtefact(protocol, "runner"), NewArtefact(rig_ref, "runner")])
 
@@ -51,10 +58,13 @@ def recorded_run(store: Store, run_id: str) -> tuple[Protocol, RunStarted]:
 
 
 def recorded_rig(store: Store, root: RunStarted) -> Rig:
-    """The rig of a run: its file must still be what it was.
+    """The rig of a run: its file must still be what it was. Of an import the list in the evidence is all there is.
 
     Raises ConfigurationError when the file has changed since the run began.
     """
+    if root.origin == "imported":
+        source = store.artefact_path(root.rig.sha256, verify=True).read_bytes()
+        return parse_rig(source, Path(root.rig.original_name))
     rig = load_rig(Path(root.rig.original_name))
     if rig.source != store.artefact_path(root.rig.sha256, verify=True).read_bytes():
         raise ConfigurationError(

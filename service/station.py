@@ -25,6 +25,7 @@ from drivers.interfaces import (
 )
 from drivers.plugin import DriverConfig, DriverSpec
 from service.core.errors import ConfigurationError
+from service.core.imported import ImportList
 from service.rig import CollisionSection, LensSection, OpticsSection, Rig
 from service.steps.context import StationLayout
 
@@ -103,9 +104,9 @@ class Station:
         """The only camera of the rig."""
         return cast(Camera, self.device(self._only("camera")))
 
-    def scanner(self) -> Scanner:
-        """The only scanner of the rig."""
-        return cast(Scanner, self.device(self._only("scanner")))
+    def scanner(self, name: str | None = None) -> Scanner:
+        """The scanner of this name, or the only one of the rig."""
+        return cast(Scanner, self.device(name or self._only("scanner")))
 
     def ct(self) -> CtSource:
         """The only CT folder of the rig."""
@@ -131,6 +132,10 @@ class Station:
     def lens(self) -> LensSection | None:
         """Focal length and sensor as the rig file states them."""
         return self.rig.section.lens
+
+    def imported(self) -> ImportList | None:
+        """What was captured earlier, in a run that imports it."""
+        return self.rig.section.imported
 
     def reopen(self, device: Device) -> None:
         """Close and open again, after a link dropped."""

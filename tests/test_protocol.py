@@ -28,6 +28,7 @@ def test_a_protocol_is_read_with_its_hash_and_typed_params(tmp_path: Path) -> No
     assert loaded.source == TOY
     assert len(loaded.sha256) == 64
     assert protocol.step_ids == ("fix_it", "capture", "spray", "scan", "register")
+    assert protocol.camera is not None
     assert protocol.camera.exposure_s == pytest.approx(1 / 15)
     assert protocol.step("capture").params_as(CaptureParams).views == 3
     assert protocol.step("capture").gates[1].max == 1.0

@@ -222,7 +222,8 @@ def _write_records(
     *,
     simulated: bool,
 ) -> None:
-    bundle.add("README.txt", [_readme(run_id, keys[-1].key_id, simulated=simulated).encode()])
+    readme = _readme(run_id, keys[-1].key_id, simulated=simulated, imported=root.origin == "imported")
+    bundle.add("README.txt", [readme.encode()])
     bundle.add("verify.py", chunks_of(_VERIFIER))
     bundle.add("events.jsonl", _event_lines(connection, run_id))
     bundle.add("site_events.jsonl", _event_lines(connection, SITE))
@@ -298,12 +299,16 @@ def _zip_time(at_utc: str) -> ZipTime:
     return max(year, 1980), month, day, hour, minute, second - second % 2
 
 
-def _readme(run_id: str, key_id: str, *, simulated: bool) -> str:
+def _readme(run_id: str, key_id: str, *, simulated: bool, imported: bool) -> str:
     warning = (
         "SIMULATED: no real device took part in this run. It is no record of a real acquisition.\n\n"
         if simulated
         else ""
     )
+    if imported:
+        warning += (
+            "IMPORTED: how the images were captured is not in evidence, only when and by whom they were imported.\n\n"
+        )
     return f"""Evidence of run {run_id}, exported by orthocapture
 
 {warning}To verify this bundle, on any machine with Python 3.9 or newer and the package `cryptography`, offline:

@@ -7,6 +7,7 @@ from typing import Any
 
 from service.audit.bundle_zip import Listed
 from service.core.acceptance import describe_accepted
+from service.core.imported import imported_sentence
 from service.core.model import (
     ArtefactRef,
     DeviceOpened,
@@ -77,6 +78,7 @@ def crate(
         "description": (
             f"{marked}Evidence of {root.protocol_id} {root.protocol_version}: every event, signature and file."
             + (" No real device took part: the whole rig was simulated." if root.simulated else "")
+            + (f" {imported_sentence(events[0].at_utc, root.operator)}." if root.origin == "imported" else "")
             + "".join(f" Accepted outside its limits: {text}." for text in accepted)
         ),
         "datePublished": events[-1].at_utc,

@@ -39,6 +39,7 @@ class RunBasics:
     protocol: str  # its id, "" when the first event cannot be read
     version: str
     operator: str
+    origin: str  # captured, imported
     head_seq: int
     head_sha256: str
 
@@ -50,7 +51,8 @@ def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
             "SELECT r.run_id, r.created_utc, r.simulated, h.seq, h.sha256, "
             "json_extract(e.payload, '$.protocol_id') AS protocol, "
             "json_extract(e.payload, '$.protocol_version') AS version, "
-            "json_extract(e.payload, '$.operator') AS operator "
+            "json_extract(e.payload, '$.operator') AS operator, "
+            "json_extract(e.payload, '$.origin') AS origin "
             "FROM runs AS r LEFT JOIN heads AS h ON h.run_id = r.run_id "
             "LEFT JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 AND json_valid(e.payload) "
             "WHERE r.run_id <> :site AND (:run IS NULL OR r.run_id = :run) ORDER BY r.created_utc DESC, r.run_id DESC"
@@ -65,6 +67,7 @@ def runs(connection: Connection, run_id: str | None = None) -> list[RunBasics]:
             protocol=str(row.protocol or ""),
             version=str(row.version or ""),
             operator=str(row.operator or ""),
+            origin=str(row.origin or "captured"),
             head_seq=row.seq or 0,
             head_sha256=row.sha256 or "",
         )

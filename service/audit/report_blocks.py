@@ -151,10 +151,11 @@ class Section:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The whole; the first five say on the first page what a reader must not miss."""
+    """The whole; the first six say on the first page what a reader must not miss."""
 
     title: str
     simulated: bool
+    origin: Cell | None  # None: the run captured its photographs itself
     release: Cell | None  # None: the protocol asks for none
     verification: Cell
     result: Cell

@@ -13,6 +13,7 @@ from service.audit.report_course import deviations, deviations_section, people_s
 from service.audit.report_origin import devices_section, pictures_section, software_section
 from service.audit.report_verification import verification_section
 from service.audit.report_words import duration, utc
+from service.core.imported import imported_sentence
 from service.store.audit import AuditReport
 
 
@@ -55,6 +56,7 @@ def report_content(
     return Report(
         title=run.protocol.title,
         simulated=run.root.simulated,
+        origin=_origin(run),
         verification=_verification(audit),
         result=result,
         deviations=Cell(f"{len(listed)} deviations, listed first", "attention")
@@ -76,6 +78,13 @@ def _verification(audit: AuditReport) -> Cell:
     return Cell(
         f"THE EVIDENCE DOES NOT VERIFY: {audit.first_fault}{more}. Nothing in this report can be relied on.", "stop"
     )
+
+
+def _origin(run: RecordedRun) -> Cell | None:
+    """None where the run captured its photographs itself."""
+    if run.root.origin != "imported":
+        return None
+    return Cell(imported_sentence(run.events[0].at_utc, run.named(run.root.operator)), "attention")
 
 
 def _release(run: RecordedRun) -> Cell | None:
@@ -109,7 +118,12 @@ def _facts(run: RecordedRun) -> Facts:
             ("Released by", run.named(state.released_by) if state.released_by else "nobody"),
             ("Protocol", f"{root.protocol_id}, version {root.protocol_version}"),
             ("SHA-256 of the protocol", root.protocol_sha256),
-            ("SHA-256 of the rig's description", root.rig.sha256),
+            (
+                "SHA-256 of the list of imported files"
+                if root.origin == "imported"
+                else "SHA-256 of the rig's description",
+                root.rig.sha256,
+            ),
             ("Photographs that count", str(views)),
             ("Records", str(len(events))),
             ("Chain head", events[-1].sha256),

@@ -178,6 +178,8 @@ def _front(report: Report, styles: _Styles) -> Iterator[Flowable]:
         yield Spacer(1, 4 * mm)
     elif report.release is not None:
         first = (report.release,)
+    if report.origin is not None:
+        first = (*first, report.origin)
     for statement in (*first, report.verification, report.deviations, report.result):
         end = "" if statement.text.endswith(".") else "."
         yield _statement(Cell(statement.text + end, statement.tone), styles, 10)

@@ -16,6 +16,7 @@ _COMMANDS = {
     "serve": "service.cli.serve:serve_command",
     "run": "service.cli.run:run_command",
     "resume": "service.cli.run:resume_command",
+    "import": "service.cli.importing:import_command",
     "act": "service.cli.run:act_command",
     "status": "service.cli.run:status_command",
     "worker": "service.cli.worker:worker_command",

@@ -28,6 +28,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.hands import SimulatedHands
+from service.cli.import_operator import ImportOperator
 from service.cli.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
 from service.cli.waiting import wait_for_results
 from service.core.actions import VERBS, record_to_sign, refuse
@@ -262,6 +263,8 @@ def drive(
         operator = AutomaticOperator(root.operator, protocol, display, hands)
     elif screens:
         operator = ScreenOperator(root.operator, protocol, display, hands)
+    elif rig.section.imported is not None:
+        operator = ImportOperator(root.operator, protocol, display, hands, listing=rig.section.imported)
     else:
         preview = partial(_preview, protocol, rig)
         operator = TerminalOperator(root.operator, protocol, display, hands, preview=preview, people=People(store))

@@ -175,8 +175,6 @@ class ViewImported(View):
     imported_by: str
     file_name: str  # within the imported folder
     modified_utc: str  # of the file, as the file system has it
-    T_base_flange: Matrix4 | None = None  # as a file of poses says that came with the photographs
-    T_base_camera: Matrix4 | None = None
 
 
 class ViewHeld(View):

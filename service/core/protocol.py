@@ -187,7 +187,7 @@ class ProtocolFields(Record):
     source: str = ""
     spheres: Spheres
     board: Board | None = None
-    camera: CameraSection
+    camera: CameraSection | None = None  # None: no settings are demanded, and no step of the protocol sets a camera
     motion: Motion = Motion()
     settle: Settle = Settle()
     # Whether a person who took no part in the run must release it before anything of it is exported.

@@ -14,6 +14,7 @@ from service.compute.poses.pose_files import write_camera_json, write_poses_csv,
 from service.core.dependence import accepted_gates
 from service.core.errors import DataError
 from service.core.geometry import Transform
+from service.core.imported import imported_sentence
 from service.dataset.summary import RunSummary
 
 
@@ -56,6 +57,8 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
     description = {
         "run": summary.run_id,
         "simulated": summary.root.simulated,
+        "origin": summary.root.origin,
+        "origin_in_words": _origin(summary),
         "protocol": f"{summary.root.protocol_id} {summary.root.protocol_version}",
         "protocol_sha256": summary.root.protocol_sha256,
         "frame": "scan",
@@ -70,3 +73,9 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
         "image_sha256": sources,
     }
     (folder / "dataset.json").write_text(json.dumps(description, indent=1), encoding="utf-8")
+
+
+def _origin(summary: RunSummary) -> str:
+    if summary.root.origin == "imported":
+        return imported_sentence(summary.events[0].at_utc, summary.root.operator)
+    return "The photographs were captured in this run"

@@ -36,9 +36,16 @@ def wait_for(context: StepContext, find: Callable[[], Sequence[T]], wait_s: floa
 
 
 def keep(context: StepContext, path: Path, *, device: str, kind: str, media_type: str) -> ArtefactRef:
-    """Copy one original file into the evidence; nothing is repaired, nothing removed at the source."""
+    """Copy one original file into the evidence; nothing is repaired, nothing removed at the source.
+
+    Raises DataError in a run that imports, when the file is not as it was listed.
+    """
     ref = context.evidence.put_file(path, kind=kind, media_type=media_type, original_name=path.name)
-    _record(context, ref, device, f"kept {path.name}")
+    note = f"kept {path.name}"
+    listing = context.devices.imported()
+    if listing is not None:
+        note = f"imported {path.name}, written {listing.check(str(path), ref.sha256).modified_utc}"
+    _record(context, ref, device, note)
     return ref
 
 

@@ -10,6 +10,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox, RobotArm, Scanner, Transform
 from service.core.decide import RunState, StepState
 from service.core.errors import OrthocaptureError
+from service.core.imported import ImportList
 from service.core.model import ArtefactRef, Payload, Record, StepNote, Uncertainty, View
 from service.core.priorities import WAITED
 from service.core.protocol import Protocol as LabProtocol
@@ -46,8 +47,8 @@ class Devices(Protocol):
         """The camera."""
         ...
 
-    def scanner(self) -> Scanner:
-        """The scanner's export folder."""
+    def scanner(self, name: str | None = None) -> Scanner:
+        """The export folder of the scanner of this name, or of the only one."""
         ...
 
     def ct(self) -> CtSource:
@@ -72,6 +73,10 @@ class Devices(Protocol):
 
     def lens(self) -> LensSection | None:
         """Focal length and sensor as the rig file states them."""
+        ...
+
+    def imported(self) -> ImportList | None:
+        """What was captured earlier, in a run that imports it; None in one that captures."""
         ...
 
     def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:

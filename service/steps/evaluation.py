@@ -36,6 +36,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     found = registration_ways(context.protocol, context.run, context.protocol.step(params.registration))
     if found is not None:
         registrations |= {name: dict(job.result) for name, job in found.arrived.items()}
+
+    def unless_skipped(step: str | None) -> Any:
+        return None if step is None or step in context.run.skipped else result_of(context, step)
+
     (answer,) = context.evidence.run_jobs(
         JobRequest(
             "evaluate",
@@ -43,8 +47,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
                 "images": captured_images(context, params.images_of),
                 "registrations": registrations,
                 "scan": result_of(context, params.scan),
-                "control_scan": None if params.control_scan is None else result_of(context, params.control_scan),
-                "ct": None if params.ct is None else result_of(context, params.ct),
+                "control_scan": unless_skipped(params.control_scan),
+                "ct": unless_skipped(params.ct),
                 "radius_m": context.protocol.spheres.radius_mm / 1000,
             },
         )

@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.errors import DeviceBusyError, DeviceUnavailableError
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, RobotSample, SettleReport
-from service.core.errors import DataError
+from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
 from service.core.model import ArtefactRef, Matrix4, ViewpointCaptured
 from service.steps.context import StepContext
@@ -184,8 +184,14 @@ def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
 
 
 def wanted_settings(context: StepContext) -> CameraSettings:
-    """The camera settings of the protocol."""
+    """The camera settings of the protocol. Raises ConfigurationError when it has none."""
     camera = context.protocol.camera
+    if camera is None:
+        raise ConfigurationError(
+            "the protocol has no section `camera`",
+            where=context.protocol.id,
+            remedy="Say there which aperture, exposure time and ISO the camera is set to",
+        )
     return CameraSettings(
         aperture_f=camera.aperture_f,
         exposure_s=camera.exposure_s,

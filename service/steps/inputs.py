@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from service.core.errors import ConfigurationError
-from service.core.model import ArtefactRef, View, ViewHeld, ViewImported, ViewpointCaptured
+from service.core.model import ArtefactRef, View, ViewHeld, ViewpointCaptured
 from service.steps.context import StepContext
 
 
@@ -67,8 +67,6 @@ def robot_pose_of(view: View) -> dict[str, Any]:
     """The robot's pose at a photograph, as job arguments; empty where there was no robot."""
     if isinstance(view, ViewpointCaptured):
         return {"T_base_flange": [list(row) for row in view.T_base_flange], "joints_rad": list(view.joints_rad)}
-    if isinstance(view, ViewImported) and view.T_base_flange is not None:
-        return {"T_base_flange": [list(row) for row in view.T_base_flange]}
     return {}
 
 

@@ -15,6 +15,7 @@ from service.core.gates import evaluate_gates
 from service.core.model import Record, ViewHeld
 from service.core.run_state import JobState
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.exposure import wanted_settings
 from service.steps.held_camera import HeldCamera
 from service.steps.inputs import artefact_of, held_views, result_of
 from service.steps.live import COVERAGE, ERROR, CoverageRule
@@ -268,7 +269,7 @@ class _Guide:
         return done[-1].artefacts[0].sha256 if done else None
 
     def _enqueue(self, view: ViewHeld) -> None:
-        wanted = self.context.protocol.camera
+        wanted = wanted_settings(self.context)
         camera = view.camera
         settings = ""
         if not view.verdicts["settings"]:

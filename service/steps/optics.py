@@ -15,7 +15,11 @@ _STATED = (
 
 
 def optics_departures(
-    context: StepContext, captures: Sequence[View] | None = None, *, quiet: bool = False
+    context: StepContext,
+    captures: Sequence[View] | None = None,
+    *,
+    quiet: bool = False,
+    against_itself: bool = False,
 ) -> tuple[OpticsDeparture, ...] | None:
     """How the images of this step depart from those that the intrinsics were calibrated from, by viewpoint.
 
@@ -25,9 +29,10 @@ def optics_departures(
     Args:
         captures: images of this step to look at; None: all.
         quiet: neither note nor tell.
+        against_itself: hold the images against one another: they are those that a later step calibrates from.
     """
     mine = context.evidence.captures(context.step.id) if captures is None else captures
-    reference = _calibration_images(context)
+    reference = mine if against_itself else _calibration_images(context)
     if not mine or not reference:
         return None
     departures = compare_optics([_optics(c) for c in reference], [_optics(c) for c in mine]).departures

@@ -11,12 +11,12 @@ from typing import Any, Literal
 
 from pydantic import field_validator
 
-from service.core.errors import ComputeError
+from service.core.errors import ComputeError, ConfigurationError
 from service.core.job_keys import arguments_name
 from service.core.model import Record
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, hand_eye_of, intrinsics_covariance_of, result_of
-from service.steps.sources import DEFAULT_SOURCES, PLANNED, Source, Wanted, Ways, decisive, ways
+from service.steps.sources import DEFAULT_SOURCES, PLANNED, Source, Wanted, Ways, decisive, posed, ways
 
 
 class StructureFromMotion(Record):
@@ -33,7 +33,7 @@ class Params(Record):
     images_of: tuple[str, ...]
     control_images_of: tuple[str, ...] = ()  # these see the control spheres and are kept for the evaluation too
     calibration: str  # step with the intrinsics
-    hand_eye: str | None = None  # step with T_flange_camera; None: a person held the camera
+    hand_eye: str | None = None  # step with T_flange_camera; None: no robot carried the camera
     scan: str
     poses: tuple[Source, ...] = DEFAULT_SOURCES
     structure_from_motion: StructureFromMotion = StructureFromMotion()
@@ -86,6 +86,12 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
 def _search(context: StepContext, params: Params) -> dict[str, Any]:
     """Arguments of the search for outlines: everything that the jobs after it have in common, and how to search."""
     images = captured_images(context, [*params.images_of, *params.control_images_of])
+    if not posed(images) and not set(params.poses) <= {"colmap", "glomap"}:
+        raise ConfigurationError(
+            "no image has a pose, and the registration asks for others than those of the images alone",
+            where=f"step {context.step.id}",
+            remedy="Let its `poses` be colmap and glomap",
+        )
     scan = result_of(context, params.scan)
     search = {
         "images": images,

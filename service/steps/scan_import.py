@@ -17,6 +17,7 @@ class Params(Record):
 
     spheres: int
     wait_s: float = 1800.0
+    device: str | None = None  # name of the scanner in rig.yaml; None: the only one
     application: str | None = None  # the step whose coat is still on the specimen
     compare_with: str | None = None  # an earlier ct_import or scan_import: did the spheres move since?
 
@@ -30,9 +31,11 @@ class Result(Record):
 
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Wait for a complete export that is newer than the step before, keep it, let the worker find the spheres."""
-    scanner = context.devices.scanner()
-    # The technician exports, then confirms: what arrived since the step before this one ended belongs to it.
-    since = max((step.ended_utc for step in context.run.steps.values()), default="")
+    scanner = context.devices.scanner(params.device)
+    # The technician exports, then confirms: what arrived since the step before this one ended belongs to it. What is
+    # imported was there before.
+    importing = context.devices.imported() is not None
+    since = "" if importing else max((step.ended_utc for step in context.run.steps.values()), default="")
 
     def fresh() -> list[Any]:
         return [e for e in scanner.exports() if not since or _time(e.modified_utc) >= _time(since)]

@@ -80,6 +80,11 @@ def _named(measure: str, names: Iterable[str]) -> list[str]:
     return found[-1:]
 
 
+def posed(images: Iterable[Mapping[str, Any]]) -> bool:
+    """Whether a robot, or the spheres, tell where the camera was; else the images alone do."""
+    return any({"T_base_flange", "T_scene_camera"} & set(image) for image in images)
+
+
 @dataclass(frozen=True, slots=True)
 class Task:
     """A job on the way to a registration, and how it stands; `job` is None while it is still to be enqueued."""
@@ -149,10 +154,15 @@ class _Walk:
 
     def _registered(self, source: str, size: str) -> JobState | None:
         search = self._arguments(size)
+        shared = {key: value for key, value in search.items() if key not in ("detector", "colour")}
+        if not posed(search["images"]):
+            first = self._model(self._mapper(""), size, shared)  # the poses come first, then the spheres
+            if first is None:
+                return None
+            search["model"] = first["model"]
         detected = self._need("detect_spheres", "", size, search)
         if detected is None:
             return None
-        shared = {key: value for key, value in search.items() if key not in ("detector", "colour")}
         markers = {**shared, "outlines": detected.artefacts[0].sha256, "poses": source}
         if source in _QUICK:
             reported: dict[str, Any] = {"arm_correction": None} if source == "robot" else {}
@@ -229,6 +239,7 @@ class _Walk:
     def _arguments(self, size: str) -> dict[str, Any]:
         """Of the search for outlines at a size; everything else has most of them in common."""
         arguments = dict(self.outlines.arguments)
+        arguments.pop("model", None)  # of a search that began with poses from the images alone
         if not size:
             return arguments
         width, height = (int(n) for n in size.split("x"))

@@ -17,6 +17,7 @@ from service.audit.first_page import verified
 from service.audit.provenance import Graph, graphs
 from service.audit.queries import RunBasics
 from service.audit.verifying import Verification, Verifications, Verifying
+from service.core.imported import imported_sentence
 from service.store.errors import UnknownRunError
 from service.web.site import Here, Site
 
@@ -77,6 +78,7 @@ class AuditFrame:
     verification: Verification | None
     verified: str
     verifying: Verifying | None
+    imported: str  # the sentence that says so; "" for a run that captured its photographs itself
 
 
 def audit_frame(audit: Audit, run_id: str, tab: str) -> AuditFrame:
@@ -95,6 +97,7 @@ def audit_frame(audit: Audit, run_id: str, tab: str) -> AuditFrame:
         verification=last,
         verified=verified(last, found[0].head_sha256),
         verifying=audit.verifications.running(run_id),
+        imported=imported_sentence(found[0].created_utc, found[0].operator) if found[0].origin == "imported" else "",
     )
 
 

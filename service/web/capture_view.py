@@ -251,8 +251,11 @@ def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
     words = {None: "not judged", True: "As wanted", False: "Differ"}
     camera = payload.camera
     figures = _settings(camera.get("aperture_f"), camera.get("exposure_s"), camera.get("iso"))
-    wanted = _settings(protocol.camera.aperture_f, protocol.camera.exposure_s, protocol.camera.iso)
-    out.append(Verdict("Settings", settings, words[settings], figures, f"wanted {wanted}"))
+    demanded = protocol.camera
+    limit = ""
+    if demanded is not None:
+        limit = f"wanted {_settings(demanded.aperture_f, demanded.exposure_s, demanded.iso)}"
+    out.append(Verdict("Settings", settings, words[settings], figures, limit))
     return out
 
 

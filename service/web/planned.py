@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from service.core.geometry import Transform
 from service.core.model import RunStarted
 from service.core.protocol import Step
 from service.evidence import RunLog
-from service.rig import RigSection
+from service.rig import RigSection, parse_rig
 from service.steps.context import StationLayout
 from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 
@@ -106,4 +105,4 @@ def recorded_rig(log: RunLog) -> RigSection:
 
 @lru_cache(maxsize=8)
 def _rig_section(path: Path) -> RigSection:
-    return RigSection.model_validate(yaml.safe_load(path.read_bytes()))
+    return parse_rig(path.read_bytes(), path).section

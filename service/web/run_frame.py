@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.core.errors import OrthocaptureError
+from service.core.imported import imported_sentence
 from service.core.model import RunStarted
 from service.core.run_state import RunState
 from service.monitor.snapshot import Snapshot, read_snapshot
@@ -48,6 +49,7 @@ class RunFrame:
     protocol_version: str
     protocol_sha256: str
     simulated: bool
+    imported: str  # the sentence that says so; "" for a run that captures its photographs itself
     live: bool  # not ended: news may come
     pausable: bool
     banner: Banner
@@ -68,6 +70,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
         protocol_version=root.protocol_version,
         protocol_sha256=root.protocol_sha256,
         simulated=root.simulated,
+        imported=imported_sentence(log.events[0].at_utc, root.operator) if root.origin == "imported" else "",
         live=not log.state.terminal,
         pausable=log.state.status == "active" and driven,
         banner=robot_banner(log.state, read_snapshot(site.data, run_id), driven=driven),
@@ -107,7 +110,9 @@ def _frame_or_unknown(site: Site, run_id: str) -> RunFrame:
 def _unreadable(run_id: str) -> RunFrame:
     text = f"The record cannot be read now. Look at the robot. {NOT_THE_STOP}"
     banner = Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)
-    return RunFrame(run_id, run_id, "", "", "", simulated=False, live=False, pausable=False, banner=banner, tabs=())
+    return RunFrame(
+        run_id, run_id, "", "", "", simulated=False, imported="", live=False, pausable=False, banner=banner, tabs=()
+    )
 
 
 LOST = Banner(

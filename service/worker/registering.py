@@ -31,10 +31,14 @@ from service.worker.robot_poses import robot_camera_poses
 def detect_spheres(context: JobContext) -> JobAnswer:
     """Outlines of every sphere in every image, as one artefact that all registrations share.
 
-    The robot's poses tell where to look; where they are too far off, the images are searched whole.
+    The robot's poses tell where to look, or those of a `model` from structure from motion, which has no scale; where
+    they are too far off, the images are searched whole. An image without a pose in the model gets no outlines.
     """
     arguments = context.arguments
-    images = arguments["images"]
+    everyone = images = arguments["images"]
+    model = context.input_json(arguments["model"])["T_world_camera"] if "model" in arguments else None
+    if model is not None:
+        images = [image for image in images if image["viewpoint"] in model]
     files = photographs(context, images)
     workers = min(len(files), os.cpu_count() or 1)
 
@@ -50,17 +54,21 @@ def detect_spheres(context: JobContext) -> JobAnswer:
         located = locate_outlines(
             files,
             context.camera(),
-            robot_camera_poses(arguments, images),
+            robot_camera_poses(arguments, images)
+            if model is None
+            else np.array([model[image["viewpoint"]] for image in images]),
             np.array(arguments["spheres_m"]),
             float(arguments["radius_m"]),
             groups=_numbered(image["station"] for image in images),
             scenes=_numbered(image["step"] for image in images),
+            metric=model is None,
             options=options,
             workers=workers,
             progress=show,
         )
     records = [[outline_record(outline) for outline in found] for found in located.outlines]
-    found = dict(zip((image["viewpoint"] for image in images), records, strict=True))
+    found = {image["viewpoint"]: [] for image in everyone}
+    found |= dict(zip((image["viewpoint"] for image in images), records, strict=True))
     total = sum(map(len, records))
     ref = context.keep_json(found, kind="outlines", name="outlines.json")
     measures = {

@@ -37,6 +37,7 @@ from drivers.interfaces import (
 from service.core.decide import AskOperator
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, from_rotation_vector, to_rotation_vector, transform
+from service.core.imported import ImportList
 from service.core.model import OperatorAction
 from service.core.run_state import RunState
 from service.monitor.snapshot import Doing
@@ -273,7 +274,11 @@ class BenchRig:
         self._open("camera", self.shutter, opened=self.shutter.opened > 0)
         return self.shutter
 
-    def scanner(self) -> Scanner:
+    def imported(self) -> ImportList | None:
+        """Nothing."""
+        return None
+
+    def scanner(self, name: str | None = None) -> Scanner:
         raise ConfigurationError("the bench has no scanner")
 
     def ct(self) -> CtSource:

@@ -1,0 +1,182 @@
+"""A folder of photographs taken earlier: which belong together, what is left out, and why."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.errors import DeviceUnavailableError, UnreadableFileError
+from drivers.photo_file import ExifRecord, check_jpeg_complete, read_exif, sha256_of
+
+JPEG_SUFFIXES = (".jpg", ".jpeg")
+RAW_MEDIA_TYPES: Mapping[str, str] = {
+    ".arw": "image/x-sony-arw",
+    ".cr2": "image/x-canon-cr2",
+    ".cr3": "image/x-canon-cr3",
+    ".dng": "image/x-adobe-dng",
+    ".nef": "image/x-nikon-nef",
+    ".orf": "image/x-olympus-orf",
+    ".pef": "image/x-pentax-pef",
+    ".raf": "image/x-fuji-raf",
+    ".rw2": "image/x-panasonic-rw2",
+}
+_SYSTEM_FILES = ("thumbs.db", "desktop.ini", "picasa.ini", ".ds_store")
+_THUMBNAIL_FOLDERS = ("thumbs", "thumbnails", ".thumbnails", "@eadir", "previews")
+
+
+@dataclass(frozen=True, slots=True)
+class ListedFile:
+    """A file as it was when it was listed."""
+
+    path: Path
+    sha256: str
+    size_bytes: int
+    modified_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """A JPEG, what it says of itself, and the raw files of the same exposure."""
+
+    file: ListedFile
+    exif: ExifRecord
+    raws: tuple[ListedFile, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A file that is not imported, and why."""
+
+    path: Path
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Photographs:
+    """What a folder holds. `damaged` are photographs that cannot be used as they are: an error, never left out."""
+
+    photographs: tuple[Photograph, ...]
+    left_out: tuple[LeftOut, ...]
+    damaged: tuple[LeftOut, ...]
+
+
+def list_photographs(folder: Path) -> Photographs:
+    """Every photograph in a folder and below it, by name.
+
+    Only JPEG files as cameras write them are photographs; a raw file counts with the JPEG that has its name (of the
+    same folder if there are several), wherever it lies in the folder. Nothing is written or changed.
+
+    Raises:
+        DeviceUnavailableError: the folder is not there or cannot be read.
+    """
+    jpegs: list[Path] = []
+    raws: list[Path] = []
+    left_out: list[LeftOut] = []
+    for path in files_below(folder):
+        reason = odd(path, folder)
+        suffix = path.suffix.lower()
+        if reason:
+            left_out.append(LeftOut(path, reason))
+        elif suffix in JPEG_SUFFIXES:
+            jpegs.append(path)
+        elif suffix in RAW_MEDIA_TYPES:
+            raws.append(path)
+        else:
+            left_out.append(LeftOut(path, "no photograph: only JPEG files, with raw files beside them, are read"))
+    of_jpeg, alone = _paired(jpegs, raws)
+    left_out += [LeftOut(path, "a raw file without the JPEG of the same name; develop it first") for path in alone]
+    photographs: list[Photograph] = []
+    damaged: list[LeftOut] = []
+    for path in jpegs:
+        try:
+            check_jpeg_complete(path)
+            exif = read_exif(path)
+            photographs.append(Photograph(listed(path), exif, tuple(map(listed, of_jpeg.get(path, ())))))
+        except UnreadableFileError as error:
+            damaged.append(LeftOut(path, error.what))
+    return Photographs(tuple(photographs), tuple(left_out), tuple(damaged))
+
+
+def files_below(folder: Path) -> list[Path]:
+    """Files in a folder and below it, by name; links that lead out of it are passed over.
+
+    Raises DeviceUnavailableError when the folder is not there or cannot be read.
+    """
+    try:
+        root = folder.resolve(strict=True)
+        return [path for path in sorted(folder.rglob("*")) if path.is_file() and path.resolve().is_relative_to(root)]
+    except OSError as error:
+        raise DeviceUnavailableError(
+            f"the folder cannot be read ({error.strerror})", where=str(folder), remedy="Check the path"
+        ) from error
+
+
+def odd(path: Path, folder: Path) -> str:
+    """Why a file is no content of the folder, by its name alone; "" for an ordinary one."""
+    name = path.name.lower()
+    parents = [part.lower() for part in path.relative_to(folder).parts[:-1]]
+    if name.startswith("._") or "__macosx" in parents:
+        return "what macOS keeps beside a file; holds no picture"
+    if name in _SYSTEM_FILES:
+        return "a file of the operating system"
+    if any(part in _THUMBNAIL_FOLDERS for part in parents):
+        return "a thumbnail"
+    if name.startswith((".", "~")) or any(part.startswith(".") for part in parents):
+        return "hidden"
+    return ""
+
+
+def listed(path: Path) -> ListedFile:
+    """A file with its hash, size and time."""
+    stat = path.stat()
+    return ListedFile(path, sha256_of(path), stat.st_size, stat.st_mtime_ns)
+
+
+def without_duplicates(
+    photographs: Sequence[Photograph], seen: dict[str, Path]
+) -> tuple[list[Photograph], list[LeftOut]]:
+    """Photographs whose bytes are not in `seen` yet, and the others; adds to `seen` (hash → first file)."""
+    kept: list[Photograph] = []
+    left_out: list[LeftOut] = []
+    # Of a file and its copies (`DSC1.JPG`, `DSC1 (1).JPG`) the one with the shortest name is the file.
+    for photograph in sorted(photographs, key=lambda p: (len(p.file.path.name), p.file.path)):
+        first = seen.setdefault(photograph.file.sha256, photograph.file.path)
+        if first == photograph.file.path:
+            kept.append(photograph)
+        else:
+            left_out.append(LeftOut(photograph.file.path, f"the same bytes as {first.parent.name}/{first.name}"))
+    return sorted(kept, key=lambda p: p.file.path), left_out
+
+
+def usual_size(photographs: Iterable[Photograph]) -> tuple[int, int] | None:
+    """Width and height of most photographs, of the larger one where they are even; None for none."""
+    counts = Counter((photograph.exif.width, photograph.exif.height) for photograph in photographs)
+    return max(counts, key=lambda size: (counts[size], size), default=None)
+
+
+def of_size(photographs: Sequence[Photograph], size: tuple[int, int]) -> tuple[list[Photograph], list[LeftOut]]:
+    """Photographs of this width and height, and the others."""
+    kept = [p for p in photographs if (p.exif.width, p.exif.height) == size]
+    left_out = [
+        LeftOut(p.file.path, f"{p.exif.width} × {p.exif.height} px, most are {size[0]} × {size[1]}")
+        for p in photographs
+        if (p.exif.width, p.exif.height) != size
+    ]
+    return kept, left_out
+
+
+def _paired(jpegs: Sequence[Path], raws: Sequence[Path]) -> tuple[dict[Path, list[Path]], list[Path]]:
+    """The raw files of each JPEG, and those that belong to none."""
+    of_jpeg: dict[Path, list[Path]] = {}
+    alone: list[Path] = []
+    for raw in raws:
+        named = [jpeg for jpeg in jpegs if jpeg.stem.lower() == raw.stem.lower()]
+        beside = [jpeg for jpeg in named if jpeg.parent == raw.parent]
+        chosen = beside or (named if len(named) == 1 else [])
+        if chosen:
+            of_jpeg.setdefault(chosen[0], []).append(raw)
+        else:
+            alone.append(raw)
+    return of_jpeg, alone
