@@ -30,10 +30,11 @@ format: $(TOOLS)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# What docs/ holds that is made from the code: protocol schema and state diagram.
+# What docs/ holds that is made from the code: protocol schema, state diagram, ways on from every stop.
 docs: $(TOOLS)
 	$(BIN)/orthocapture protocol schema > docs/protocol.schema.json
 	$(BIN)/orthocapture protocol diagram protocols/exvivo_spine.yaml > docs/state_machine.md
+	$(BIN)/orthocapture protocol ways protocols/exvivo_spine.yaml > docs/ways_on.md
 
 # Measurements that take long; each is a script of its own and writes to bench/results.
 bench: $(TOOLS)

@@ -46,6 +46,8 @@ PAGES: dict[str, tuple[tuple[Role | None, str], ...]] = {
         ("technician", "/runs/{signing}"),
         ("technician", "/runs/{signing}?dialog=sign"),
         ("technician", "/runs/{failed}"),
+        ("technician", "/runs/{acceptable}"),
+        ("technician", "/runs/{acceptable}?dialog=accept"),
         ("technician", "/runs/{calibrated}"),
         ("technician", "/runs/{moving}?step=fixation"),
         ("supervisor", "/runs/{listing}"),
@@ -218,7 +220,13 @@ def tab_faults(page: Page) -> list[str]:
 
 @pytest.mark.parametrize(
     ("run", "opener"),
-    [("listing", "End run…"), ("listing", "Skip…"), ("signing", "Sign: spray"), ("signing", "Redo…")],
+    [
+        ("listing", "End run…"),
+        ("listing", "Skip…"),
+        ("signing", "Sign: spray"),
+        ("signing", "Redo…"),
+        ("acceptable", "Accept…"),
+    ],
 )
 def test_a_dialog_holds_the_focus_and_gives_it_back(desk: Desk, run: str, opener: str) -> None:
     shown = desk.screen("technician")

@@ -46,7 +46,7 @@ from service.core.model import (
     ViewpointFailed,
 )
 from service.core.protocol import Recovery
-from service.core.recovery import FATAL, NEEDS_A_PERSON, PASSING, recovery_policy
+from service.core.recovery import NEEDS_A_PERSON, PASSING, recovery_policy
 from tests.support.core import GOOD, TOY, Log, captured, imported, toy_protocol
 from tests.support.counting import calls_of
 
@@ -313,7 +313,7 @@ def test_recovery_can_abort_the_run(log: Log) -> None:
         ("DeviceBusyError", 3, "abort", "abort"),
         ("SafetyStopError", 1, "abort", "ask"),
         ("DeviceStorageFullError", 1, "abort", "ask"),
-        ("IntegrityError", 1, "ask", "abort"),
+        ("IntegrityError", 1, "abort", "ask"),
         ("ComputeError", 1, "ask", "ask"),
         ("ComputeError", 1, "abort", "abort"),
     ],
@@ -324,7 +324,7 @@ def test_the_recovery_policy(error: str, failures: int, on_failure: str, expecte
 
 
 def test_the_policy_names_errors_that_exist() -> None:
-    for name in PASSING | NEEDS_A_PERSON | FATAL:
+    for name in PASSING | NEEDS_A_PERSON:
         assert hasattr(device_errors, name) or hasattr(core_errors, name)
 
 

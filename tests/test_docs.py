@@ -23,6 +23,7 @@ from service.compute.poses.pose_files import write_camera_json, write_poses_csv
 from service.core.model import JobFailed
 from service.core.protocol import load_protocol
 from service.core.protocol_docs import lifecycle_text, schema_text
+from service.core.ways_docs import ways_text
 from service.steps import params_models
 from service.store.records import NewJob
 from service.store.store import Store
@@ -250,6 +251,7 @@ def test_the_generated_documents_are_up_to_date() -> None:
     docs = ROOT / "docs"
     assert (docs / "protocol.schema.json").read_text(encoding="utf-8") == schema_text(params_models())
     assert (docs / "state_machine.md").read_text(encoding="utf-8") == lifecycle_text(protocol)
+    assert (docs / "ways_on.md").read_text(encoding="utf-8") == ways_text(protocol)
 
 
 def test_links_of_the_documents_lead_somewhere() -> None:

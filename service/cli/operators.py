@@ -20,6 +20,7 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.model import OperatorAction
 from service.core.protocol import Protocol
 from service.core.run_state import RunState
+from service.core.ways_on import takes_words
 from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Doing
 from service.people.errors import PeopleError
@@ -178,6 +179,7 @@ class TerminalOperator(_Operator):
         plan = self.preview(question.step) if question.for_ == "confirm" else ""
         if plan:
             lines.append(f"\nThe plan: {plan}")
+        lines += _ways_lines(question)
         lines.append(f"\nType one of: {', '.join(question.options)} (with a reason where one is needed).")
         if "confirm" in question.options and question.checklist:
             lines.append("By `confirm` you say that every item of the list is done.")
@@ -234,16 +236,31 @@ class TerminalOperator(_Operator):
             self._accepting = _Accepting(reason, state.step.gates_sha256)
             self.display.tell(f"who accepts it? The name of the {demanded_role(self.protocol, state)}, then Enter:")
             return None
+        target, _, rest = reason.partition(" ")
+        names_step = verb == "redo" and target in self.protocol.step_ids
+        reason = rest.strip() if names_step else reason
         return OperatorAction.model_validate(
             {
                 "action": verb,
-                "step": question.step,
+                "step": target if names_step else question.step,
                 "reason": reason,
                 "checklist": question.checklist if verb == "confirm" else (),
                 "meaning": (reason or "checked and released") if verb == "sign" else "",
                 "signed_sha256": question.sign_sha256 if verb == "sign" else "",
             }
         )
+
+
+def _ways_lines(question: AskOperator) -> list[str]:
+    """The choices, the recommended one first, each with what to type, what it takes and what it loses."""
+    lines = ["\nWhat can be done now, the recommended first:"] if question.ways else []
+    for way in question.ways:
+        if way.available:
+            typed = f"redo {way.step}" if way.verb == "redo" else way.verb
+            lines.append(f"  {typed}: {way.words}. Takes {takes_words(way.minutes)}. Loses: {way.loses}")
+        else:
+            lines.append(f"  ({way.words}: not possible, {way.why_not})")
+    return lines
 
 
 @dataclass

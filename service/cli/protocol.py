@@ -11,6 +11,7 @@ from rich.markup import escape
 from service.cli.common import JsonOption, console, print_json, reporting_errors
 from service.core.protocol import load_protocol
 from service.core.protocol_docs import lifecycle_text, schema_text
+from service.core.ways_docs import ways_text
 from service.steps import params_models
 
 protocol_app = typer.Typer(name="protocol", help="Check a protocol file before it is used.", no_args_is_help=True)
@@ -43,3 +44,10 @@ def diagram_command(file: Annotated[Path, typer.Argument(help="The protocol file
     """Print the state machine of a protocol as a page with Mermaid diagrams."""
     with reporting_errors():
         typer.echo(lifecycle_text(load_protocol(file, params_models()).protocol), nl=False)
+
+
+@protocol_app.command("ways")
+def ways_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
+    """Print what can be done about every failure of a protocol's steps, with cost and loss, as a page of tables."""
+    with reporting_errors():
+        typer.echo(ways_text(load_protocol(file, params_models()).protocol), nl=False)

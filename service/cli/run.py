@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -37,6 +38,7 @@ from service.core.fold import fold
 from service.core.model import ActionRefused, OperatorAction
 from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState
+from service.core.ways_on import takes_words, ways_on
 from service.evidence import RunLog, results_to_come
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.people import People
@@ -186,7 +188,8 @@ def status_command(
         log = RunLog(store, run_id, protocol)
         state, missing = log.state, [left.text for left in results_to_come(log)]
     if json:
-        print_json(status_record(run_id, state) | {"still_to_come": missing})
+        ways = [asdict(way) for way in ways_on(protocol, state)]
+        print_json(status_record(run_id, state) | {"still_to_come": missing, "ways_on": ways})
         return
     table = Table(title=f"Run {run_id}: {state.status}", title_justify="left")
     for heading in ("step", "state", "attempt", "views", "gates"):
@@ -202,6 +205,9 @@ def status_command(
         console.print(escape(describe_view(job)))
     for line in missing:
         console.print(f"still to come: {escape(line)}")
+    for way in ways_on(protocol, state):
+        can = f"takes {takes_words(way.minutes)}, loses: {way.loses}" if way.available else f"no: {way.why_not}"
+        console.print(f"way on: {way.verb} {way.step}: {escape(way.words)}; {escape(can)}")
     for deviation in state.deviations:
         if not deviation.is_note:
             console.print(f"deviation: {escape(deviation.text)}")

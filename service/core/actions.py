@@ -51,6 +51,25 @@ def unmet_requirements(step: Step, state: RunState) -> tuple[str, ...]:
     return tuple(name for name in step.requires if not state.steps[name].passed_its_gates)
 
 
+def stranded(protocol: Protocol, state: RunState) -> bool:
+    """Whether the current step can never begin: what it requires has not passed and cannot be done again.
+
+    It may be left out then, whatever the protocol says: nothing else but the end of the run would be left.
+    """
+    unmet = unmet_requirements(protocol.step(state.current), state) if state.phase == "ready" else ()
+    return any(redo_refusal(protocol, state, name) is not None for name in unmet)
+
+
+def redo_refusal(protocol: Protocol, state: RunState, target: str) -> Refusal | None:
+    """Why a step cannot be done again now, or None."""
+    return refuse(protocol, state, OperatorAction(action="redo", step=target, reason="asked"), "operator")
+
+
+def skip_refusal(protocol: Protocol, state: RunState) -> Refusal | None:
+    """Why the current step cannot be left out now, or None."""
+    return refuse(protocol, state, OperatorAction(action="skip", step=state.current, reason="asked"), "operator")
+
+
 def needs_signature_now(protocol: Protocol, state: RunState) -> bool:
     """Whether a signature is due: before an irreversible step begins; before any other step is accepted."""
     step = protocol.step(state.current)
@@ -102,8 +121,7 @@ def allowed_actions(protocol: Protocol, state: RunState) -> tuple[OperatorVerb, 
 
 def redoable_steps(protocol: Protocol, state: RunState) -> tuple[str, ...]:
     """The steps that an operator could send the run back to now."""
-    actions = (OperatorAction(action="redo", step=step, reason="asked") for step in protocol.step_ids)
-    return tuple(str(a.step) for a in actions if refuse(protocol, state, a, "operator") is None)
+    return tuple(step for step in protocol.step_ids if redo_refusal(protocol, state, step) is None)
 
 
 # --- one rule a verb -------------------------------------------------------------------------------------
@@ -159,9 +177,11 @@ def _sign(protocol: Protocol, state: RunState, action: OperatorAction, actor: st
 
 def _skip(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:
     step = protocol.step(state.current)
-    if not step.skippable:
+    if not (step.skippable or stranded(protocol, state)):
         return Refusal(
-            "the protocol does not allow this step to be skipped", where=step.id, remedy="Redo it or abort"
+            "the protocol does not allow this step to be skipped",
+            where=step.id,
+            remedy="Redo it, or end the run here",
         )
     if not lifecycle(protocol.step_ids).may(state.machine_state, "skip"):
         return Refusal(

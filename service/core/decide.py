@@ -21,6 +21,7 @@ from service.core.gates import describe, evaluate_gates
 from service.core.model import OperatorVerb, Uncertainty
 from service.core.protocol import Protocol
 from service.core.run_state import Deviation, JobState, Note, RunState, StepState, Superseded
+from service.core.ways_on import WayOn, ways_on
 
 __all__ = [
     "AbortRun",
@@ -60,6 +61,7 @@ class AskOperator:
     checklist: tuple[str, ...]  # to be ticked with a confirm
     options: tuple[OperatorVerb, ...]
     sign_sha256: str = ""  # what a signature binds (OperatorAction.signed_sha256)
+    ways: tuple[WayOn, ...] = ()  # where the step is stopped: the choices, the recommended one first
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,6 +192,9 @@ def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
 
 
 def _ask(protocol: Protocol, state: RunState, for_: Literal["confirm", "sign", "recovery"], text: str) -> AskOperator:
-    checklist = protocol.step(state.current).checklist if for_ == "confirm" else ()
+    items = protocol.step(state.current).checklist
+    unticked = state.phase == "recovering" and len(state.step.ticked) < len(items)
+    checklist = items if for_ == "confirm" or unticked else ()
     options = allowed_actions(protocol, state)
-    return AskOperator(state.current, for_, text, checklist, options, record_to_sign(protocol, state))
+    signed = record_to_sign(protocol, state)
+    return AskOperator(state.current, for_, text, checklist, options, signed, ways_on(protocol, state))

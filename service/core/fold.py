@@ -43,7 +43,7 @@ from service.core.model import (
     ViewpointCaptured,
     ViewpointFailed,
 )
-from service.core.moves import UNMEASURED, change, deviate, go, pass_on, supersede
+from service.core.moves import UNMEASURED, change, deviate, go, pass_on, seconds_between, supersede
 from service.core.operator_effects import apply_action
 from service.core.protocol import Protocol
 from service.core.release import refuse_release
@@ -56,6 +56,8 @@ from service.core.run_state import (
     StepState,
     Trouble,
 )
+
+_VIEWS_TIMED = 30  # the median of so many tells how long a view takes now
 
 
 def initial_state(protocol: Protocol) -> RunState:
@@ -143,6 +145,20 @@ def _is_void_now(state: RunState, event: Event, step: str, attempt: int) -> bool
     return False
 
 
+def _worked_s(state: RunState, event: Event) -> float | None:
+    began = state.step.work_began_utc
+    return seconds_between(began, event.at_utc) if began else None
+
+
+def _with_view(state: RunState, event: Event, step: str) -> RunState:
+    """Keep how long a view took, of the last ones."""
+    there, at_utc = state.last_view
+    gaps = state.view_gaps_s
+    if there == step:
+        gaps = (*gaps, seconds_between(at_utc, event.at_utc))[-_VIEWS_TIMED:]
+    return replace(state, view_gaps_s=gaps, last_view=(step, event.at_utc))
+
+
 def _require_running(state: RunState, event: Event) -> None:
     if state.phase != "running":
         raise _impossible(event, f"{state.current} is {state.phase}, not running")
@@ -209,7 +225,9 @@ def _step_started(protocol: Protocol, state: RunState, event: Event, p: StepStar
         raise _impossible(event, "the operator has not confirmed")
     if unmet_requirements(step, state) or (step.irreversible and not now.signed):
         raise _impossible(event, "what it requires has not passed, or nobody has signed")
-    return _system(protocol, state, event, "begin", failures=0, started_utc=event.at_utc)
+    state = replace(state, last_view=("", ""))
+    began = {"started_utc": event.at_utc, "work_began_utc": event.at_utc}
+    return _system(protocol, state, event, "begin", failures=0, **began)
 
 
 def _step_note(protocol: Protocol, state: RunState, event: Event, p: StepNote) -> RunState:
@@ -230,6 +248,7 @@ def _view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> R
     if _is_void_now(state, event, p.step, p.attempt):
         return _void(_among_the_superseded(state, event, p), event)
     _require_running(state, event)
+    state = _with_view(state, event, p.step)
     now = state.step
     if p.viewpoint in now.captured:  # taken again within the attempt: the later one counts
         earlier = {p.viewpoint: now.captured[p.viewpoint]}
@@ -281,6 +300,7 @@ def _step_measured(protocol: Protocol, state: RunState, event: Event, p: StepMea
         result=p.result,
         uncertainties=p.uncertainties,
         failures=0,
+        worked_s=_worked_s(state, event),
     )
 
 
@@ -288,7 +308,8 @@ def _step_failed(protocol: Protocol, state: RunState, event: Event, p: StepFaile
     if _is_void_now(state, event, p.step, p.attempt):
         return _void(state, event)
     failure = Failure(event.seq, p.error, p.message, p.recovery)
-    return _system(protocol, state, event, "failed", failure=failure, failures=state.step.failures + 1)
+    changes = {"failure": failure, "failures": state.step.failures + 1, "worked_s": _worked_s(state, event)}
+    return _system(protocol, state, event, "failed", **changes)
 
 
 def _step_retried(protocol: Protocol, state: RunState, event: Event, p: StepRetried) -> RunState:
@@ -297,7 +318,9 @@ def _step_retried(protocol: Protocol, state: RunState, event: Event, p: StepRetr
     now = state.step
     if not (now.retry_granted or (now.failure is not None and now.failure.recovery == "retry")):
         raise _impossible(event, "neither the policy nor the operator allowed a retry")
+    state = replace(state, last_view=("", ""))
     changes: dict[str, Any] = {**UNMEASURED, "attempt": p.attempt, "retry_granted": False}
+    changes["work_began_utc"] = event.at_utc
     if protocol.step(p.step).irreversible:  # its signature is the release to begin, and still holds
         changes |= {"signed": now.signed, "signed_by": now.signed_by}
     if now.retry_granted:  # what was given up gets another chance
@@ -374,7 +397,8 @@ def _action_refused(protocol: Protocol, state: RunState, event: Event, p: Action
 
 def _item_ticked(protocol: Protocol, state: RunState, event: Event, p: ItemTicked) -> RunState:
     """A mark that comes too late, or for an item that the protocol does not have, has no effect."""
-    if state.terminal or (p.step, p.attempt, "ready") != (state.current, state.step.attempt, state.phase):
+    open_now = state.phase in ("ready", "recovering") and (p.step, p.attempt) == (state.current, state.step.attempt)
+    if state.terminal or not open_now:
         return _void(state, event)
     items = [item for item in protocol.step(p.step).checklist if item in state.step.ticked and item != p.item]
     if p.ticked and p.item in protocol.step(p.step).checklist:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from datetime import datetime
 from typing import Any
 
 from service.core.lifecycle import ABORTED, COMPLETED, lifecycle
@@ -25,6 +26,11 @@ UNMEASURED: Mapping[str, Any] = {
     "signed_by": "",
     "failure": None,
 }
+
+
+def seconds_between(earlier_utc: str, later_utc: str) -> float:
+    """Seconds from one time of the record (ISO 8601) to another."""
+    return (datetime.fromisoformat(later_utc) - datetime.fromisoformat(earlier_utc)).total_seconds()
 
 
 def go(protocol: Protocol, state: RunState, trigger: str, **changes: Any) -> RunState:

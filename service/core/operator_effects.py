@@ -26,7 +26,8 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
         )
     match p.action:
         case "confirm" if state.phase == "recovering":
-            return change(state, state.current, retry_granted=True, confirmed_by=event.actor)
+            ticked = p.checklist or state.step.ticked  # a list that was left open is ticked now
+            return change(state, state.current, retry_granted=True, confirmed_by=event.actor, ticked=ticked)
         case "confirm":
             return change(state, state.current, confirmed=True, confirmed_by=event.actor, ticked=p.checklist)
         case "sign":

@@ -12,9 +12,8 @@ Policy = Literal["retry", "ask", "abort"]
 # Passing troubles: the same call may succeed in a moment.
 PASSING = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "DeviceBusyError", "StaleImageError"})
 # Only a person at the table can put these right, whatever the protocol says.
-NEEDS_A_PERSON = frozenset({"SafetyStopError", "DeviceStorageFullError"})
-# The evidence itself is in doubt: going on would build on it.
-FATAL = frozenset({"IntegrityError"})
+# (a damaged file of the evidence is put back from a copy; what is read again is checked against its hash again).
+NEEDS_A_PERSON = frozenset({"SafetyStopError", "DeviceStorageFullError", "IntegrityError"})
 
 
 def recovery_policy(recovery: Recovery, error: str, failures: int) -> Policy:
@@ -25,8 +24,6 @@ def recovery_policy(recovery: Recovery, error: str, failures: int) -> Policy:
         error: class name of the error that ended the work.
         failures: how often the step has failed in a row, this failure included (StepState.failures + 1).
     """
-    if error in FATAL:
-        return "abort"
     if error in NEEDS_A_PERSON:
         return "ask"
     if error in PASSING and failures <= recovery.retries:

@@ -118,6 +118,8 @@ class StepState:
     jobs: Mapping[str, JobState] = field(default_factory=dict[str, JobState])
     started_utc: str = ""
     ended_utc: str = ""
+    work_began_utc: str = ""  # of the present attempt
+    worked_s: float | None = None  # how long the last attempt worked until it had its figures or failed
 
     @property
     def passed_its_gates(self) -> bool:
@@ -212,6 +214,8 @@ class RunState:
     ended_utc: str = ""  # of run_completed or run_aborted
     completed_sha256: str = ""  # of the run_completed event: what a release binds
     released_by: str = ""
+    view_gaps_s: tuple[float, ...] = ()  # of the last views: seconds from one to the next in the same work
+    last_view: tuple[str, str] = ("", "")  # step and time of the latest, while its work goes on
 
     @property
     def step(self) -> StepState:

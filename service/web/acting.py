@@ -99,7 +99,7 @@ def tick(
     log = site.run(run_id)
     Control(site.store).require(run_id, person)
     now = log.state.step
-    if log.state.terminal or (step, attempt, "ready") != (now.step, now.attempt, now.phase):
+    if log.state.terminal or (step, attempt) != (now.step, now.attempt) or now.phase not in ("ready", "recovering"):
         raise _out_of_date(log.state)
     if item not in log.protocol.step(step).checklist:
         raise IllegalTransitionError("there is no such item in the checklist", where=step)

@@ -15,6 +15,7 @@ from service.core.model import Event, OperatorVerb
 from service.core.protocol import Protocol, Step
 from service.core.registered import evaluated
 from service.core.run_state import Deviation, RunState
+from service.core.ways_on import WayOn, takes_words
 from service.monitor.snapshot import Snapshot
 from service.web.run_figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
 from service.web.run_words import (
@@ -173,6 +174,19 @@ class Trouble:
 
 
 @dataclass(frozen=True, slots=True)
+class Way:
+    """A choice of what to do now."""
+
+    verb: OperatorVerb
+    step: str
+    words: str
+    takes: str
+    loses: str
+    why_not: str  # "" where it can be taken
+    button: str
+
+
+@dataclass(frozen=True, slots=True)
 class RunView:
     """The run page."""
 
@@ -193,6 +207,7 @@ class RunView:
     standing: bool  # paused, and the robot stands still
     looker: Looker
     trouble: Trouble | None
+    ways: tuple[Way, ...]  # where it is stopped, the recommended one first
     signature: Signature | None
     acceptance: Acceptance | None
     redos: tuple[Redo, ...]
@@ -241,6 +256,7 @@ def run_view(
         standing=snapshot.doing == "paused" and snapshot.robot != "moving",
         looker=looker,
         trouble=_trouble(protocol, state, decision),
+        ways=tuple(map(_way, decision.ways)) if isinstance(decision, AskOperator) else (),
         signature=_signature(protocol, state),
         acceptance=_acceptance(protocol, state),
         redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
@@ -377,6 +393,19 @@ def _trouble(protocol: Protocol, state: RunState, decision: object) -> Trouble |
         found = "not decided yet" if undecided else "outside its limits"
         return Trouble(f"{step.title}: {found}", "; ".join(failed), safe, advice)
     return Trouble(f"{step.title} cannot begin yet", decision.text, safe, advice)
+
+
+_BUTTONS: Mapping[OperatorVerb, str] = {
+    "redo": "Do again…",
+    "skip": "Go on without…",
+    "accept": "Accept…",
+    "abort": "End here…",
+}
+
+
+def _way(way: WayOn) -> Way:
+    takes = takes_words(way.minutes)
+    return Way(way.verb, way.step, sentence(way.words), takes, way.loses, way.why_not, _BUTTONS.get(way.verb, ""))
 
 
 def _signature(protocol: Protocol, state: RunState) -> Signature | None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from service.core.gates import bounds
 from service.core.model import GateVerdict
 from service.core.protocol import Protocol, Step
 from service.core.run_state import RunState, StepState
+from service.core.ways_on import planned_sets, planned_views
 
 _DRAWINGS_BY_ID = {
     "fixation": "fixation",
@@ -75,21 +74,9 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")
 
 
-def planned_views(step: Step) -> int:
-    """How many images the protocol plans in a step."""
-    return sum(int(one.count) for one in _sets(step))
-
-
-def _sets(step: Step) -> tuple[Any, ...]:
-    """Sets of viewpoints, or the board poses that the software plans: each has a count and a station."""
-    planned = getattr(step.params, "board_poses", None)
-    listed: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
-    return listed if planned is None else (*listed, planned)
-
-
 def station_of(step: Step) -> str:
     """`station 1` of a capture step; "" for others."""
-    return " and ".join(dict.fromkeys(str(one.station).replace("_", " ") for one in _sets(step)))
+    return " and ".join(dict.fromkeys(str(one.station).replace("_", " ") for one in planned_sets(step)))
 
 
 def count(amount: int, one: str, many: str = "") -> str:

@@ -42,6 +42,7 @@ from service.core.model import OperatorAction
 from service.core.run_state import RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
+from service.runner import Spoken
 from service.steps.context import StationLayout
 
 TRAVEL_S = 0.02
@@ -349,7 +350,7 @@ class ScriptedOperator:
         default_factory=list[tuple[str, int, tuple[Mapping[str, Any], ...]]]
     )
 
-    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
         self.asked.append(question)
         answers = self.script.get((question.step, question.for_), [])
         return (answers.pop(0) if answers else agree)(question, state)

@@ -88,13 +88,14 @@ def record_reported_run(
     person: str = "Ada Λ. Müller",
     release: str = "none",
     registered: bool = False,
+    acceptable: bool = False,
     accepted_by: str = "",
 ) -> str:
-    """The run in folder/data; its name. `accepted_by`: who accepts a figure that is outside its limit."""
+    """The run in folder/data; its name. `acceptable`: a figure outside its limit may be; `accepted_by`: and is."""
     text = PROTOCOL.replace("steps:", f"release: {release}\nsteps:", 1)
     if registered:
         text = text.replace("  - id: evaluation\n", REGISTRATION)
-    if accepted_by:
+    if acceptable or accepted_by:
         text = text.replace("max: 0.35, unit: mm", "max: 0.35, unit: mm, accept_by: another_supervisor")
     (folder / "rig.yaml").write_text("name: small\nsimulated: true\ndevices: {}\n")
     loaded = parse_protocol(text.encode(), params_models(), name="reported.yaml")

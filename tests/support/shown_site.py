@@ -27,10 +27,11 @@ class ShownSite:
     moving: str  # waits for the confirmation of a motion
     signing: str  # waits for the signature of an irreversible step
     failed: str  # waits for a decision: a gate has failed
+    acceptable: str  # the same, and a supervisor may accept it
 
     @property
     def under_way(self) -> tuple[str, ...]:
-        return self.calibrated, self.listing, self.moving, self.signing, self.failed
+        return self.calibrated, self.listing, self.moving, self.signing, self.failed, self.acceptable
 
 
 def shown_site(folder: Path) -> ShownSite:
@@ -38,6 +39,7 @@ def shown_site(folder: Path) -> ShownSite:
     registered = record_run(folder)
     completed = record_reported_run(folder, person="grace")
     failed = record_reported_run(folder, error_mm=0.9, person="grace")
+    acceptable = record_reported_run(folder, error_mm=0.9, person="grace", acceptable=True)
     with web_site(folder) as web:
         calibrated = begin_calibrated_run(web)
         listing = web.begin_run().run_id
@@ -50,7 +52,7 @@ def shown_site(folder: Path) -> ShownSite:
         signing.script("spraying", "sign", leave)
         with contextlib.suppress(_LeftError):
             signing.run()
-    return ShownSite(folder, completed, registered, calibrated, listing, moving, signing.run_id, failed)
+    return ShownSite(folder, completed, registered, calibrated, listing, moving, signing.run_id, failed, acceptable)
 
 
 class _LeftError(Exception):

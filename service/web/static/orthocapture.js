@@ -310,7 +310,11 @@
     const opener = at?.closest("[data-dialog]");
     if (opener && by(opener.dataset.dialog)) {
       event.preventDefault();
-      if (!offline) by(opener.dataset.dialog).showModal();
+      if (!offline) {
+        const chosen = opener.dataset.choose && by(opener.dataset.dialog).querySelector(`input[name=step][value="${opener.dataset.choose}"][type=radio]`);
+        if (chosen) chosen.checked = true;
+        by(opener.dataset.dialog).showModal();
+      }
       return;
     }
     if (at?.closest("[data-close]")) {
