@@ -29,8 +29,8 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 def test_table_has_the_papers_rows_and_its_reason(demo: dict[str, Any]) -> None:
     rows = {row["poses"]: row for row in demo["table"]}
-    assert set(rows) == {"robot", "robot_corrected", "colmap", "glomap", "hybrid"}
-    for source in ("robot_corrected", "colmap", "glomap", "hybrid"):
+    assert set(rows) == {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"}
+    for source in ("robot_corrected", "triangulated", "colmap", "glomap", "hybrid"):
         assert rows[source]["mean_radial_error_mm"] <= 0.15
         assert rows[source]["true_error_mm"] <= 0.15
     # The arm's systematic error, which structure from motion does not share.

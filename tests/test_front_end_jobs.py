@@ -17,7 +17,7 @@ from service.worker.job import JobContext
 from service.worker.loop import HANDLERS
 from tests.support.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
-EFFORT = {"max_image_size": 640, "max_features": 1500, "neighbours": 4}
+EFFORT: dict[str, Any] = {"max_image_size": 640, "max_features": 1500, "neighbours": 4}
 
 
 class Jobs:
@@ -60,8 +60,8 @@ def test_pieces_made_as_images_arrive_give_the_same_model_as_pieces_made_afterwa
 
     models = [
         jobs.run(
-            "structure_from_motion", images=jobs.images, mappers=["incremental"], prior=prior, features=features,
-            matches=[matched(some) for some in parts if some],
+            "structure_from_motion", images=jobs.images, mappers=["triangulated", "incremental"], prior=prior,
+            features=features, matches=[matched(some) for some in parts if some],
         )
         for parts in ([pairs], [pairs[3:], pairs[:3], extra])
     ]  # fmt: skip

@@ -41,7 +41,11 @@ CAMERA = {
     "p1": 0.0,
     "p2": 0.0,
 }
-IMAGES = [{"viewpoint": f"v{i}", "sha256": f"{i:064x}", "station": "station_1", "step": "c"} for i in range(4)]
+POSE = np.eye(4).tolist()
+IMAGES = [
+    {"viewpoint": f"v{i}", "sha256": f"{i:064x}", "station": "station_1", "step": "c", "T_base_flange": POSE}
+    for i in range(4)
+]
 NOW = "2026-11-22T10:00:00Z"
 
 
@@ -146,11 +150,15 @@ def test_each_job_is_due_when_its_input_is_there_and_once(tmp_path: Path) -> Non
         run.enqueue(*jobs)
         assert run.due() == []
     mapped = [j for j in run.state.steps["registration"].jobs.values() if j.kind == "structure_from_motion"]
-    assert sorted(j.arguments["mappers"][0] for j in mapped) == ["global", "incremental"]  # side by side
+    assert sorted(j.arguments["mappers"][0] for j in mapped) == [
+        "global",
+        "incremental",
+        "triangulated",
+    ]  # side by side
     run.finish("register")
     found = registration_ways(run.protocol, run.state, run.protocol.step("registration"))
     assert found is not None
-    assert set(found.arrived) == {"robot", "robot_corrected", "colmap", "glomap", "hybrid"}
+    assert set(found.arrived) == {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"}
     assert run.due() == []
 
 
@@ -164,7 +172,7 @@ def test_a_way_that_failed_is_said_to_have_failed_and_not_tried_again_by_itself(
     run.finish("structure_from_motion", status="failed")
     assert run.due() == []
     left = missing_results(run.protocol, run.state, {}, NOW, 2)
-    assert {one.name for one in left} == {"colmap", "glomap", "hybrid"}
+    assert {one.name for one in left} == {"triangulated", "colmap", "glomap", "hybrid"}
     assert all("said so" in one.failed for one in left)
 
 

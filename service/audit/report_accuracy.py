@@ -27,6 +27,7 @@ _PAPER = {
 _SOURCES = {
     "robot": "the robot's poses as reported",
     "robot_corrected": "the robot's poses, its errors corrected",
+    "triangulated": "adjusted from the corrected robot poses",
     "colmap": "incremental structure from motion, COLMAP",
     "glomap": "global structure from motion, GLOMAP",
     "hybrid": "structure from motion, robot and spheres adjusted together",

@@ -27,14 +27,15 @@ from service.store.records import NewJob
 
 # "robot" is what the paper compares with: the arm's poses as reported. "robot_corrected" takes off what the hand-eye
 # calibration found of the arm's errors, and what the spheres show of each pose's. "spheres" places each image of a
-# hand-held camera by the spheres that it shows, before any registration.
-Source = Literal["robot", "robot_corrected", "spheres", "colmap", "glomap", "hybrid"]
-DEFAULT_SOURCES: tuple[Source, ...] = ("robot", "robot_corrected", "colmap", "glomap", "hybrid")
+# hand-held camera by the spheres that it shows, before any registration. "triangulated" adjusts what the images have
+# in common, beginning with the corrected robot poses; COLMAP and GLOMAP begin with nothing.
+Source = Literal["robot", "robot_corrected", "spheres", "triangulated", "colmap", "glomap", "hybrid"]
+DEFAULT_SOURCES: tuple[Source, ...] = ("robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid")
 PLANNED = "sources_planned"  # name of the note with which a registration says what it decides by and what comes later
 
 _QUICK = ("robot", "robot_corrected", "spheres")  # seconds: they need the outlines alone
-_BY_PREFERENCE = ("robot_corrected", "robot", "spheres", "colmap", "glomap", "hybrid")
-_MAPPERS = {"colmap": "incremental", "glomap": "global"}
+_BY_PREFERENCE = ("robot_corrected", "robot", "spheres", "triangulated", "colmap", "glomap", "hybrid")
+_MAPPERS = {"colmap": "incremental", "glomap": "global", "triangulated": "triangulated"}
 
 
 @dataclass(frozen=True, slots=True)

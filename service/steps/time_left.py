@@ -173,7 +173,7 @@ def _left_of(
 
 
 _MODELLED = ("features", "match", "structure_from_motion")
-_WAYS = {"colmap": _MODELLED, "glomap": _MODELLED, "hybrid": (*_MODELLED, "hybrid")}
+_WAYS = {"triangulated": _MODELLED, "colmap": _MODELLED, "glomap": _MODELLED, "hybrid": (*_MODELLED, "hybrid")}
 
 
 def _rest(source: str, last: str) -> tuple[str, ...]:

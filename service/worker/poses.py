@@ -59,15 +59,21 @@ def structure_from_motion(context: JobContext) -> JobAnswer:
 def _from_pieces(context: JobContext, options: SfmOptions) -> Callable[[Mapper], SfmModel]:
     features = read_features(context)
     matches = read_matches(context, features)
-    return partial(
-        reconstruct_from,
-        features,
-        matches,
-        context.camera(),
-        context.scratch,
-        options=options,
-        progress=context.progress,
-    )
+    prior = {name: np.array(T) for name, T in (context.arguments.get("prior") or {}).items()}
+
+    def reconstructed(mapper: Mapper) -> SfmModel:
+        return reconstruct_from(
+            features,
+            matches,
+            context.camera(),
+            context.scratch,
+            mapper,
+            T_world_camera_start=prior if mapper == "triangulated" else None,
+            options=options,
+            progress=context.progress,
+        )
+
+    return reconstructed
 
 
 def _from_images(context: JobContext, options: SfmOptions) -> Callable[[Mapper], SfmModel]:
