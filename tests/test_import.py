@@ -20,6 +20,7 @@ from service.cli.main import app
 from service.compute.registration.evaluation import true_error_m
 from service.core.errors import DataError
 from service.core.geometry import inverse
+from service.core.imported import FileRole, PhotographRole
 from service.core.model import OperatorAction, RunStarted, ViewImported, ViewpointCaptured
 from service.core.protocol import load_protocol
 from service.dataset.export import export_dataset
@@ -34,7 +35,9 @@ from service.store.store import Store
 from tests.support.import_folder import Photographer, around, over_the_board
 from tests.support.rig import REPOSITORY, command, orthocapture
 
-PARTS = frozenset({"calibration", "image", "control_image", "scan", "control_scan", "ct"})
+PARTS: frozenset[PhotographRole | FileRole] = frozenset(
+    ("calibration", "image", "control_image", "scan", "control_scan", "ct")
+)
 PROTOCOL = REPOSITORY / "protocols" / "import_spine.yaml"
 
 
@@ -86,6 +89,7 @@ def test_odd_files_are_left_out_by_name_with_the_reason(folder: Path) -> None:
     (images / "lonely.arw").write_bytes(b"II*\0")
     (folder / "notes.txt").write_text("hello")
     picture = cv2.imread(str(first))
+    assert picture is not None
     cv2.imwrite(str(images / "DSC00021.JPG"), cv2.resize(picture, (160, 107)))
     reasons = left_out(folder)
     assert reasons.keys() == {

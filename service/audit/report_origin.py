@@ -111,7 +111,7 @@ def _scene(summary: RunSummary) -> Scene | None:
 
     best, registrations = summary.best(), summary.registrations()
     spheres = summary.result("scan_import").get("spheres_m")
-    if best not in registrations or spheres is None or not summary.artefacts("scan_mesh"):
+    if best is None or best not in registrations or spheres is None or not summary.artefacts("scan_mesh"):
         return None
     try:
         summary.store.artefact_path(summary.artefacts("scan_mesh")[-1].sha256, verify=True)

@@ -12,6 +12,7 @@ from service.core.imported import FileRole, ImportList, PhotographRole
 from service.core.model import OperatorAction
 from service.core.protocol import Protocol
 from service.core.run_state import RunState
+from service.runner import Spoken
 
 
 def part_of(protocol: Protocol, step_id: str) -> PhotographRole | FileRole | None:
@@ -35,7 +36,7 @@ class ImportOperator(TerminalOperator):
     listing: ImportList | None = None
     _retried: bool = False
 
-    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
         """Confirm or skip the import of a part; ask for anything else, where there is a terminal."""
         part = part_of(self.protocol, question.step)
         if question.for_ == "confirm" and part is not None and self.listing is not None:

@@ -86,8 +86,11 @@ def import_command(
     with reporting_errors(json):
         loaded = load_protocol(protocol, params_models())
         with progress_bar(quiet=json) as progress:
-            asked = (part_of(loaded.protocol, step) for step in loaded.protocol.step_ids)
-            parts = {part for part in asked if part is not None}
+            parts: set[PhotographRole | FileRole] = set()
+            for step in loaded.protocol.step_ids:
+                part = part_of(loaded.protocol, step)
+                if part is not None:
+                    parts.add(part)
             listing = list_import(find_places(folder, given, parts), progress)
         _require_wanted(loaded.protocol, listing)
         if not json:

@@ -15,7 +15,7 @@ from service.compute.markers.records import DetectionOptions, SphereOutline
 from service.compute.planning.information import ViewInformation, view_information
 from service.compute.predicting import fit_pose
 from service.compute.registration.identity import identify
-from service.compute.registration.photo_layout import places_from_outlines
+from service.compute.registration.photo_layout import places_by_size
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse
@@ -114,7 +114,7 @@ def _read(
 
 def _rough_pose(outlines: Sequence[SphereOutline], spheres_m: Array, radius_m: float) -> Transform | None:
     """The same from the spheres' places as this image alone shows them, laid over those of other photographs."""
-    places, _ = places_from_outlines(outlines, radius_m)
+    places = places_by_size([outline.cone for outline in outlines], radius_m)
     if len(places) < _LEAST_SPHERES:
         return None
     try:

@@ -324,7 +324,7 @@ class BoardCapture:
         for capture in self.context.evidence.captures(step):
             sha256 = capture.artefacts[0].sha256
             job = jobs.get(sha256)
-            if job is None or job.status == "enqueued":
+            if job is None or job.status == "enqueued" or not isinstance(capture, ViewpointCaptured):
                 continue
             if sha256 not in self._views:
                 self._views[sha256] = self._read(capture, job)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from service.compute.markers.cones import Cone
 from service.compute.registration.photo_adjustment import Adjusted, LensPrior, Photograph, adjust
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply, inverse
@@ -75,7 +76,7 @@ def layout_from_photographs(
         )
     first = photographs[order[0]]
     group = _Group([order[0]], [np.arange(len(first.cones))], [np.eye(4)])
-    found = _adjusted(photographs, group, _places(first, radius_m), radius_m, prior)
+    found = _adjusted(photographs, group, places_by_size(first.cones, radius_m), radius_m, prior)
     for k in order[1:]:
         group, found = _joined(photographs, group, found, k, radius_m, prior)
     if expected is not None and len(found.centres_m) > expected:
@@ -113,7 +114,7 @@ def _joined(
     photographs: Sequence[Photograph], group: _Group, found: Adjusted, k: int, radius_m: float, prior: LensPrior
 ) -> tuple[_Group, Adjusted]:
     """With photograph k, in the reading that fits best; without it where none does."""
-    places = _places(photographs[k], radius_m)
+    places = places_by_size(photographs[k].cones, radius_m)
     best: tuple[_Group, Adjusted] | None = None
     for T_first_photo, pairs in _readings(found.centres_m, places):
         ids = np.full(len(places), -1, dtype=np.int64)
@@ -153,10 +154,10 @@ def _reduced(
     return smaller, _adjusted(photographs, smaller, found.centres_m[kept], radius_m, prior)
 
 
-def _places(photograph: Photograph, radius_m: float) -> Array:
+def places_by_size(cones: Sequence[Cone], radius_m: float) -> Array:
     """(n, 3) centres in the photograph's own frame, by the sizes of the outlines."""
     return np.array(
-        [cone.axis * (radius_m / np.sin(cone.half_angle_rad)) for cone in photograph.cones], dtype=np.float64
+        [cone.axis * (radius_m / np.sin(cone.half_angle_rad)) for cone in cones], dtype=np.float64
     ).reshape(-1, 3)
 
 
