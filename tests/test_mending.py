@@ -7,7 +7,7 @@ import json
 import socketserver
 import threading
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,10 @@ from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import load_rig
 from service.runner import Runner
 from service.runs import recorded_run, start_run
-from service.steps import params_models
+from service.steps import params_models, viewpoint_capture
+from service.steps.context import StepContext
 from service.store.store import Store
-from tests.support.bench_rig import BenchRig, other_settings
+from tests.support.bench_rig import other_settings
 from tests.support.bench_run import PROTOCOL, Bench
 
 ADVICE = {
@@ -93,16 +94,14 @@ def automatic_run(bench: Bench, world: _World) -> RunState:
     ).run()
 
 
-def advise(bench: Bench, rig: BenchRig, data: dict[str, Any]) -> None:
-    """With every exposure, the capture notes what would mend it: as a step does that knows a way on."""
+def advise(monkeypatch: pytest.MonkeyPatch, data: dict[str, Any] | None) -> None:
+    """The capture, whose own advice is to take images again, advises this when it falls short; None: nothing."""
 
-    def note(_exposure: int) -> None:
-        attempt = bench.state().steps["capture"].attempt
-        bench.store.record(
-            bench.run_id, [StepNote(step="capture", attempt=attempt, note="wheel", data=data)], actor=""
-        )
+    def note(context: StepContext, _measures: Mapping[str, float], _images: int) -> None:
+        if data is not None:
+            context.note("wheel", **data)
 
-    rig.shutter.on_capture = note
+    monkeypatch.setattr(viewpoint_capture, "advise_retakes", note)
 
 
 def mends(bench: Bench) -> list[OperatorAction]:
@@ -110,9 +109,11 @@ def mends(bench: Bench) -> list[OperatorAction]:
     return actions[1:]  # the first one began the capture
 
 
-def test_the_simulated_technician_does_what_a_step_advises_and_confirms(bench: Bench, world: _World) -> None:
+def test_the_simulated_technician_does_what_a_step_advises_and_confirms(
+    bench: Bench, world: _World, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.rig.shutter.exif = lambda applied: applied if world.asked else other_settings(applied)
-    advise(bench, bench.rig, ADVICE)
+    advise(monkeypatch, ADVICE)
     assert automatic_run(bench, world).status == "completed"
     assert world.asked == [
         {"op": "act", "action": "turn_wheel", "iso": 100},
@@ -124,17 +125,22 @@ def test_the_simulated_technician_does_what_a_step_advises_and_confirms(bench: B
     bench.must_verify()
 
 
-def test_he_gives_up_after_a_few_mends_that_did_not_help(bench: Bench, world: _World) -> None:
+def test_he_gives_up_after_a_few_mends_that_did_not_help(
+    bench: Bench, world: _World, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.rig.shutter.exif = other_settings
-    advise(bench, bench.rig, ADVICE)
+    advise(monkeypatch, ADVICE)
     with pytest.raises(OrthocaptureError, match="settings_departures"):
         automatic_run(bench, world)
     assert len(mends(bench)) == 4
     assert bench.state().phase == "recovering", "the run is whole and can be resumed"
 
 
-def test_without_advice_from_this_attempt_he_leaves_it_to_a_person(bench: Bench, world: _World) -> None:
+def test_without_advice_from_this_attempt_he_leaves_it_to_a_person(
+    bench: Bench, world: _World, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench.rig.shutter.exif = other_settings
+    advise(monkeypatch, None)
     bench.store.record(bench.run_id, [StepNote(step="fixation", attempt=1, note="wheel", data=ADVICE)], actor="")
     with pytest.raises(OrthocaptureError, match="settings_departures"):
         automatic_run(bench, world)
@@ -142,8 +148,23 @@ def test_without_advice_from_this_attempt_he_leaves_it_to_a_person(bench: Bench,
     assert not world.asked
 
 
-def test_hands_that_cannot_do_it_say_so(bench: Bench, world: _World) -> None:
+def test_hands_that_cannot_do_it_say_so(bench: Bench, world: _World, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.rig.shutter.exif = other_settings
-    advise(bench, bench.rig, {"advice": "Juggle", "hands": [{"action": "juggle"}]})
+    advise(monkeypatch, {"advice": "Juggle", "hands": [{"action": "juggle"}]})
     with pytest.raises(OrthocaptureError, match="could not juggle"):
         automatic_run(bench, world)
+
+
+def test_the_newest_advice_counts_with_its_words_and_its_hands(bench: Bench, world: _World) -> None:
+    bench.rig.shutter.exif = other_settings
+
+    def earlier(_exposure: int) -> None:
+        attempt = bench.state().steps["capture"].attempt
+        note = StepNote(step="capture", attempt=attempt, note="wheel", data=ADVICE)
+        bench.store.record(bench.run_id, [note], actor="")
+
+    bench.rig.shutter.on_capture = earlier
+    with pytest.raises(OrthocaptureError, match="First set the camera as the protocol has it"):
+        automatic_run(bench, world)
+    assert len(mends(bench)) == 4
+    assert not world.asked, "hands of advice that no screen shows any more"

@@ -128,7 +128,10 @@ class StepState:
 
     @property
     def mend(self) -> Mapping[str, Any]:
-        """What would mend this attempt, as it found out: data of its newest note with `advice`; empty without one."""
+        """What would mend this attempt, as it found out: data of its newest note with `advice`; empty without one.
+
+        The `hands` are those of that note: nobody acts on advice that a later note has replaced.
+        """
         advised = (
             note.data for note in reversed(self.notes) if note.attempt == self.attempt and "advice" in note.data
         )
