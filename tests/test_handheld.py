@@ -42,7 +42,7 @@ def small_protocol(folder: Path) -> Path:
 def run(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """One run, shared by the tests of this file."""
     folder = tmp_path_factory.mktemp("handheld")
-    options = ("--scene", "7", "--image-width", WIDTH, "--ct-voxel-mm", "1.2", "--hand", "usual")
+    options = ("--scene", "7", "--image-width", WIDTH, "--ct-voxel-mm", "1.0", "--hand", "usual")
     with simulated_rig(folder, *options, host="127.0.0.9") as rig:
         assert "robot" not in Path(rig["rig"]).read_text()
         answer = orthocapture(

@@ -13,6 +13,7 @@ from service.core.errors import OrthocaptureError
 from service.core.protocol import Step
 
 _WAY_ON = "next: "  # how a message begins that says where to hold the camera
+_PATIENCE_S = 900  # a CT volume or a scan of the whole scene takes minutes on a busy machine
 
 
 @dataclass
@@ -50,7 +51,7 @@ class SimulatedHands:
 
 def _ask_world(address: str, request: dict[str, Any]) -> dict[str, Any]:
     host, _, port = address.rpartition(":")
-    deadline_s = time.monotonic() + 300
+    deadline_s = time.monotonic() + _PATIENCE_S
     try:
         with socket.create_connection((host, int(port)), timeout=10) as link:
             link.settimeout(deadline_s - time.monotonic())
