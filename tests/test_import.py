@@ -34,6 +34,7 @@ from service.store.database import database_path
 from service.store.store import Store
 from tests.support.import_folder import Photographer, around, over_the_board
 from tests.support.rig import REPOSITORY, command, orthocapture
+from tests.support.web import web_site
 
 PARTS: frozenset[PhotographRole | FileRole] = frozenset(
     ("calibration", "image", "control_image", "scan", "control_scan", "ct")
@@ -219,7 +220,7 @@ def true_error_mm(data: Path, run: str, photographer: Photographer) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(900)
 def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
     spine: tuple[Path, Photographer], short: Path, tmp_path: Path
 ) -> None:
@@ -239,7 +240,7 @@ def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
     process.send_signal(signal.SIGKILL)
     process.wait()
     before = imported_so_far(data)
-    answer = orthocapture(*words, "--json", timeout_s=500)
+    answer = orthocapture(*words, "--json", timeout_s=800)
     assert answer.returncode == 0, answer.stdout + answer.stderr
     result = json.loads(answer.stdout.splitlines()[-1])
     assert result["status"] == "completed"
@@ -284,3 +285,10 @@ def says_so(data: Path, run: str, folder: Path) -> None:
     answer = orthocapture("audit", "report", run, "--html", str(report), "--data", str(data), timeout_s=300)
     assert answer.returncode == 0, answer.stdout + answer.stderr
     assert words in report.read_text()
+    with web_site(folder) as site:
+        browser = site.browser("auditor")
+        for page in ("", "/capture", "/scene", "/calibration", "/calibration/certificate"):
+            answered = browser.get(f"/runs/{run}{page}")
+            assert (answered.status_code, words in answered.text) == (200, True), page
+        first = browser.get(f"/audit/runs/{run}")
+        assert (first.status_code, words in first.text) == (200, True)

@@ -198,7 +198,7 @@ def _show(listing: ImportList) -> None:
             continue
         found = photographs_record(listing, role)
         raws = f" + {found['raw_files']} raw" if found["raw_files"] else ""
-        optics = "; ".join([*found["cameras"], *found["lenses"]])
+        optics = "; ".join(dict.fromkeys([*found["cameras"], *found["lenses"]]))
         dates = _dates(found["first"], found["last"])
         size = f"{found['bytes'] / 1e6:.1f}"
         table.add_row(words, f"{found['count']}{raws}", escape(optics), ", ".join(found["sizes"]), dates, size)

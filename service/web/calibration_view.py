@@ -236,6 +236,12 @@ class Certificate:
     stops: tuple[str, ...]
 
 
+_STATED = (
+    "model", "body_serial", "lens", "lens_serial", "focal_length_mm", "aperture_f", "exposure_s", "iso", "focus_mode",
+    "focus_distance_m", "width", "height",
+)  # fmt: skip
+
+
 def certificate_of(log: RunLog, calibration: Calibration) -> Certificate:
     """From the record alone."""
     state, (_, there) = log.state, calibration.steps[-1]
@@ -265,10 +271,11 @@ def certificate_of(log: RunLog, calibration: Calibration) -> Certificate:
         if isinstance(event.payload, DeviceOpened)
     }
     models = [str(identity.get("model", "")) for identity in known.values() if identity.get("kind") == "camera"]
+    stated = dict.fromkeys(_STATED) | ({} if first is None else first.camera)  # imported images state what they do
     robots = [(name, known.get(name, {})) for name in calibration.robots]
     return Certificate(
-        {} if first is None else first.camera,
-        models[-1] if models else "",
+        stated,
+        models[-1] if models else str(stated["model"] or ""),
         tuple((name, str(about.get("model", "")), str(about.get("serial", ""))) for name, about in robots),
         {} if first is None else first.environment,
         state.operator,
