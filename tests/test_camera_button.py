@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -71,6 +72,18 @@ def test_a_press_of_the_button_brings_an_image(held: tuple[World, Camera], tmp_p
     again.mkdir()
     released_by_software = camera.capture(again)
     assert released_by_software.counter == image.counter + 1
+
+
+def test_an_image_announced_while_the_camera_is_asked_something_else_is_not_lost(
+    held: tuple[World, Camera], tmp_path: Path
+) -> None:
+    world, camera = held
+    world.press_shutter(Press())
+    for _ in range(30):  # longer than an exposure takes: its announcement comes in between
+        camera.report()
+        time.sleep(0.1)
+    (image,) = camera.released_images(tmp_path, 90.0)
+    assert image.exif == PAPER
 
 
 def test_a_dial_turned_by_accident_shows_in_the_file(held: tuple[World, Camera], tmp_path: Path) -> None:

@@ -59,12 +59,14 @@ class GphotoCamera:
         self._last: CapturedImage | None = None
         self._hashes: set[str] = set()
         self._clock_offset_s: float | None = None
+        self._announced: list[AddedFile] = []  # while something else was asked of the camera; not fetched yet
 
     # --- every device -----------------------------------------------------------------------------------
 
     def open(self) -> DeviceIdentity:
         """Connect (again), set where files go, read back who answers."""
         self._link.open()
+        self._announced.clear()
         self._set(words.TARGET, words.TARGET_CODES[self._config.capture_target])
         self._identity = DeviceIdentity(
             kind="camera",
@@ -85,7 +87,7 @@ class GphotoCamera:
         """Battery, free space, mode dial; the clock offset is that of the last exposure's EXIF time."""
         if self._identity is None:
             raise DeviceUnavailableError("The camera is not open", where=self._link.where, remedy="Open it first")
-        self._link.refresh()
+        self._refresh()
         free = self._link.free_bytes()
         battery = words.number_of(self._link.value("batterylevel").rstrip("%"))
         program = self._link.value("expprogram")
@@ -110,7 +112,7 @@ class GphotoCamera:
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
         """Set one by one from the live choice lists and read back; DeviceRefusedError when it does not hold."""
-        self._link.refresh()
+        self._refresh()
         self._apply_word(words.QUALITY, settings.image_quality)
         self._apply_word(words.FOCUS, settings.focus_mode)
         self._apply_number(words.F_NUMBER, settings.aperture_f)
@@ -120,7 +122,7 @@ class GphotoCamera:
 
     def settings(self) -> CameraSettings:
         """What the camera is set to now: events are drained first, which empties libgphoto2's 2 s cache."""
-        self._link.refresh()
+        self._refresh()
         return CameraSettings(
             aperture_f=self._number(words.F_NUMBER),
             exposure_s=self._number(words.SHUTTER),
@@ -167,7 +169,7 @@ class GphotoCamera:
     def _reads_back(self, name: str, word: str) -> bool:
         deadline = time.monotonic() + READ_BACK_TIMEOUT_S
         while True:
-            self._link.refresh()
+            self._refresh()
             if self._link.value(name) == word:
                 return True
             if time.monotonic() > deadline:
@@ -182,8 +184,10 @@ class GphotoCamera:
         `exif` has aperture, time and ISO of the file; focus mode and quality, for which EXIF has no standard tag, are
         the camera's settings. Raises StaleImageError, UnreadableFileError, DeviceStorageFullError and link errors.
         """
-        for left in self._link.refresh():
+        self._refresh()
+        for left in self._announced:
             _LOG.warning("%s was still in the camera and is not part of this exposure", left.name)
+        self._announced.clear()
         quality = words.quality_of(self._link.value(words.QUALITY))
         focus = self._link.value(words.FOCUS)
         self._check_space()
@@ -196,17 +200,29 @@ class GphotoCamera:
         deadline_s = time.monotonic() + timeout_s
         images: list[CapturedImage] = []
         while True:
+            if self._announced:
+                images.append(self._released(folder))
+                continue
             left_ms = max(1, round(1000 * (deadline_s - time.monotonic())))
             event, data = self._link.next_event(1 if images else min(200, left_ms))
             if event == gp.GP_EVENT_FILE_ADDED:
-                announced_s = time.monotonic()
-                quality = words.quality_of(self._link.value(words.QUALITY))
-                focus = self._link.value(words.FOCUS)
-                first = AddedFile(str(data.folder), str(data.name))
-                added = self._collect(2 if quality == "RAW+JPEG" else 1, announced_s, first)
-                images.append(self._image(added, folder, announced_s, quality, focus))
+                self._announced.append(AddedFile(str(data.folder), str(data.name)))
             elif event == gp.GP_EVENT_TIMEOUT and (images or time.monotonic() >= deadline_s):
                 return tuple(images)
+
+    def _released(self, folder: Path) -> CapturedImage:
+        """The exposure whose file was announced first."""
+        announced_s = time.monotonic()
+        quality = words.quality_of(self._link.value(words.QUALITY))
+        focus = self._link.value(words.FOCUS)
+        expected = 2 if quality == "RAW+JPEG" else 1
+        first, self._announced = self._announced[:expected], self._announced[expected:]
+        added = self._collect(expected, announced_s, *first)
+        return self._image(added, folder, announced_s, quality, focus)
+
+    def _refresh(self) -> None:
+        """Drain events, so that values are read anew; files that they announce wait for `released_images`."""
+        self._announced += self._link.refresh()
 
     def _image(
         self, added: list[AddedFile], folder: Path, trigger_s: float, quality: str, focus: str
