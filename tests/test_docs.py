@@ -192,6 +192,12 @@ RUN_ELSEWHERE = {
         ("make test", "make lint", "make test-versions", "make clean"),
         "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
     ),
+    "orthocapture import FOLDER --data runs": (
+        "tests/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
+    ),
+    "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
+        "tests/test_handheld.py::test_the_evidence_verifies"
+    ),
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
     ),
