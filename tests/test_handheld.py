@@ -58,13 +58,15 @@ def test_the_hand_covers_the_hemisphere_in_spite_of_its_mistakes(run: dict[str, 
     assert measures["hemisphere_coverage"] >= 0.9
     assert measures["predicted_target_error_mm"] < 0.15
     taken = [run["steps"][name]["measures"] for name in ("board_capture", "handheld_capture")]
-    assert sum(m["images_not_used"] for m in taken) >= 3, "mistakes were made"
+    # Of every fourth press: a blurred board and a finger still leave an image that can be used, as does half a way.
+    assert sum(m["images_not_used"] for m in taken) >= 2, "settings turned, and an image taken twice"
     assert sum(m["images_used"] for m in taken) >= 19
 
 
 def test_every_image_that_was_not_used_says_why(run: dict[str, Any]) -> None:
     refused = [line for line in run["told"].splitlines() if "not used: " in line]
-    assert len(refused) >= 3
+    assert len(refused) >= 2
+    assert any("ISO 200; wanted are" in line for line in refused)
     assert run["told"].count("next: ") >= 19
 
 
