@@ -83,6 +83,8 @@ NO_PAGES = {
     "/robots",
     "/runs/{run_id}/parts/{names}",
     "/runs/{run_id}/capture/parts/{names}",
+    "/runs/{run_id}/held/parts/{names}",
+    "/runs/{run_id}/board-plan.svg",
     "/runs/{run_id}/scene/frame",  # sandboxed within its page, and checked there
     "/runs/{run_id}/stream",
     "/runs/{run_id}/files/{sha256}",
