@@ -106,7 +106,7 @@ def test_extension_info_announces_version_3(body: CameraBody) -> None:
     reply = Responder(body, FaultPlan()).handle(request(0x9202, 0x12C, 1), b"")
     assert reply.data is not None
     assert struct.unpack_from("<H", reply.data)[0] == 300
-    assert reply.data.endswith(bytes.fromhex("02000000" + "c1d2" + "c2d2"))
+    assert reply.data.endswith(bytes.fromhex("04000000" + "c1d2" + "c2d2" + "d1d2" + "d2d2"))
 
 
 def test_exposure_through_the_operations(body: CameraBody) -> None:
