@@ -57,6 +57,10 @@ PAGES: dict[str, tuple[tuple[Role | None, str], ...]] = {
         ("technician", "/runs/{calibrated}/capture"),
         ("technician", "/runs/{completed}/capture?step=capture&viewpoint=v001"),
     ),
+    "/runs/{run_id}/held": (
+        ("technician", "/runs/{held}/held"),
+        ("technician", "/runs/{completed}/held"),
+    ),
     "/runs/{run_id}/scene": (("auditor", "/runs/{registered}/scene"),),
     "/runs/{run_id}/calibration": (("technician", "/runs/{calibrated}/calibration"),),
     "/runs/{run_id}/calibration/certificate": (("auditor", "/runs/{calibrated}/calibration/certificate"),),
@@ -94,6 +98,7 @@ NO_PAGES = {
 }
 STANDING = {"doing": "asking", "robot": "standing", "robot_name": "robot", "light_lux": 800.0}
 WORKING = {"doing": "working", "robot": "moving", "what": "image", "done": 1, "total": 4}
+HOLDING = {"doing": "working", "what": "waiting for the next image", "done": 4, "total": 7}
 VIEWS = [view for views in PAGES.values() for view in views]
 
 
@@ -135,6 +140,8 @@ class Desk:
         runs = {run_id: STANDING for run_id in self.site.under_way if run_id in address}
         if self.site.calibrated in runs:
             runs[self.site.calibrated] = STANDING | WORKING
+        if self.site.held in runs:
+            runs[self.site.held] = STANDING | HOLDING
         with attended(self.server.data, runs):
             yield address
 

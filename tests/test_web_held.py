@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Generator, Mapping
 from html import unescape
@@ -13,29 +12,15 @@ import pytest
 
 from service.core.model import CaptureAsked
 from tests.support.bench_run import Bench
+from tests.support.held_run import left_held_run
 from tests.support.web import Browser, WebSite, web_site
-from tests.test_manual_capture import STEP, held_run
-
-
-class _LeftError(Exception):
-    """The runner's process has ended in the middle."""
 
 
 @pytest.fixture
 def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[tuple[WebSite, Browser, Bench]]:
     """A run in which four images were taken, the second one blurred."""
     with web_site(tmp_path) as site:
-        bench, person = held_run(site.begin_run, monkeypatch, tmp_path, {2: "blurred"}, STEP)
-        serve = bench.operator.on_show
-
-        def until_four(what: str) -> None:
-            serve(what)
-            if person.presses == 5:
-                raise _LeftError
-
-        bench.operator.on_show = until_four
-        with contextlib.suppress(_LeftError):
-            bench.run()
+        bench = left_held_run(site.begin_run, monkeypatch, tmp_path)
         browser = site.browser("technician")
         site.take_control(bench.run_id, browser)
         yield site, browser, bench

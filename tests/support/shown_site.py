@@ -6,10 +6,13 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 from service.core.decide import AskOperator
 from service.core.model import ItemTicked, OperatorAction
 from service.core.run_state import RunState
 from tests.support.calibrated_run import begin_calibrated_run
+from tests.support.held_run import left_held_run
 from tests.support.recorded_run import record_run
 from tests.support.reported_run import record_reported_run
 from tests.support.web import web_site
@@ -28,10 +31,11 @@ class ShownSite:
     signing: str  # waits for the signature of an irreversible step
     failed: str  # waits for a decision: a gate has failed
     acceptable: str  # the same, and a supervisor may accept it
+    held: str  # images are taken by hand, one of them cannot be used
 
     @property
     def under_way(self) -> tuple[str, ...]:
-        return self.calibrated, self.listing, self.moving, self.signing, self.failed, self.acceptable
+        return self.calibrated, self.listing, self.moving, self.signing, self.failed, self.acceptable, self.held
 
 
 def shown_site(folder: Path) -> ShownSite:
@@ -52,7 +56,11 @@ def shown_site(folder: Path) -> ShownSite:
         signing.script("spraying", "sign", leave)
         with contextlib.suppress(_LeftError):
             signing.run()
-    return ShownSite(folder, completed, registered, calibrated, listing, moving, signing.run_id, failed, acceptable)
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            held = left_held_run(web.begin_run, monkeypatch, folder).run_id
+    return ShownSite(
+        folder, completed, registered, calibrated, listing, moving, signing.run_id, failed, acceptable, held
+    )
 
 
 class _LeftError(Exception):
