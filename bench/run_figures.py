@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from service.compute.planning.motion_plan import turn_times_s
 from service.core.model import (
     Event,
     JobFinished,
@@ -63,14 +64,13 @@ def overhead(events: Iterable[Event], protocol: Protocol, speed_up: float) -> di
     to the last byte. Waits: the settle window and the dwell.
     """
     motion, settle = protocol.motion, protocol.settle
-    v, a = motion.speed_rad_s, motion.acceleration_rad_s2
     shots = [e.payload for e in events if isinstance(e.payload, ViewpointCaptured)]
     spent: list[float] = []
     for before, after in pairwise(shots):
         if (before.step, before.attempt, before.station) != (after.step, after.attempt, after.station):
             continue
-        turn_rad = float(np.max(np.abs(np.array(after.joints_rad) - np.array(before.joints_rad))))
-        travel_s = turn_rad / v + v / a if turn_rad > v**2 / a else 2 * float(np.sqrt(turn_rad / a))
+        turn_rad = np.max(np.abs(np.array(after.joints_rad) - np.array(before.joints_rad)))
+        travel_s = float(turn_times_s(turn_rad, motion.speed_rad_s, motion.acceleration_rad_s2))
         camera_s = before.arrival_monotonic_s - before.trigger_monotonic_s
         cycle_s = after.trigger_monotonic_s - before.trigger_monotonic_s
         spent.append(cycle_s - camera_s - travel_s / speed_up - settle.window_s - motion.dwell_s)

@@ -35,6 +35,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse
 from service.worker.job import JobAnswer, JobContext
 from service.worker.layout import nominal_camera
+from service.worker.live import kept_surface
 
 _SAME_M, _SAME_RAD = 0.02, np.deg2rad(3.0)  # nearer than this, an image repeats another
 _LOST_AFTER = 1  # images in a row, before this one, that do not tell where the camera is
@@ -121,7 +122,7 @@ def _answer(context: JobContext, found: _Seen, camera: CameraModel) -> JobAnswer
     """The verdict on the image among those before it, what all of them come to, and where to go next."""
     arguments = context.arguments
     image = arguments["image"]
-    surface = _surface(context)
+    surface = kept_surface(context)
     earlier = [_read(context, sha256, surface) for sha256 in arguments["earlier"]]
     used = [e for e in earlier if e.used and e.T_scene_camera is not None]
     T = found.T_scene_camera
@@ -286,14 +287,6 @@ def _informative(
 
 def _places(listed: Sequence[Mapping[str, Any]]) -> list[Place]:
     return [place_at(**spot) for spot in listed]
-
-
-def _surface(context: JobContext) -> CoverageSurface | None:
-    sha256 = context.arguments.get("surface")
-    if sha256 is None:
-        return None
-    with np.load(context.input(sha256), allow_pickle=False) as arrays:
-        return CoverageSurface(**{name: arrays[name] for name in arrays.files})
 
 
 def _visible(

@@ -108,7 +108,7 @@ def live_view(context: JobContext) -> JobAnswer:
     arguments = context.arguments
     camera, spheres = context.camera(), np.array(arguments["spheres_m"])
     radius_m, image = float(arguments["radius_m"]), arguments["image"]
-    surface = _surface(context)
+    surface = kept_surface(context)
     earlier = _records(context, arguments["earlier"], camera, surface)
     mine = [r for r in earlier if r.station == image["station"]]
     known = next((r.T_base_scan for r in reversed(mine) if r.T_base_scan is not None), None)
@@ -166,7 +166,7 @@ def live_summary(context: JobContext) -> JobAnswer:
     """All images so far: the predicted error of the worst station, the coverage, and which views would help most."""
     arguments = context.arguments
     camera, limits = context.camera(), CoverageLimits(**arguments["limits"])
-    surface = _surface(context)
+    surface = kept_surface(context)
     records = _records(context, arguments["views"], camera, surface)
     stations: dict[str, _Station] = {}
     reasons: dict[str, str] = {}
@@ -279,8 +279,9 @@ def _candidates(
     return out
 
 
-def _surface(context: JobContext) -> CoverageSurface | None:
-    sha256 = context.arguments["surface"]
+def kept_surface(context: JobContext) -> CoverageSurface | None:
+    """The specimen's surface that the job names; None where there is none, or none yet."""
+    sha256 = context.arguments.get("surface")
     if sha256 is None:
         return None
     with np.load(context.input(sha256), allow_pickle=False) as arrays:

@@ -124,8 +124,13 @@ def _blurred(T_base_camera: Transform, situation: Situation) -> str:
 def travel_times_s(joints_rad: Array, situation: Situation) -> Array:
     """(K, K) time between joint positions (K, 6), by the joint that turns furthest: ramp up, constant, ramp down."""
     distance = np.abs(joints_rad[:, None] - joints_rad[None]).max(axis=2)
-    v, a = situation.speed_rad_s, situation.acceleration_rad_s2
-    return np.where(distance > v**2 / a, distance / v + v / a, 2 * np.sqrt(distance / a))
+    return turn_times_s(distance, situation.speed_rad_s, situation.acceleration_rad_s2)
+
+
+def turn_times_s(turns_rad: Array, speed_rad_s: float, acceleration_rad_s2: float) -> Array:
+    """Time for joints to turn by angles of any shape: ramp up, constant speed if it is reached, ramp down."""
+    v, a = speed_rad_s, acceleration_rad_s2
+    return np.where(turns_rad > v**2 / a, turns_rad / v + v / a, 2 * np.sqrt(turns_rad / a))
 
 
 def shortest_order(times_s: Array) -> list[int]:
