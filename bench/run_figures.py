@@ -60,8 +60,8 @@ def steps_s(events: Sequence[Event]) -> dict[str, float]:
 def overhead(events: Iterable[Event], protocol: Protocol, speed_up: float) -> dict[str, float]:
     """Seconds between two exposures that neither the arm nor the camera nor the protocol's waits account for.
 
-    Arm: the time of the joint that turns furthest, at the protocol's speed and acceleration. Camera: from the release
-    to the last byte. Waits: the settle window and the dwell.
+    Arm: the time of the joint that turns furthest, at the protocol's speed and acceleration, and its ringing.
+    Camera: from the release until it announces the last file. Waits: the settle window and the dwell.
     """
     motion, settle = protocol.motion, protocol.settle
     shots = [e.payload for e in events if isinstance(e.payload, ViewpointCaptured)]
@@ -73,7 +73,8 @@ def overhead(events: Iterable[Event], protocol: Protocol, speed_up: float) -> di
         travel_s = float(turn_times_s(turn_rad, motion.speed_rad_s, motion.acceleration_rad_s2))
         camera_s = before.arrival_monotonic_s - before.trigger_monotonic_s
         cycle_s = after.trigger_monotonic_s - before.trigger_monotonic_s
-        spent.append(cycle_s - camera_s - travel_s / speed_up - settle.window_s - motion.dwell_s)
+        waits_s = after.ringing_s + settle.window_s + motion.dwell_s
+        spent.append(cycle_s - camera_s - travel_s / speed_up - waits_s)
     usual = [s for s in spent if s < _PATIENCE_S]
     if not usual:
         return {}

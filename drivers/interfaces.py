@@ -134,6 +134,7 @@ class SettleReport:
     rotation_peak_to_peak_rad: float
     T_base_flange: Transform  # mean over the window
     joints_rad: Array
+    ringing_s: float = 0.0  # from the end of the commanded motion to the last sample beyond the speed limits
 
 
 class RobotArm(Device, Protocol):

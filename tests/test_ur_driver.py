@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import socket
 import time
@@ -22,7 +23,7 @@ from drivers.errors import (
 from drivers.host import hosted
 from drivers.interfaces import Array, Payload, RobotArm, RobotSample, SafetyState, SettleCriteria
 from drivers.ur import UrConfig
-from drivers.ur.stream import judge, safety_state
+from drivers.ur.stream import judge, ringing_s, safety_state
 from service.core.geometry import inverse, rotation_angle_rad, transform
 from tests.support.ur_simulator import address, simulated_ur
 from tests.support.waiting import until
@@ -350,6 +351,15 @@ def test_judge_counts_vibration_creep_and_a_short_window() -> None:
     assert not judge(still(speed_rad_s=0.002), criteria).settled
     assert not judge(still(target=0.01), criteria).settled
     assert not judge(still(count=20), criteria).settled
+
+
+def test_ringing_lasts_from_the_end_of_the_commanded_motion_to_the_last_loud_sample() -> None:
+    criteria = SettleCriteria()
+    course = [*still(5, target=0.1), *still(8, speed_rad_s=0.01), *still(80)]
+    samples = [dataclasses.replace(sample, monotonic_s=0.008 * i) for i, sample in enumerate(course)]
+    assert ringing_s(samples, criteria) == pytest.approx(8 * 0.008)
+    assert ringing_s(samples[:5] + samples[13:], criteria) == 0, "an arm that stops dead"
+    assert ringing_s(still(), criteria) == 0, "no motion in these samples"
 
 
 @pytest.mark.parametrize(

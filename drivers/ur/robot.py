@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import logging
 import time
@@ -34,7 +35,7 @@ from drivers.interfaces import (
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
 from drivers.ur.link import VENDOR_ERRORS, ControllerFacts, connect_dashboard, probe, read_facts, vendor
-from drivers.ur.stream import STREAM_HZ, PoseStream, judge, safety_state
+from drivers.ur.stream import STREAM_HZ, PoseStream, driven, judge, ringing_s, safety_state
 from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
 
 DRIVER_VERSION = "1"
@@ -66,6 +67,7 @@ VARIABLES = (
 READ_BACK_S = 1.0
 SCRIPT_START_S = 5.0
 TOOL_CHANGE_S = 0.05  # of the controller's clock, for a new tool to show in the stream
+LONGEST_RINGING_S = 10.0  # after a motion; how far back its end is looked for
 MOTION_START_S = 0.06  # for the target velocity to show in the stream
 
 _LOG = logging.getLogger(__name__)
@@ -277,13 +279,17 @@ class UrRobot:
         """Whether the controller drives the arm in this sample. Raises SafetyStopError when a stop has ended it."""
         if not sample.safety.may_move:
             raise self._safety_error(sample)
-        return bool(np.any(np.abs(sample.target_velocities_rad_s) > 1e-9))
+        return driven(sample)
 
     def settle(self, criteria: SettleCriteria) -> SettleReport:
         """See RobotArm."""
-        newest = self._streaming().latest()
-        window = self._streaming().between(newest.monotonic_s - criteria.window_s, newest.monotonic_s)
-        return judge(window, criteria)
+        stream = self._streaming()
+        now_s = stream.latest().monotonic_s
+        report = judge(stream.between(now_s - criteria.window_s, now_s), criteria)
+        if not report.settled:
+            return report
+        recent = stream.between(now_s - criteria.window_s - LONGEST_RINGING_S, now_s)
+        return dataclasses.replace(report, ringing_s=ringing_s(recent, criteria))
 
     def set_digital_output(self, index: int, on: bool) -> None:
         """See RobotArm."""

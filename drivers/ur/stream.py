@@ -20,6 +20,7 @@ BUFFER_S = 300.0  # an image's pose is looked up once its files have arrived, wh
 STREAM_HZ = 125.0
 POLL_S = 0.004
 MINIMUM_COVERAGE = 0.8  # of the settle window by samples
+TARGET_AT_REST_RAD_S = 1e-9  # the controller's target velocity, beyond which it drives the arm
 
 _LOG = logging.getLogger(__name__)
 
@@ -150,7 +151,7 @@ def judge(samples: Sequence[RobotSample], criteria: SettleCriteria) -> SettleRep
     rotation_rad = float(np.linalg.norm(np.ptp(turns, axis=0)))
     joint_speed = float(max(np.max(np.abs(s.joint_velocities_rad_s)) for s in samples))
     tcp_speed = max(s.tcp_speed_m_s for s in samples)
-    at_target = all(not np.any(np.abs(s.target_velocities_rad_s) > 1e-9) for s in samples)
+    at_target = not any(driven(s) for s in samples)
     covered_s = samples[-1].monotonic_s - samples[0].monotonic_s
     return SettleReport(
         settled=bool(
@@ -169,3 +170,25 @@ def judge(samples: Sequence[RobotSample], criteria: SettleCriteria) -> SettleRep
         T_base_flange=transform(mean, T[:, :3, 3].mean(axis=0)),
         joints_rad=np.mean([s.joints_rad for s in samples], axis=0),
     )
+
+
+def ringing_s(samples: Sequence[RobotSample], criteria: SettleCriteria) -> float:
+    """How long the arm went on swinging after the controller's target had come to rest, in seconds.
+
+    0 where `samples`, oldest first, do not reach back to a commanded motion.
+    """
+    last_loud_s: float | None = None
+    for sample in reversed(samples):
+        if driven(sample):
+            return 0.0 if last_loud_s is None else last_loud_s - sample.monotonic_s
+        if last_loud_s is None and (
+            np.max(np.abs(sample.joint_velocities_rad_s)) >= criteria.joint_speed_rad_s
+            or sample.tcp_speed_m_s >= criteria.tcp_speed_m_s
+        ):
+            last_loud_s = sample.monotonic_s
+    return 0.0
+
+
+def driven(sample: RobotSample) -> bool:
+    """Whether the controller drives the arm in this sample."""
+    return bool(np.any(np.abs(sample.target_velocities_rad_s) > TARGET_AT_REST_RAD_S))

@@ -166,6 +166,7 @@ class ViewpointCaptured(View):
     arrival_monotonic_s: float
     controller_time_s: float
     clock_offset_s: float  # controller time minus host monotonic
+    ringing_s: float = 0.0  # for which the arm swung after the commanded motion: a loose mount shows here
 
 
 class ViewImported(View):

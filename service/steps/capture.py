@@ -20,7 +20,7 @@ from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, 
 from service.core.geometry import Array, Transform
 from service.core.model import ViewpointFailed
 from service.steps.context import StepContext
-from service.steps.exposure import Shot, expose, expose_when_free, record_shot, wanted_settings
+from service.steps.exposure import Shot, environment_now, expose, expose_when_free, record_shot, wanted_settings
 from service.steps.motion import MotionLimits, move_and_settle, settle_criteria
 from service.steps.viewpoints import Viewpoint, flange_target
 
@@ -175,9 +175,12 @@ class _CaptureLoop:
         for tries_left in range(context.step.recovery.retries, -1, -1):
             arrived = False
             try:
-                settled = self._go_to(robot, viewpoint, later)
+                settled = self._go_to(robot, viewpoint)
                 arrived = True
-                return expose(context, self.camera, robot, viewpoint, settled, self.wanted, self.image_kind)
+                environment = self._dwell(robot, later)
+                return expose(
+                    context, self.camera, robot, viewpoint, settled, environment, self.wanted, self.image_kind
+                )
             except WORTH_ANOTHER_TRY as error:
                 self.keep()
                 self._record_failure(viewpoint, error, skipped=False)
@@ -191,19 +194,24 @@ class _CaptureLoop:
                     context.devices.reopen(robot)
         raise AssertionError
 
-    def _go_to(self, robot: RobotArm, viewpoint: Viewpoint, later: Sequence[Viewpoint]) -> SettleReport:
+    def _go_to(self, robot: RobotArm, viewpoint: Viewpoint) -> SettleReport:
         context = self.context
         target = self._targets.pop(viewpoint.name, None)
         if target is None:
             target = self._solve(robot, viewpoint)
         motion = context.protocol.motion
         limits = MotionLimits(motion.speed_rad_s, motion.acceleration_rad_s2, context.protocol.settle.timeout_s)
-        report = move_and_settle(context, robot, target, limits, settle_criteria(context), meanwhile=self.keep)
-        if motion.dwell_s > 0:
-            dwell_ends_s = context.monotonic_s() + motion.dwell_s
+        return move_and_settle(context, robot, target, limits, settle_criteria(context), meanwhile=self.keep)
+
+    def _dwell(self, robot: RobotArm, later: Sequence[Viewpoint]) -> dict[str, float]:
+        """Let the arm rest before the exposure, and use the time; returns the environment."""
+        dwell_s = self.context.protocol.motion.dwell_s
+        ends_s = self.context.monotonic_s() + dwell_s
+        if dwell_s > 0:
             self._solve_ahead(robot, later)
-            context.wait(max(0.0, dwell_ends_s - context.monotonic_s()))
-        return report
+        environment = environment_now(self.context)
+        self.context.wait(max(0.0, ends_s - self.context.monotonic_s()))
+        return environment
 
     def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
         """Joints (6,) for a viewpoint, of the controller. Raises UnreachablePoseError."""

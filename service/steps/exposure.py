@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from drivers.errors import DeviceBusyError, DeviceUnavailableError
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, RobotSample, SettleReport
 from service.core.errors import ConfigurationError, DataError
-from service.core.geometry import Array, Transform, inverse, rotation_angle_rad
+from service.core.geometry import Array, Transform, inverse
 from service.core.model import ArtefactRef, Matrix4, ViewpointCaptured
 from service.steps.context import StepContext
 from service.steps.motion import settle_criteria
@@ -37,6 +38,7 @@ class Shot:
     environment: dict[str, float]
     verdicts: dict[str, bool]
     image_kind: str
+    ringing_s: float
 
 
 def expose(
@@ -45,6 +47,7 @@ def expose(
     robot: RobotArm,
     viewpoint: Viewpoint,
     settled: SettleReport,
+    environment: dict[str, float],
     wanted: CameraSettings,
     image_kind: str,
 ) -> Shot:
@@ -52,7 +55,6 @@ def expose(
 
     Raises DeviceError, DeviceUnavailableError when no pose of the arm is known for the exposure.
     """
-    environment = environment_now(context)
     folder = tempfile.TemporaryDirectory(prefix="orthocapture-")
     try:
         image = expose_when_free(context, camera, Path(folder.name))
@@ -67,7 +69,7 @@ def expose(
         and pose.spread_rad <= criteria.rotation_peak_to_peak_rad,
         "settings": settings_agree(image.exif, wanted),
     }
-    return Shot(viewpoint, image, folder, window, pose, environment, verdicts, image_kind)
+    return Shot(viewpoint, image, folder, window, pose, environment, verdicts, image_kind, settled.ringing_s)
 
 
 def record_shot(context: StepContext, shot: Shot) -> None:
@@ -112,6 +114,7 @@ def record_shot(context: StepContext, shot: Shot) -> None:
             arrival_monotonic_s=image.arrival_monotonic_s,
             controller_time_s=pose.controller_time_s,
             clock_offset_s=pose.clock_offset_s,
+            ringing_s=shot.ringing_s,
             camera=camera_record(image),
             environment=shot.environment,
             verdicts=shot.verdicts,
@@ -154,10 +157,10 @@ def _mean_pose(window: Sequence[RobotSample], settled: SettleReport) -> Exposure
             "the robot's pose stream has no sample during the exposure",
             remedy="The image cannot be used without its pose; the viewpoint is taken again",
         )
-    reference = inverse(settled.T_base_flange)
-    deltas = [reference @ s.T_base_flange for s in window]
-    positions = np.array([s.T_base_flange[:3, 3] for s in window])
-    angles = np.array([rotation_angle_rad(d) for d in deltas])
+    poses = np.stack([s.T_base_flange for s in window])
+    deltas = inverse(settled.T_base_flange) @ poses
+    positions = poses[:, :3, 3]
+    angles = Rotation.from_matrix(deltas[:, :3, :3]).magnitude()
     middle = window[len(window) // 2]
     T = settled.T_base_flange.copy() if len(window) < 3 else middle.T_base_flange.copy()
     T[:3, 3] = positions.mean(axis=0)

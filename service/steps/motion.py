@@ -12,6 +12,7 @@ from service.core.geometry import Array
 from service.steps.context import StepContext, StepInterruptedError
 
 _POLL_S = 0.02
+_POLL_AT_THE_END_S = 0.004  # once the window may be complete: each millisecond from there on is the viewpoint's
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +67,7 @@ def _wait_settled(
     context: StepContext, robot: RobotArm, limits: MotionLimits, criteria: SettleCriteria
 ) -> SettleReport:
     deadline_s = context.monotonic_s() + limits.travel_timeout_s + limits.settle_timeout_s
+    stopped_s: float | None = None
     while True:
         context.checkpoint()
         safety = robot.state().sample.safety
@@ -74,16 +76,21 @@ def _wait_settled(
                 f"the robot reports {safety.value.replace('_', ' ')}",
                 remedy="Find and clear the cause at the robot; the step goes on after you confirm",
             )
-        if not robot.is_moving():
+        if stopped_s is None and not robot.is_moving():
+            stopped_s = context.monotonic_s()
+        if stopped_s is not None:
             report = robot.settle(criteria)
             if report.settled:
                 return report
-        if context.monotonic_s() > deadline_s:
+        now_s = context.monotonic_s()
+        if now_s > deadline_s:
             raise DeviceTimeoutError(
                 "the robot did not arrive and settle in time",
                 remedy="Look for vibration of the mount or a joint that drifts",
             )
-        context.wait(_POLL_S)
+        # The stop is seen up to three polls after it happened.
+        near_the_end = stopped_s is not None and now_s > stopped_s + criteria.window_s - 3 * _POLL_S
+        context.wait(_POLL_AT_THE_END_S if near_the_end else _POLL_S)
 
 
 def _stand_still(context: StepContext, robot: RobotArm, criteria: SettleCriteria) -> None:
