@@ -35,6 +35,18 @@ def test_the_shortened_protocol_is_sound_and_keeps_every_kind_of_step(tmp_path: 
     long = load_protocol(whole, params_models()).protocol
     assert [step.kind for step in short.steps] == [step.kind for step in long.steps]
     for step in yaml.safe_load((tmp_path / "short.yaml").read_text())["steps"]:
-        views = sum(arc["count"] for s in step.get("params", {}).get("viewpoints", []) for arc in s["arcs"])
-        counted = [gate["min"] for gate in step.get("gates", []) if gate["measure"] == "viewpoints_captured"]
-        assert all(least <= views for least in counted)
+        params = step.get("params", {})
+        views = sum(arc["count"] for s in params.get("viewpoints", []) for arc in s["arcs"])
+        views += params.get("board_poses", {}).get("count", 0)
+        counted = [
+            gate["min"] for gate in step.get("gates", []) if gate["measure"] in ("views", "viewpoints_captured")
+        ]
+        assert all(0 < least <= views for least in counted)
+
+
+def test_a_sixth_of_the_views_is_taken_but_board_images_stay_enough(tmp_path: Path) -> None:
+    shortened(REPOSITORY / "protocols" / "exvivo_spine.yaml", 6, tmp_path / "short.yaml")
+    steps = {step["id"]: step for step in yaml.safe_load((tmp_path / "short.yaml").read_text())["steps"]}
+    assert steps["intrinsics"]["params"]["board_poses"]["count"] == 15
+    assert next(g["min"] for g in steps["intrinsics"]["gates"] if g["measure"] == "views") == 10
+    assert steps["hand_eye"]["params"]["board_poses"]["count"] == 12
