@@ -74,7 +74,7 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels (0.4)")
     parser.add_argument("--speed-up", type=float, default=1.0, help="the arm takes 1/N of its time (1)")
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="another protocol than the paper's")
-    parser.add_argument("--one-of", type=int, default=1, metavar="N", help="take one view of N, board images included (1)")
+    parser.add_argument("--one-of", type=int, default=1, metavar="N", help="take one view of N (1)")
     parser.add_argument("--timeout-h", type=float, default=3.0, help="of each command (3)")
     parser.add_argument("--name", default="whole_protocol", help="of the two files of results")
     parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat(), help="today")
