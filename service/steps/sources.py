@@ -151,7 +151,18 @@ class _Walk:
     def to_registration(self, name: str, source: str, size: str, priority: int) -> JobState | None:
         """The finished job `register`, or None; what is needed for it is among the tasks."""
         self._for, self._priority = name, priority
+        if size and (reason := self._no_reduction(size)):
+            self.failed[name] = reason
+            return None
         return self._registered(source, size)
+
+    def _no_reduction(self, size: str) -> str:
+        """Why a size cannot be compared with the full one, or nothing: a protocol serves cameras of any size."""
+        width, height = _pixels(size)
+        camera = CameraModel.from_record(self.outlines.arguments["camera"])
+        if width <= camera.width and height <= camera.height:
+            return ""
+        return f"the photographs have {camera.width} × {camera.height} px, not more than {width} × {height}"
 
     def _registered(self, source: str, size: str) -> JobState | None:
         search = self._arguments(size)
@@ -243,7 +254,7 @@ class _Walk:
         arguments.pop("model", None)  # of a search that began with poses from the images alone
         if not size:
             return arguments
-        width, height = (int(n) for n in size.split("x"))
+        width, height = _pixels(size)
         camera = arguments["camera"]
         arguments |= {"camera": camera_at(CameraModel.from_record(camera), width, height).record()}
         arguments.pop("intrinsics_covariance", None)  # it is of the full size
@@ -263,6 +274,12 @@ class _Walk:
             mine.append((kind, name))
         self.tasks.setdefault((kind, name), Task(name, JobRequest(kind, arguments, self._priority), job))
         return job if job is not None and job.status == "finished" else None
+
+
+def _pixels(size: str) -> tuple[int, int]:
+    """Width and height of 1920x1080."""
+    width, _, height = size.partition("x")
+    return int(width), int(height)
 
 
 # --- what is due, whoever asks ------------------------------------------------------------------------------------
