@@ -29,7 +29,7 @@ from service.core.decide import (
     evaluate_gates,
 )
 from service.core.errors import OrthocaptureError, StoreError
-from service.core.gates import describe
+from service.core.gates import describe_judged
 from service.core.model import (
     ActionRefused,
     DeviceOpened,
@@ -167,8 +167,8 @@ class Runner:
                 self._append(verdicts)
                 for verdict in verdicts.verdicts:
                     if not verdict.passed:
-                        how = "not decided" if verdict.undecided else "outside its limits"
-                        self.operator.tell(f"{step}: {describe(verdict)}: {how}")
+                        outside = "" if verdict.undecided else ": outside its limits"
+                        self.operator.tell(f"{step}: {describe_judged(verdict)}{outside}")
             case Accept(step, attempt):
                 self._append(StepPassed(step=step, attempt=attempt))
                 self._seal()

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from service.core.decide import AskOperator, decide, evaluate_gates
 from service.core.fold import fold
+from service.core.gates import quantity
 from service.core.model import (
     ItemTicked,
     OperatorVerb,
@@ -27,7 +28,7 @@ from service.steps import params_models
 from service.web.run_figures import duration, view_intervals_s
 from service.web.run_frame import robot_banner
 from service.web.run_view import Looker, RunView, run_view
-from service.web.run_words import limit, measure_name, number, planned_views
+from service.web.run_words import limit, measure_name, planned_views
 from tests.support.core import Log
 
 PROTOCOLS = Path(__file__).parents[1] / "protocols"
@@ -247,8 +248,8 @@ def test_measures_have_names_for_people(measure: str, words: str) -> None:
 
 
 def test_numbers_have_units_and_limits_words() -> None:
-    assert number(0.71234, "px") == "0.712 px"
-    assert number(54.0, "views") == "54 views"
-    assert number(None, "mm") == "not measured"
+    assert quantity(0.712345, "px") == "0.7123 px"
+    assert quantity(54.0, "views") == "54 views"
+    assert quantity(None, "mm") == "not measured"
     assert limit(None, 0.5, "px") == "at most 0.5 px"
     assert [duration(s) for s in (7, 100, 3900)] == ["5 s", "2 min", "1 h 05 min"]

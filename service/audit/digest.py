@@ -13,7 +13,7 @@ from service.audit.computed import Computed, Step
 from service.audit.queries import Facets, head, root
 from service.core.errors import IntegrityError, OrthocaptureError
 from service.core.fold import advance, initial_state
-from service.core.model import PAYLOAD, Event, GatesEvaluated, Payload, ViewImported, ViewpointCaptured
+from service.core.model import PAYLOAD, Event, GatesEvaluated, GateVerdict, Payload, ViewImported, ViewpointCaptured
 from service.core.protocol import Protocol, parse_protocol
 from service.core.run_state import Deviation, RunState
 from service.store.store import Store
@@ -50,17 +50,13 @@ _PLACE: TypeAdapter[tuple[str, int, str]] = TypeAdapter(tuple[str, int, str])
 
 @dataclass(frozen=True, slots=True)
 class FailedGate:
-    """A measured number outside its limit, and when."""
+    """A gate that did not pass, and when: outside its limits, or not decided."""
 
     seq: int
     at_utc: str
     step: str
     attempt: int
-    measure: str
-    value: float | None
-    minimum: float | None
-    maximum: float | None
-    unit: str
+    verdict: GateVerdict
 
 
 @dataclass
@@ -199,17 +195,7 @@ def _advance(digest: Digest, row: Any) -> None:
         digest.times[row.seq] = row.at_utc
     if isinstance(payload, GatesEvaluated) and not payload.passed:
         digest.failed_gates += [
-            FailedGate(
-                row.seq,
-                row.at_utc,
-                payload.step,
-                payload.attempt,
-                verdict.measure,
-                verdict.value,
-                verdict.minimum,
-                verdict.maximum,
-                verdict.unit,
-            )
+            FailedGate(row.seq, row.at_utc, payload.step, payload.attempt, verdict)
             for verdict in payload.verdicts
             if not verdict.passed
         ]

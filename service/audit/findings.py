@@ -19,6 +19,7 @@ from service.audit.queries import (
     seqs_of_kind,
 )
 from service.core.errors import StoreError
+from service.core.gates import quantity, uncertain
 
 LISTED = 200  # of what is listed whole; the timeline has the rest
 
@@ -183,7 +184,7 @@ class Attempt:
     attempt: int
     seq: int
     at_utc: str
-    measures: Mapping[str, float]
+    measures: Mapping[str, str]  # as people read them, with their bounds where they state any
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +206,8 @@ def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[
     rows = connection.execute(
         text(
             "SELECT e.seq, e.at_utc, i.step, json_extract(e.payload, '$.attempt') AS attempt, "
-            "json_extract(e.payload, '$.measures') AS measures "
+            "json_extract(e.payload, '$.measures') AS measures, "
+            "json_extract(e.payload, '$.uncertainties') AS uncertainties "
             "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
             "WHERE i.run_id = :run AND i.kind = 'step_measured' ORDER BY i.seq DESC LIMIT :limit"
         ),
@@ -213,7 +215,9 @@ def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[
     ).all()
     measured: dict[str, list[Attempt]] = {}
     for row in reversed(rows):
-        measured.setdefault(row.step, []).append(Attempt(row.attempt, row.seq, row.at_utc, _numbers(row.measures)))
+        measured.setdefault(row.step, []).append(
+            Attempt(row.attempt, row.seq, row.at_utc, _numbers(row.measures, row.uncertainties))
+        )
     if digest.state is None:
         return []
     reasons: dict[str, list[tuple[int, str]]] = {}
@@ -227,8 +231,13 @@ def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[
     ]
 
 
-def _numbers(content: str | None) -> Mapping[str, float]:
-    return json.loads(content or "{}")
+def _numbers(measures: str | None, uncertainties: str | None) -> Mapping[str, str]:
+    known: Mapping[str, Mapping[str, float]] = json.loads(uncertainties or "{}")
+    values: Mapping[str, float] = json.loads(measures or "{}")
+    return {
+        name: uncertain(value, known[name]["lower"], known[name]["upper"]) if name in known else quantity(value)
+        for name, value in values.items()
+    }
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from service.audit.computed import Progress
-from service.audit.digest import Digest
+from service.audit.digest import Digest, FailedGate
 from service.audit.queries import RunBasics
 from service.audit.verifying import Verification
-from service.core.gates import limits
+from service.core.gates import describe_judged
 from service.core.run_state import DeviationKind
 
 # Group on the page → its name, and the kinds of deviations in it.
@@ -21,6 +21,7 @@ GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
     "overridden": ("Gates overridden", frozenset({"gate_overridden"})),
     "refused": ("Refused actions", frozenset({"refused"})),
     "failed_gates": ("Failed gates", frozenset()),
+    "undecided_gates": ("Gates not decided", frozenset()),
     "automatic": ("Automatic confirmations", frozenset({"automatic"})),
 }
 _NAMES: Mapping[str, str] = {
@@ -34,6 +35,7 @@ _NAMES: Mapping[str, str] = {
     "refused": "Refused",
     "automatic": "Automatic (note)",
     "failed_gate": "Gate failed",
+    "undecided_gate": "Gate not decided",
 }
 
 
@@ -67,25 +69,24 @@ def findings(digest: Digest, group: str = "") -> list[Finding]:
         for d in digest.deviations
         if (d.kind in kinds if kinds is not None else not d.is_note)
     ]
-    if kinds is None or group == "failed_gates":
+    if kinds is None or group in _GATE_GROUPS.values():
         found += [
-            Finding(
-                gate.seq,
-                gate.at_utc,
-                "failed_gate",
-                gate.step,
-                "",
-                f"{gate.measure} {_value(gate.value, gate.unit)}, allowed {limits(gate.minimum, gate.maximum)}"
-                f"{' ' + gate.unit if gate.unit else ''} (attempt {gate.attempt})",
-            )
-            for gate in digest.failed_gates
+            _of_gate(gate) for gate in digest.failed_gates if kinds is None or _GATE_GROUPS[_gate_kind(gate)] == group
         ]
         found.sort(key=lambda finding: (finding.kind != "gate_accepted", finding.seq))
     return found
 
 
-def _value(value: float | None, unit: str) -> str:
-    return "was not measured" if value is None else f"{value:.4g} {unit}".rstrip()
+_GATE_GROUPS = {"failed_gate": "failed_gates", "undecided_gate": "undecided_gates"}
+
+
+def _gate_kind(gate: FailedGate) -> str:
+    return "undecided_gate" if gate.verdict.undecided else "failed_gate"
+
+
+def _of_gate(gate: FailedGate) -> Finding:
+    text = f"{describe_judged(gate.verdict)} (attempt {gate.attempt})"
+    return Finding(gate.seq, gate.at_utc, _gate_kind(gate), gate.step, "", text)
 
 
 def counts(digest: Digest) -> dict[str, int]:
@@ -94,7 +95,8 @@ def counts(digest: Digest) -> dict[str, int]:
     for deviation in digest.deviations:
         by_kind[deviation.kind] = by_kind.get(deviation.kind, 0) + 1
     found = {group: sum(by_kind.get(kind, 0) for kind in kinds) for group, (_, kinds) in GROUPS.items()}
-    return found | {"failed_gates": len(digest.failed_gates)}
+    kinds_of_gates = [_gate_kind(gate) for gate in digest.failed_gates]
+    return found | {group: kinds_of_gates.count(kind) for kind, group in _GATE_GROUPS.items()}
 
 
 # --- the list of runs -------------------------------------------------------------------------------------------

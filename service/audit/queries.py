@@ -345,10 +345,15 @@ def headline(payload: Mapping[str, Any]) -> str:
     """One line on an event: what tells most comes first, without names of fields where the value speaks."""
     told = [str(payload[name]) for name in _TELLING if isinstance(payload.get(name), str) and payload[name]]
     if "passed" in payload:
-        told.append("passed" if payload["passed"] else "not passed")
+        told.append("passed" if payload["passed"] else _not_passed(payload.get("verdicts")))
     told = [text if len(text) <= 80 else text[:79] + "…" for text in told]
     rest = {name: value for name, value in payload.items() if name not in ("step", "attempt")}
     return " · ".join(told) or summary(rest)
+
+
+def _not_passed(verdicts: Any) -> str:
+    short = [v for v in verdicts or () if isinstance(v, Mapping) and not v.get("passed")]
+    return "not decided" if short and all(v.get("undecided") for v in short) else "not passed"
 
 
 def computed_sha256(run_id: str, row: EventRow) -> str:

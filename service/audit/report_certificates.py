@@ -133,11 +133,12 @@ def _validity(run: RecordedRun, step_id: str) -> Iterator[Block]:
     )
     rows: list[tuple[Cell | str, ...]] = []
     for step in run.protocol.steps:
-        verdicts = run.state.steps[step.id].verdicts
+        state = run.state.steps[step.id]
+        accepted = state.accepted is not None
         mine = step.id == step_id
-        for verdict in verdicts:
+        for verdict in state.verdicts:
             if mine or verdict.measure in _INVARIANTS:
-                rows.append((step.title, *measured(verdict), limit(verdict), judged(verdict)))
+                rows.append((step.title, *measured(verdict), limit(verdict), judged(verdict, accepted=accepted)))
     columns = (
         Column("step", 2.4),
         Column("watched", 2.0),

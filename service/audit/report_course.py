@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from service.audit.recorded import RecordedRun
 from service.audit.report_blocks import Block, Cell, Column, Paragraph, Section, Table
 from service.audit.report_words import clock, duration, judged, limit, measured, utc, words
-from service.core.gates import describe
+from service.core.gates import BOUNDS_HOLD, describe_judged
 from service.core.model import (
     DeviceTrouble,
     GatesEvaluated,
@@ -58,8 +58,11 @@ def deviations(run: RecordedRun) -> list[Departure]:
 def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
     match payload:
         case GatesEvaluated(passed=False):
-            failed = [describe(verdict) for verdict in payload.verdicts if not verdict.passed]
-            yield "gate failed", payload.step, f"attempt {payload.attempt}: {'; '.join(failed)}"
+            for kind, undecided in (("gate failed", False), ("gate not decided", True)):
+                short = [v for v in payload.verdicts if not v.passed and v.undecided == undecided]
+                if short:
+                    told = "; ".join(describe_judged(verdict) for verdict in short)
+                    yield kind, payload.step, f"attempt {payload.attempt}: {told}"
         case StepFailed():
             yield "step failed", payload.step, f"attempt {payload.attempt}: {payload.message}"
         case ViewpointFailed(skipped=False):
@@ -118,8 +121,11 @@ def steps_section(run: RecordedRun) -> Section:
         state = run.state.steps[step.id]
         heads.add(len(rows))
         rows.append((_state(run, f"{number}. {step.title}", state), "", "", ""))
-        rows += [(*measured(verdict), limit(verdict), judged(verdict)) for verdict in state.verdicts]
-    return Section("Steps and gates", (Table(columns, tuple(rows), frozenset(heads), frozenset(heads)),))
+        accepted = state.accepted is not None
+        rows += [(*measured(v), limit(v), judged(v, accepted=accepted)) for v in state.verdicts]
+    table = Table(columns, tuple(rows), frozenset(heads), frozenset(heads))
+    bounded = any(v.lower is not None for state in run.state.steps.values() for v in state.verdicts)
+    return Section("Steps and gates", (table, *([Paragraph(f"{BOUNDS_HOLD}.")] if bounded else [])))
 
 
 def _state(run: RecordedRun, title: str, state: StepState) -> Cell:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 from service.audit.report_blocks import Cell
-from service.core.gates import bounds, limits
+from service.core.gates import Standing, figure, limits, standing
 from service.core.model import GateVerdict
 
 
@@ -38,8 +38,6 @@ def words(name: str) -> str:
 
 def limit(verdict: GateVerdict) -> str:
     """What a gate allows: ≥ 0.2 and ≤ 1."""
-    if verdict.minimum is not None and verdict.minimum == verdict.maximum:
-        return f"= {verdict.minimum:g}"
     return limits(verdict.minimum, verdict.maximum)
 
 
@@ -49,17 +47,20 @@ def measured(verdict: GateVerdict) -> tuple[str, str]:
     for ending, unit in (("_mm", "mm"), ("_px", "px"), ("_deg", "°"), ("_min", "min")):
         if verdict.unit == unit:
             name = name.removesuffix(ending)
-    value = (
-        "not measured" if verdict.value is None else f"{verdict.value:.4g} {verdict.unit}".strip() + bounds(verdict)
-    )
-    return words(name), value
+    return words(name), figure(verdict)
 
 
-def judged(verdict: GateVerdict) -> Cell:
-    """A word, a sign and a colour."""
-    if verdict.undecided:
-        return Cell("? undecided", "attention")
-    return Cell("✓ passed", "ok") if verdict.passed else Cell("✗ failed", "stop")
+_JUDGED: dict[Standing, Cell] = {
+    "within": Cell("✓ passed", "ok"),
+    "not_decided": Cell("? not decided", "attention"),
+    "accepted": Cell("! accepted", "attention"),
+    "outside": Cell("✗ failed", "stop"),
+}
+
+
+def judged(verdict: GateVerdict, *, accepted: bool = False) -> Cell:
+    """A word, a sign and a colour. `accepted`: a person let the step pass with its figures as they are."""
+    return _JUDGED[standing(verdict, accepted=accepted)]
 
 
 def mm(value: float | None, digits: int = 3) -> str:

@@ -35,9 +35,10 @@ from service.cli.waiting import wait_for_results
 from service.core.actions import VERBS, record_to_sign, refuse
 from service.core.errors import ConfigurationError
 from service.core.fold import fold
-from service.core.model import ActionRefused, OperatorAction
+from service.core.gates import Standing, describe, standing
+from service.core.model import ActionRefused, GateVerdict, OperatorAction
 from service.core.protocol import Protocol, load_protocol
-from service.core.run_state import RunState
+from service.core.run_state import RunState, StepState
 from service.core.ways_on import takes_words, ways_on
 from service.evidence import RunLog, results_to_come
 from service.monitor.reporter import OpenDevices, Reporter
@@ -196,9 +197,9 @@ def status_command(
         table.add_column(heading)
     for step in protocol.steps:
         now = state.steps[step.id]
-        gates = ", ".join(f"{v.measure} {'ok' if v.passed else 'FAILED'}" for v in now.verdicts)
+        gates = "\n".join(f"{describe(v)}: {_STANDINGS[_standing(v, now)]}" for v in now.verdicts)
         phase = "skipped" if now.skipped else now.phase.replace("_", " ")
-        table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), gates)
+        table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), escape(gates))
     console.print(table)
     live = [job for job in state.step.jobs.values() if job.kind == "live_view" and job.status != "enqueued"]
     for job in live[-3:]:
@@ -211,6 +212,18 @@ def status_command(
     for deviation in state.deviations:
         if not deviation.is_note:
             console.print(f"deviation: {escape(deviation.text)}")
+
+
+_STANDINGS: dict[Standing, str] = {
+    "within": "ok",
+    "not_decided": "NOT DECIDED",
+    "accepted": "ACCEPTED",
+    "outside": "FAILED",
+}
+
+
+def _standing(verdict: GateVerdict, step: StepState) -> Standing:
+    return standing(verdict, accepted=step.accepted is not None)
 
 
 def status_record(run_id: str, state: RunState) -> dict[str, Any]:
@@ -226,6 +239,7 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
                 "attempt": s.attempt,
                 "captured": sorted(s.captured),
                 "measures": dict(s.measures),
+                "gates": [v.model_dump() | {"standing": _standing(v, s), "text": describe(v)} for v in s.verdicts],
                 "live": [
                     {"viewpoint": job.result["viewpoint"], **job.measures}
                     for job in s.jobs.values()

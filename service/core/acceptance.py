@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from service.core.errors import IllegalTransitionError
-from service.core.gates import describe
+from service.core.gates import describe_judged
 from service.core.model import GateVerdict, OperatorAction
 from service.core.protocol import AcceptedBy, Protocol
 from service.core.run_state import Accepted, RunState, StepState
@@ -88,6 +88,6 @@ def acceptor_refusal(
 
 def describe_accepted(accepted: Accepted) -> str:
     """`coverage 0.896, allowed ≥ 0.9; accepted by Emmy (supervisor): the corners are not used`: for every reader."""
-    figures = "; ".join(describe(verdict) for verdict in accepted.verdicts)
+    figures = "; ".join(describe_judged(verdict) for verdict in accepted.verdicts)
     how = ", by claim" if accepted.identified == "claimed" else ""
     return f"{figures}; accepted by {accepted.by} ({accepted.role}{how}): {accepted.reason}"

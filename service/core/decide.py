@@ -17,7 +17,7 @@ from service.core.actions import (
 )
 from service.core.errors import IntegrityError
 from service.core.fold import advance, fold, initial_state
-from service.core.gates import describe, evaluate_gates
+from service.core.gates import describe, describe_judged, evaluate_gates
 from service.core.model import OperatorVerb, Uncertainty
 from service.core.protocol import Protocol
 from service.core.run_state import Deviation, JobState, Note, RunState, StepState, Superseded
@@ -175,8 +175,9 @@ def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
     if now.retry_granted:
         return Retry(now.step, now.attempt + 1, "the operator asked for it", 0.0)
     if now.failure is None:
-        failed = "; ".join(describe(verdict) for verdict in now.verdicts if not verdict.passed)
         outside = any(not verdict.passed and not verdict.undecided for verdict in now.verdicts)
+        say = describe_judged if outside else describe  # all of them are said to be undecided then
+        failed = "; ".join(say(verdict) for verdict in now.verdicts if not verdict.passed)
         found = "Outside its limits" if outside else "Not decided yet"
         # What the step itself suggests, if it knows a way: further viewpoints that would bring the numbers within.
         advice = str(now.mend.get("advice", ""))

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
+from typing import Literal
 
 from service.core.model import GatesEvaluated, GateVerdict, Uncertainty
 from service.core.protocol import Gate, Step
+
+BOUNDS_HOLD = (
+    "Two numbers behind a value are the bounds that its own uncertainty leaves, each held with 99 %. It is within "
+    "its limits when both bounds are, outside when all between them is, and not decided otherwise"
+)
+_LARGEST_WHOLE = 1e7
 
 
 def evaluate_gates(
@@ -56,36 +63,60 @@ def _verdict(gate: Gate, value: float | None, known: Uncertainty | None) -> Gate
     )
 
 
+Standing = Literal["within", "not_decided", "accepted", "outside"]
+
+
+def standing(verdict: GateVerdict, *, accepted: bool = False) -> Standing:
+    """How a gate came out, for every reader. `accepted`: a person let the step pass with its figures as they are."""
+    if verdict.passed:
+        return "within"
+    if accepted:
+        return "accepted"
+    return "not_decided" if verdict.undecided else "outside"
+
+
 def describe(verdict: GateVerdict) -> str:
-    """`rms 0.71 px, allowed ≤ 0.5`: one line for an operator."""
-    value = "was not measured" if verdict.value is None else figure(verdict)
-    return f"{verdict.measure} {value}, allowed {limits(verdict.minimum, verdict.maximum)}"
+    """`rms 0.71 px, allowed ≤ 0.5`: a figure against its limit, in one line."""
+    text = (
+        f"{verdict.measure} {figure(verdict)}" if verdict.value is not None else f"{verdict.measure} was not measured"
+    )
+    return f"{text}, allowed {limits(verdict.minimum, verdict.maximum)}"
+
+
+def describe_judged(verdict: GateVerdict) -> str:
+    """The same of a gate that did not pass, where the line stands alone: it says so of a gate that is not decided."""
+    return describe(verdict) + (": not decided" if verdict.undecided else "")
 
 
 def figure(verdict: GateVerdict) -> str:
-    """`0.71 px`, or `0.52 mm, 0.41 to 0.63` of a value that states its uncertainty; empty where there is none."""
-    if verdict.value is None:
-        return ""
-    within = bounds(verdict)
-    text = f"{verdict.value:.{_places(verdict)}f}" if within else f"{verdict.value:.4g}"
-    return f"{text} {verdict.unit}".rstrip() + within
+    """`0.71 px`, or `0.52 mm, 0.41 to 0.63` of a value that states its uncertainty (see BOUNDS_HOLD)."""
+    if verdict.value is None or verdict.lower is None or verdict.upper is None:
+        return quantity(verdict.value, verdict.unit)
+    return uncertain(verdict.value, verdict.lower, verdict.upper, verdict.unit)
 
 
-def bounds(verdict: GateVerdict) -> str:
-    """`, 0.41 to 0.63` after a value that states its uncertainty, with as many places as tell the bounds apart."""
-    if verdict.lower is None or verdict.upper is None:
-        return ""
-    places = _places(verdict)
-    return f", {verdict.lower:.{places}f} to {verdict.upper:.{places}f}"
+def uncertain(value: float, lower: float, upper: float, unit: str = "") -> str:
+    """The same of any number with its bounds, with as many places as tell the bounds apart."""
+    places = _places(upper - lower)
+    return f"{value:.{places}f} {unit}".rstrip() + f", {lower:.{places}f} to {upper:.{places}f}"
 
 
-def _places(verdict: GateVerdict) -> int:
-    apart = 0.0 if verdict.lower is None or verdict.upper is None else verdict.upper - verdict.lower
+def quantity(value: float | None, unit: str = "") -> str:
+    """A number without bounds as people read it, with its unit: `8 images`, `0.7131 px`, `not measured`."""
+    if value is None:
+        return "not measured"
+    text = f"{value:.0f}" if value == int(value) and abs(value) < _LARGEST_WHOLE else f"{value:.4g}"
+    return f"{text} {unit}".rstrip()
+
+
+def _places(apart: float) -> int:
     return 2 if apart <= 0 else min(max(1 - math.floor(math.log10(apart)), 0), 4)
 
 
 def limits(minimum: float | None, maximum: float | None) -> str:
-    """`≥ 0.2 and ≤ 1`."""
+    """`≥ 0.2 and ≤ 1`, or `= 0`."""
+    if minimum is not None and minimum == maximum:
+        return f"= {minimum:g}"
     low = "" if minimum is None else f"≥ {minimum:g}"
     high = "" if maximum is None else f"≤ {maximum:g}"
     return " and ".join(limit for limit in (low, high) if limit)

@@ -13,6 +13,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.poses.pose_files import write_camera_json, write_poses_csv, write_transforms_json
 from service.core.dependence import accepted_gates
 from service.core.errors import DataError
+from service.core.gates import BOUNDS_HOLD, describe, standing
 from service.core.geometry import Transform
 from service.core.imported import imported_sentence
 from service.dataset.summary import RunSummary
@@ -66,6 +67,8 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
         "poses": "poses.csv is T_scan_camera: x right, y down, z forward; transforms.json has OpenGL axes",
         "pose_source": best,
         "evaluation": list(summary.table()),
+        "gates": _gates(summary),
+        "gates_explained": BOUNDS_HOLD,
         "accepted_gates": [gate.text for gate in accepted_gates(summary.protocol, summary.state)],
         "arrived_later_and_better": None if later is None else later["poses"],
         "deviations": [d.text for d in summary.state.deviations if not d.is_note],
@@ -73,6 +76,19 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
         "image_sha256": sources,
     }
     (folder / "dataset.json").write_text(json.dumps(description, indent=1), encoding="utf-8")
+
+
+def _gates(summary: RunSummary) -> dict[str, list[str]]:
+    """Every gate of every step that was judged, in words, with how it came out."""
+    steps = {step.id: summary.state.steps[step.id] for step in summary.protocol.steps}
+    return {
+        name: [
+            f"{describe(v)}: {standing(v, accepted=state.accepted is not None).replace('_', ' ')}"
+            for v in state.verdicts
+        ]
+        for name, state in steps.items()
+        if state.verdicts
+    }
 
 
 def _origin(summary: RunSummary) -> str:

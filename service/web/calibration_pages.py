@@ -9,6 +9,7 @@ from fastapi.responses import HTMLResponse, Response
 
 from service.core.dependence import AcceptedGate, depends_on
 from service.core.errors import IllegalTransitionError
+from service.core.gates import figure
 from service.core.model import ViewpointCaptured
 from service.evidence import RunLog
 from service.web.calibration_view import (
@@ -22,13 +23,13 @@ from service.web.calibration_view import (
 )
 from service.web.pages import render
 from service.web.run_frame import run_frame
-from service.web.run_words import limit, measure_name, number
+from service.web.run_words import gate_word, limit, measure_name
 from service.web.security import requires
 from service.web.site import Here, Site
 
 router = APIRouter(tags=["calibration"])
 
-_WORDS: dict[str, Any] = {"measure_name": measure_name, "number": number, "limit": limit}
+_WORDS: dict[str, Any] = {"measure_name": measure_name, "figure": figure, "limit": limit, "gate_word": gate_word}
 RunId = Annotated[str, Path(max_length=64)]
 
 

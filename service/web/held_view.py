@@ -9,11 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from service.core.gates import quantity
 from service.core.model import ViewHeld
 from service.core.protocol import Protocol, Step
 from service.core.run_state import JobState
 from service.evidence import RunLog
-from service.web.run_words import limit, measure_name, number
+from service.web.run_words import limit, measure_name
 from service.web.viewpoints import captures_of
 
 SIZE = 480.0  # of the drawing, which is square
@@ -172,5 +173,7 @@ def _figures(step: Step, measures: Mapping[str, float]) -> tuple[tuple[str, str,
         met = None
         if value is not None:
             met = (gate.min is None or value >= gate.min) and (gate.max is None or value <= gate.max)
-        out.append((measure_name(gate.measure), number(value, gate.unit), limit(gate.min, gate.max, gate.unit), met))
+        out.append(
+            (measure_name(gate.measure), quantity(value, gate.unit), limit(gate.min, gate.max, gate.unit), met)
+        )
     return tuple(out)

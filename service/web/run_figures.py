@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
 
-from service.core.gates import bounds
+from service.core.gates import figure
 from service.core.model import Event, GateVerdict, SessionStarted, View
 from service.core.protocol import Gate, Protocol, Step
 from service.core.run_state import RunState, StepState
 from service.monitor.snapshot import Snapshot
-from service.web.run_words import limit, measure_name, number, planned_views
+from service.web.run_words import gate_word, limit, measure_name, planned_views
 
 _GIB = 2.0**30
 _BAR_LIMIT = 75.0  # where along a bar its limit stands, in %
@@ -26,7 +26,7 @@ class GateLine:
     value: str
     limit: str
     why: str
-    status: str  # Within, Outside, Accepted, Not yet, Not judged
+    status: str  # Within, Outside, Not decided, Accepted, Not yet, Not judged
     tone: str
     percent: float | None  # length of its bar; None where a bar would say nothing
     limit_percent: float
@@ -74,13 +74,8 @@ def _gate_line(gate: Gate, verdict: GateVerdict | None, skipped: frozenset[str],
     bound = gate.max if gate.max is not None else gate.min
     if verdict.value is not None and bound is not None and bound > 0 and verdict.value >= 0:
         percent = min(100.0, _BAR_LIMIT * verdict.value / bound)
-    status, tone = (
-        ("Within", "ok") if verdict.passed else ("Accepted", "attention") if accepted else ("Outside", "stop")
-    )
-    if verdict.undecided and not accepted:
-        status, tone = "Not decided", "attention"
-    value = number(verdict.value, gate.unit) + bounds(verdict)
-    return GateLine(name, value, limits, gate.why, status, tone, percent, _BAR_LIMIT)
+    status, tone = gate_word(verdict, accepted=accepted)
+    return GateLine(name, figure(verdict), limits, gate.why, status, tone, percent, _BAR_LIMIT)
 
 
 def capture_progress(protocol: Protocol, state: RunState, events: Sequence[Event]) -> Progress:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.core.gates import bounds
+from service.core.gates import Standing, figure, standing
 from service.core.model import GateVerdict
 from service.core.protocol import Protocol, Step
 from service.core.run_state import RunState, StepState
@@ -51,14 +51,6 @@ def measure_name(measure: str) -> str:
         parts.pop()
     words = " ".join(_ACRONYMS.get(part, part) for part in parts)
     return words[:1].upper() + words[1:]
-
-
-def number(value: float | None, unit: str = "") -> str:
-    """A number as people read it, with its unit."""
-    if value is None:
-        return "not measured"
-    text = f"{value:.0f}" if value == int(value) and abs(value) < 1e7 else f"{value:.3g}"
-    return f"{text} {unit}".rstrip()
 
 
 def limit(minimum: float | None, maximum: float | None, unit: str = "") -> str:
@@ -123,11 +115,23 @@ def irreversible_warning(protocol: Protocol, step: Step) -> str:
 
 
 def figure_line(verdict: GateVerdict) -> str:
-    """One figure of what is signed."""
-    return (
-        f"{measure_name(verdict.measure)} {number(verdict.value, verdict.unit)}{bounds(verdict)} "
-        f"({limit(verdict.minimum, verdict.maximum, verdict.unit)})"
-    )
+    """One figure of what is signed or did not pass."""
+    allowed = limit(verdict.minimum, verdict.maximum, verdict.unit)
+    undecided = "; not decided" if verdict.undecided else ""
+    return f"{measure_name(verdict.measure)} {figure(verdict)} ({allowed}{undecided})"
+
+
+_STANDINGS: dict[Standing, tuple[str, str]] = {
+    "within": ("Within", "ok"),
+    "not_decided": ("Not decided", "attention"),
+    "accepted": ("Accepted", "attention"),
+    "outside": ("Outside", "stop"),
+}
+
+
+def gate_word(verdict: GateVerdict, *, accepted: bool = False) -> tuple[str, str]:
+    """How a gate came out: word and tone. `accepted`: a person let the step pass with its figures as they are."""
+    return _STANDINGS[standing(verdict, accepted=accepted)]
 
 
 def phase_words(state: RunState, step: StepState) -> tuple[str, str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -17,7 +18,15 @@ from service.compute.calibration.intrinsics_record import intrinsics_record
 from service.compute.calibration.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.calibration.validation import calibration_warnings, cross_validate
 from service.core.gates import evaluate_gates
-from service.core.model import ArtefactRef, DeviceOpened, StepMeasured, StepPassed, StepStarted, ViewpointCaptured
+from service.core.model import (
+    ArtefactRef,
+    DeviceOpened,
+    StepMeasured,
+    StepPassed,
+    StepStarted,
+    Uncertainty,
+    ViewpointCaptured,
+)
 from service.core.protocol import parse_protocol
 from service.rig import load_rig
 from service.runs import start_run
@@ -70,8 +79,8 @@ VIEWS = 10
 _NAMES = [f"b{i:03d}" for i in range(VIEWS)]
 
 
-def begin_calibrated_run(site: WebSite) -> str:
-    """Calibrated, and the step after it under way with no image yet; the run's name."""
+def begin_calibrated_run(site: WebSite, known: Mapping[str, Uncertainty] | None = None) -> str:
+    """Calibrated, and the step after it under way with no image yet; the run's name. `known`: of its measures."""
     rig = site.folder / "small.yaml"
     rig.write_text(RIG)
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="calibrated.yaml")
@@ -84,9 +93,16 @@ def begin_calibrated_run(site: WebSite) -> str:
     for i, name in enumerate(_NAMES):
         capture(site, run_id, "calibration", name, session.T_base_flange[i].tolist(), kind="board_image", shade=i)
     ref = _put(site, json.dumps(result).encode(), "calibration", "application/json", "calibration.json")
-    measured = StepMeasured(step="calibration", attempt=1, measures=measures, artefacts=(ref,), result=result)
+    measured = StepMeasured(
+        step="calibration",
+        attempt=1,
+        measures=measures,
+        artefacts=(ref,),
+        result=result,
+        uncertainties=dict(known or {}),
+    )
     store.record(run_id, [measured], actor="runner", artefacts=[NewArtefact(ref, "worker", "calibration", 1)])
-    gates = evaluate_gates(loaded.protocol.step("calibration"), 1, measures)
+    gates = evaluate_gates(loaded.protocol.step("calibration"), 1, measures, (), known)
     store.record(run_id, [gates, StepPassed(step="calibration", attempt=1)], actor="runner")
     store.record(run_id, [StepStarted(step="capture", attempt=1)], actor="runner")
     return run_id

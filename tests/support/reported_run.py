@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from service.core.model import (
     StepMeasured,
     StepPassed,
     StepStarted,
+    Uncertainty,
     ViewpointCaptured,
     ViewpointFailed,
 )
@@ -65,6 +67,7 @@ steps:
 """
 
 
+_ERROR = "best_mean_radial_error_mm"
 T_SCAN_CAMERA = [[0.0, -1.0, 0.0, 0.25], [1.0, 0.0, 0.0, -0.125], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]]
 REGISTRATION = """\
   - id: scan
@@ -90,8 +93,12 @@ def record_reported_run(
     registered: bool = False,
     acceptable: bool = False,
     accepted_by: str = "",
+    error_bounds_mm: tuple[float, float] | None = None,
 ) -> str:
-    """The run in folder/data; its name. `acceptable`: a figure outside its limit may be; `accepted_by`: and is."""
+    """The run in folder/data; its name. `acceptable`: a figure outside its limit may be; `accepted_by`: and is.
+
+    `error_bounds_mm`: the evaluation's error states its uncertainty, and so does the calibration's.
+    """
     text = PROTOCOL.replace("steps:", f"release: {release}\nsteps:", 1)
     if registered:
         text = text.replace("  - id: evaluation\n", REGISTRATION)
@@ -107,7 +114,8 @@ def record_reported_run(
         data = json.dumps(calibration()).encode()
         ref = run.put(data, "calibration", "application/json", "calibration.json")
         run.add(StepStarted(step="calibration", attempt=1))
-        run.measure("calibration", 1, {"rms_px": 0.03}, calibration(), (ref,))
+        known = {} if error_bounds_mm is None else {"rms_px": Uncertainty(sigma=0.003, lower=0.023, upper=0.037)}
+        run.measure("calibration", 1, {"rms_px": 0.03}, calibration(), (ref,), known)
         run.add(StepPassed(step="calibration", attempt=1), StepStarted(step="capture", attempt=1))
         run.capture(1, "v001")
         run.add(DeviceTrouble(device="camera", error="TransportError", message="the camera does not answer"))
@@ -135,10 +143,15 @@ def record_reported_run(
         if registered:
             run.register()
         run.add(StepStarted(step="evaluation", attempt=1))
-        judged = run.measure("evaluation", 1, {"best_mean_radial_error_mm": error_mm}, evaluation(error_mm))
+        known = {}
+        if error_bounds_mm is not None:
+            lower, upper = error_bounds_mm
+            known = {_ERROR: Uncertainty(sigma=(upper - lower) / 4.65, lower=lower, upper=upper)}
+        judged = run.measure("evaluation", 1, {_ERROR: error_mm}, evaluation(error_mm), known=known)
+        undecided = bool(known) and known[_ERROR].upper > 0.35
         if accepted_by:
             run.accept("evaluation", judged, accepted_by)
-        elif error_mm > 0.35:  # the gate has failed: nobody can sign, and the run waits
+        elif error_mm > 0.35 or undecided:  # the gate has failed: nobody can sign, and the run waits
             return run_id
         run.act("sign", step="evaluation", meaning="reviewed and accepted", signed_sha256=judged)
         run.add(StepPassed(step="evaluation", attempt=1), RunCompleted(deviations=3))
@@ -217,12 +230,20 @@ class _Writer:
         measures: dict[str, float],
         result: dict[str, Any],
         artefacts: tuple[ArtefactRef, ...] = (),
+        known: Mapping[str, Uncertainty] | None = None,
     ) -> str:
         """StepMeasured and its gates; the hash of the latter."""
-        measured = StepMeasured(step=step, attempt=attempt, measures=measures, artefacts=artefacts, result=result)
+        measured = StepMeasured(
+            step=step,
+            attempt=attempt,
+            measures=measures,
+            artefacts=artefacts,
+            result=result,
+            uncertainties=dict(known or {}),
+        )
         rows = tuple(NewArtefact(ref, "worker", step, attempt) for ref in artefacts)
         self.add(measured, artefacts=rows)
-        return self.add(evaluate_gates(self._protocol.step(step), attempt, measures))
+        return self.add(evaluate_gates(self._protocol.step(step), attempt, measures, (), known))
 
 
 def calibration() -> dict[str, Any]:
