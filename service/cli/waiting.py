@@ -11,7 +11,7 @@ from service.evidence import RunLog, results_to_come
 from service.steps.time_left import duration_words
 from service.store.store import Store
 
-_LOOK_S = 0.5
+_LOOK_S = 2.0  # a look at a whole run costs a sixth of a second, which the results themselves need
 
 
 def wait_for_results(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from service.compute.markers.cones import Cone
+from service.compute.registration.layout import distances
 from service.compute.registration.photo_adjustment import Adjusted, LensPrior, Photograph, adjust
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply, inverse
@@ -21,6 +22,7 @@ _TOLERANCE_M = 0.015  # between two photographs that are read each by itself: de
 _TRIANGLES = 10  # of the leading photograph, the largest ones, with which poses of another one are proposed
 _PROPOSALS = 4000
 _READINGS = 3  # of one photograph, tried in the adjustment of all
+_APART = 1.5  # radii, at least, between two centres: 2 for spheres that touch, less what is uncertain
 _WORST_CHI2 = 20.0  # per degree of freedom: beyond, the photograph shows something else
 
 
@@ -130,9 +132,16 @@ def _joined(
             adjusted = _adjusted(photographs, joined, centres, radius_m, prior)
         except ComputeError:
             continue  # not this reading
+        if _nearest_m(adjusted.centres_m) < _APART * radius_m:
+            continue  # spheres are solid: an outline of a known one was read as one more
         if adjusted.chi2 < (_WORST_CHI2 if best is None else best[1].chi2):
             best = joined, adjusted
     return (group, found) if best is None else best
+
+
+def _nearest_m(centres: Array) -> float:
+    """Between the two nearest of the centres (N, 3)."""
+    return float(distances(centres)[~np.eye(len(centres), dtype=bool)].min())
 
 
 def _reduced(
