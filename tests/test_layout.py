@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from bench.layout_gate import judge
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, cone_of_sphere, fit_cone
@@ -175,6 +176,14 @@ def test_a_photograph_of_something_else_is_left_out() -> None:
     assert found.used == 2
     assert len(found.centres_m) == 13
     assert found.T_photo_first[2] is None
+
+
+def test_an_outline_of_a_known_sphere_is_not_read_as_one_more() -> None:
+    """In this drawn layout one reading of the second photograph put two spheres in one place."""
+    outcome = judge("irregular", 1106)
+    assert outcome.good
+    assert outcome.passed
+    assert outcome.photographs == 2
 
 
 def test_bounds_hold_the_truth_as_often_as_they_say() -> None:

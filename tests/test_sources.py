@@ -176,6 +176,18 @@ def test_a_way_that_failed_is_said_to_have_failed_and_not_tried_again_by_itself(
     assert all("said so" in one.failed for one in left)
 
 
+def test_a_size_that_is_no_reduction_of_the_photographs_is_left_out_and_holds_nothing_up() -> None:
+    effort = "structure_from_motion: {max_image_size: 1600, max_features: 1500, neighbours: 8}"
+    run = _Run(protocol((effort, effort + "\n      reduced: [640x360, 4752x3168]")))
+    run.finish("detect_spheres")
+    found = registration_ways(run.protocol, run.state, run.protocol.step("registration"))
+    assert found is not None
+    assert set(found.failed) == {"colmap_4752x3168"}
+    left = {one.name: one.failed for one in missing_results(run.protocol, run.state, {}, NOW, 2)}
+    assert "1280 × 853" in left["colmap_4752x3168"]
+    assert left["colmap_640x360"] == ""
+
+
 def test_the_time_left_follows_from_what_such_jobs_took() -> None:
     run = _Run(protocol())
     run.finish("detect_spheres")
