@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import cv2
 import numpy as np
 
+from service.compute.poses.colmap_process import ColmapProcess
 from service.compute.poses.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
 from service.compute.poses.front_end import FrontEnd, pairs_of
 from service.compute.poses.sfm_options import SfmOptions
@@ -22,7 +24,7 @@ def features(context: JobContext) -> JobAnswer:
     files = photographs(context, images)
     refs = []
     count = 0
-    with FrontEnd(context.camera(), _options(context), log=context.scratch / "features.log") as front:
+    with _front_end(context) as front:
         for number, (image, file) in enumerate(zip(images, files, strict=True)):
             context.progress("features", number, len(images))
             found = front.extract_features(file)
@@ -36,7 +38,7 @@ def features(context: JobContext) -> JobAnswer:
 def match(context: JobContext) -> JobAnswer:
     """Verified matches of some pairs of images."""
     pairs = [(str(a), str(b)) for a, b in context.arguments["pairs"]]
-    with FrontEnd(context.camera(), _options(context), log=context.scratch / "match.log") as front:
+    with _front_end(context) as front:
         found = front.match_pairs(read_features(context), pairs, context.progress)
     media_type = "application/octet-stream"
     ref = context.keep_bytes(pack_matches(found), kind="sfm_matches", media_type=media_type, name="matches.npz")
@@ -58,6 +60,22 @@ def read_matches(context: JobContext, names: Iterable[str]) -> list[PairMatches]
     found = (m for sha256 in context.arguments["matches"] for m in unpack_matches(context.input(sha256).read_bytes()))
     by_pair = {m.pair: m for m in found}
     return [by_pair[pair] for pair in sorted(wanted & by_pair.keys())]
+
+
+class _Kept(threading.local):
+    """COLMAP's child of each thread that does jobs, by seed: starting one takes as long as an image's features."""
+
+    def __init__(self) -> None:
+        self.children: dict[int, ColmapProcess] = {}
+
+
+_KEPT = _Kept()
+
+
+def _front_end(context: JobContext) -> FrontEnd:
+    options = _options(context)
+    child = _KEPT.children.setdefault(options.seed, ColmapProcess(seed=options.seed))
+    return FrontEnd(context.camera(), options, child=child)
 
 
 def _options(context: JobContext) -> SfmOptions:

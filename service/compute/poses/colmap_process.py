@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import tempfile
 import time
+import weakref
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
@@ -106,6 +107,7 @@ class ColmapProcess:
                 handle, name = tempfile.mkstemp(prefix="orthocapture-colmap-", suffix=".log")
                 os.close(handle)
                 self._log = Path(name)
+                weakref.finalize(self, self._log.unlink, missing_ok=True)  # also where nobody closes it
             context = multiprocessing.get_context("spawn")
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(

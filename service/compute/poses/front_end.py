@@ -38,7 +38,13 @@ class FrontEnd:
     """
 
     def __init__(
-        self, camera: CameraModel, options: SfmOptions | None = None, *, processes: int = 1, log: Path | None = None
+        self,
+        camera: CameraModel,
+        options: SfmOptions | None = None,
+        *,
+        processes: int = 1,
+        log: Path | None = None,
+        child: ColmapProcess | None = None,
     ) -> None:
         """No process is started before there is something to do.
 
@@ -47,15 +53,22 @@ class FrontEnd:
             options: settings.
             processes: children that work side by side, each on one core.
             log: file for COLMAP's output; None: a temporary one. Further processes write beside it.
+            child: works instead of children of its own, and is left alive for whoever comes next.
         """
         self._camera = camera
         self._options = options or SfmOptions()
-        self._children = [
-            ColmapProcess(
-                seed=self._options.seed, log=log if log is None or k == 0 else log.with_suffix(f".{k}{log.suffix}")
-            )
-            for k in range(max(1, processes))
-        ]
+        self._lent = child is not None
+        self._children = (
+            [child]
+            if child is not None
+            else [
+                ColmapProcess(
+                    seed=self._options.seed,
+                    log=log if log is None or k == 0 else log.with_suffix(f".{k}{log.suffix}"),
+                )
+                for k in range(max(1, processes))
+            ]
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -66,8 +79,8 @@ class FrontEnd:
         self.close()
 
     def close(self) -> None:
-        """End the child processes."""
-        for child in self._children:
+        """End the child processes, but for one that was lent."""
+        for child in [] if self._lent else self._children:
             child.close()
 
     def extract_features(self, file: Path) -> ImageFeatures:
