@@ -160,9 +160,9 @@ class _Walk:
         """Why a size cannot be compared with the full one, or nothing: a protocol serves cameras of any size."""
         width, height = _pixels(size)
         camera = CameraModel.from_record(self.outlines.arguments["camera"])
-        if width <= camera.width and height <= camera.height:
+        if width < camera.width and height < camera.height:  # else at least one side is cut only, at the full scale
             return ""
-        return f"the photographs have {camera.width} × {camera.height} px, not more than {width} × {height}"
+        return f"{width} × {height} is no reduction of photographs of {camera.width} × {camera.height} px"
 
     def _registered(self, source: str, size: str) -> JobState | None:
         search = self._arguments(size)
