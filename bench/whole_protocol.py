@@ -53,8 +53,9 @@ def main(words: Sequence[str] | None = None) -> int:
             load = round(os.getloadavg()[0], 1)
             print(f"scene {scene} …", file=sys.stderr, flush=True)
             answer = whole_run(
-                protocol, scene, folder, rig, speed_up=options.speed_up, timeout_s=options.timeout_h * 3600
-            )
+                protocol, scene, folder, rig, speed_up=options.speed_up, timeout_s=options.timeout_h * 3600,
+                replayed=len(found) < options.replayed,
+            )  # fmt: skip
         found.append({**answer, "load_before": load})
         # Written after each scene: a bench that is interrupted has not measured for nothing.
         record = {**about, "scenes": found}
@@ -76,6 +77,7 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--protocol", type=Path, default=PROTOCOL, help="another protocol than the paper's")
     parser.add_argument("--one-of", type=int, default=1, metavar="N", help="take one view of N (1)")
     parser.add_argument("--timeout-h", type=float, default=3.0, help="of each command (3)")
+    parser.add_argument("--replayed", type=int, default=1, metavar="N", help="the first N scenes (1)")
     parser.add_argument("--name", default="whole_protocol", help="of the two files of results")
     parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat(), help="today")
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the two files (bench/results)")
