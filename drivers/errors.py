@@ -29,6 +29,10 @@ class DeviceRefusedError(DeviceError):
     """The device understood and said no (setting not available, out of range, wrong mode)."""
 
 
+class ReleasedElsewhereError(DeviceRefusedError):
+    """The software cannot release this camera: a person does, and its photographs come as files."""
+
+
 class DeviceFaultError(DeviceError):
     """The device answers but is not fit for use (unsupported firmware, inconsistent read-back)."""
 

@@ -223,6 +223,7 @@ class CapturedImage:
     lens_serial: str = ""
     body_serial: str = ""
     focus_distance_m: float = 0.0
+    found_at: str = ""  # path of the file that it came as; "" where it came from the camera itself
 
     @property
     def jpeg(self) -> CapturedFile:
@@ -234,7 +235,10 @@ class Camera(Device, Protocol):
     """A stills camera under remote control."""
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Set one by one, wait, read back; DeviceRefusedError when the read-back differs."""
+        """Set one by one, wait, read back; DeviceRefusedError when the read-back differs.
+
+        Without a cable it only takes note of what a person has to dial.
+        """
         ...
 
     def settings(self) -> CameraSettings:
@@ -242,14 +246,18 @@ class Camera(Device, Protocol):
         ...
 
     def capture(self, folder: Path) -> CapturedImage:
-        """Take one exposure and download its undecoded files into `folder`; StaleImageError if not new."""
+        """Take one exposure and download its undecoded files into `folder`; StaleImageError if not new.
+
+        Raises ReleasedElsewhereError where the camera's own button is the only one.
+        """
         ...
 
-    def released_images(self, folder: Path, timeout_s: float) -> tuple[CapturedImage, ...]:
+    def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
         """Images that the camera's own button has released, oldest first, downloaded into `folder`.
 
         Waits up to `timeout_s` for the first one; empty when the button was not pressed. The trigger's time is that
-        of the camera's announcement.
+        of the camera's announcement, or of the file's arrival. Where images are found as files, those taken earlier
+        than `since_utc_s` (seconds since 1970) are left alone; what a camera announces is new in any case.
         """
         ...
 

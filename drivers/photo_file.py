@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,19 @@ def _taken(exif: Any) -> str:
     if not moment:
         return ""
     return moment + (f".{subseconds}" if subseconds else "") + _text(exif, "offset")
+
+
+def taken_utc_s(taken: str) -> float | None:
+    """Seconds since 1970 of a time as EXIF writes it (ExifRecord.taken); None where it is none.
+
+    Without an offset from UTC it counts as this computer's local time, by which people set their cameras.
+    """
+    for form in ("%Y:%m:%d %H:%M:%S.%f%z", "%Y:%m:%d %H:%M:%S%z", "%Y:%m:%d %H:%M:%S.%f", "%Y:%m:%d %H:%M:%S"):
+        try:
+            return datetime.strptime(taken, form).astimezone().timestamp()
+        except ValueError:
+            continue
+    return None
 
 
 def check_jpeg_complete(path: Path) -> None:

@@ -85,7 +85,7 @@ def list_photographs(folder: Path) -> Photographs:
             raws.append(path)
         else:
             left_out.append(LeftOut(path, "no photograph: only JPEG files, with raw files beside them, are read"))
-    of_jpeg, alone = _paired(jpegs, raws)
+    of_jpeg, alone = paired(jpegs, raws)
     left_out += [LeftOut(path, "a raw file without the JPEG of the same name; develop it first") for path in alone]
     photographs: list[Photograph] = []
     damaged: list[LeftOut] = []
@@ -167,12 +167,15 @@ def of_size(photographs: Sequence[Photograph], size: tuple[int, int]) -> tuple[l
     return kept, left_out
 
 
-def _paired(jpegs: Sequence[Path], raws: Sequence[Path]) -> tuple[dict[Path, list[Path]], list[Path]]:
+def paired(jpegs: Sequence[Path], raws: Sequence[Path]) -> tuple[dict[Path, list[Path]], list[Path]]:
     """The raw files of each JPEG, and those that belong to none."""
+    by_stem: dict[str, list[Path]] = {}
+    for jpeg in jpegs:
+        by_stem.setdefault(jpeg.stem.lower(), []).append(jpeg)
     of_jpeg: dict[Path, list[Path]] = {}
     alone: list[Path] = []
     for raw in raws:
-        named = [jpeg for jpeg in jpegs if jpeg.stem.lower() == raw.stem.lower()]
+        named = by_stem.get(raw.stem.lower(), [])
         beside = [jpeg for jpeg in named if jpeg.parent == raw.parent]
         chosen = beside or (named if len(named) == 1 else [])
         if chosen:

@@ -195,7 +195,7 @@ class GphotoCamera:
         added = self._collect(2 if quality == "RAW+JPEG" else 1, trigger_s)
         return self._image(added, folder, trigger_s, quality, focus)
 
-    def released_images(self, folder: Path, timeout_s: float) -> tuple[CapturedImage, ...]:
+    def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
         """See drivers.interfaces.Camera. Files come as events; RAW and JPEG of one exposure together."""
         deadline_s = time.monotonic() + timeout_s
         images: list[CapturedImage] = []

@@ -1,0 +1,326 @@
+"""A camera without a cable: its photographs come as files into a folder, from a card or sent by the camera."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from pydantic import Field
+
+from drivers.errors import (
+    DeviceRefusedError,
+    DeviceUnavailableError,
+    ReleasedElsewhereError,
+    StaleImageError,
+    UnreadableFileError,
+)
+from drivers.interfaces import CameraSettings, CapturedFile, CapturedImage, DeviceIdentity, DeviceReport
+from drivers.photo_file import ExifRecord, check_jpeg_complete, read_exif, sha256_of, taken_utc_s
+from drivers.photo_folder import JPEG_SUFFIXES, RAW_MEDIA_TYPES, files_below, odd, paired
+from drivers.plugin import DriverConfig, DriverSpec
+
+_LOOK_S = 0.2  # between two looks at the folder
+_COUNTER = re.compile(r"(\d+)$")
+
+
+class PhotoWatchConfig(DriverConfig):
+    """Section of rig.yaml."""
+
+    folder: Path = Field(description="where the card appears, or where the camera sends its files; may come later")
+    stable_s: float = Field(default=2.0, ge=0, description="how long a file must stay unchanged; 10 s on a share")
+    stalled_s: float = Field(default=60.0, gt=0, description="after this a file that is cut off counts as damaged")
+    clock_ahead_s: float = Field(default=0.0, description="camera's clock minus this computer's; negative: slow")
+
+
+@dataclass(slots=True)
+class _Seen:
+    """A file as it was at the last look."""
+
+    size_bytes: int
+    modified_ns: int
+    since_s: float  # unchanged since, on this host's monotonic clock
+    from_start: bool  # it lay there when the folder was first looked at
+    exif: ExifRecord | None = None  # of a JPEG that tells when it was taken
+    taken_s: float = 0.0  # seconds since 1970, by this host's clock
+    whole: bool = False
+    trouble: UnreadableFileError | None = None  # why it cannot be used as it is
+    done: bool = False  # handed over, or reported
+
+
+class PhotoWatch:
+    """drivers.interfaces.Camera on a folder; polls, reads, and never writes or deletes there.
+
+    A photograph is handed over once for each opening, by its content. As long as any file still arrives all wait, so
+    that those of a card come in the order in which they were taken.
+    """
+
+    def __init__(self, config: PhotoWatchConfig, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._config = config
+        self._monotonic = monotonic
+        self._seen: dict[Path, _Seen] = {}
+        self._raws: dict[Path, list[Path]] = {}  # of each JPEG
+        self._alone: list[Path] = []  # raw files without one
+        self._observing = False
+        self._given: set[str] = set()
+        self._wanted: CameraSettings | None = None
+
+    # --- every device -----------------------------------------------------------------------------------
+
+    def open(self) -> DeviceIdentity:
+        """Begin to observe the folder, which may not be there yet: a card is put in later."""
+        self._seen.clear()
+        self._given.clear()
+        self._observing = False
+        self._observe()
+        self._observing = True
+        return self._identity()
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def report(self) -> DeviceReport:
+        """Where photographs are awaited, and how many files lie there."""
+        folder = self._config.folder
+        there = folder.is_dir()
+        return DeviceReport(
+            identity=self._identity(),
+            free_bytes=shutil.disk_usage(folder).free if there else None,
+            details={"photographs_from": str(folder), "files": str(len(self._seen))},
+            problems=() if there else (f"{folder} is not there yet: put the card in, or check the path in rig.yaml",),
+        )
+
+    # --- what only a camera on a cable can do -----------------------------------------------------------------
+
+    def apply(self, settings: CameraSettings) -> CameraSettings:
+        """Take note of what is wanted, which a person dials; each file tells what the camera was set to."""
+        self._wanted = settings
+        return settings
+
+    def settings(self) -> CameraSettings:
+        """Raises DeviceRefusedError: nobody can ask the camera."""
+        raise self._refusal("this camera cannot be asked for its settings: its photographs come as files")
+
+    def preview(self) -> bytes:
+        """Raises DeviceRefusedError: nobody sees what the camera sees."""
+        raise self._refusal("this camera has no live view on the screen: its photographs come as files")
+
+    def capture(self, folder: Path) -> CapturedImage:
+        """Raises ReleasedElsewhereError: its own button is the only one that it has."""
+        raise ReleasedElsewhereError(
+            "the software cannot release this camera: its photographs come as files",
+            where=str(self._config.folder),
+            remedy="Press the camera's own button; where the software must release, connect a camera by its cable",
+        )
+
+    # --- photographs ------------------------------------------------------------------------------------------
+
+    def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
+        """See drivers.interfaces.Camera. Their order is that of the times in their EXIF.
+
+        Raises UnreadableFileError once for each file that cannot be used; StaleImageError once for photographs that
+        have come since the folder is observed and say that they were taken earlier than `since_utc_s`.
+        """
+        deadline_s = self._monotonic() + timeout_s
+        while True:
+            self._observe()
+            arriving = [path for path in self._seen if self._arrives(path, since_utc_s)]
+            images = () if arriving else self._hand_over(folder, since_utc_s)
+            if images:
+                return images
+            self._raise_trouble(since_utc_s)
+            left_s = deadline_s - self._monotonic()
+            if left_s <= 0:
+                return ()
+            time.sleep(min(_LOOK_S, left_s))
+
+    def _observe(self) -> None:
+        """Look at the folder: which files are there, and since when they are as they are."""
+        root, now_s = self._config.folder, self._monotonic()
+        try:
+            paths = [path for path in files_below(root) if _is_photograph(path) and not odd(path, root)]
+        except DeviceUnavailableError:
+            paths = []  # the card is in the camera
+        before, self._seen = self._seen, {}
+        for path in paths:
+            try:
+                stat = path.stat()
+            except OSError:
+                continue  # gone between two looks
+            seen = before.get(path)
+            if seen is None or (seen.size_bytes, seen.modified_ns) != (stat.st_size, stat.st_mtime_ns):
+                from_start = not self._observing if seen is None else seen.from_start
+                seen = _Seen(stat.st_size, stat.st_mtime_ns, now_s, from_start)
+            self._seen[path] = seen
+        jpegs = [path for path in self._seen if _is_jpeg(path)]
+        self._raws, self._alone = paired(jpegs, [path for path in self._seen if not _is_jpeg(path)])
+
+    def _arrives(self, path: Path, since_utc_s: float) -> bool:
+        """Whether something of this file is still to come."""
+        seen = self._seen[path]
+        waited_s = self._monotonic() - seen.since_s
+        if seen.done:
+            return False
+        if waited_s < self._config.stable_s:
+            return True
+        if not _is_jpeg(path):
+            return False
+        if not seen.whole and seen.trouble is None:
+            self._read(path, seen, since_utc_s)
+        if waited_s >= self._config.stalled_s or self._is_older(seen, since_utc_s):
+            return False
+        if seen.whole:
+            raw_wanted = self._wanted is not None and self._wanted.image_quality == "RAW+JPEG"
+            return raw_wanted and seen.trouble is None and not self._raws.get(path)
+        return True
+
+    def _read(self, path: Path, seen: _Seen, since_utc_s: float) -> None:
+        """What a JPEG that has stopped changing says of itself; of one that is too old only when it was taken."""
+        try:
+            seen.exif = read_exif(path)
+            taken_s = taken_utc_s(seen.exif.taken)
+            seen.taken_s = float("inf") if taken_s is None else taken_s - self._config.clock_ahead_s
+            if self._is_older(seen, since_utc_s):
+                return
+            check_jpeg_complete(path)
+            seen.whole = True
+            seen.exif.settings(focus_mode="", image_quality="")
+            if taken_s is None:
+                seen.trouble = UnreadableFileError(
+                    "The photograph does not state when it was taken",
+                    where=str(path),
+                    remedy="Use files as they left the camera; editing programs often remove EXIF",
+                )
+        except UnreadableFileError as error:
+            seen.trouble = error
+        except OSError as error:
+            seen.trouble = UnreadableFileError(
+                f"The photograph cannot be read ({error.strerror})", where=str(path), remedy="Put the card in again"
+            )
+
+    @staticmethod
+    def _is_older(seen: _Seen, since_utc_s: float) -> bool:
+        return seen.exif is not None and seen.taken_s < since_utc_s
+
+    def _hand_over(self, folder: Path, since_utc_s: float) -> tuple[CapturedImage, ...]:
+        """Copies of all that can be used, by the time at which they were taken."""
+        ready = [
+            (seen.taken_s, path)
+            for path, seen in self._seen.items()
+            if seen.whole and not seen.done and seen.trouble is None and not self._is_older(seen, since_utc_s)
+        ]
+        images = [self._copied(path, Path(tempfile.mkdtemp(dir=folder))) for _, path in sorted(ready)]
+        return tuple(image for image in images if image is not None)
+
+    def _copied(self, path: Path, folder: Path) -> CapturedImage | None:
+        """The files of one photograph; None for bytes that were handed over before, and where the card was pulled."""
+        seen = self._seen[path]
+        assert seen.exif is not None
+        try:
+            files = tuple(_copy(one, folder, self._seen[one]) for one in (path, *self._raws.get(path, ())))
+        except OSError:
+            seen.since_s = self._monotonic()  # looked at again once it has stayed as it is for a while
+            return None
+        seen.done = True
+        if files[0].sha256 in self._given:
+            return None
+        self._given.add(files[0].sha256)
+        exif, arrival_s = seen.exif, self._monotonic()
+        counter = _COUNTER.search(path.stem)
+        quality = "RAW+JPEG" if len(files) > 1 else "JPEG"
+        return CapturedImage(
+            files=files,
+            counter=int(counter[1]) if counter else 0,
+            exif_time=exif.taken,
+            exif=exif.settings(focus_mode=exif.focus_mode, image_quality=quality),
+            lens=exif.lens,
+            focal_length_mm=exif.focal_length_mm or 0.0,
+            trigger_monotonic_s=arrival_s,
+            arrival_monotonic_s=arrival_s,
+            width=exif.width,
+            height=exif.height,
+            lens_serial=exif.lens_serial,
+            body_serial=exif.body_serial,
+            focus_distance_m=exif.focus_distance_m or 0.0,
+            found_at=str(path),
+        )
+
+    # --- what cannot be used --------------------------------------------------------------------------------------
+
+    def _raise_trouble(self, since_utc_s: float) -> None:
+        now_s = self._monotonic()
+        for seen in self._seen.values():
+            if seen.trouble and not seen.done and (seen.whole or now_s - seen.since_s >= self._config.stalled_s):
+                seen.done = True
+                raise seen.trouble
+        old = {path: seen for path, seen in self._seen.items() if self._is_older(seen, since_utc_s) and not seen.done}
+        for seen in old.values():
+            seen.done = True
+        alone = [path for path in self._alone if now_s - self._seen[path].since_s >= self._config.stalled_s]
+        new = [path for path in alone if not (self._seen[path].from_start or self._seen[path].done)]
+        for path in new:
+            self._seen[path].done = True
+        if new:
+            raise UnreadableFileError(
+                f"{new[0].name} and {len(new) - 1} more are raw files without the JPEG of the same name",
+                where=str(self._config.folder),
+                remedy="Set the camera to JPEG, or to RAW and JPEG, and take the photographs again",
+            )
+        told = [path for path, seen in old.items() if not seen.from_start]
+        if told:
+            newest = max(told, key=lambda path: old[path].taken_s)
+            exif = old[newest].exif
+            assert exif is not None
+            raise StaleImageError(
+                f"{len(told)} photographs are left out, taken before this step began: the newest, {newest.name}, at "
+                f"{exif.taken} by the camera's clock",
+                where=str(self._config.folder),
+                remedy="If they belong to this step the camera's clock is slow: set it and take them again",
+            )
+
+    def _refusal(self, what: str) -> DeviceRefusedError:
+        return DeviceRefusedError(
+            what, where=str(self._config.folder), remedy="Look at the camera; or connect one by its cable"
+        )
+
+    def _identity(self) -> DeviceIdentity:
+        return DeviceIdentity(
+            kind="camera",
+            model="any, by its files",  # each photograph names the body that took it
+            serial="",
+            firmware="",
+            driver="photo_folder",
+            driver_version=f"exiv2 {version('exiv2')}",
+            address=str(self._config.folder),
+        )
+
+
+def _copy(path: Path, folder: Path, seen: _Seen) -> CapturedFile:
+    """Raises OSError when the file is not as it was seen."""
+    target = folder / path.name
+    shutil.copyfile(path, target)
+    stat = path.stat()
+    if (target.stat().st_size, stat.st_mtime_ns) != (seen.size_bytes, seen.modified_ns):
+        raise OSError(f"{path.name} changed while it was copied")
+    media_type = "image/jpeg" if _is_jpeg(path) else RAW_MEDIA_TYPES[path.suffix.lower()]
+    return CapturedFile(target, path.name, sha256_of(target), seen.size_bytes, media_type)
+
+
+def _is_jpeg(path: Path) -> bool:
+    return path.suffix.lower() in JPEG_SUFFIXES
+
+
+def _is_photograph(path: Path) -> bool:
+    return _is_jpeg(path) or path.suffix.lower() in RAW_MEDIA_TYPES
+
+
+def _build(config: PhotoWatchConfig) -> PhotoWatch:
+    return PhotoWatch(config)
+
+
+DRIVER = DriverSpec(kind="camera", config=PhotoWatchConfig, build=_build)

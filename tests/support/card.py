@@ -1,0 +1,67 @@
+"""A card of a camera without a cable: photographs with their EXIF, copied by a process of its own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from simulators.sony_camera.exif import Shot, encode_jpeg, encode_raw
+from simulators.sony_camera.properties import ExposureSettings
+
+BEGAN = datetime(2026, 11, 21, 10, 0, tzinfo=UTC)
+_COPY = """\
+import shutil, sys
+target, source = sys.argv[1:]
+data = open(source, "rb").read()
+with open(target, "wb") as stream:
+    stream.write(data[: len(data) // 2])
+    stream.flush()
+    print("half", flush=True)
+    if sys.stdin.readline():
+        stream.write(data[len(data) // 2 :])
+"""
+
+
+def photograph(number: int, taken: datetime, *, iso: int = 100, raw: bool = False) -> bytes:
+    """A small file, another one for each number."""
+    settings = ExposureSettings(22.0, 1 / 50, (1, 50), iso, manual_focus=True, file_format=2, jpeg_quality=2,
+                                capture_target=16)  # fmt: skip
+    picture = np.full((64, 96, 3), 40 + number, dtype=np.uint8)
+    picture[number % 64] = 255
+    return (encode_raw if raw else encode_jpeg)(picture, Shot(settings, number, taken))
+
+
+def after(seconds: float) -> datetime:
+    """So long after the beginning."""
+    return BEGAN + timedelta(seconds=seconds)
+
+
+def put(folder: Path, name: str, data: bytes) -> Path:
+    """Copy a file there, by another process, whole before this returns."""
+    with half_copied(folder, name, data) as path:
+        pass
+    return path
+
+
+@contextmanager
+def half_copied(folder: Path, name: str, data: bytes, *, whole: bool = True) -> Generator[Path]:
+    """Another process has copied half a file and stops; at the end of the block it goes on, or gives up."""
+    source = folder.parent / f"{name}.source"
+    source.write_bytes(data)
+    command = [sys.executable, "-c", _COPY, str(folder / name), str(source)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout.readline() == "half\n"
+        yield folder / name
+        if whole:
+            process.stdin.write("go on\n")
+        process.stdin.close()
+        assert process.wait(10) == 0
+    source.unlink()
