@@ -32,11 +32,11 @@ from service.cli.hands import SimulatedHands
 from service.cli.import_operator import ImportOperator
 from service.cli.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
 from service.cli.waiting import wait_for_results
-from service.core.actions import VERBS, record_to_sign, refuse
-from service.core.errors import ConfigurationError
+from service.core.actions import VERBS, capture_refusal, record_to_sign, refuse
+from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.fold import fold
 from service.core.gates import Standing, describe, standing
-from service.core.model import ActionRefused, GateVerdict, OperatorAction
+from service.core.model import ActionRefused, CaptureAsked, GateVerdict, OperatorAction
 from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState, StepState
 from service.core.ways_on import takes_words, ways_on
@@ -72,6 +72,7 @@ PasswordOption = Annotated[
 WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
 
 _WORKER_GRACE_S = 10.0
+_OF_A_CAPTURE = ("release", "finish")
 
 
 def run_command(
@@ -115,7 +116,12 @@ def resume_command(
 
 
 def act_command(
-    verb: Annotated[str, typer.Argument(help="confirm, sign, redo, skip, accept, pause, resume or abort.")],
+    verb: Annotated[
+        str,
+        typer.Argument(
+            help="confirm, sign, redo, skip, accept, pause, resume or abort; of a capture by hand: release or finish."
+        ),
+    ],
     run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
     step: Annotated[str | None, typer.Option("--step", help="The step, if it is not the current one.")] = None,
     viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo this viewpoint alone.")] = None,
@@ -127,13 +133,25 @@ def act_command(
     json: JsonOption = False,
 ) -> None:
     """Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist."""
-    if verb not in VERBS:
-        raise typer.BadParameter(f"{verb!r} is none of {', '.join(VERBS)}", param_hint="VERB")
+    if verb not in (*VERBS, *_OF_A_CAPTURE):
+        raise typer.BadParameter(f"{verb!r} is none of {', '.join((*VERBS, *_OF_A_CAPTURE))}", param_hint="VERB")
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)
         state = fold(protocol, store.events(run_id))
         name = operator or getpass.getuser()
+        if verb in _OF_A_CAPTURE:
+            asked = step or state.current
+            _ask_capture(
+                store,
+                run_id,
+                protocol,
+                state,
+                CaptureAsked.model_validate({"step": asked, "attempt": state.step.attempt, "what": verb}),
+                name,
+            )
+            _report_recorded(run_id, verb, asked, name, json=json)
+            return
         identity = identity_for(
             People(store), protocol, state, verb, name, partial(_password, name, from_stdin=password_stdin)
         )
@@ -155,10 +173,26 @@ def act_command(
             store.record(run_id, [record], actor=name)
             raise refusal
         store.record(run_id, [action], actor=name)
-        if json:
-            print_json({"run": run_id, "recorded": verb, "step": action.step})
-        else:
-            console.print(f"Recorded: {verb} of {action.step} by {escape(name)}")
+        _report_recorded(run_id, verb, action.step, name, json=json)
+
+
+def _ask_capture(
+    store: Store, run_id: str, protocol: Protocol, state: RunState, asked: CaptureAsked, name: str
+) -> None:
+    """Ask a capture by hand for a release of the shutter, or to end with what it has."""
+    if asked.step not in protocol.step_ids:
+        raise IllegalTransitionError(f"there is no step {asked.step!r}", where=asked.what)
+    refusal = capture_refusal(protocol, state, asked.step, asked.attempt)
+    if refusal is not None:
+        raise refusal
+    store.record(run_id, [asked], actor=name)
+
+
+def _report_recorded(run_id: str, verb: str, step: str | None, name: str, *, json: bool) -> None:
+    if json:
+        print_json({"run": run_id, "recorded": verb, "step": step})
+    else:
+        console.print(f"Recorded: {verb} of {step} by {escape(name)}")
 
 
 def signed_by_verb(verb: str, protocol: Protocol, state: RunState) -> str:

@@ -46,6 +46,23 @@ def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: s
     return _RULES[action.action](protocol, state, action, actor)
 
 
+def capture_refusal(protocol: Protocol, state: RunState, step: str, attempt: int) -> Refusal | None:
+    """Why nobody can ask a capture by hand now for a release of the shutter, or to end with what it has; or None."""
+    if state.terminal:
+        return Refusal(f"the run is {state.status}", where=step, remedy="Start a new run")
+    if state.paused:
+        return Refusal("the run is paused", where=step, remedy="Resume first")
+    now = state.step
+    if (step, attempt) != (now.step, now.attempt) or protocol.step(step).kind != "manual_capture":
+        title = protocol.step(now.step).title
+        return Refusal("this step takes no images now", where=step, remedy=f"The run is at: {title}")
+    if now.phase != "running":
+        return Refusal(
+            "this step takes no images now", where=step, remedy=f"It is {now.phase.replace('_', ' ')}: confirm first"
+        )
+    return None
+
+
 def unmet_requirements(step: Step, state: RunState) -> tuple[str, ...]:
     """Steps that `step` requires and that have not passed their gates (a skipped step has not)."""
     return tuple(name for name in step.requires if not state.steps[name].passed_its_gates)

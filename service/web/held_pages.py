@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends, Form, Path, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from service.core.errors import IllegalTransitionError
+from service.core.actions import capture_refusal
 from service.core.model import CaptureAsked
 from service.people.control import Control
 from service.people.person import Person
@@ -49,9 +49,9 @@ def ask(
     """Release the shutter, or end the capture with what it has."""
     log = site.run(run_id)
     Control(site.store).require(run_id, person)
-    now = log.state.step
-    if log.state.terminal or log.state.paused or (step, attempt, "running") != (now.step, now.attempt, now.phase):
-        raise IllegalTransitionError("this step takes no images now", where=step, remedy="Reload the page")
+    refusal = capture_refusal(log.protocol, log.state, step, attempt)
+    if refusal is not None:
+        raise refusal
     site.store.record(run_id, [CaptureAsked(step=step, attempt=attempt, what=what)], actor=person.account)
     return RedirectResponse(f"/runs/{run_id}/held", status_code=303)
 
