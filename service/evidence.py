@@ -99,6 +99,10 @@ class StepEvidence:
         """Where an artefact's bytes lie."""
         return self.log.store.artefact_path(ref.sha256)
 
+    def holds(self, sha256: str) -> bool:
+        """See service.steps.context.Evidence."""
+        return any(row.ref.sha256 == sha256 for row in self.log.store.artefacts(self.log.run_id))
+
     def captures(self, step_id: str) -> tuple[View, ...]:
         """See service.steps.context.Evidence."""
         return self.log.captures(step_id)

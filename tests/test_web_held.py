@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Generator, Mapping
 from html import unescape
@@ -9,8 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
-from service.core.model import CaptureAsked
+from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
+from service.cli.main import app
+from service.core.model import CaptureAsked, DeviceOpened
 from tests.support.bench_run import Bench
 from tests.support.held_run import left_held_run
 from tests.support.web import Browser, WebSite, web_site
@@ -61,6 +65,13 @@ def test_the_buttons_ask_the_step(shown: tuple[WebSite, Browser, Bench]) -> None
         assert answer.status_code == 303
     assert [asked.what for asked in bench.payloads(CaptureAsked)] == ["release", "finish"]
     assert bench.state().steps["capture"].asked == ("release", "finish")
+    typed = ["act", "release", "--data", str(bench.data), "--operator", "Grace"]
+    assert CliRunner().invoke(app, typed).exit_code == 0, "and so does the command line"
+    assert bench.state().steps["capture"].asked == ("release", "finish", "release")
+    refused = CliRunner().invoke(app, [*typed, "--step", "ct"])
+    assert refused.exit_code == 1
+    assert "takes no images now" in refused.output
+    assert bench.state().steps["capture"].asked == ("release", "finish", "release")
 
 
 def test_who_does_not_control_the_run_sees_no_buttons_and_may_not_press_them(
@@ -89,3 +100,30 @@ def test_parts_of_the_page_come_alone(shown: tuple[WebSite, Browser, Bench]) -> 
     answer = browser.get(f"/runs/{bench.run_id}/held/parts/way,overlay,image,plan")
     assert answer.status_code == 200
     assert answer.text.count("<template") == 4
+
+
+def test_an_image_that_could_not_be_looked_at_says_why_and_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with web_site(tmp_path) as site:
+        bench = left_held_run(site.begin_run, monkeypatch, tmp_path, {4: "fails"})
+        page = words(site.browser("technician").get(f"/runs/{bench.run_id}/held").text)
+        assert "H_004 could not be looked at: the image cannot be decoded" in page
+        assert "take it again from the same place" in page
+
+
+def test_a_camera_without_a_cable_has_no_release_and_no_live_view_on_the_page(
+    shown: tuple[WebSite, Browser, Bench],
+) -> None:
+    _, browser, bench = shown
+    page = f"/runs/{bench.run_id}/held"
+    assert "Live view" in browser.get(page).text
+    watch = PhotoWatch(PhotoWatchConfig(folder=bench.data / "card"))
+    watch.open()
+    opened = DeviceOpened(device="camera", report=dataclasses.asdict(watch.report()))
+    bench.store.record(bench.run_id, [opened], actor="runner")
+    shown_now = browser.get(page).text
+    assert "Release the shutter" not in shown_now
+    assert "Live view" not in shown_now
+    assert "That is enough" in shown_now
+    assert f"as soon as their files are in {bench.data / 'card'}" in words(shown_now)

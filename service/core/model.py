@@ -182,8 +182,10 @@ class ViewHeld(View):
     """One exposure of a camera in a person's hands. Where it was the image itself tells, in the worker's answer."""
 
     kind: Literal["view_held"] = "view_held"
-    # By the camera's own button, or by the software for a press on a screen or the pedal.
-    released_by: Literal["camera", "screen", "pedal"]
+    # By the camera's own button, or by the software for a press on a screen or the pedal; or the image was found as a
+    # file: the software was not there, and knows no more than what the file says.
+    released_by: Literal["camera", "screen", "pedal", "elsewhere"]
+    found_at: str = ""  # path of that file
     arrival_monotonic_s: float
 
 

@@ -125,6 +125,10 @@ class Evidence(Protocol):
         """Where the bytes of an artefact lie."""
         ...
 
+    def holds(self, sha256: str) -> bool:
+        """Whether a file with these bytes is in the evidence of this run already."""
+        ...
+
     def captures(self, step_id: str) -> tuple[View, ...]:
         """The valid captures of a step's current attempt, this moment's included, in order."""
         ...

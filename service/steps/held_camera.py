@@ -1,13 +1,20 @@
-"""Images of a tethered camera that a person holds, released by its button, a screen or the pedal."""
+"""Images of a camera that a person holds: at a cable, released by anybody; or without one, found as files."""
 
 from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from drivers.errors import DeviceError, StaleImageError, UnreadableFileError
+from drivers.errors import (
+    DeviceError,
+    DeviceTimeoutError,
+    ReleasedElsewhereError,
+    StaleImageError,
+    UnreadableFileError,
+)
 from drivers.interfaces import Camera, CapturedImage
 from service.core.model import ViewHeld, ViewpointFailed
 from service.core.run_state import WAITING_FOR_HAND
@@ -17,13 +24,14 @@ from service.steps.exposure import camera_record, environment_now, settings_agre
 from service.store.records import NewArtefact
 
 _PATIENCE_S = 0.3  # of one look at the camera
+_CLOCKS_S = 300.0  # by so much a camera's clock may be slow: what was taken earlier than the step began is of no use
 
 By = Literal["camera", "screen", "pedal"]
 
 
 @dataclass
 class HeldCamera:
-    """The tethered camera of one execution of a step, and everything that may release it."""
+    """The camera of one execution of a step, and everything that may release it."""
 
     context: StepContext
     prefix: str
@@ -34,7 +42,10 @@ class HeldCamera:
 
     def __post_init__(self) -> None:
         self._asked, self._pedal = len(self.context.evidence.asked()), self._presses()
-        self._set(self.context.devices.camera())
+        camera = self.context.devices.camera()
+        self._set(camera)
+        for problem in camera.report().problems:
+            self.context.tell(problem)
 
     def new_views(self) -> list[ViewHeld]:
         """Waits a moment for images, which are evidence at once. An image that cannot be read is noted, not kept."""
@@ -50,9 +61,12 @@ class HeldCamera:
     def _images(self, camera: Camera, folder: Path) -> tuple[By, tuple[CapturedImage, ...]]:
         wanted = wanted_settings(self.context)
         for by in self._requests():
-            return by, (photograph(self.context, camera, wanted, folder),)
+            try:
+                return by, (photograph(self.context, camera, wanted, folder),)
+            except ReleasedElsewhereError as error:
+                self.context.tell(str(error))
         try:
-            return "camera", camera.released_images(folder, _PATIENCE_S)
+            return "camera", new_images(self.context, camera, folder)
         except (StaleImageError, UnreadableFileError) as error:
             self._failed(error)
         except WORTH_ANOTHER_TRY as error:
@@ -113,7 +127,8 @@ class HeldCamera:
             camera=camera_record(image),
             environment=environment_now(context),
             verdicts={"settings": settings_agree(image.exif, wanted_settings(context))},
-            released_by=by,
+            released_by="elsewhere" if image.found_at else by,
+            found_at=image.found_at,
             arrival_monotonic_s=image.arrival_monotonic_s,
         )
         rows = tuple(
@@ -146,3 +161,29 @@ class HeldCamera:
     def waiting(self, done: int, total: int) -> None:
         """For the screens: the live view runs while nothing else happens."""
         self.context.progress(WAITING_FOR_HAND, done, total)
+
+
+def new_images(context: StepContext, camera: Camera, folder: Path) -> tuple[CapturedImage, ...]:
+    """Waits a moment for what the camera's button has released in this step and is not in the evidence yet."""
+    began = datetime.fromisoformat(context.evidence.state().steps[context.step.id].started_utc)
+    images = camera.released_images(folder, _PATIENCE_S, began.timestamp() - _CLOCKS_S)
+    # Of a folder all photographs come again after a restart. Bytes that a camera itself sends twice are an error.
+    return tuple(image for image in images if not (image.found_at and context.evidence.holds(image.jpeg.sha256)))
+
+
+def awaited_images(context: StepContext, camera: Camera, folder: Path, wait_s: float) -> tuple[CapturedImage, ...]:
+    """Those that come next from a camera without a cable, at least one; DeviceTimeoutError after `wait_s`."""
+    context.tell("take the photograph now, with the camera's own button; it is read as soon as its file is there")
+    for problem in camera.report().problems:
+        context.tell(problem)
+    deadline_s = context.monotonic_s() + wait_s
+    while not (images := new_images(context, camera, folder)):
+        context.checkpoint()
+        context.progress("waiting for the photograph's file", 0, 1)
+        if context.monotonic_s() > deadline_s:
+            raise DeviceTimeoutError(
+                f"no photograph came within {wait_s:.0f} s",
+                where=f"step {context.step.id}",
+                remedy="Put the card in, or check that the camera sends its files; then confirm to wait again",
+            )
+    return images

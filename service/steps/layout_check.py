@@ -5,14 +5,18 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import Field
+
+from drivers.errors import ReleasedElsewhereError
 from service.core.gates import evaluate_gates
 from service.core.model import ArtefactRef, GateVerdict, Record
 from service.steps.arrivals import keep
 from service.steps.capture import photograph
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.exposure import wanted_settings
+from service.steps.held_camera import awaited_images
 from service.steps.layouts import layout_uncertainties
 
 PHOTOGRAPH = "layout_photograph"
@@ -34,6 +38,7 @@ class Params(Record):
     photographs: int = 1  # to begin with; the camera is moved in between
     most_photographs: int = 5  # of one layout, as long as the number is not known well enough
     between_s: float = 5.0  # for moving the camera
+    wait_s: Annotated[float, Field(gt=0)] = 600.0  # for a photograph that comes as a file
     sensor_width_mm: float = 35.7  # with the focal length of the file, a camera that is not calibrated yet
 
 
@@ -51,12 +56,13 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     """
     images = _earlier(context)
     kept: list[ArtefactRef] = []
-    for number in range(max(1, params.photographs - len(images))):
+    needed = max(len(images) + 1, params.photographs)
+    while len(images) < needed:
         context.checkpoint()
-        context.progress("photographs of the spheres", number, params.photographs)
-        if number:
+        context.progress("photographs of the spheres", len(images), needed)
+        if kept:
             context.wait(params.between_s)
-        kept.append(_photograph(context, images))
+        kept += _photographs(context, images, params.wait_s)
     spheres = context.protocol.spheres
     arguments = {
         "images": images,
@@ -82,19 +88,29 @@ def _earlier(context: StepContext) -> list[dict[str, Any]]:
         if note.note == MOVE_WANTED:
             images = []
         elif note.note == PHOTOGRAPH:
-            images.append(dict(note.data))
+            images.append({key: note.data[key] for key in ("sha256", "focal_mm")})
     return images
 
 
-def _photograph(context: StepContext, images: list[dict[str, Any]]) -> ArtefactRef:
-    """Take one, keep it, note it and add it to `images`."""
-    with tempfile.TemporaryDirectory(prefix="orthocapture-") as folder:
-        image = photograph(context, context.devices.camera(), wanted_settings(context), Path(folder))
-        ref = keep(context, image.jpeg.path, device="camera", kind="layout_image", media_type=image.jpeg.media_type)
-    data = {"sha256": ref.sha256, "focal_mm": image.focal_length_mm}
-    context.note(PHOTOGRAPH, **data)
-    images.append(data)
-    return ref
+def _photographs(context: StepContext, images: list[dict[str, Any]], wait_s: float) -> list[ArtefactRef]:
+    """Take one, or wait for those of a camera without a cable; keep them, note them and add them to `images`."""
+    camera = context.devices.camera()
+    refs: list[ArtefactRef] = []
+    with tempfile.TemporaryDirectory(prefix="orthocapture-") as name:
+        folder = Path(name)
+        try:
+            taken = (photograph(context, camera, wanted_settings(context), folder),)
+        except ReleasedElsewhereError:
+            taken = awaited_images(context, camera, folder, wait_s)
+        for image in taken:
+            media_type = image.jpeg.media_type
+            ref = keep(context, image.jpeg.path, device="camera", kind="layout_image", media_type=media_type)
+            found = {"found_at": image.found_at} if image.found_at else {}
+            data = {"sha256": ref.sha256, "focal_mm": image.focal_length_mm}
+            context.note(PHOTOGRAPH, **data, **found)
+            images.append(data)
+            refs.append(ref)
+    return refs
 
 
 def _advise(

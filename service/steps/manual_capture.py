@@ -65,6 +65,20 @@ class Params(Record):
     wait_s: Annotated[float, Field(gt=0)] = 600.0  # for the next image, before the step asks what is wrong
 
 
+def failure_words(job: JobState) -> str:
+    """For a person: which work on the images has failed, what that means and what to do."""
+    why = job.message.rstrip(".")
+    if job.kind == "coverage_points":
+        return (
+            f"what of the specimen the images show cannot be told: {why}. Images are judged without it; a limit on "
+            "it is not met: end with what there is (finish), and the step lists the ways on"
+        )
+    return (
+        f"{job.arguments['image']['viewpoint']} could not be looked at: {why}. It stays in the evidence and is not "
+        "used: take it again from the same place"
+    )
+
+
 class Result(Record):
     """Which images count."""
 
@@ -192,11 +206,16 @@ class _Guide:
                 return
             if job.status == "enqueued":
                 return
-            if job.status == "finished" and job.job not in self._reported:
+            if job.job not in self._reported:
                 self._reported.add(job.job)
                 self._report(job)
+        for job in self.context.evidence.jobs(self.context.step.id):
+            if job.kind == "coverage_points" and job.status == "failed" and job.job not in self._reported:
+                self._reported.add(job.job)
+                self.context.tell(failure_words(job))
 
     def __post_init__(self) -> None:
+        # What ended before a restart was told then.
         self._reported = {job.job for job in self._jobs() if job.status != "enqueued"}
 
     def images_used(self) -> int:
@@ -218,12 +237,18 @@ class _Guide:
     def outcome(self) -> StepOutcome:
         """The step's numbers."""
         found = held_views(self.context, self.context.step.id)
-        views = [found.get(view.artefacts[0].sha256, {}) for view in self._views()]
-        named = list(zip(self._views(), views, strict=True))
+        failed = {j.arguments["image"]["sha256"]: j.message for j in self._jobs() if j.status == "failed"}
+        named = [
+            (
+                view,
+                found.get(view.artefacts[0].sha256, {"why": failed.get(view.artefacts[0].sha256, "not looked at")}),
+            )
+            for view in self._views()
+        ]
         result = Result(
             purpose=self.params.purpose,
             used=tuple(view.viewpoint for view, answer in named if answer.get("used")),
-            not_used={v.viewpoint: str(a.get("why", "not looked at")) for v, a in named if not a.get("used")},
+            not_used={view.viewpoint: str(answer["why"]) for view, answer in named if not answer.get("used")},
         )
         return StepOutcome(self._measures(), (), result.model_dump(mode="json"))
 
@@ -289,6 +314,11 @@ class _Guide:
         self.context.evidence.enqueue(JobRequest(self.kind, arguments), image["sha256"])
 
     def _report(self, job: JobState) -> None:
+        if job.status == "failed":
+            self.context.tell(failure_words(job))
+            done = self._answers()
+            self._say_next(str(done[-1].result["words"]) if done else str(self.shared["first_words"]))
+            return
         m, result = job.measures, job.result
         parts = [f"{m['images_used']:.0f} used", f"hemisphere {100 * m['hemisphere_coverage']:.0f} %"]
         if "spheres_seen" in m:
@@ -300,8 +330,13 @@ class _Guide:
                 parts.append(f"{word} {100 * m[name]:.0f} %")
         verdict = "" if result["used"] else f" not used: {result['why']}."
         self.context.tell(f"{result['viewpoint']}:{verdict} {', '.join(parts)}")
-        if not self.enough():
-            self._say(str(result["words"]))
+        self._say_next(str(result["words"]))
+
+    def _say_next(self, words: str) -> None:
+        """Unless that is enough, or another image waits to be looked at, as of a card: its words will count."""
+        ended = sum(job.status != "enqueued" for job in self._jobs())
+        if ended == len(self._views()) and not self.enough():
+            self._say(words)
 
     def _say(self, words: str) -> None:
         self.context.tell(f"next: {words}")

@@ -10,10 +10,11 @@ from typing import Any, Literal
 import numpy as np
 
 from service.core.gates import quantity
-from service.core.model import ViewHeld
+from service.core.model import DeviceOpened, ViewHeld
 from service.core.protocol import Protocol, Step
 from service.core.run_state import JobState
 from service.evidence import RunLog
+from service.steps.manual_capture import failure_words
 from service.web.run_words import limit, measure_name
 from service.web.viewpoints import captures_of
 
@@ -63,6 +64,8 @@ class HeldNow:
     step: Step
     running: bool
     words: str
+    failures: tuple[str, ...]  # of work on the images: what failed, what to do
+    photographs_from: str  # folder of a camera without a cable; "" for one that can be released from here
     overlay: Overlay | None
     spots: tuple[Spot, ...]
     camera: Spot | None
@@ -92,6 +95,12 @@ def held_now(log: RunLog, step: Step) -> HeldNow:
     jobs = {str(j.arguments["image"]["sha256"]): j for j in state.jobs.values() if j.kind in _KINDS}
     done = sorted((j for j in jobs.values() if j.status == "finished"), key=lambda j: j.enqueued_seq)
     last = done[-1] if done else None
+    newest = max((j.enqueued_seq for j in jobs.values()), default=0)  # what failed before it has been told
+    failed = [
+        j
+        for j in state.jobs.values()
+        if j.status == "failed" and (j.kind == "coverage_points" or (j.kind in _KINDS and j.enqueued_seq == newest))
+    ]
     running = log.state.current == step.id and state.phase == "running" and not log.state.paused
     captures = [c for c in captures_of(log, step.id) if c.replaced is None and isinstance(c.payload, ViewHeld)]
     result: Mapping[str, Any] = {} if last is None else last.result
@@ -101,12 +110,20 @@ def held_now(log: RunLog, step: Step) -> HeldNow:
         step=step,
         running=running,
         words=str(result.get("words", "")) if running else "",
+        photographs_from=_photographs_from(log),
+        failures=tuple(failure_words(job) for job in failed) if running else (),
         overlay=_overlay(here, target["T_level_camera"]) if running and here and target else None,
         spots=_spots(result.get("places", ()), "" if target is None else str(target["name"])),
         camera=None if not here else _spot("camera", "done", here, _lowest(result["places"])),
         seen=tuple(_seen(c.payload.viewpoint, c.sha256, jobs.get(c.sha256)) for c in reversed(captures)),
         figures=_figures(step, {} if last is None else last.measures),
     )
+
+
+def _photographs_from(log: RunLog) -> str:
+    opened = (e.payload.report for e in reversed(log.events) if isinstance(e.payload, DeviceOpened))
+    camera = next((report for report in opened if report["identity"]["kind"] == "camera"), {})
+    return str(camera.get("details", {}).get("photographs_from", ""))
 
 
 def _overlay(here: Any, there: Any) -> Overlay:

@@ -218,7 +218,7 @@ class BenchCamera:
             arrival_monotonic_s=time.monotonic(),
         )
 
-    def released_images(self, folder: Path, timeout_s: float) -> tuple[CapturedImage, ...]:
+    def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
         pressed, self.pressed = self.pressed, []
         images: list[CapturedImage] = []
         for number, dialled in enumerate(pressed):
@@ -264,6 +264,7 @@ class BenchRig:
 
     arm: BenchArm = field(default_factory=BenchArm)
     shutter: BenchCamera = field(default_factory=BenchCamera)
+    card: Camera | None = None  # instead of it: a camera without a cable
     box: BenchLightbox | None = field(default_factory=BenchLightbox)
     _on_open: Callable[[str, DeviceReport], None] | None = None
 
@@ -272,6 +273,8 @@ class BenchRig:
         return self.arm
 
     def camera(self) -> Camera:
+        if self.card is not None:
+            return self.card
         self._open("camera", self.shutter, opened=self.shutter.opened > 0)
         return self.shutter
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -14,8 +15,8 @@ import pytest
 from drivers.interfaces import CameraSettings
 from service.compute.hand_view import HandView
 from service.compute.planning.information import ViewInformation
+from service.core.errors import ComputeError
 from service.core.geometry import Array
-from service.core.model import ViewHeld
 from service.worker.loop import work
 from simulators.hand import Grip, follow
 from tests.support.bench_rig import BenchRig, ScriptedOperator
@@ -67,6 +68,9 @@ class Person:
         self.rig.shutter.pressed.append(CameraSettings(22.0, 1 / 50, 400) if mishap == "dial" else None)
 
 
+P = TypeVar("P", bound=Person)
+
+
 @dataclass
 class ReadingOperator(ScriptedOperator):
     """Hands what is told to a person."""
@@ -80,23 +84,32 @@ class ReadingOperator(ScriptedOperator):
 
 
 def held_run(
-    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, folder: Path, mishaps: dict[int, str], step: str
-) -> tuple[Bench, Person]:
+    begin: Callable[[str], Bench],
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    mishaps: dict[int, str],
+    step: str,
+    person_of: Callable[[BenchRig, dict[int, str]], P] = Person,
+) -> tuple[Bench, P]:
     """A run of which a person takes the images; what they show follows from where the person held the camera."""
     head = PROTOCOL.split("  - id: capture\n")[0]
     bench = begin(head + MEASURED + step)
     rig = MeasuringRig()
     rig.suite = BenchCt(folder)
     bench.rig = rig
-    person = Person(rig, mishaps)
+    person = person_of(rig, mishaps)
     bench.operator = ReadingOperator(person=person)
     known: dict[str, Any] = {
         "calibrate": {"camera": asdict(camera(1200)), "T_flange_camera": np.eye(4).tolist(), "details": {}},
         "locate_spheres": {"spheres_m": SPHERES_M.tolist(), "details": {}},
     }
 
+    looks = count()
+
     def look(*_args: Any, **_options: Any) -> HandView:
-        T, mishap = person.views[len(bench.payloads(ViewHeld)) - 1]
+        T, mishap = person.views[next(looks)]  # images are looked at one by one, in the order of arrival
+        if mishap == "fails":
+            raise ComputeError("the image cannot be decoded", remedy="Take it again")
         if mishap == "nothing":
             return HandView(None, None, 1, 0, 0, 2.0, 0.2, 0.0, "1 spheres found, which do not tell where it was")
         why = "blurred: outlines are 9.0 px wide; hold the camera still" if mishap == "blurred" else ""
@@ -118,9 +131,14 @@ class _LeftError(Exception):
     """The runner's process has ended in the middle."""
 
 
-def left_held_run(begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, folder: Path) -> Bench:
+def left_held_run(
+    begin: Callable[[str], Bench],
+    monkeypatch: pytest.MonkeyPatch,
+    folder: Path,
+    mishaps: dict[int, str] | None = None,
+) -> Bench:
     """A run in which four images were taken, the second one blurred, and which nobody drives any more."""
-    bench, person = held_run(begin, monkeypatch, folder, {2: "blurred"}, STEP)
+    bench, person = held_run(begin, monkeypatch, folder, mishaps or {2: "blurred"}, STEP)
     serve = bench.operator.on_show
 
     def until_four(what: str) -> None:
