@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
@@ -68,7 +68,8 @@ def results_to_come(log: RunLog) -> list[Left]:
     """What was planned for a registration and has not arrived, with the time left; empty when all has."""
     started = log.store.jobs_started(log.run_id)
     cores = os.cpu_count() or 1
-    return missing_results(log.protocol, log.refresh(), started, datetime.now(UTC).isoformat(), cores)
+    left = missing_results(log.protocol, log.refresh(), started, datetime.now(UTC).isoformat(), cores)
+    return [replace(one, waits=not started) for one in left]
 
 
 @dataclass

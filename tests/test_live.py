@@ -16,7 +16,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from drivers.errors import DeviceFaultError
-from drivers.interfaces import CtSource, Mesh, ScanExport, ScannedMesh
+from drivers.interfaces import CameraSettings, CtSource, Mesh, ScanExport, ScannedMesh
 from service.compute.calibration.arm_correction import ArmCorrection, corrected_T_base_flange
 from service.compute.calibration.kinematics import arm_model
 from service.compute.live import LiveView, clipped_fraction, find_spheres, paired, register_station, sharpness
@@ -46,7 +46,7 @@ from service.worker.job import JobAnswer, JobContext
 from service.worker.live import coverage_points, live_summary, live_view
 from service.worker.loop import HANDLERS, work
 from service.worker.robot_poses import robot_camera_poses
-from tests.support.bench_rig import BenchRig, answer
+from tests.support.bench_rig import BenchRig, answer, other_settings
 from tests.support.bench_run import PROTOCOL, Bench, begin_run
 from tests.support.sphere_images import (
     CONTROL_M,
@@ -523,6 +523,36 @@ def test_confirming_takes_the_suggested_views_and_the_gate_is_judged_again(
     ]
     assert errors[0] > 0.14 >= errors[-1] > 0
     assert all(later < earlier for earlier, later in pairwise(errors))
+    bench.must_verify()
+
+
+def test_images_to_take_again_and_views_to_add_are_told_together_and_taken_by_one_confirmation(
+    begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    bench = measured_run(begin, monkeypatch, tmp_path, held_out_mm=0.5)
+    turned = {3}  # after the board's: v002
+
+    def exif(applied: CameraSettings) -> CameraSettings:
+        return other_settings(applied) if bench.rig.shutter.exposures in turned else applied
+
+    bench.rig.shutter.exif = exif
+    asked: list[Any] = []
+
+    def more(question: Any, _state: Any) -> Any:
+        asked.append(question)
+        return answer(question, "confirm")
+
+    bench.script("capture", "recovery", more, more)
+    assert bench.run().status == "completed"
+    first = asked[0].text
+    assert "set the camera as the protocol has it" in first
+    assert "Confirm to take 1 image(s) again; all others are kept. predicted_target_error_mm is" in first
+    assert "The same confirmation also takes" in first
+    note = next(n.data for n in bench.payloads(StepNote) if n.note == "suggested_viewpoints")
+    wanted = [view["viewpoint"] for view in note["viewpoints"]]
+    assert all(name in first for name in wanted)
+    assert note["images"] == 1
+    assert set(bench.captured()[5 : 6 + len(wanted)]) == {"v002", *wanted}
     bench.must_verify()
 
 

@@ -7,7 +7,7 @@ that the people who signed had the roles they had.
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from sqlalchemy import Connection, Table, select
 
 from service.audit.bundle_zip import BundleZip, Listed, ZipTime, writing_bundle
 from service.audit.crate import METADATA, crate
+from service.audit.not_in_yet import not_in_yet
 from service.core.errors import IntegrityError
 from service.core.fold import fold
 from service.core.model import EvidenceExported, RunStarted
@@ -179,17 +180,18 @@ def export_bundle(
 
         with writing_bundle(target, _zip_time(head.at_utc), leave) as bundle:
             recorded = read_artefacts(connection, run_id)
-            _write_records(bundle, store, connection, run_id, root, keys, simulated=root.simulated)
+            events = read_events(connection, run_id, 0)
+            state = fold(protocol, events)
+            missing = not_in_yet(protocol, state, events)
+            _write_records(bundle, store, connection, run_id, root, keys, missing)
             if report is not None:
                 if progress is not None:
                     progress("writing the report", 0, 0)
                 bundle.add("report.html", [report(exportable.audit, head.seq)])
             if not hashes_only:
                 _write_artefacts(bundle, store, recorded, progress)
-            events = read_events(connection, run_id, 0)
-            metadata = crate(
-                run_id, root, fold(protocol, events), events, recorded, bundle.listed, full_names(connection)
-            )
+            names = full_names(connection)
+            metadata = crate(run_id, root, state, events, recorded, bundle.listed, names, missing)
             bundle.add(METADATA, [canonical(metadata).encode()])
             manifest = {
                 "format": FORMAT,
@@ -219,10 +221,9 @@ def _write_records(
     run_id: str,
     root: RunStarted,
     keys: list[PublicKey],
-    *,
-    simulated: bool,
+    missing: Sequence[str],
 ) -> None:
-    readme = _readme(run_id, keys[-1].key_id, simulated=simulated, imported=root.origin == "imported")
+    readme = _readme(run_id, keys[-1].key_id, root, missing)
     bundle.add("README.txt", [readme.encode()])
     bundle.add("verify.py", chunks_of(_VERIFIER))
     bundle.add("events.jsonl", _event_lines(connection, run_id))
@@ -299,15 +300,20 @@ def _zip_time(at_utc: str) -> ZipTime:
     return max(year, 1980), month, day, hour, minute, second - second % 2
 
 
-def _readme(run_id: str, key_id: str, *, simulated: bool, imported: bool) -> str:
+def _readme(run_id: str, key_id: str, root: RunStarted, missing: Sequence[str]) -> str:
     warning = (
         "SIMULATED: no real device took part in this run. It is no record of a real acquisition.\n\n"
-        if simulated
+        if root.simulated
         else ""
     )
-    if imported:
+    if root.origin == "imported":
         warning += (
             "IMPORTED: how the images were captured is not in evidence, only when and by whom they were imported.\n\n"
+        )
+    if missing:
+        warning += (
+            "NOT IN YET: when this bundle was made, these results had not arrived. "
+            f"A later export has those that came.\n{''.join(f'  - {line}{chr(10)}' for line in missing)}\n"
         )
     return f"""Evidence of run {run_id}, exported by orthocapture
 

@@ -57,8 +57,12 @@ def crate(
     artefacts: Sequence[Artefact],
     files: Sequence[Listed],
     full_names: Mapping[str, str],
+    missing: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The metadata as plain data. `files` are those of the bundle; recorded ones may be missing (only hashes)."""
+    """The metadata as plain data. `files` are those of the bundle; recorded ones may be missing (only hashes).
+
+    `missing`: results that had not arrived yet, in words.
+    """
     described = _artefact_entities(artefacts, {item.path for item in files})
     ids = {artefact.ref.sha256: entity["@id"] for artefact, entity in described}
     accepted = [f"{name}: {describe_accepted(s.accepted)}" for name, s in state.steps.items() if s.accepted]
@@ -80,6 +84,7 @@ def crate(
             + (" No real device took part: the whole rig was simulated." if root.simulated else "")
             + (f" {imported_sentence(events[0].at_utc, root.operator)}." if root.origin == "imported" else "")
             + "".join(f" Accepted outside its limits: {text}." for text in accepted)
+            + (f" Not in when this was made: {'; '.join(missing)}." if missing else "")
         ),
         "datePublished": events[-1].at_utc,
         "license": {"@id": "#rights"},

@@ -13,6 +13,7 @@ from service.audit.computed import Computed, Step
 from service.audit.queries import Facets, head, root
 from service.core.errors import IntegrityError, OrthocaptureError
 from service.core.fold import advance, initial_state
+from service.core.late import LateResult, late_results
 from service.core.model import PAYLOAD, Event, GatesEvaluated, GateVerdict, Payload, ViewImported, ViewpointCaptured
 from service.core.protocol import Protocol, parse_protocol
 from service.core.run_state import Deviation, RunState
@@ -39,6 +40,10 @@ FOLDED = (
     "run_released",
     "control_taken",
 )
+
+# Of computations only these change what a first page says: results that came after the evaluation.
+_JOB_EVENTS = ("job_enqueued", "job_finished")
+_JOB_KINDS = ("evaluate",)
 
 # Of these the fold needs only step, attempt and name.
 _VIEWS: Mapping[str, type[ViewpointCaptured | ViewImported]] = {
@@ -80,6 +85,11 @@ class Digest:
     def deviations(self) -> Sequence[Deviation]:
         """All, in order; notes included."""
         return self.state.deviations if self.state else ()
+
+    @property
+    def late(self) -> list[LateResult]:
+        """Results that came after the evaluation."""
+        return late_results(self.protocol, self.state) if self.protocol and self.state else []
 
     @property
     def status(self) -> str:
@@ -142,26 +152,37 @@ def _chunk_end(connection: Connection, run_id: str, after: int, last: int) -> in
     found = connection.execute(
         text(
             "SELECT seq FROM event_index WHERE run_id = :run AND seq > :after "
-            f"AND kind IN ({_quoted()}) ORDER BY seq LIMIT 1 OFFSET :chunk"
+            f"AND kind IN ({_quoted(FOLDED)}) ORDER BY seq LIMIT 1 OFFSET :chunk"
         ),
         {"run": run_id, "after": after, "chunk": CHUNK - 1},
     ).scalar_one_or_none()
     return last if found is None else int(found)
 
 
-def _quoted() -> str:
-    return ", ".join(f"'{kind}'" for kind in FOLDED)
+def _quoted(kinds: Sequence[str]) -> str:
+    return ", ".join(f"'{kind}'" for kind in kinds)
+
+
+# A result without all but the evaluation's table, where it has one; its files are not needed either.
+_WITH_TABLE_ALONE = (
+    "json_set(json_remove(payload, '$.artefacts'), '$.result', CASE json_type(payload, '$.result.table') "
+    "WHEN 'array' THEN json_object('table', json_extract(payload, '$.result.table')) ELSE json('{}') END)"
+)
 
 
 def _rows(connection: Connection, run_id: str, after: int, upto: int) -> Sequence[Any]:
     return connection.execute(
         text(
             "SELECT seq, kind, at_utc, monotonic_s, actor, previous_sha256, sha256, CASE "
-            "WHEN kind = 'step_measured' THEN json_remove(payload, '$.result', '$.artefacts') "
+            f"WHEN kind IN ('step_measured', 'job_finished') THEN {_WITH_TABLE_ALONE} "
+            "WHEN kind = 'job_enqueued' THEN json_set(payload, '$.arguments', json('{}')) "
             "WHEN kind IN ('viewpoint_captured', 'view_imported') THEN json_array(json_extract(payload, '$.step'), "
             "json_extract(payload, '$.attempt'), json_extract(payload, '$.viewpoint')) "
             "ELSE payload END AS payload FROM events "
-            f"WHERE run_id = :run AND seq > :after AND seq <= :upto AND kind IN ({_quoted()}) ORDER BY seq"
+            f"WHERE run_id = :run AND seq > :after AND seq <= :upto AND (kind IN ({_quoted(FOLDED)}) "
+            f"OR kind IN ({_quoted(_JOB_EVENTS)}) "
+            f"AND json_extract(payload, '$.job_kind') IN ({_quoted(_JOB_KINDS)})) "
+            "ORDER BY seq"
         ),
         {"run": run_id, "after": after, "upto": upto},
     ).all()

@@ -68,9 +68,10 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
 
 
 def _write_dataset(run: RecordedRun, folder: Path, target: Path, leave: Callable[[Path], None]) -> None:
+    from service.audit.not_in_yet import not_in_yet  # noqa: PLC0415
     from service.dataset.export import export_dataset  # noqa: PLC0415
 
-    export_dataset(run.summary(), folder)
+    export_dataset(run.summary(), folder, not_in_yet(run.protocol, run.state, run.events))
     with writing_bundle(target, _OLDEST, leave) as archive:
         for path in sorted(path for path in folder.rglob("*") if path.is_file()):
             compress = path.suffix.lower() not in (".jpg", ".jpeg", ".png", ".npz")

@@ -22,6 +22,7 @@ GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
     "refused": ("Refused actions", frozenset({"refused"})),
     "failed_gates": ("Failed gates", frozenset()),
     "undecided_gates": ("Gates not decided", frozenset()),
+    "late_results": ("Results that came later", frozenset()),
     "automatic": ("Automatic confirmations", frozenset({"automatic"})),
 }
 _NAMES: Mapping[str, str] = {
@@ -34,6 +35,7 @@ _NAMES: Mapping[str, str] = {
     "viewpoint_skipped": "View skipped",
     "refused": "Refused",
     "automatic": "Automatic (note)",
+    "late_result": "Result came later (note)",
     "failed_gate": "Gate failed",
     "undecided_gate": "Gate not decided",
 }
@@ -58,7 +60,7 @@ class Finding:
     @property
     def is_note(self) -> bool:
         """For the record only."""
-        return self.kind == "automatic"
+        return self.kind in ("automatic", "late_result")
 
 
 def findings(digest: Digest, group: str = "") -> list[Finding]:
@@ -74,6 +76,8 @@ def findings(digest: Digest, group: str = "") -> list[Finding]:
             _of_gate(gate) for gate in digest.failed_gates if kinds is None or _GATE_GROUPS[_gate_kind(gate)] == group
         ]
         found.sort(key=lambda finding: (finding.kind != "gate_accepted", finding.seq))
+    if group == "late_results":
+        found += [Finding(late.seq, late.at_utc, "late_result", late.step, "", late.text) for late in digest.late]
     return found
 
 
@@ -96,7 +100,8 @@ def counts(digest: Digest) -> dict[str, int]:
         by_kind[deviation.kind] = by_kind.get(deviation.kind, 0) + 1
     found = {group: sum(by_kind.get(kind, 0) for kind in kinds) for group, (_, kinds) in GROUPS.items()}
     kinds_of_gates = [_gate_kind(gate) for gate in digest.failed_gates]
-    return found | {group: kinds_of_gates.count(kind) for kind, group in _GATE_GROUPS.items()}
+    of_gates = {group: kinds_of_gates.count(kind) for kind, group in _GATE_GROUPS.items()}
+    return found | of_gates | {"late_results": len(digest.late)}
 
 
 # --- the list of runs -------------------------------------------------------------------------------------------

@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from service.audit.not_in_yet import not_in_yet
 from service.audit.report_blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
-from service.audit.report_words import mm, words
+from service.audit.report_words import mm, utc, words
 from service.core.dependence import depends_on
+from service.core.late import late_results
+from service.core.registered import shared_adjustment_note
 from service.dataset.summary import RunSummary
 
 PAPER_LIMIT_MM = 0.35
@@ -110,7 +113,6 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
         if true_error_mm is not None:
             texts.append(mm(true_error_mm.get(row["poses"])))
         shown.append(tuple(texts))
-    later = summary.better_later()
     on = rows[0]["evaluated_on"]
     explained = (
         f"Measured on {on}. The radial error is how far the sphere seen by the camera lies from the sphere of the "
@@ -119,14 +121,34 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
     )
     blocks: list[Block] = [Paragraph(text, "attention") for text in rests_on(summary)]
     blocks += [Table(tuple(columns), tuple(shown), frozenset(strong)), Paragraph(explained)]
-    if later is not None:
-        blocks.append(
-            Paragraph(
-                f"{later['poses']} came after the evaluation was made and has the smaller error, "
-                f"{later['mean_radial_error_mm']:.3f} mm. What was signed and released is {summary.best()}."
-            )
-        )
+    note = shared_adjustment_note(summary.protocol, summary.state)
+    if note:
+        blocks.append(Paragraph(note))
     return Section(title, tuple(blocks))
+
+
+def later_section(summary: RunSummary) -> Section | None:
+    """Results that came after the evaluation, what they changed, and those that had not come; None without any."""
+    late = late_results(summary.protocol, summary.state)
+    missing = not_in_yet(summary.protocol, summary.state, summary.events)
+    if not late and not missing:
+        return None
+    blocks: list[Block] = []
+    if late:
+        columns = (Column("event", 0.5, "number"), Column("time", 1.2), Column("what came, and what it changed", 5.0))
+        blocks.append(Table(columns, tuple((str(one.seq), utc(one.at_utc), f"{one.text}.") for one in late)))
+        better = summary.better_later()
+        if better is not None:
+            blocks.append(
+                Paragraph(
+                    f"{better['poses']} has the smallest error of all, {better['mean_radial_error_mm']:.3f} mm. What "
+                    f"was judged and signed is {summary.best()}, and the data set has its poses."
+                )
+            )
+    if missing:
+        blocks.append(Paragraph("Not in when this was made:", "attention"))
+        blocks += [Paragraph(f"{line}.", "attention") for line in missing]
+    return Section("Results that came later", tuple(blocks))
 
 
 def _paper(row: Mapping[str, Any]) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 
+from service.audit.not_in_yet import not_in_yet
 from service.audit.recorded import RecordedRun
-from service.audit.report_accuracy import accuracy_section, budget_section, result_sentence
+from service.audit.report_accuracy import accuracy_section, budget_section, later_section, result_sentence
 from service.audit.report_blocks import Cell, Facts, Paragraph, Report, Section
 from service.audit.report_certificates import certificate_sections
 from service.audit.report_course import deviations, deviations_section, people_section, steps_section
@@ -14,6 +15,7 @@ from service.audit.report_origin import devices_section, pictures_section, softw
 from service.audit.report_verification import verification_section
 from service.audit.report_words import duration, utc
 from service.core.imported import imported_sentence
+from service.core.late import late_results
 from service.store.audit import AuditReport
 
 
@@ -42,6 +44,7 @@ def report_content(
     sections = [
         deviations_section(run, listed),
         accuracy_section(summary, true_error_mm),
+        later_section(summary),
         budget_section(summary),
         steps_section(run),
         people_section(run),
@@ -96,6 +99,15 @@ def _release(run: RecordedRun) -> Cell | None:
     return Cell("NOT RELEASED: the protocol asks that a second person reads and releases this run", "stop")
 
 
+def _later(run: RecordedRun) -> Iterator[tuple[str, Cell]]:
+    late = late_results(run.protocol, run.state)
+    if late:
+        yield "Results that came after the evaluation", Cell(", ".join(one.name for one in late), "attention")
+    missing = not_in_yet(run.protocol, run.state, run.events)
+    if missing:
+        yield "Results not in yet", Cell("; ".join(missing), "attention")
+
+
 def _facts(run: RecordedRun) -> Facts:
     root, state, events = run.root, run.state, run.events
     views = sum(len(step.captured) for step in state.steps.values())
@@ -124,6 +136,7 @@ def _facts(run: RecordedRun) -> Facts:
                 else "SHA-256 of the rig's description",
                 root.rig.sha256,
             ),
+            *_later(run),
             ("Photographs that count", str(views)),
             ("Records", str(len(events))),
             ("Chain head", events[-1].sha256),

@@ -14,8 +14,10 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.markup import escape
 from rich.table import Table
 
+from service.audit.not_in_yet import not_in_yet
 from service.audit.recorded import read_run
 from service.audit.report_content import report_content
 from service.audit.report_html import write_html
@@ -25,6 +27,7 @@ from service.compute.registration.evaluation import true_error_m
 from service.core.errors import OrthocaptureError
 from service.core.geometry import inverse
 from service.core.protocol import load_protocol
+from service.core.registered import shared_adjustment_note
 from service.dataset.export import export_dataset
 from service.dataset.summary import RunSummary, summarise
 from service.rig import load_rig
@@ -64,7 +67,7 @@ def demo_command(
             report = folder / "report.html"
             write_html(report_content(read_run(data, run_id), audit, true_error_mm=truth), report)
             dataset = folder / "dataset"
-            export_dataset(summary, dataset)
+            export_dataset(summary, dataset, not_in_yet(summary.protocol, summary.state, summary.events))
             table = [{**row, "true_error_mm": truth[row["poses"]]} for row in summary.table()]
             database = str(store.database_path)
     result = {
@@ -77,6 +80,7 @@ def demo_command(
         "audit_ok": audit.ok,
         "duration_s": round(time.monotonic() - started_s, 1),
         "table": table,
+        "table_note": shared_adjustment_note(summary.protocol, summary.state),
     }
     if json:
         print_json(result)
@@ -158,6 +162,8 @@ def _print(result: Mapping[str, Any]) -> None:
             f"{row['true_error_mm']:.3f}",
         )
     console.print(table)
+    if result["table_note"]:
+        console.print(escape(result["table_note"]))
     for name in ("run", "database", "artefacts", "dataset", "report"):
         console.print(f"{name:<10} {result[name]}")
     console.print(f"{'audit':<10} {'verified' if result['audit_ok'] else 'FAILED'}")

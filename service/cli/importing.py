@@ -27,6 +27,7 @@ from service.cli.run import OperatorOption, WorkerOption, drive
 from service.core.errors import ConfigurationError
 from service.core.imported import FileRole, ImportedView, ImportList, PhotographRole
 from service.core.protocol import LoadedProtocol, Protocol, load_protocol
+from service.core.registered import shared_adjustment_note
 from service.dataset.summary import summarise
 from service.evidence import recorded_root
 from service.importing import find_places, import_rig, list_import
@@ -104,11 +105,13 @@ def import_command(
             run_id = _run_of(store, loaded, rig, operator=operator or getpass.getuser(), again=again)
             state = drive(store, run_id, rig, data=data, auto_confirm=False, worker=worker)
             summary = summarise(store, run_id, loaded.protocol)
-            table = summary.table()
+            table, note = summary.table(), shared_adjustment_note(loaded.protocol, summary.state)
         if json:
-            print_json({"run": run_id, "status": state.status, "table": table, **listing_record(listing)})
+            print_json(
+                {"run": run_id, "status": state.status, "table": table, "table_note": note, **listing_record(listing)}
+            )
         else:
-            _show_result(run_id, state.status, state.deviation_count, table)
+            _show_result(run_id, state.status, state.deviation_count, table, note)
         if state.status != "completed":
             raise typer.Exit(1)
 
@@ -222,7 +225,7 @@ def _dates(first: str, last: str) -> str:
     return begin if begin == end else f"{begin} to {end[11:] if end[:10] == begin[:10] else end}"
 
 
-def _show_result(run_id: str, status: str, deviations: int, rows: Sequence[Mapping[str, Any]]) -> None:
+def _show_result(run_id: str, status: str, deviations: int, rows: Sequence[Mapping[str, Any]], note: str) -> None:
     if rows:
         table = Table(title="Registration error", title_justify="left")
         for heading in ("camera poses", "images", "evaluated on", "mean radial error (mm)", "reprojection (px)"):
@@ -236,6 +239,8 @@ def _show_result(run_id: str, status: str, deviations: int, rows: Sequence[Mappi
                 f"{row['mean_reprojection_error_px']:.2f}",
             )
         console.print(table)
+        if note:
+            console.print(escape(note))
     console.print(
         f"Run {run_id} is {status}; {deviations} deviations. Its photographs are imported: how they were captured is "
         "not in evidence."

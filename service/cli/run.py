@@ -239,7 +239,7 @@ def status_command(
     for job in live[-3:]:
         console.print(escape(describe_view(job)))
     for line in missing:
-        console.print(f"still to come: {escape(line)}")
+        console.print(f"result to come: {escape(line)}")
     for way in ways_on(protocol, state):
         can = f"takes {takes_words(way.minutes)}, loses: {way.loses}" if way.available else f"no: {way.why_not}"
         console.print(f"way on: {way.verb} {way.step}: {escape(way.words)}; {escape(can)}")

@@ -384,7 +384,7 @@ def _job_ended(protocol: Protocol, state: RunState, event: Event, p: JobFinished
         job = replace(job, status="finished", duration_s=p.duration_s, late_s=p.late_s, **done)
     else:
         job = replace(job, status="failed", error=p.error, message=p.message)
-    job = replace(job, ended_utc=event.at_utc)
+    job = replace(job, ended_seq=event.seq, ended_utc=event.at_utc)
     return change(state, p.step, jobs={**state.steps[p.step].jobs, p.job: job})
 
 

@@ -45,6 +45,7 @@ class JobState:
     message: str = ""
     priority: int = WAITED
     enqueued_utc: str = ""
+    ended_seq: int = 0  # of the event with which it finished or failed
     ended_utc: str = ""
     duration_s: float = 0.0
     late_s: float | None = None  # after the specimen's release, or the run's end; None: in time

@@ -107,7 +107,8 @@ def _again(protocol: Protocol, state: RunState, trouble: Trouble) -> WayOn:
     words = str(now.mend.get("advice") or (_WITH_WHAT_IS_THERE if _all_taken(step, now) else _again_of(step).words))
     if not now.mend and trouble == "failure" and now.failure is not None:
         words = f"{REMEDIES.get(now.failure.error, UNKNOWN_REMEDY)}; then try again"
-    left = len(now.mend.get("viewpoints", ())) or max(planned_views(step) - len(now.captured), 0)
+    mended = len(now.mend.get("viewpoints", ())) + int(now.mend.get("images", 0))
+    left = mended or max(planned_views(step) - len(now.captured), 0)
     each_s = view_s(protocol, state, step)
     minutes = _minutes(now.worked_s)
     if left and each_s is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,20 @@ from service.core.errors import DataError
 from service.core.gates import BOUNDS_HOLD, describe, standing
 from service.core.geometry import Transform
 from service.core.imported import imported_sentence
+from service.core.late import late_results
+from service.core.registered import shared_adjustment_note
 from service.dataset.summary import RunSummary
 
 
-def export_dataset(summary: RunSummary, folder: Path) -> None:
+def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] = ()) -> None:
     """Write images/, camera.json, poses.csv, transforms.json, mesh.ply and dataset.json into a new folder.
 
     The common frame is that of the scan (metres): the scan is the ground truth and is not resampled.
+
+    Args:
+        summary: of the run.
+        folder: to be made.
+        not_in_yet: results that had not arrived, in words.
 
     Raises:
         DataError: nothing was evaluated, or the folder exists.
@@ -70,7 +78,10 @@ def export_dataset(summary: RunSummary, folder: Path) -> None:
         "gates": _gates(summary),
         "gates_explained": BOUNDS_HOLD,
         "accepted_gates": [gate.text for gate in accepted_gates(summary.protocol, summary.state)],
+        "evaluation_note": shared_adjustment_note(summary.protocol, summary.state),
+        "arrived_later": [late.text for late in late_results(summary.protocol, summary.state)],
         "arrived_later_and_better": None if later is None else later["poses"],
+        "not_in_yet": list(not_in_yet),
         "deviations": [d.text for d in summary.state.deviations if not d.is_note],
         "head_of_chain_sha256": summary.events[-1].sha256,
         "image_sha256": sources,

@@ -104,12 +104,16 @@ class LiveAnalysis:
             self.context.evidence.enqueue(JobRequest("live_view", arguments, LIVE), sha256)
         self._tell()
 
-    def summary(self, station: str, candidates: Sequence[tuple[Viewpoint, float]]) -> dict[str, float]:
+    def summary(
+        self, station: str, candidates: Sequence[tuple[Viewpoint, float]], retakes: str = "", again: int = 0
+    ) -> dict[str, float]:
         """Wait, up to a limit, for the last images; the measures of the gate. A shortfall becomes a suggestion.
 
         Args:
             station: where the robot stands.
             candidates: viewpoints that could be taken there in addition, with the time to get there.
+            retakes: what the same confirmation takes again, in words; the suggestion is added to it.
+            again: how many images that are.
         """
         self._wait()
         error_gate, coverage_gate = self._gate(ERROR), self._gate(COVERAGE)
@@ -140,7 +144,7 @@ class LiveAnalysis:
         failed = [gate for gate in self.context.step.gates if _fails(gate, answer.measures)]
         suggestions = answer.result["next_best_views"]
         if failed and suggestions:
-            self._suggest(failed, answer.measures, suggestions)
+            self._suggest(failed, answer.measures, suggestions, retakes, again)
         return dict(answer.measures)
 
     def suggested(self) -> set[str]:
@@ -149,7 +153,12 @@ class LiveAnalysis:
         return {str(view["viewpoint"]) for note in notes for view in note.data["viewpoints"]}
 
     def _suggest(
-        self, failed: Sequence[Gate], measures: Mapping[str, float], suggestions: Sequence[Mapping[str, Any]]
+        self,
+        failed: Sequence[Gate],
+        measures: Mapping[str, float],
+        suggestions: Sequence[Mapping[str, Any]],
+        retakes: str,
+        again: int,
     ) -> None:
         last = suggestions[-1]
         names = ", ".join(str(view["viewpoint"]) for view in suggestions)
@@ -158,12 +167,15 @@ class LiveAnalysis:
             for gate in failed
             if gate.measure in measures
         )
+        confirm = "The same confirmation also takes" if retakes else "Confirm to take"
         advice = (
-            f"{short}. Confirm to take {len(suggestions)} more views ({names}): the error is then predicted to be "
+            f"{short}. {confirm} {len(suggestions)} more views ({names}): the error is then predicted to be "
             f"{last['predicted_error_mm']:.3f} mm and the coverage {100 * last['coverage']:.0f} %"
         )
-        self.context.note(SUGGESTION, advice=advice, viewpoints=list(suggestions))
-        self.context.tell(advice)
+        self.context.tell(advice)  # of what is taken again it was told before
+        # The newest note with advice is what a person is shown: it holds all that the confirmation does.
+        both = f"{retakes}. {advice}" if retakes else advice
+        self.context.note(SUGGESTION, advice=both, viewpoints=list(suggestions), images=again)
 
     def _gate(self, measure: str) -> Gate | None:
         return next((gate for gate in self.context.step.gates if gate.measure == measure), None)

@@ -27,8 +27,10 @@ def to_take_again(context: StepContext) -> set[str]:
     return {c.viewpoint for c in captures if c.viewpoint in departed and c.attempt <= notes[-1]["attempt"]}
 
 
-def advise_retakes(context: StepContext, measures: Mapping[str, float], images: int) -> None:
+def advise_retakes(context: StepContext, measures: Mapping[str, float], images: int) -> str:
     """Where such a gate fails, note what a retry will do: the failed images only.
+
+    Returns the advice; "" where none is needed.
 
     Args:
         measures: of the capture.
@@ -37,9 +39,10 @@ def advise_retakes(context: StepContext, measures: Mapping[str, float], images: 
     verdicts = evaluate_gates(context.step, context.attempt, measures, context.run.skipped).verdicts
     failed = [verdict for verdict in verdicts if not verdict.passed and verdict.measure in TAKEN_AGAIN]
     if not failed:
-        return
+        return ""
     short = "; ".join(describe(verdict) for verdict in failed)
     words = "; ".join(TAKEN_AGAIN[verdict.measure] for verdict in failed)
     advice = f"{short}. First {words}. Confirm to take {images} image(s) again; all others are kept"
-    context.note("retakes", advice=advice)
+    context.note("retakes", advice=advice, images=images)
     context.tell(advice)
+    return advice

@@ -47,14 +47,16 @@ class Left:
     what: str
     seconds: float
     failed: str = ""
+    waits: bool = False  # nothing of the run is being computed now: no worker runs, or it is busy with other runs
 
     @property
     def text(self) -> str:
-        """`COLMAP from nothing: about 4 min left`."""
-        return (
-            f"{self.what}: {self.failed}"
-            if self.failed
-            else f"{self.what}: about {duration_words(self.seconds)} left"
+        """`COLMAP from nothing: still computing, about 4 min left`."""
+        if self.failed:
+            return f"{self.what}: there will be none, {self.failed}"
+        takes = f"about {duration_words(self.seconds)}"
+        return f"{self.what}: " + (
+            f"waits for a worker, then {takes}" if self.waits else f"still computing, {takes} left"
         )
 
 
@@ -78,7 +80,7 @@ def missing_results(
         cores: how many jobs are computed side by side.
     """
     left: list[Left] = []
-    for step in protocol.steps:
+    for step in protocol.steps if state.status != "aborted" else ():  # nothing follows in an aborted run
         found = registration_ways(protocol, state, step)
         if found is not None:
             evaluation = next((s for s in protocol.steps if _evaluates(s, step)), None)

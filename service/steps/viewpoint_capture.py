@@ -71,11 +71,12 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         measures["optics_departures"] = float(departing_images(departures))
     departing = {departure.image for departure in departures or ()}
     refused = {c.viewpoint for c in context.evidence.captures(context.step.id) if not all(c.verdicts.values())}
-    advise_retakes(context, measures, len(departing | refused) + totals.given_up)
+    again = len(departing | refused) + totals.given_up
+    retakes = advise_retakes(context, measures, again)
     if live is not None:
         taken = {viewpoint.name for viewpoint in plan}
         candidates = feasible_extra(context, [v for v in extra if v.name not in taken], nominal)
-        measures |= live.summary(last.station, candidates)
+        measures |= live.summary(last.station, candidates, retakes, again if retakes else 0)
     result = Result(purpose=params.purpose, captured=totals.captured)
     return StepOutcome(measures=measures, result=result.model_dump())
 

@@ -12,10 +12,13 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from service.audit import artefact_queries, findings, first_page, queries
 from service.audit.computed import Progress
 from service.audit.correcting import correct, correctable
+from service.audit.digest import Digest
 from service.audit.first_page import GROUPS, ListedRun, RunFilter
 from service.audit.provenance import origin
 from service.audit.provenance_drawing import draw
 from service.audit.queries import EventFilter
+from service.evidence import results_to_come
+from service.steps.time_left import Left
 from service.store.records import SITE
 from service.web.audit_view import Audit, Auditing, audit_frame, close_audit, cut, link
 from service.web.pages import TEMPLATES, render
@@ -128,7 +131,17 @@ def run_page(request: Request, audit: Auditing, run_id: str) -> Response:
         exports=exports,
         releases=[s for s in signatures if not s.step],
         signatures=signatures,
+        late=known.late if known else [],
+        to_come=[left.text for left in _to_come(audit, run_id, known)],
     )
+
+
+def _to_come(audit: Audit, run_id: str, digest: Digest | None) -> list[Left]:
+    """Results that are still being computed, or will never come. Read whole only where there may be any."""
+    failed = digest is not None and digest.facets.kinds.get("job_failed", 0) > 0
+    if digest is None or digest.problem or not (failed or audit.site.store.open_jobs(run_id)):
+        return []
+    return results_to_come(audit.site.run(run_id))
 
 
 @router.get(

@@ -12,7 +12,7 @@ from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
 from service.core.dependence import accepted_gates
-from service.core.registered import evaluated
+from service.core.registered import evaluated, shared_adjustment_note
 from service.evidence import RunLog, results_to_come
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
@@ -69,6 +69,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         "now_utc": datetime.now(UTC).isoformat(),
         "depends": accepted_gates(log.protocol, log.state),
         "result_table": evaluated(log.protocol, log.state),
+        "result_note": shared_adjustment_note(log.protocol, log.state),
     }
 
 

@@ -1,0 +1,21 @@
+"""Results that were planned and had not arrived when something was exported: by the record alone, without a guess."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from service.core.model import Event
+from service.core.protocol import Protocol
+from service.core.run_state import RunState
+from service.steps.time_left import missing_results
+
+
+def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> list[str]:
+    """`COLMAP from nothing: was still being computed`, or why it never comes; empty when all is there.
+
+    The same events give the same lines: how long it would have taken is not among them.
+    """
+    return [
+        f"{left.what}: {f'there will be none, {left.failed}' if left.failed else 'was still being computed'}"
+        for left in missing_results(protocol, state, {}, events[-1].at_utc, 1)
+    ]
