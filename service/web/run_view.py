@@ -101,6 +101,7 @@ class Shown:
     why: str
     instructions: str
     drawing: str
+    picture: str  # SHA-256 of the photograph on which the step shows what it found; "" without one
     station: str
     status: str
     current: bool
@@ -321,6 +322,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
         why=step.why,
         instructions="\n".join(" ".join(part.split()) for part in step.instructions.split("\n\n")),
         drawing=drawing_of(step),
+        picture=next((ref.sha256 for ref in reversed(now.artefacts) if ref.kind == "layout_overlay"), ""),
         station=station_of(step),
         status=phase_words(state, now)[0],
         current=step.id == state.current and not state.terminal,

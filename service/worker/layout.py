@@ -29,7 +29,7 @@ from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.worker.job import JobAnswer, JobContext
 
-_GREEN, _YELLOW, _BLACK = (60, 220, 60), (0, 220, 255), (0, 0, 0)  # BGR
+_GREEN, _YELLOW, _BLACK, _WHITE = (60, 220, 60), (0, 220, 255), (0, 0, 0), (255, 255, 255)  # BGR
 
 
 def layout(context: JobContext) -> JobAnswer:
@@ -131,19 +131,49 @@ def _picture(
     """JPEG of the photograph with numbered spheres, and arrows where spheres are to go."""
     picture = pixels.copy()
     thick = max(1, round(camera.width / 900))
-    size = camera.width / 1900
-    for sphere, outline in zip(ids.tolist(), outlines, strict=False):
-        curve = np.rint(outline.captured_px(camera) * 16).astype(np.int32)
-        cv2.polylines(picture, [curve], True, _GREEN, thick, cv2.LINE_AA, shift=4)
-        if sphere < 0:
-            continue
-        x, y = (round(v) for v in outline.centre_px)
-        place = (x - round(10 * size * len(str(sphere))), y + round(10 * size))
-        for tone, width in ((_BLACK, 4 * thick), (_GREEN, 2 * thick)):
-            cv2.putText(picture, str(sphere), place, cv2.FONT_HERSHEY_SIMPLEX, size, tone, width, cv2.LINE_AA)
+    curves = [outline.captured_px(camera) for outline in outlines]
+    for curve in curves:
+        cv2.polylines(picture, [_sixteenths(curve)], True, _GREEN, 2 * thick, cv2.LINE_AA, shift=4)
     for move in moves:
-        (x0, y0), (x1, y1) = np.rint([move.from_px, move.to_px]).astype(int).tolist()
-        for tone, width in ((_BLACK, 6 * thick), (_YELLOW, 3 * thick)):
-            cv2.arrowedLine(picture, (x0, y0), (x1, y1), tone, width, cv2.LINE_AA, tipLength=0.25)
+        moved = min(curves, key=lambda curve: float(np.linalg.norm(curve.mean(axis=0) - move.from_px)))
+        _draw_move(picture, move, moved - moved.mean(axis=0), thick)
+    for sphere, curve in zip(ids.tolist(), curves, strict=False):  # above all else: the advice names them
+        if sphere >= 0:
+            _draw_number(picture, str(sphere), curve, thick)
     _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
     return encoded.tobytes()
+
+
+def _draw_move(picture: NDArray[np.uint8], move: ShownMove, outline: Array, thick: int) -> None:
+    """Where the sphere is to go as a circle, and an arrow from rim to rim, so that its number stays to be read.
+
+    Args:
+        picture: drawn into.
+        move: the move.
+        outline: (n, 2) pixels of the sphere's outline about its middle.
+        thick: of a thin line, in pixels.
+    """
+    way = move.to_px - move.from_px
+    length = float(np.linalg.norm(way))
+    rim = float(np.linalg.norm(outline, axis=1).mean()) * way / length if length > 0 else np.zeros(2)
+    (x0, y0), (x1, y1) = np.rint([move.from_px + rim, move.to_px + rim]).astype(int).tolist()
+    for tone, width in ((_BLACK, 5 * thick), (_YELLOW, 2 * thick)):
+        cv2.polylines(picture, [_sixteenths(outline + move.to_px)], True, tone, width, cv2.LINE_AA, shift=4)
+    for tone, width in ((_BLACK, 7 * thick), (_YELLOW, 4 * thick)):
+        cv2.arrowedLine(picture, (x0, y0), (x1, y1), tone, width, cv2.LINE_AA, tipLength=0.3)
+
+
+def _draw_number(picture: NDArray[np.uint8], text: str, curve: Array, thick: int) -> None:
+    """In the middle of its sphere, as large as fits there: a page shows the photograph at a fraction of its size."""
+    x, y = curve.mean(axis=0)
+    radius = float(np.linalg.norm(curve - (x, y), axis=1).mean())
+    (width_1, height_1), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 2 * thick)
+    size = 1.3 * radius / max(height_1, width_1 / 1.1)
+    place = (round(x - size * width_1 / 2), round(y + size * height_1 / 2))
+    for tone, width in ((_BLACK, 6 * thick), (_WHITE, 2 * thick)):
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, tone, width, cv2.LINE_AA)
+
+
+def _sixteenths(curve: Array) -> NDArray[np.int32]:
+    """As OpenCV takes pixels with four binary places."""
+    return np.rint(curve * 16).astype(np.int32)
