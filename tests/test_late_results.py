@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import pty
+import select
+import signal
+import subprocess
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from service.audit import first_page
@@ -23,6 +31,7 @@ from service.core.fold import fold
 from service.core.gates import evaluate_gates
 from service.core.late import late_results
 from service.core.model import (
+    FilesKept,
     OperatorAction,
     Payload,
     RunCompleted,
@@ -40,9 +49,12 @@ from service.runs import start_run
 from service.steps import params_models
 from service.steps.sources import PLANNED
 from service.steps.time_left import missing_results
-from service.store.records import NewJob
+from service.store.audit import verify
+from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 from tests.support.reported_run import evaluation
+from tests.support.rig import REPOSITORY, command, orthocapture
+from tests.support.store import rows
 from tests.support.waiting import until
 from tests.support.web import web_site
 
@@ -232,8 +244,8 @@ def test_ctrl_c_while_waiting_ends_in_order_and_says_what_goes_on(run: Run) -> N
         def __init__(self) -> None:
             pass
 
-        def tell(self, text: str) -> None:
-            said.append(text)
+        def tell(self, message: str) -> None:
+            said.append(message)
 
         def show(self, what: str, done: int, total: int) -> None:
             raise KeyboardInterrupt
@@ -245,3 +257,89 @@ def test_ctrl_c_while_waiting_ends_in_order_and_says_what_goes_on(run: Run) -> N
     assert said[-1] == "cleared"
     assert "--until-idle" in said[-2]
     assert run.store.open_jobs(run.run_id) == 2
+
+
+def long_job(run: Run, count: int) -> None:
+    """Features of images of noise, which take their time; nobody waits for them."""
+    draw = np.random.default_rng(1)
+    images: list[dict[str, str]] = []
+    for number in range(count):
+        jpeg = cv2.imencode(".jpg", draw.integers(0, 255, (_HEIGHT, _WIDTH, 3), np.uint8))[1].tobytes()
+        ref = run.store.put_bytes(jpeg, kind="image", media_type="image/jpeg", original_name=f"{number}.jpg")
+        kept = FilesKept(step="registration", attempt=1, device="camera", note="noise", artefacts=(ref,))
+        row = NewArtefact(ref, "camera", "registration", 1)
+        run.store.record(run.run_id, [kept], actor="runner", artefacts=[row])
+        images.append({"viewpoint": f"n{number}", "sha256": ref.sha256})
+    camera = {"width": _WIDTH, "height": _HEIGHT, **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)} | {
+        "fx": 2000.0,
+        "fy": 2000.0,
+        "cx": 480.0,
+        "cy": 320.0,
+    }
+    effort = {"max_image_size": 3200, "max_features": 8000, "neighbours": 12}
+    run.job("features", "registration", "noise", LATER, images=images, camera=camera, effort=effort)
+
+
+def jobs(data: Path, run_id: str) -> dict[str, str]:
+    found = rows(data, f"SELECT kind, state FROM jobs WHERE run_id = '{run_id}'")
+    return {str(kind): str(state) for kind, state in found}
+
+
+@pytest.mark.timeout(400)  # five processes, one after another
+def test_a_terminal_that_waits_can_be_left_and_nothing_is_lost(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with Store.open(data) as store:
+        run = record(tmp_path, store)
+        long_job(run, 60)
+        run_id = run.run_id
+    master, slave = pty.openpty()
+    words = command("resume", run_id, "--data", str(data))
+    waiting = subprocess.Popen(words, cwd=REPOSITORY, stdin=slave, stdout=slave, stderr=slave, start_new_session=True)
+    os.close(slave)
+    said = ""
+
+    def shown() -> str:
+        nonlocal said
+        with contextlib.suppress(OSError):  # the terminal closes with the program
+            while select.select([master], [], [], 0)[0]:
+                said += os.read(master, 65536).decode(errors="replace")
+        return said
+
+    try:
+        _left_while_it_waits(waiting, data, run_id, shown, tmp_path / "bundle-SIMULATED.zip")
+    finally:
+        waiting.kill()
+        waiting.wait()
+        os.close(master)
+
+
+def _left_while_it_waits(
+    waiting: subprocess.Popen[bytes], data: Path, run_id: str, shown: Callable[[], str], bundle: Path
+) -> None:
+    until(lambda: "Ctrl-C leaves them" in shown(), shown, 120.0)
+    until(lambda: jobs(data, run_id)["features"] == "running", shown, 120.0)
+    exported = orthocapture("audit", "export", run_id, str(bundle), "--data", str(data))
+    assert exported.returncode == 0, exported.stderr
+    assert verify_bundle([str(bundle)]) == 0
+    assert jobs(data, run_id)["features"] == "running"  # all this while it was computed
+    os.killpg(waiting.pid, signal.SIGINT)  # what Ctrl-C does
+    until(lambda: bool(shown()) and waiting.poll() is not None, shown, 60.0)
+    assert waiting.returncode == 0, shown()
+    assert "worker --data" in shown()
+    assert "is completed" in shown()
+    assert "Traceback" not in shown()
+    assert jobs(data, run_id)["features"] == "queued"
+    assert verify(data, run_id).ok
+
+
+@pytest.mark.timeout(400)
+def test_what_was_left_is_computed_by_the_next_worker(tmp_path: Path) -> None:
+    with Store.open(tmp_path / "data") as store:
+        run = record(tmp_path, store)
+        long_job(run, 1)
+        abandoned = store.claim_job("worker", 0.0, kinds=["features"])  # its worker was killed
+        assert abandoned is not None
+    done = orthocapture("worker", "--data", str(tmp_path / "data"), "--until-idle")
+    assert done.returncode == 0, done.stderr
+    assert jobs(tmp_path / "data", run.run_id)["features"] == "finished"
+    assert verify(tmp_path / "data", run.run_id).ok
