@@ -20,7 +20,9 @@ class Fault(BaseModel):
 
     device: str
     on: str = Field(description="name of the message or operation; * counts every message of the device")
-    kind: str = Field(description="drop, stall, truncate, corrupt, reject, protective_stop, disk_full, …")
+    kind: str = Field(
+        description="drop, stall, truncate, corrupt, reject, protective_stop, disk_full, smear, black, …"
+    )
     nth: int = Field(default=1, ge=1)
     times: int = Field(default=1, ge=1)
     value: float | int | str | bool | None = Field(

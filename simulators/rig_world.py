@@ -50,6 +50,7 @@ class World:
     control_spheres: bool = True
     board_placements: int = 0
     board_placed: bool = False
+    lens_cleanings: int = 0
     pedal_presses: int = 0
     camera_held: bool = False  # in the technician's hands, instead of on the arm
     T_world_held: Array = field(default_factory=HELD_CAMERAS["above"].copy)  # where he holds it
@@ -95,6 +96,7 @@ class World:
                 "light_lux": self.scene.light_lux,
                 "temperature_c": self.scene.temperature_c,
                 "pedal_presses": self.pedal_presses,
+                "lens_cleanings": self.lens_cleanings,
                 "hand": {"shake": self.press.shake, "finger": self.press.finger},
             }
 
@@ -121,11 +123,9 @@ class World:
         action = request.get("action")
         with self._lock:
             match action:
-                case "place_board":
-                    self.board_placements += 1
-                    self.board_placed = True
-                case "remove_board":
-                    self.board_placed = False
+                case "place_board" | "remove_board":
+                    self.board_placed = action == "place_board"
+                    self.board_placements += self.board_placed
                 case "move_robot":
                     if request.get("station") not in STATIONS:
                         return {"ok": False, "error": f"no station {request.get('station')!r}; {', '.join(STATIONS)}"}
@@ -144,6 +144,8 @@ class World:
                     self.press = Press()
                     self.shutter_presses += 1
                     self._pressed.notify_all()
+                case "clean_lens":
+                    self.lens_cleanings += 1
                 case "press_pedal":
                     self.pedal_presses += 1
                 case _:

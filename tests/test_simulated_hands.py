@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from simulators.faults import Fault
 from simulators.geometry import Array, apply, inverse
+from simulators.picture_faults import Lens
 from simulators.rig_world import HELD_CAMERAS, World
 from simulators.world import Scene, parse_moved
 
@@ -47,3 +49,21 @@ def test_what_he_cannot_do_he_says(world: World) -> None:
     height = float(neighbours[1, 2] - neighbours[0, 2])
     answer = world.act({"action": "move_sphere", "from": here, "to": there, "higher_m": height})
     assert "in the way" in answer["error"]
+
+
+def test_a_smeared_lens_blurs_every_picture_until_it_is_cleaned(world: World) -> None:
+    lens, sharp = Lens(), np.random.default_rng(0).integers(0, 255, (60, 90, 3)).astype(np.uint8)
+    np.testing.assert_array_equal(lens.picture(sharp, None, world.view()), sharp)
+    smear = Fault(device="camera", on="image", kind="smear", value=0.03)
+    smeared = [lens.picture(sharp, fault, world.view()) for fault in (smear, None, None)]
+    assert all(picture.std() < 0.5 * sharp.std() for picture in smeared)
+    assert world.act({"action": "clean_lens"})["ok"]
+    np.testing.assert_array_equal(lens.picture(sharp, None, world.view()), sharp)
+
+
+@pytest.mark.parametrize(("kind", "changed"), [("blur", 1.0), ("black", 1.0), ("covered", 0.5)])
+def test_other_faults_spoil_one_picture(world: World, kind: str, changed: float) -> None:
+    lens, sharp = Lens(), np.random.default_rng(0).integers(1, 255, (60, 90, 3)).astype(np.uint8)
+    spoilt = lens.picture(sharp, Fault(device="camera", on="image", kind=kind, value=0.5), world.view())
+    assert np.mean((spoilt != sharp).any(axis=2)) == pytest.approx(changed, abs=0.1)
+    np.testing.assert_array_equal(lens.picture(sharp, None, world.view()), sharp)

@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 
 from simulators.faults import Fault, FaultPlan
+from simulators.picture_faults import Lens
 from simulators.serve import SimulatorError
 from simulators.sony_camera.exif import Shot, encode_jpeg, encode_raw
 from simulators.sony_camera.properties import (
@@ -78,6 +79,7 @@ class CameraBody:
         self.free_bytes = CARD_BYTES * 3 // 4
         self._source = source
         self._faults = faults
+        self._lens = Lens()
         self._counter = options.first_counter
         self._waiting: deque[CameraFile] = deque()
         self._previous: list[CameraFile] = []
@@ -136,7 +138,7 @@ class CameraBody:
         try:
             moment = self._source.freeze(counter)
             taken = datetime.now().astimezone()
-            files = self._develop(moment, settings, Shot(settings, counter, taken))
+            files = self._develop(moment, settings, Shot(settings, counter, taken), fault)
             if not self.options.fast:
                 time.sleep(max(0.0, settings.exposure_s + HANDLING_S - (time.monotonic() - started)))
             self._finish(files, fault, moment, settings, taken)
@@ -146,8 +148,10 @@ class CameraBody:
         finally:
             self._exposing.clear()
 
-    def _develop(self, moment: Moment, settings: ExposureSettings, shot: Shot) -> list[CameraFile]:
-        picture = self._source.develop(moment, settings)
+    def _develop(
+        self, moment: Moment, settings: ExposureSettings, shot: Shot, fault: Fault | None
+    ) -> list[CameraFile]:
+        picture = self._lens.picture(self._source.develop(moment, settings), fault, moment.view)
         captured = f"{shot.taken:%Y%m%dT%H%M%S}"
         height, width = picture.shape[:2]
         stem = f"DSC{(moment.counter - 1) % 9999 + 1:05d}"

@@ -1,0 +1,59 @@
+"""What spoils a picture before it reaches the sensor: a smeared lens, a shake, no light, a cloth in the way."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+
+from simulators.faults import Fault
+from simulators.geometry import Bytes
+
+# Kinds of faults of the message `image`: `smear` lasts until somebody cleans the lens; `blur`, `black` and `covered`
+# last one picture. `value` is σ over the picture's width (smear, blur), or the share of the width under the cloth.
+_BLUR, _COVERED = 0.004, 0.5
+_CLOTH = (60, 105, 120)  # RGB of a surgical drape
+
+
+class Lens:
+    """The front of the lens: who touches it smears it, and so it stays until it is cleaned. Safe in any thread."""
+
+    def __init__(self) -> None:
+        self._smear = 0.0  # σ over the width of the picture
+        self._cleanings = 0
+        self._lock = threading.Lock()
+
+    def picture(self, picture: Bytes, fault: Fault | None, view: Mapping[str, Any]) -> Bytes:
+        """The picture (H, W, 3) as it passes the lens, given the fault that is due and how often it was cleaned."""
+        kind = fault.kind if fault is not None else ""
+        value = fault.value if fault is not None else None
+        share = float(value) if isinstance(value, int | float) else None
+        with self._lock:
+            if view.get("lens_cleanings", 0) != self._cleanings:
+                self._smear, self._cleanings = 0.0, int(view["lens_cleanings"])
+            if kind == "smear":
+                self._smear = share or _BLUR
+            smear = self._smear
+        if kind == "black":
+            return np.zeros_like(picture)
+        if kind == "covered":
+            picture = _covered(picture, share or _COVERED)
+        blur = max(smear, share or _BLUR) if kind == "blur" else smear
+        return _blurred(picture, blur) if blur > 0 else picture
+
+
+def _blurred(picture: Bytes, share: float) -> Bytes:
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), share * picture.shape[1]), dtype=np.uint8)
+
+
+def _covered(picture: Bytes, share: float) -> Bytes:
+    """A cloth with folds over the left part of the picture, its edge uneven."""
+    height, width = picture.shape[:2]
+    x, y = np.arange(width, dtype=np.float32)[None, :], np.arange(height, dtype=np.float32)[:, None]
+    edge = width * share + 0.02 * width * np.sin(9.0 * y / height)
+    folds = 0.8 + 0.2 * np.sin(25.0 * (x + 0.4 * y) / width)
+    cloth = folds[..., None] * np.array(_CLOTH, dtype=np.float32)
+    return np.where((x < edge)[..., None], cloth, picture).astype(np.uint8)
