@@ -6,6 +6,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -122,3 +123,54 @@ def test_the_board_on_its_other_side_stops_after_a_few_images(begin: Callable[[s
     assert "the first images show no board" in texts[0]
     assert "the image is black" in texts[0]
     bench.must_verify()
+
+
+def test_a_single_blurred_image_is_replaced_and_not_calibrated_from(begin: Callable[[str], Bench]) -> None:
+    bench = begin(PROTOCOL)
+    room = board_room(bench)
+    room.spoil = lambda exposure, picture: blurred(picture) if exposure == 8 else picture
+    state = bench.run()
+    assert state.status == "completed"
+    assert not bench.payloads(StepRetried)
+    (replaced,) = [plan for plan in plans(bench) if plan["why"] == "replacement"]
+    ((name, why),) = replaced["instead_of"].items()
+    assert name == bench.captured()[7]
+    assert "blurred, its edges are" in why
+    solved = state.steps["calibration"].result["details"]["intrinsics"]["images"]
+    assert len(solved) == 14
+    assert name not in solved
+
+
+def test_a_smeared_lens_stops_the_capture_and_exactly_the_blurred_images_are_taken_again(
+    begin: Callable[[str], Bench],
+) -> None:
+    bench = begin(PROTOCOL)
+    room = board_room(bench)
+    cleaned_after: list[int] = []
+    room.spoil = lambda exposure, picture: blurred(picture) if exposure >= 9 and not cleaned_after else picture
+    asked: list[str] = []
+
+    def clean(question: Any, state: Any) -> Any:
+        asked.append(question.text)
+        assert state.step.mend["hands"] == [{"action": "clean_lens"}]
+        cleaned_after.append(bench.rig.shutter.exposures)
+        return answer(question, "confirm")
+
+    bench.script("calibration", "recovery", clean)
+    state = bench.run()
+    assert state.status == "completed"
+    assert len(asked) == 1
+    assert "Clean the lens, then confirm" in asked[0]
+    captured = bench.captured()
+    (stop,) = cleaned_after
+    assert stop < 14, "no more images through a smeared lens than it takes to tell"
+    bad = captured[8:stop]
+    assert len(bad) >= 3
+    assert sorted(name for name in set(captured) if captured.count(name) > 1) == sorted(bad)
+    assert len(captured) == 14 + len(bad)
+    assert not [plan for plan in plans(bench) if plan["why"] == "replacement"]
+    bench.must_verify()
+
+
+def blurred(picture: Picture) -> Picture:
+    return np.asarray(cv2.GaussianBlur(picture, (0, 0), 4.0), dtype=np.uint8)

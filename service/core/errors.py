@@ -58,5 +58,9 @@ class DataError(OrthocaptureError):
     """Input data (image, mesh, DICOM series, pose file) cannot be used."""
 
 
+class ImagesSpoiltError(OrthocaptureError):
+    """Several images in a row are blurred or black: a person looks at the camera before more are taken."""
+
+
 class ComputeError(OrthocaptureError):
     """A computation has no trustworthy answer on this data, and says why."""

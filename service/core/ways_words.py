@@ -55,6 +55,7 @@ REMEDIES: Mapping[str, str] = {
     "IncompleteExportError": "Wait until the export has ended, or export it again with all its files",
     "DriverMissingError": "Install the driver that the message names",
     "DataError": "Put in another file; this one cannot be used",
+    "ImagesSpoiltError": "Clean the lens, and look whether its cap is off and the light is on",
     "ComputeError": "Put right what the message names, or take what is missing",
     "ConfigurationError": "Put right what the message names",
     "ProtocolError": "Put right what the message names",

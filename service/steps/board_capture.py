@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from service.compute.calibration.board import Board, BoardView
+from service.compute.calibration.board import Board
 from service.compute.calibration.board_design import Aims, Prediction, Taken
 from service.compute.calibration.board_knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
 from service.compute.planning.motion_plan import able_postures
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
-from service.core.model import ViewpointCaptured
-from service.core.run_state import JobState
+from service.steps.board_looks import BoardLooks, Look
 from service.steps.board_plan import (
     NOTE,
     START,
@@ -30,7 +28,7 @@ from service.steps.board_plan import (
     prediction_record,
 )
 from service.steps.capture import capture_viewpoints
-from service.steps.context import JobRequest, StepContext
+from service.steps.context import StepContext
 from service.steps.planning import known_arm, plan_step, situation_of, usual_posture
 from service.steps.retakes import to_take_again
 from service.steps.viewpoints import Viewpoint
@@ -38,18 +36,6 @@ from service.steps.viewpoints import Viewpoint
 _MOST_FIRST = 4  # tries for a first image that shows the board
 _MOVED_M = 0.01  # a board found further from where an earlier step had it has been moved
 _MOST_FOR_LENS = 40  # images that the estimate between captures uses
-
-
-@dataclass(frozen=True, slots=True)
-class Look:
-    """One board image and what was found in it."""
-
-    capture: ViewpointCaptured
-    seen: bool
-    reason: str
-    corners_sha256: str | None = None
-    view: BoardView | None = None
-    size: tuple[int, int] = (0, 0)
 
 
 @dataclass
@@ -77,7 +63,7 @@ class BoardCapture:
         self._replaced = sum(
             len(n["poses"]) for n in self._notes if n["why"] == "replacement" and n["attempt"] == self.context.attempt
         )
-        self._views: dict[str, Look] = {}
+        self._looks = BoardLooks(self.context, self.board, self.earlier)
 
     # --- the loop ---
 
@@ -90,6 +76,7 @@ class BoardCapture:
             if fresh:
                 self._capture(fresh)
             looks = self.looks()
+            self._looks.stop_where_spoilt()
             planned = self._more(looks)
             if not planned:
                 return self._measures(looks)
@@ -246,7 +233,7 @@ class BoardCapture:
         seen = [look for look in looks if look.seen]
         if self.known is not None and self.known.measured == len(seen) > 0:
             return self.known
-        before = [look for look in self._looks_of(self.earlier) if look.seen] if self.earlier is not None else []
+        before = [look for look in self._looks.of(self.earlier) if look.seen] if self.earlier is not None else []
         size = next((look.size for look in (*seen, *before)), None)
         if self.camera is None:
             camera, focal = nominal_camera(self.context.devices.lens(), size)
@@ -286,64 +273,16 @@ class BoardCapture:
             self._mount,
             image_kind="board_image",
             refused=refused,
-            on_captured=self._look,
+            on_captured=self._looks.begin,
+            until=lambda: bool(self._looks.spoilt_in_a_row()),
             again=to_take_again(self.context),
         )
 
-    def _look(self) -> None:
-        """Have every new image looked at. Returns at once."""
-        begun = {job.arguments["image"]["sha256"] for job in self._jobs(self.context.step.id)}
-        for capture in self.context.evidence.captures(self.context.step.id):
-            sha256 = capture.artefacts[0].sha256
-            if sha256 not in begun:
-                arguments = {
-                    "image": {"viewpoint": capture.viewpoint, "sha256": sha256},
-                    **board_arguments(self.board),
-                }
-                self.context.evidence.enqueue(JobRequest("board_view", arguments), sha256)
-
-    def _jobs(self, step: str) -> list[JobState]:
-        return [job for job in self.context.evidence.jobs(step) if job.kind == "board_view"]
-
     def looks(self, *, wait: bool = True) -> list[Look]:
         """Every valid image with what was found in it."""
-        self._look()
-        while wait:
-            self.context.checkpoint()
-            jobs = self._jobs(self.context.step.id)
-            left = sum(job.status == "enqueued" for job in jobs)
-            if not left:
-                break
-            self.context.progress("looking for the board", len(jobs) - left, len(jobs))
-            self.context.wait(0.05)
-        return self._looks_of(self.context.step.id)
-
-    def _looks_of(self, step: str) -> list[Look]:
-        jobs = {str(job.arguments["image"]["sha256"]): job for job in self._jobs(step)}
-        out: list[Look] = []
-        for capture in self.context.evidence.captures(step):
-            sha256 = capture.artefacts[0].sha256
-            job = jobs.get(sha256)
-            if job is None or job.status == "enqueued" or not isinstance(capture, ViewpointCaptured):
-                continue
-            if sha256 not in self._views:
-                self._views[sha256] = self._read(capture, job)
-            look = self._views[sha256]
-            if not all(capture.verdicts.values()):
-                departs = [name for name, passed in capture.verdicts.items() if not passed]
-                look = Look(capture, False, f"not as wanted: {', '.join(departs)}")
-            out.append(look)
-        return out
-
-    def _read(self, capture: ViewpointCaptured, job: JobState) -> Look:
-        if job.status == "failed" or not job.result.get("seen"):
-            why = job.message if job.status == "failed" else str(job.result.get("reason", "not looked at"))
-            self.context.tell(f"{capture.viewpoint}: not used, {why}")
-            return Look(capture, False, why)
-        ref = job.artefacts[0]
-        record = json.loads(self.context.evidence.path(ref).read_bytes())
-        view = BoardView(np.array(record["indices"], dtype=np.int64), np.array(record["corners"], dtype=np.float64))
-        return Look(capture, True, "", ref.sha256, view, (int(record["size"][0]), int(record["size"][1])))
+        if wait:
+            self._looks.wait()
+        return self._looks.of(self.context.step.id)
 
     def _measures(self, looks: Sequence[Look]) -> dict[str, float]:
         poses, captures = self.poses(), self.context.evidence.captures(self.context.step.id)
@@ -364,11 +303,6 @@ _WORDS: Mapping[Why, str] = {
     "replacement": "instead of images without a board",
     "mend": "to mend what falls short",
 }
-
-
-def board_arguments(board: Board) -> dict[str, Any]:
-    """A board as job arguments."""
-    return {"columns": board.columns, "rows": board.rows, "square_m": board.square_m}
 
 
 def _refine(nominal: BoardKnowledge, looks: Sequence[Look], board: Board, *, lens_known: bool) -> BoardKnowledge:

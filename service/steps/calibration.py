@@ -11,7 +11,8 @@ from pydantic import model_validator
 from service.compute.calibration.board import Board
 from service.core.errors import ConfigurationError
 from service.core.model import Record
-from service.steps.board_capture import BoardCapture, board_arguments
+from service.steps.board_capture import BoardCapture
+from service.steps.board_looks import board_arguments
 from service.steps.board_mend import mend_calibration
 from service.steps.board_plan import BoardPoses
 from service.steps.context import JobRequest, JobResult, StepContext, StepKind, StepOutcome
@@ -124,6 +125,8 @@ def _solve(
     capture: BoardCapture | None,
 ) -> JobResult:
     images = captured_images(context, [params.images_of or context.step.id])
+    looks = {} if capture is None else {look.capture.artefacts[0].sha256: look for look in capture.looks()}
+    images = [image for image in images if image["sha256"] not in looks or not looks[image["sha256"]].spoilt]
     arguments: dict[str, Any] = {
         "solve": list(params.solve),
         "images": images,
@@ -131,7 +134,6 @@ def _solve(
         "camera": None if camera is None else dict(camera),
     }
     if capture is not None:
-        looks = {look.capture.artefacts[0].sha256: look for look in capture.looks()}
         corners = [looks[image["sha256"]].corners_sha256 if image["sha256"] in looks else None for image in images]
         arguments["corners"] = corners
         known = capture.known

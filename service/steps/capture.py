@@ -64,6 +64,7 @@ def capture_viewpoints(
     image_kind: str,
     refused: Mapping[str, str] = NONE_REFUSED,
     on_captured: Callable[[], None] = lambda: None,
+    until: Callable[[], bool] = lambda: False,
     again: Collection[str] = (),
 ) -> CaptureTotals:
     """Capture every viewpoint that this attempt has not captured yet, in order.
@@ -73,14 +74,17 @@ def capture_viewpoints(
         image_kind: artefact kind of the photographs (`image`, `board_image`, `control_image`).
         refused: viewpoints that the plan has given up, with the reason; recorded as such, not tried.
         on_captured: called after each image that is in the record; must return at once.
-        again: viewpoints whose image of an earlier attempt is to be taken again.
+        until: asked before each viewpoint; where it says so, the rest is not taken.
+        again: SHA-256 of images that are to be taken again.
 
     Raises DeviceError when a viewpoint fails for good, StepInterruptedError on pause.
     """
     camera = context.devices.camera()
     wanted = wanted_settings(context)
     _apply(context, camera, wanted)
-    loop = _CaptureLoop(context, camera, viewpoints, T_flange_camera, wanted, image_kind, on_captured, set(again))
+    loop = _CaptureLoop(
+        context, camera, viewpoints, T_flange_camera, wanted, image_kind, on_captured, until, set(again)
+    )
     try:
         loop.run(refused)
     finally:
@@ -111,6 +115,7 @@ class _CaptureLoop:
     wanted: CameraSettings
     image_kind: str
     on_captured: Callable[[], None]
+    until: Callable[[], bool]
     again: Set[str]
     given_up: set[str] = field(init=False)
     _taken: set[str] = field(init=False, default_factory=set[str])  # in this execution, successful or not
@@ -125,6 +130,8 @@ class _CaptureLoop:
         # Looked up anew each time: an operator may send a viewpoint back while the arm moves.
         while todo := self._next():
             self.context.checkpoint()
+            if self.until():
+                return
             self.context.progress("viewpoints", len(self.viewpoints) - len(todo), len(self.viewpoints))
             viewpoint = todo[0]
             if viewpoint.name in refused:
@@ -153,7 +160,7 @@ class _CaptureLoop:
         An image whose verdicts failed is taken again, once an execution.
         """
         captures = {capture.viewpoint: capture for capture in self.context.evidence.captures(self.context.step.id)}
-        old = {name for name in self.again if name in captures and captures[name].attempt < self.context.attempt}
+        old = {name for name, capture in captures.items() if capture.artefacts[0].sha256 in self.again}
         good = {name for name, c in captures.items() if all(c.verdicts.values())} - old
         done = good | (self._taken & captures.keys())
         if self._held is not None:

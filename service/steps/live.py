@@ -17,6 +17,7 @@ from service.core.protocol import Gate
 from service.core.run_state import JobState
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import artefact_of, hand_eye_of, result_of, robot_pose_of
+from service.steps.spoilt import SPOILT, LookedAt, row_to_stop_for, stop_for_lens, why_spoilt
 from service.steps.viewpoints import Viewpoint
 
 ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
@@ -147,6 +148,29 @@ class LiveAnalysis:
             self._suggest(failed, answer.measures, suggestions, retakes, again)
         return dict(answer.measures)
 
+    def spoilt_in_a_row(self) -> list[LookedAt]:
+        """Blurred or black images with which this step's images end, where they are to stop it."""
+        mine = self._looked_at(self.context.step.id)
+        return row_to_stop_for(self.context, mine, self._looked_at(*self.params.images_of))
+
+    def spoilt(self) -> dict[str, str]:
+        """Wait, up to a limit, for the last images: the reason of each spoilt one, by its SHA-256.
+
+        Raises ImagesSpoiltError after several in a row.
+        """
+        self._wait()
+        row = self.spoilt_in_a_row()
+        if row:
+            stop_for_lens(self.context, row)
+        return why_spoilt(self._looked_at(self.context.step.id), self._looked_at(*self.params.images_of))
+
+    def note_spoilt(self, reasons: Mapping[str, str]) -> None:
+        """Images that are spoilt although they were taken again: a retry of the step takes them once more."""
+        captures = self.context.evidence.captures(self.context.step.id)
+        names = [capture.viewpoint for capture in captures if capture.artefacts[0].sha256 in reasons]
+        if names:
+            self.context.note(SPOILT, viewpoints=names, attempt=self.context.attempt)
+
     def suggested(self) -> set[str]:
         """Names of the viewpoints that earlier attempts of this step found wanting."""
         notes = [note for note in self.context.state.notes if note.note == SUGGESTION]
@@ -175,7 +199,11 @@ class LiveAnalysis:
         self.context.tell(advice)  # of what is taken again it was told before
         # The newest note with advice is what a person is shown: it holds all that the confirmation does.
         both = f"{retakes}. {advice}" if retakes else advice
-        self.context.note(SUGGESTION, advice=both, viewpoints=list(suggestions), images=again)
+        # What is to be done for the retakes is to be done for this newer note, which takes their place.
+        mend = self.context.evidence.state().steps[self.context.step.id].mend if retakes else {}
+        self.context.note(
+            SUGGESTION, advice=both, viewpoints=list(suggestions), images=again, hands=list(mend.get("hands", ()))
+        )
 
     def _gate(self, measure: str) -> Gate | None:
         return next((gate for gate in self.context.step.gates if gate.measure == measure), None)
@@ -192,6 +220,14 @@ class LiveAnalysis:
             captures += self.context.evidence.captures(step)
         hashes = [capture.artefacts[0].sha256 for capture in captures]
         return [by_image[sha256] for sha256 in hashes if sha256 in by_image]
+
+    def _looked_at(self, *steps: str) -> list[LookedAt]:
+        """The images of these steps that have been looked at, in the order of capture."""
+        by_image = {j.arguments["image"]["sha256"]: j for j in self._jobs("live_view") if j.status == "finished"}
+        captures = [capture for step in steps for capture in self.context.evidence.captures(step)]
+        hashes = [capture.artefacts[0].sha256 for capture in captures]
+        width = int(self.shared["camera"]["width"])
+        return [LookedAt.of(by_image[sha256], width) for sha256 in hashes if sha256 in by_image]
 
     def _surface(self) -> str | None:
         done = [job for job in self._jobs("coverage_points") if job.status == "finished"]

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from service.core.gates import describe, evaluate_gates
 from service.steps.context import StepContext
+from service.steps.spoilt import CLEAN, spoilt_before
 
 DEPARTING = "images depart from the calibration"  # name of the note
 #: Gates that are about how images were taken, and what a person looks at before they are taken again.
@@ -13,18 +14,20 @@ TAKEN_AGAIN: Mapping[str, str] = {
     "viewpoints_captured": "look at why the arm could not take the viewpoints that are missing",
     "settings_departures": "set the camera as the protocol has it",
     "moved_during_exposure": "look for what shook the arm or its mount",
+    "images_spoilt": "clean the lens, and look whether something stands before it or in the light",
     "optics_departures": "set zoom, focus and lens as they were for the calibration, or redo the calibration",
 }
 
 
 def to_take_again(context: StepContext) -> set[str]:
-    """Viewpoints whose images departed from the calibration's optics in an earlier attempt, and still do."""
+    """SHA-256 of images that departed from the calibration's optics, or were spoilt, in an earlier attempt."""
+    captures = context.evidence.captures(context.step.id)
     notes = [note.data for note in context.state.notes if note.note == DEPARTING and "attempt" in note.data]
     if not notes or notes[-1]["attempt"] >= context.attempt:
-        return set()
-    captures = context.evidence.captures(context.step.id)
-    departed = set(notes[-1]["viewpoints"])
-    return {c.viewpoint for c in captures if c.viewpoint in departed and c.attempt <= notes[-1]["attempt"]}
+        return spoilt_before(context)
+    departed, attempt = set(notes[-1]["viewpoints"]), notes[-1]["attempt"]
+    departing = {c.artefacts[0].sha256 for c in captures if c.viewpoint in departed and c.attempt <= attempt}
+    return departing | spoilt_before(context)
 
 
 def advise_retakes(context: StepContext, measures: Mapping[str, float], images: int) -> str:
@@ -43,6 +46,7 @@ def advise_retakes(context: StepContext, measures: Mapping[str, float], images: 
     short = "; ".join(describe(verdict) for verdict in failed)
     words = "; ".join(TAKEN_AGAIN[verdict.measure] for verdict in failed)
     advice = f"{short}. First {words}. Confirm to take {images} image(s) again; all others are kept"
-    context.note("retakes", advice=advice, images=images)
+    hands = CLEAN if any(verdict.measure == "images_spoilt" for verdict in failed) else []
+    context.note("retakes", advice=advice, images=images, hands=hands)
     context.tell(advice)
     return advice

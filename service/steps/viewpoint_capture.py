@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Literal
 
 from service.compute.planning.motion_plan import Order
 from service.core.model import Record
-from service.steps.capture import capture_viewpoints
+from service.steps.capture import CaptureTotals, capture_viewpoints
 from service.steps.context import StepContext, StepKind, StepOutcome
 from service.steps.front_end import EarlyFeatures
 from service.steps.live import Live, LiveAnalysis
 from service.steps.optics import departing_images, optics_departures
 from service.steps.planning import feasible_extra, plan_step
 from service.steps.retakes import advise_retakes, to_take_again
-from service.steps.viewpoints import ViewpointSet, denser_viewpoints, plan_viewpoints
+from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 
 
 class Params(Record):
@@ -56,22 +58,45 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
             if begun is not None:
                 begun.look()
 
-    totals = capture_viewpoints(
-        context,
-        [*planned.viewpoints, *(v for v in plan if v.name in there)],
-        nominal,
-        image_kind="image" if params.purpose == "dataset" else "control_image",
-        refused=planned.refused,
-        on_captured=look,
-        again=to_take_again(context),
-    )
-    measures = totals.measures()
+    def take(viewpoints: Sequence[Viewpoint], again: Collection[str]) -> CaptureTotals:
+        return capture_viewpoints(
+            context,
+            viewpoints,
+            nominal,
+            image_kind="image" if params.purpose == "dataset" else "control_image",
+            refused=planned.refused,
+            on_captured=look,
+            until=lambda: live is not None and bool(live.spoilt_in_a_row()),
+            again=again,
+        )
+
+    everything = [*planned.viewpoints, *(v for v in plan if v.name in there)]
+    totals = take(everything, to_take_again(context))
+    measures: dict[str, float] = {}
+    spoilt: dict[str, str] = {}
+    if live is not None:
+        spoilt = live.spoilt()
+        if spoilt:
+            for capture in context.evidence.captures(context.step.id):
+                why = spoilt.get(capture.artefacts[0].sha256)
+                if why is not None:
+                    context.tell(f"{capture.viewpoint}: {why}; it is taken again")
+            totals = replace(
+                take(_of_images(context, everything, spoilt), spoilt),
+                planned=totals.planned,
+                given_up=totals.given_up,
+            )
+            spoilt = live.spoilt()
+        live.note_spoilt(spoilt)
+        measures["images_spoilt"] = float(len(spoilt))
+    measures |= totals.measures()
     departures = optics_departures(context)
     if departures is not None:
         measures["optics_departures"] = float(departing_images(departures))
     departing = {departure.image for departure in departures or ()}
     refused = {c.viewpoint for c in context.evidence.captures(context.step.id) if not all(c.verdicts.values())}
-    again = len(departing | refused) + totals.given_up
+    bad = departing | refused | {v.name for v in _of_images(context, everything, spoilt)}
+    again = len(bad) + totals.given_up
     retakes = advise_retakes(context, measures, again)
     if live is not None:
         taken = {viewpoint.name for viewpoint in plan}
@@ -79,6 +104,12 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         measures |= live.summary(last.station, candidates, retakes, again if retakes else 0)
     result = Result(purpose=params.purpose, captured=totals.captured)
     return StepOutcome(measures=measures, result=result.model_dump())
+
+
+def _of_images(context: StepContext, viewpoints: Sequence[Viewpoint], images: Collection[str]) -> list[Viewpoint]:
+    """The viewpoints at which these images (SHA-256) were taken."""
+    taken = {c.viewpoint for c in context.evidence.captures(context.step.id) if c.artefacts[0].sha256 in images}
+    return [viewpoint for viewpoint in viewpoints if viewpoint.name in taken]
 
 
 KIND = StepKind("viewpoint_capture", Params, Result, execute, moves_robot=True)

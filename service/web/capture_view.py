@@ -187,6 +187,10 @@ def _board(log: RunLog, step: Step, capture: Capture) -> Verdict:
     why = {entry["image"]: entry["reason"] for entry in intrinsics.get("excluded", ())}
     why = dict.fromkeys(details.get("views_without_board", ()), "no board was found in it") | why
     name = capture.payload.viewpoint
+    for note in log.state.steps[step.id].notes:  # why other poses were planned
+        instead_of = note.data.get("instead_of", {})
+        if name in instead_of:
+            why[name] = f"{instead_of[name]} (another pose was taken instead)"
     for job in log.state.steps[step.id].jobs.values():  # looked at as it arrived
         unseen = job.kind == "board_view" and job.status == "finished" and not job.result.get("seen")
         if unseen and job.arguments["image"]["sha256"] == capture.sha256:

@@ -13,11 +13,12 @@ from service.compute.calibration.board import Board, BoardView, find_board
 from service.compute.calibration.board_images import BoardImage, find_boards
 from service.compute.calibration.board_knowledge import BoardKnowledge
 from service.compute.calibration.board_parts import with_parts
+from service.compute.image_quality import image_quality
 from service.compute.images import read_grey
 from service.core.errors import ComputeError
 from service.worker.job import JobAnswer, JobContext
 
-_BLACK, _WHITE = 12.0, 245.0  # grey levels that nearly all pixels must lie beyond
+_WHITE = 245.0  # grey level that nearly all pixels must lie beyond
 
 
 def board_of(arguments: Mapping[str, Any]) -> Board:
@@ -26,22 +27,24 @@ def board_of(arguments: Mapping[str, Any]) -> Board:
 
 
 def board_view(context: JobContext) -> JobAnswer:
-    """Find the whole board in one image; without it the reason is the answer."""
+    """Find the whole board in one image, without it the reason is the answer; and tell how sharp the image is."""
     image = context.arguments["image"]
     cv2.setNumThreads(1)  # beside a capture
     grey = read_grey(context.input(image["sha256"]))
     size = [grey.shape[1], grey.shape[0]]
+    quality = image_quality(grey)
+    measures = {} if np.isnan(quality.edge_px) else {"image_edge_px": quality.edge_px}
     result: dict[str, Any] = {"viewpoint": image["viewpoint"], "size": size, "seen": False, "reason": ""}
+    result["black"] = quality.black
     try:
         view = find_board(grey, board_of(context.arguments))
     except ComputeError as error:
-        level = float(np.percentile(grey, 99)), float(np.percentile(grey, 1))
-        dark, bright = level[0] < _BLACK, level[1] > _WHITE
-        result["reason"] = "the image is black" if dark else "the image is white" if bright else error.what
-        return JobAnswer({}, (), result)
+        bright = float(np.percentile(grey, 1)) > _WHITE
+        result["reason"] = "the image is black" if quality.black else "the image is white" if bright else error.what
+        return JobAnswer(measures, (), result)
     record = {"size": size, "indices": view.indices.tolist(), "corners": np.round(view.corners, 4).tolist()}
     ref = context.keep_json(record, kind="board_corners", name=f"{image['viewpoint']}.corners.json")
-    return JobAnswer({"corners": float(len(view.indices))}, (ref,), result | {"seen": True})
+    return JobAnswer(measures | {"corners": float(len(view.indices))}, (ref,), result | {"seen": True})
 
 
 def read_corners(record: Mapping[str, Any]) -> BoardImage:

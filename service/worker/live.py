@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
+from service.compute.image_quality import image_quality
 from service.compute.images import read_image
 from service.compute.live import (
     LiveView,
@@ -117,8 +118,10 @@ def live_view(context: JobContext) -> JobAnswer:
     predicted = None if known is None else inverse(T_base_camera) @ known
     outlines = find_spheres(pixels, camera, spheres, radius_m, predicted)
     quality = sharpness(pixels, outlines, camera)
+    whole = image_quality(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
     view = LiveView(image["viewpoint"], T_base_camera, outlines)
     measures = {
+        "image_edge_px": whole.edge_px,
         "outlines": float(len(outlines)),
         "outline_coverage": quality.coverage,
         "outline_rms_px": quality.rms_px,
@@ -126,6 +129,7 @@ def live_view(context: JobContext) -> JobAnswer:
         "clipped_fraction": clipped_fraction(pixels),
     }
     result: dict[str, Any] = {"viewpoint": image["viewpoint"], "station": image["station"], "reason": ""}
+    result["black"] = whole.black
     visible = np.zeros(0 if surface is None else len(surface.points_m), dtype=bool)
     T_base_scan = known
     try:

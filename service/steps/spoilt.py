@@ -1,0 +1,118 @@
+"""Images that show nothing sharp: one is taken again at once; after several in a row a person cleans the lens."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from service.core.errors import ImagesSpoiltError
+from service.core.run_state import JobState
+from service.steps.context import StepContext
+
+SPOILT = "spoilt images"  # name of the note that a retry of the step reads
+CLEAN: list[dict[str, Any]] = [{"action": "clean_lens"}]  # what a simulated technician does
+IN_A_ROW = 3  # spoilt images that are no accident any more
+_MOST_STOPS = 2  # of one step: after that a person has seen them, and the step's gates judge
+_FACTOR = 1.6  # of the edges in the sharpest image of the step
+_WIDEST_PX, _WIDEST_SHARE = 7.0, 0.002  # of an edge, and of the image's width, where there is nothing to compare
+_MOST_NAMES = 6
+
+
+@dataclass(frozen=True, slots=True)
+class LookedAt:
+    """What a job found of one image, as far as sharpness goes.
+
+    Attributes:
+        edge_px: width of its clearest edges; None where it has none.
+        width: of the image, px.
+    """
+
+    viewpoint: str
+    sha256: str
+    edge_px: float | None
+    black: bool
+    width: int
+
+    @classmethod
+    def of(cls, job: JobState, width: int) -> LookedAt:
+        """From the answer of a finished job that looked at one image."""
+        image = job.arguments["image"]
+        edge_px = job.measures.get("image_edge_px")
+        return cls(image["viewpoint"], image["sha256"], edge_px, bool(job.result.get("black")), width)
+
+
+def why_spoilt(images: Sequence[LookedAt], others: Sequence[LookedAt] = ()) -> dict[str, str]:
+    """The reason of each spoilt image by its SHA-256.
+
+    Args:
+        images: all of one step.
+        others: of earlier steps, which show the same things and tell how sharp images can be.
+    """
+    edges = [image.edge_px for image in (*images, *others) if image.edge_px is not None]
+    sharpest_px = min(edges, default=0.0)
+    reasons: dict[str, str] = {}
+    for image in images:
+        limit_px = min(_FACTOR * sharpest_px, max(_WIDEST_PX, _WIDEST_SHARE * image.width))
+        if image.black:
+            reasons[image.sha256] = "the image is black"
+        elif image.edge_px is not None and image.edge_px > limit_px:
+            reasons[image.sha256] = f"blurred, its edges are {image.edge_px:.1f} px wide (limit {limit_px:.1f})"
+    return reasons
+
+
+def last_in_a_row(images: Sequence[LookedAt], reasons: Mapping[str, str]) -> list[LookedAt]:
+    """The spoilt images with which a sequence ends, in order of capture; none where they are too few to mean more."""
+    row: list[LookedAt] = []
+    for image in reversed(images):
+        if image.sha256 not in reasons:
+            break
+        row.insert(0, image)
+    return row if len(row) >= IN_A_ROW else []
+
+
+def spoilt_before(context: StepContext) -> set[str]:
+    """SHA-256 of images that were spoilt in an earlier attempt and have not been taken again yet."""
+    captures = context.evidence.captures(context.step.id)
+    notes = [note.data for note in context.state.notes if note.note == SPOILT]
+    return {
+        capture.artefacts[0].sha256
+        for note in notes
+        if note["attempt"] < context.attempt
+        for capture in captures
+        if capture.viewpoint in note["viewpoints"] and capture.attempt <= note["attempt"]
+    }
+
+
+def row_to_stop_for(context: StepContext, images: Sequence[LookedAt], others: Sequence[LookedAt]) -> list[LookedAt]:
+    """The spoilt images in a row with which a step's images end, where they are to stop it; else none.
+
+    Args:
+        images: of the step, in the order of capture.
+        others: of earlier steps, to compare with.
+    """
+    if not may_stop(context):
+        return []
+    due = spoilt_before(context)
+    return last_in_a_row([image for image in images if image.sha256 not in due], why_spoilt(images, others))
+
+
+def may_stop(context: StepContext) -> bool:
+    """Whether spoilt images may still stop the step: not again and again, for then a person has seen them."""
+    return sum(note.note == SPOILT and "advice" in note.data for note in context.state.notes) < _MOST_STOPS
+
+
+def stop_for_lens(context: StepContext, row: Sequence[LookedAt]) -> None:
+    """Note what a person is to do and which images are then taken again.
+
+    Raises:
+        ImagesSpoiltError: always, with the same words.
+    """
+    names = [image.viewpoint for image in row]
+    shown = ", ".join(names) if len(names) <= _MOST_NAMES else f"{names[0]} … {names[-1]}"
+    dark = all(image.black for image in row)
+    what = f"the last {len(row)} images are {'black' if dark else 'blurred'}: {shown}"
+    first = "Look whether the lens cap is off and the light is on" if dark else "Clean the lens"
+    advice = f"{first}, then confirm: these {len(row)} images are taken again, all others are kept"
+    context.note(SPOILT, advice=advice, hands=[] if dark else CLEAN, viewpoints=names, attempt=context.attempt)
+    raise ImagesSpoiltError(what, where=f"step {context.step.id}", remedy=advice)
