@@ -198,6 +198,7 @@ RUN_ELSEWHERE = {
     "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
         "tests/test_handheld.py::test_the_evidence_verifies"
     ),
+    "orthocapture act release": "tests/test_web_held.py::test_the_buttons_ask_the_step",
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
     ),
