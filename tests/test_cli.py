@@ -15,6 +15,7 @@ import psutil
 import pytest
 from typer.testing import CliRunner, Result
 
+from service.cli.common import console
 from service.cli.main import app
 from service.core.model import ActionRefused, OperatorAction
 from service.store.store import Store
@@ -123,11 +124,12 @@ def test_a_missing_protocol_is_refused(tmp_path: Path) -> None:
 # --- runs -------------------------------------------------------------------------------------------------
 
 
-def test_status_shows_steps_gates_and_views(recorded: tuple[Path, str, str]) -> None:
+def test_status_shows_steps_gates_and_views(recorded: tuple[Path, str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     data, completed, begun = recorded
+    monkeypatch.setattr(console, "width", 220)  # a narrower table breaks its lines
     result = invoke("status", completed, "--data", data)
     assert result.exit_code == 0
-    assert "viewpoints_captured ok" in result.output.replace("\n", " ")
+    assert "viewpoints_captured 4, allowed ≥ 4: ok" in result.output
     record = answer_of(invoke("status", completed, "--data", data, "--json"))
     assert (record["run"], record["status"]) == (completed, "completed")
     assert record["steps"]["capture"]["captured"] == ["v001", "v002", "v003", "v004"]

@@ -15,6 +15,7 @@ from service.audit.digest import digests
 from service.audit.recorded import read_run
 from service.audit.report_content import report_content
 from service.audit.report_html import render_html
+from service.cli.common import console
 from service.cli.main import app
 from service.core.gates import describe, describe_judged, figure, quantity, standing
 from service.core.model import GateVerdict, Uncertainty
@@ -104,9 +105,10 @@ def test_an_accepted_figure_is_said_to_be_accepted_not_failed(tmp_path: Path) ->
     assert f"{BOUNDED}, allowed ≤ 0.35: not decided; accepted by Emmy" in page
 
 
-def test_the_command_shows_every_figure(undecided: tuple[Path, str]) -> None:
+def test_the_command_shows_every_figure(undecided: tuple[Path, str], monkeypatch: pytest.MonkeyPatch) -> None:
     data, run_id = undecided
-    done = CliRunner().invoke(app, ["status", run_id, "--data", str(data)], env={"COLUMNS": "220"})
+    monkeypatch.setattr(console, "width", 220)  # a narrower table breaks its lines
+    done = CliRunner().invoke(app, ["status", run_id, "--data", str(data)])
     assert f"best_mean_radial_error_mm {BOUNDED}, allowed ≤ 0.35: NOT DECIDED" in done.output
     assert "rms_px 0.030 px, 0.023 to 0.037, allowed ≤ 0.5: ok" in done.output
     told = json.loads(CliRunner().invoke(app, ["status", run_id, "--data", str(data), "--json"]).output)

@@ -50,6 +50,7 @@ REMEDIES: Mapping[str, str] = {
     "DeviceStorageFullError": "Make room where the device stores its data, or put in another card",
     "SafetyStopError": "Look at the robot and the people around it, then clear the stop at the robot",
     "UnreachablePoseError": "Move what stands in the way, or the robot's foot, so that it reaches the pose",
+    "ReleasedElsewhereError": "Press the camera's own button, or connect a camera that the software can release",
     "StaleImageError": "Look at the camera: it delivered an earlier image instead of a new one",
     "UnreadableFileError": "Export the file again, or another one",
     "IncompleteExportError": "Wait until the export has ended, or export it again with all its files",

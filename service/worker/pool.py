@@ -54,10 +54,14 @@ class Pool:
         self._most: dict[Lane, int] = {"waited": min(at_once, _MOST_WAITED), "background": at_once}
         self._children = [self._start("waited")]  # the others when there is work for them
 
-    def tend(self, progress: Progress, timeout_s: float = _POLL_S) -> None:
-        """Hear what the children say, up to `timeout_s`; replace those that have died, and start what is needed."""
+    def tend(self, progress: Progress, timeout_s: float = _POLL_S) -> bool:
+        """Hear what the children say, up to `timeout_s`; replace those that have died, and start what is needed.
+
+        Whether any of them had something to say.
+        """
         by_pipe = {child.pipe: child for child in self._children if child.died_s is None}
-        for ready in wait(list(by_pipe), timeout_s):
+        heard = wait(list(by_pipe), timeout_s)
+        for ready in heard:
             assert isinstance(ready, Connection)
             with contextlib.suppress(EOFError, OSError):  # it has died, which is seen below
                 what, done, total = ready.recv()
@@ -78,6 +82,7 @@ class Pool:
                 self._children.append(self._start(lane))
         if not by_pipe:
             time.sleep(timeout_s)
+        return bool(heard)
 
     def pids(self) -> list[int]:
         """The children's processes, in the order in which they were started."""
@@ -136,6 +141,8 @@ def work_side_by_side(
             while not stop():
                 pool.tend(progress)
                 if until_idle and not store.open_jobs():
+                    while pool.tend(progress, 1.0):  # a job's end is in the store before its child says so
+                        pass
                     break
             return pool.done
 

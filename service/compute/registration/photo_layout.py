@@ -118,6 +118,7 @@ def _joined(
     """With photograph k, in the reading that fits best; without it where none does."""
     places = places_by_size(photographs[k].cones, radius_m)
     best: tuple[_Group, Adjusted] | None = None
+    best_rank = (True, np.inf)
     for T_first_photo, pairs in _readings(found.centres_m, places):
         ids = np.full(len(places), -1, dtype=np.int64)
         for sphere, outline in pairs:
@@ -132,10 +133,11 @@ def _joined(
             adjusted = _adjusted(photographs, joined, centres, radius_m, prior)
         except ComputeError:
             continue  # not this reading
-        if _nearest_m(adjusted.centres_m) < _APART * radius_m:
-            continue  # spheres are solid: an outline of a known one was read as one more
-        if adjusted.chi2 < (_WORST_CHI2 if best is None else best[1].chi2):
-            best = joined, adjusted
+        # Spheres are solid: where two share a place, an outline of a known one was read as one more, or one sphere
+        # was outlined twice. Such a reading counts only where there is no other.
+        rank = (_nearest_m(adjusted.centres_m) < _APART * radius_m, adjusted.chi2)
+        if adjusted.chi2 < _WORST_CHI2 and (best is None or rank < best_rank):
+            best, best_rank = (joined, adjusted), rank
     return (group, found) if best is None else best
 
 
