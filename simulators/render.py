@@ -16,6 +16,7 @@ from simulators.surfaces import Surfaces
 from simulators.world import NOMINAL_LUX, RADIUS_M, Moved, Scene
 
 TILE_PIXELS = 500_000
+MOST_KEPT_RAYS = 16_000_000  # 24 bytes each
 HALO = 4  # rows beyond a tile, so that edges and the lens' blur do not see its border
 _TEXTURES = ((800, 512), (1400, 1024), (2601, 2048))  # image width below which so many texels suffice
 PREVIEW_WIDTH = 640
@@ -147,7 +148,7 @@ class Renderer:
 
     def _ray_rows(self, lens: Intrinsics, top: int, bottom: int) -> Array:
         """Rays (rows, W, 3) of pixel centres, camera frame."""
-        if lens.width * lens.height > 4_000_000:
+        if lens.width * lens.height > MOST_KEPT_RAYS:
             return _pixel_rays(lens, top, bottom)
         if self._rays is None or self._rays[0] != lens:
             self._rays = (lens, _pixel_rays(lens, 0, lens.height))

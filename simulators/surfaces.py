@@ -63,8 +63,9 @@ class MipMap:
         out = np.empty((len(uv), 4), dtype=np.float32)
         for k in np.unique(low):
             at = np.flatnonzero(low == k)
+            uv_at = uv.take(at, axis=0)
             fraction = (level[at] - np.float32(k))[:, None]
-            fine, coarse = (_bilinear(self._levels[k + j], uv[at]) for j in (0, 1))
+            fine, coarse = (_bilinear(self._levels[k + j], uv_at) for j in (0, 1))
             out[at] = fine + fraction * (coarse - fine)
         return out
 
@@ -152,13 +153,13 @@ class Surfaces:
             return Shaded(colour, depth, material)
         f = face[hit]
         material[hit] = self._material[f]
-        corners = self._faces[f]
+        corners = self._faces.take(f, axis=0)
         weights = np.stack([1.0 - u[hit] - v[hit], u[hit], v[hit]], axis=1).astype(np.float32)
         light = self._light_at(corners, weights, control)
         uv = _interpolated(self._uv, corners, weights)
-        ray = directions[hit]
+        ray = directions.take(hit, axis=0)
         length = np.sqrt(np.einsum("ij,ij->i", ray, ray))
-        cosine = np.abs(np.einsum("ij,ij->i", ray, self._face_normal[f])) / length
+        cosine = np.abs(np.einsum("ij,ij->i", ray, self._face_normal.take(f, axis=0))) / length
         # Between the footprint's two axes: sharper than isotropic filtering, and still without crawling.
         footprint = np.float32(pixel_rad) * depth[hit] * np.minimum(1.0 / np.sqrt(np.maximum(cosine, 0.06)), 3.0)
         texel = self._sampled(material[hit], uv, footprint.astype(np.float32))
@@ -179,7 +180,7 @@ class Surfaces:
         for index, texture in enumerate(self._textures):
             at = np.flatnonzero(material == index)
             if len(at):
-                texel[at] = texture.sample(uv[at], footprint_m[at])
+                texel[at] = texture.sample(uv.take(at, axis=0), footprint_m[at])
         return texel
 
     def _add_gloss(
@@ -214,9 +215,12 @@ class Surfaces:
 
 def _interpolated(values: Array32, corners: Ints, weights: Array32) -> Array32:
     """Values (V, k) at barycentric weights (N, 3) of corners (N, 3)."""
-    out = values[corners[:, 0]] * weights[:, :1]
-    out += values[corners[:, 1]] * weights[:, 1:2]
-    out += values[corners[:, 2]] * weights[:, 2:]
+    out = values.take(corners[:, 0], axis=0)
+    out *= weights[:, :1]
+    for k in (1, 2):
+        more = values.take(corners[:, k], axis=0)
+        more *= weights[:, k : k + 1]
+        out += more
     return out
 
 
