@@ -76,9 +76,11 @@ _VIEWS = (("viewpoint_capture", 8), ("control_capture", 2))
 def test_errors_are_those_of_a_good_data_set(whole: Whole) -> None:
     rows = {row["poses"]: row for row in whole.summary.table()}
     assert {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"} <= set(rows)
-    assert rows["robot_corrected"]["mean_radial_error_mm"] < 0.35
-    assert whole.true_mm["robot_corrected"] < 0.35
-    assert min(row["mean_radial_error_mm"] for row in rows.values()) < 0.2
+    # The arm is as it was built; everything else is adjusted to the images, which are small here.
+    assert whole.true_mm["robot"] < 0.35
+    for source in set(rows) - {"robot"}:
+        assert rows[source]["mean_radial_error_mm"] < 0.1
+        assert whole.true_mm[source] < 0.1
 
 
 def test_the_evidence_verifies(whole: Whole) -> None:
