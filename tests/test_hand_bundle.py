@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -73,8 +75,16 @@ def test_images_refine_what_they_begin_with() -> None:
 def test_the_stated_uncertainty_is_that_of_the_errors() -> None:
     for count in (2, 4, 6):
         bundle = bundle_of(count)
-        assert spheres_error_m(bundle) < 4 * bundle.sigma_m
+        assert spheres_error_m(bundle) < 3 * bundle.sigma_m
     assert bundle_of(6).sigma_m < bundle_of(2).sigma_m < 0.002
+
+
+def test_outlines_that_are_all_too_wide_are_within_the_stated_uncertainty() -> None:
+    wide_rad = 0.03 / CAMERA.fx  # of a pixel: light that shines past every edge
+    grown = [replace(r, half_angles_rad=r.half_angles_rad + wide_rad) for r in readings(0.0)]
+    bundle = adjust_together(grown, ROUGH_M, CAMERA, RADIUS_M)
+    assert bundle is not None
+    assert bundle.sigma_m / 2 < spheres_error_m(bundle) < 2 * bundle.sigma_m
 
 
 def test_the_frame_stays_where_it_was() -> None:

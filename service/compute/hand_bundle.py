@@ -13,6 +13,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.photo_adjustment import CALIBRATED, Photograph, adjust
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply, inverse
 
@@ -135,14 +136,20 @@ def adjust_together(
     refined = spheres_m.copy()
     refined[shared] = apply(T_scene_first, found.centres_m)
     poses = {r.viewpoint: T_scene_first @ inverse(T) for r, T in zip(joined, found.T_photo_first, strict=True)}
-    return Bundle(refined, shared, _worst_sigma_m(found.centres_m, found.covariance), poses)
+    halves = np.concatenate([r.half_angles_rad for r in joined])
+    scale_sigma = EXPECTED_COMMON_ERRORS.growth_px / (camera.fx * float(np.tan(np.median(halves))))
+    return Bundle(refined, shared, _worst_sigma_m(found.centres_m, found.covariance, scale_sigma), poses)
 
 
-def _worst_sigma_m(centres_m: Array, covariance: Array) -> float:
-    """Of the shape alone: where the whole is, and how it is turned, is of no interest."""
+def _worst_sigma_m(centres_m: Array, covariance: Array, scale_sigma: float) -> float:
+    """Of the shape alone: where the whole is, and how it is turned, is of no interest.
+
+    The spheres' radius is the only length in the images: outlines that are all too wide make the whole too small.
+    """
     away = centres_m - centres_m.mean(axis=0)
     turns = np.stack([np.cross(axis, away).ravel() for axis in np.eye(3)], axis=1)
     free, _ = np.linalg.qr(np.hstack([np.tile(np.eye(3), (len(away), 1)), turns]))
     shape = np.eye(len(free)) - free @ free.T
     own = (shape @ covariance @ shape.T).reshape(len(away), 3, len(away), 3)
-    return float(np.sqrt(np.einsum("ijij->i", own).max()))
+    of_scale = scale_sigma**2 * np.sum(away**2, axis=1)
+    return float(np.sqrt((np.einsum("ijij->i", own) + of_scale).max()))
