@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -37,6 +37,7 @@ class HandView:
         T_scene_camera: (4, 4) in the frame of the spheres; None where they do not tell.
         information: of the scan's pose in the camera's, None without a pose.
         why: what makes the image unusable; empty for a good one.
+        shown: outlines by the sphere that each of them shows.
     """
 
     T_scene_camera: Transform | None
@@ -48,6 +49,7 @@ class HandView:
     rms_px: float
     clipped: float
     why: str
+    shown: Mapping[int, SphereOutline] = field(default_factory=dict[int, SphereOutline], repr=False)
 
 
 def look_at_image(
@@ -95,7 +97,16 @@ def look_at_image(
     if not why and len(expected) >= _LEAST_SPHERES and seen < _LEAST_SHARE * len(expected):
         why = f"{seen} of {len(expected)} spheres are seen: something stands before the lens"
     return HandView(
-        T_scene_camera, information, len(outlines), seen, len(expected), quality.edge_px, quality.rms_px, clipped, why
+        T_scene_camera,
+        information,
+        len(outlines),
+        seen,
+        len(expected),
+        quality.edge_px,
+        quality.rms_px,
+        clipped,
+        why,
+        {sphere: outlines[o] for o, sphere in markers.items()},
     )
 
 

@@ -71,12 +71,20 @@ def robot_pose_of(view: View) -> dict[str, Any]:
 
 
 def held_views(context: StepContext, step_id: str) -> dict[str, Mapping[str, Any]]:
-    """By photograph: what the worker found in the hand-held images of a step."""
-    return {
-        str(job.arguments["image"]["sha256"]): job.result
-        for job in context.evidence.jobs(step_id)
-        if job.kind in ("hand_view", "hand_board") and job.status == "finished"
-    }
+    """By photograph: what the worker found in the hand-held images of a step.
+
+    Without a CT each image refines where all were: the newest poses count.
+    """
+    jobs = [j for j in context.evidence.jobs(step_id) if j.kind in ("hand_view", "hand_board")]
+    done = [job for job in jobs if job.status == "finished"]
+    refined: Mapping[str, Any] = done[-1].result.get("T_scene_cameras", {}) if done else {}
+    found: dict[str, Mapping[str, Any]] = {}
+    for job in done:
+        newest = refined.get(job.result["viewpoint"])
+        found[str(job.arguments["image"]["sha256"])] = (
+            job.result if newest is None else {**job.result, "T_scene_camera": newest}
+        )
+    return found
 
 
 def _held_pose(found: Mapping[str, Any]) -> dict[str, Any]:

@@ -323,6 +323,8 @@ class _Guide:
         parts = [f"{m['images_used']:.0f} used", f"hemisphere {100 * m['hemisphere_coverage']:.0f} %"]
         if "spheres_seen" in m:
             parts.insert(0, f"{m['spheres_seen']:.0f}/{m['spheres_expected']:.0f} spheres")
+        if "spheres_sigma_mm" in m:  # nobody has measured them: the images tell where they are
+            parts.append(f"spheres known to {m['spheres_sigma_mm']:.2f} mm")
         if ERROR in m:
             parts.append(f"predicted error {m[ERROR]:.3f} mm")
         for name, word in ((COVERAGE, "specimen"), ("coverage", "frame")):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from service.compute.calibration.board import Board, find_board
 from service.compute.calibration.intrinsics import coverage_map_of, locate_view
 from service.compute.camera_model import CameraModel
+from service.compute.hand_bundle import Reading, adjust_together
 from service.compute.hand_view import look_at_image
 from service.compute.images import read_grey, read_image
 from service.compute.live import expected_spheres
@@ -55,6 +56,8 @@ class _Earlier:
     information: Array = field(repr=False)  # (6, 6)
     seen: NDArray[np.bool_] = field(repr=False)
     cells: NDArray[np.int64] = field(repr=False)
+    reading: Mapping[str, Any] | None = field(repr=False)  # outlines and spheres, where nobody has measured these
+    spheres_m: Array | None = field(repr=False)  # as this image and those before it tell them
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +71,30 @@ class _Seen:
     up: Array
     middle_m: Array
     cells: NDArray[np.int64] = field(repr=False)
+    spheres_m: Array = field(default_factory=lambda: np.zeros((0, 3)), repr=False)  # none in images of the board
+    reading: Reading | None = field(default=None, repr=False)
 
 
 def hand_view(context: JobContext) -> JobAnswer:
-    """An image of the specimen: pose from the spheres, verdict, coverage, predicted error, way on."""
+    """An image of the specimen: pose from the spheres, verdict, coverage, predicted error, way on.
+
+    Spheres that only photographs tell of are rough: they, and every camera, are adjusted to all images together.
+    """
     cv2.setNumThreads(1)
     arguments, camera = context.arguments, context.camera()
-    spheres, radius_m = np.array(arguments["spheres_m"]), float(arguments["radius_m"])
+    name, radius_m, rough = (
+        arguments["image"]["viewpoint"],
+        float(arguments["radius_m"]),
+        bool(arguments.get("rough")),
+    )
+    surface = kept_surface(context)
+    earlier = _all_earlier(context, surface)
+    known = [e.spheres_m for e in earlier if e.spheres_m is not None]
+    spheres = known[-1] if known else np.array(arguments["spheres_m"])
     pixels = read_image(context.input(arguments["image"]["sha256"]))
     options = options_for(arguments.get("colour"))
-    view = look_at_image(pixels, camera, spheres, radius_m, options, rough=bool(arguments.get("rough")))
+    view = look_at_image(pixels, camera, spheres, radius_m, options, rough=rough)
+    pose, reading = view.T_scene_camera, None
     measures = {
         "outlines": float(view.outlines),
         "spheres_seen": float(view.spheres_seen),
@@ -86,13 +103,33 @@ def hand_view(context: JobContext) -> JobAnswer:
         "outline_rms_px": view.rms_px,
         "clipped_fraction": view.clipped,
     }
-    eye = np.zeros(3) if view.T_scene_camera is None else view.T_scene_camera[:3, 3]
+    if rough:
+        good = not (view.why or arguments["image"]["settings"])
+        reading = Reading.of(name, pose, view.shown) if pose is not None and good else None
+        bundle = adjust_together([*_readings(earlier), *([reading] if reading else [])], spheres, camera, radius_m)
+        if bundle is not None:
+            spheres, pose = bundle.spheres_m, bundle.poses.get(name, pose)
+            earlier = [replace(e, T_scene_camera=bundle.poses.get(e.viewpoint, e.T_scene_camera)) for e in earlier]
+            measures["spheres_sigma_mm"] = 1e3 * bundle.sigma_m
+    eye = np.zeros(3) if pose is None else pose[:3, 3]
     information = np.zeros((6, 6)) if view.information is None else view.information.information
     found = _Seen(
-        view.T_scene_camera, view.why, measures, information, away_from_plane(spheres, eye), spheres.mean(axis=0),
-        np.zeros((0, 0), dtype=np.int64),
+        pose, view.why, measures, information, away_from_plane(spheres, eye), spheres.mean(axis=0),
+        np.zeros((0, 0), dtype=np.int64), spheres, reading,
     )  # fmt: skip
-    return _answer(context, found, camera)
+    return _answer(context, found, camera, surface, earlier)
+
+
+def _all_earlier(context: JobContext, surface: CoverageSurface | None) -> list[_Earlier]:
+    return [_read(context, sha256, surface) for sha256 in context.arguments["earlier"]]
+
+
+def _readings(earlier: Sequence[_Earlier]) -> list[Reading]:
+    return [
+        Reading.read(e.viewpoint, e.T_scene_camera, e.reading)
+        for e in earlier
+        if e.used and e.reading is not None and e.T_scene_camera is not None
+    ]
 
 
 def hand_board(context: JobContext) -> JobAnswer:
@@ -115,15 +152,20 @@ def hand_board(context: JobContext) -> JobAnswer:
         pose, cells = inverse(T_camera_board), coverage_map_of([corners.corners], size)
         measures = {"corners": float(len(corners.indices)), "nominal_rms_px": rms_px}
     up = np.array([0.0, 0.0, -1.0])  # the board's z points into the table
-    return _answer(context, _Seen(pose, why, measures, np.zeros((6, 6)), up, middle, cells), camera)
+    found = _Seen(pose, why, measures, np.zeros((6, 6)), up, middle, cells)
+    return _answer(context, found, camera, None, _all_earlier(context, None))
 
 
-def _answer(context: JobContext, found: _Seen, camera: CameraModel) -> JobAnswer:
+def _answer(
+    context: JobContext,
+    found: _Seen,
+    camera: CameraModel,
+    surface: CoverageSurface | None,
+    earlier: Sequence[_Earlier],
+) -> JobAnswer:
     """The verdict on the image among those before it, what all of them come to, and where to go next."""
     arguments = context.arguments
     image = arguments["image"]
-    surface = kept_surface(context)
-    earlier = [_read(context, sha256, surface) for sha256 in arguments["earlier"]]
     used = [e for e in earlier if e.used and e.T_scene_camera is not None]
     T = found.T_scene_camera
     why = str(image["settings"]) or found.why or _repeats(T, used)
@@ -131,14 +173,17 @@ def _answer(context: JobContext, found: _Seen, camera: CameraModel) -> JobAnswer
     if level is None and T is not None:
         level = level_frame(found.middle_m, found.up, -T[:3, 1])
     visible = _visible(context, surface, T, camera)
-    mine = _Earlier(image["viewpoint"], not why, T, level, found.information, visible, found.cells)
+    reading = None if found.reading is None else found.reading.record()
+    mine = _Earlier(
+        image["viewpoint"], not why, T, level, found.information, visible, found.cells, reading, found.spheres_m
+    )
     good = [*used, mine] if mine.used and T is not None else used
     places = _places(arguments["places"])
     poses = [] if level is None else [inverse(level) @ e.T_scene_camera for e in good if e.T_scene_camera is not None]
     done = covered(places, poses, float(arguments["within_deg"]))
     measures = {**found.measures, "images_used": float(len(good)), "hemisphere_coverage": len(done) / len(places)}
-    measures |= _totals(context, good, surface)
-    next_words, target = _way_on(context, mine, earlier, good, places, done, measures, surface, camera)
+    measures |= _totals(context, good, found.spheres_m, surface)
+    next_words, target = _way_on(context, mine, earlier, good, places, done, surface, camera)
     record = {
         "viewpoint": mine.viewpoint,
         "used": mine.used,
@@ -148,6 +193,11 @@ def _answer(context: JobContext, found: _Seen, camera: CameraModel) -> JobAnswer
         "seen": base64.b64encode(np.packbits(visible).tobytes()).decode(),
         "cells": found.cells.tolist(),
     }
+    rough: dict[str, Any] = {}
+    if arguments.get("rough"):
+        record |= {"reading": reading, "spheres_m": found.spheres_m.tolist()}
+        poses = {e.viewpoint: e.T_scene_camera.tolist() for e in [*used, mine] if e.T_scene_camera is not None}
+        rough = {"spheres_m": record["spheres_m"], "T_scene_cameras": poses}
     ref = context.keep_json(record, kind="hand_view", name=f"{mine.viewpoint}.hand.json")
     result = {
         "viewpoint": mine.viewpoint,
@@ -159,6 +209,7 @@ def _answer(context: JobContext, found: _Seen, camera: CameraModel) -> JobAnswer
         "T_level_camera": None if T is None or level is None else (inverse(level) @ T).tolist(),
         "places": [{**_listed(p), "done": p.name in done} for p in places],
         "cells": np.sum([e.cells for e in good if e.cells.size], axis=0).tolist() if found.cells.size else [],
+        **rough,
     }
     return JobAnswer({k: v for k, v in measures.items() if np.isfinite(v)}, (ref,), result)
 
@@ -178,14 +229,15 @@ def _same(a: Transform, b: Transform) -> bool:
     return same_view(a, b, _SAME_M, _SAME_RAD)
 
 
-def _totals(context: JobContext, good: Sequence[_Earlier], surface: CoverageSurface | None) -> dict[str, float]:
+def _totals(
+    context: JobContext, good: Sequence[_Earlier], spheres: Array, surface: CoverageSurface | None
+) -> dict[str, float]:
     """What the used images come to."""
-    arguments = context.arguments
-    if "spheres_m" not in arguments:
+    if not len(spheres):
         cells = [e.cells for e in good if e.cells.size]
         return {"coverage": float(np.mean(np.sum(cells, axis=0) > 0)) if cells else 0.0}
     measures: dict[str, float] = {}
-    present = _present(context, good, surface)
+    present = _present(context, good, spheres, surface)
     error_m = present.error_m()
     if np.isfinite(error_m):
         measures["predicted_target_error_mm"] = 1e3 * error_m
@@ -194,10 +246,11 @@ def _totals(context: JobContext, good: Sequence[_Earlier], surface: CoverageSurf
     return measures
 
 
-def _present(context: JobContext, good: Sequence[_Earlier], surface: CoverageSurface | None) -> Present:
+def _present(
+    context: JobContext, good: Sequence[_Earlier], spheres: Array, surface: CoverageSurface | None
+) -> Present:
     """The images as measurements of the scan's pose, whose cameras structure from motion will place."""
     arguments = context.arguments
-    spheres = np.array(arguments["spheres_m"])
     sigma_m, sigma_rad = float(arguments["pose_sigma_m"]), float(arguments["pose_sigma_rad"])
     targets = spheres if surface is None else surface.points_m[:: max(1, len(surface.points_m) // 200)]
     points = 0 if surface is None else len(surface.points_m)
@@ -218,7 +271,6 @@ def _way_on(
     good: Sequence[_Earlier],
     places: Sequence[Place],
     done: set[str],
-    measures: Mapping[str, float],
     surface: CoverageSurface | None,
     camera: CameraModel,
 ) -> tuple[str, Place | None]:
@@ -233,8 +285,8 @@ def _way_on(
     here = inverse(mine.T_scene_level) @ mine.T_scene_camera
     left = [place for place in places if place.name not in done]
     target = nearest(left, here) if left else None
-    if target is None and "spheres_m" in context.arguments:
-        target = _informative(context, mine.T_scene_level, good, surface, camera)
+    if target is None and mine.spheres_m is not None and len(mine.spheres_m):
+        target = _informative(context, mine.T_scene_level, good, mine.spheres_m, surface, camera)
     if target is None:
         target = max(places, key=lambda place: float(np.linalg.norm(place.T_level_camera[:3, 3] - here[:3, 3])))
     return words(here, target.T_level_camera) or "stay there and take it again", target
@@ -244,12 +296,13 @@ def _informative(
     context: JobContext,
     T_scene_level: Transform,
     good: Sequence[_Earlier],
+    spheres: Array,
     surface: CoverageSurface | None,
     camera: CameraModel,
 ) -> Place | None:
     """Of a denser hemisphere, the view that helps most once every planned place has its image."""
     arguments = context.arguments
-    spheres, radius_m = np.array(arguments["spheres_m"]), float(arguments["radius_m"])
+    radius_m = float(arguments["radius_m"])
     limits = CoverageLimits(**arguments["limits"])
     taken = [inverse(T_scene_level) @ e.T_scene_camera for e in good if e.T_scene_camera is not None]
     distance_m = float(np.median([spot["distance_m"] for spot in arguments["places"]]))
@@ -276,7 +329,7 @@ def _informative(
             candidates.append(Candidate(name, information, mask))
             places[name] = place
     found = next_best_views(
-        _present(context, good, surface),
+        _present(context, good, spheres, surface),
         candidates,
         limit_m=float(arguments["limit_m"]),
         min_coverage=float(arguments["min_coverage"]),
@@ -306,4 +359,8 @@ def _read(context: JobContext, sha256: str, surface: CoverageSurface | None) -> 
     if len(bits) < points:  # looked at before the surface was ready
         visible = _visible(context, surface, T, context.camera())
     cells = np.array(data["cells"], dtype=np.int64)
-    return _Earlier(data["viewpoint"], bool(data["used"]), T, level, np.array(data["information"]), visible, cells)
+    spheres = None if data.get("spheres_m") is None else np.array(data["spheres_m"])
+    return _Earlier(
+        data["viewpoint"], bool(data["used"]), T, level, np.array(data["information"]), visible, cells,
+        data.get("reading"), spheres,
+    )  # fmt: skip
