@@ -101,9 +101,11 @@ class Hand:
         self.grip = Grip(self.above_m + np.array([0.0, -0.1, 0.7]))
 
     def read(self, words: str) -> None:
-        """Words that say where to go next; returns at once."""
+        """Words that say where to go next, or to take the photograph now; returns at once."""
         if words.startswith("next: "):
             threading.Thread(target=self.do, args=(words,), daemon=True).start()
+        elif words.startswith("take the photograph now"):
+            threading.Thread(target=self.press, args=(Press(),), daemon=True).start()
 
     def do(self, words: str) -> None:
         """Move as the words say and press the button."""

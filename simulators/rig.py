@@ -40,10 +40,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--hand", choices=tuple(MISHAP_EVERY), help="no arm: a technician holds the camera, who makes mistakes or not"
     )
+    parser.add_argument(
+        "--without-cable", action="store_true", help="with --hand: the camera sends its photographs into a folder"
+    )
 
 
 def serve(args: argparse.Namespace) -> None:
     """Start everything, announce, serve until SIGTERM."""
+    if args.without_cable and not args.hand:
+        raise SimulatorError("--without-cable is for a camera that a person holds: add --hand")
     termination = Termination(with_parent=args.with_parent)
     rig = _Rig(args, termination)
     try:
@@ -81,7 +86,7 @@ class _Rig:
         # First of all: stop() waits for the server's loop, and would wait for ever for one that never began.
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
         try:
-            for name in ("ct", "scans", "logs"):
+            for name in ("ct", "scans", "photographs", "logs"):
                 (self.folder / name).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise SimulatorError(f"the folder {self.folder} cannot be used: {error.strerror}") from error
@@ -96,6 +101,7 @@ class _Rig:
         camera = self._child(
             "camera", "camera", "--port", "0", "--world", world, "--image-width", str(self.args.image_width),
             "--exposures-log", str(self.folder / "truth_exposures.jsonl"),
+            *(("--send-to", str(self.folder / "photographs")) if self.args.without_cable else ()),
         )  # fmt: skip
         self._child("lightbox", "lightbox", "--link", str(self.folder / "lightbox"), "--world", world)
         self._write_truth()
@@ -157,7 +163,7 @@ class _Rig:
             "hands": self.server.address,
             "devices": {
                 **robots,
-                "camera": {"driver": "gphoto", "port": gphoto_port, "capture_timeout_s": self._exposure_s()},
+                "camera": self._camera(gphoto_port),
                 "scanner": {"driver": "scan_folder", "folder": "scans", "unit": "mm", "stable_s": 1.0},
                 "ct": {"driver": "dicom_folder", "folder": "ct", "stable_s": 1.0},
                 "lightbox": {"driver": "lightbox", "port": "lightbox"},
@@ -173,6 +179,11 @@ class _Rig:
             "collision": {"arm": ARM_MODEL.name},
             "lens": self._lens(),
         }
+
+    def _camera(self, gphoto_port: str) -> dict[str, Any]:
+        if self.args.without_cable:
+            return {"driver": "photo_folder", "folder": "photographs", "stable_s": 1.0}
+        return {"driver": "gphoto", "port": gphoto_port, "capture_timeout_s": self._exposure_s()}
 
     def _exposure_s(self) -> float:
         """How long a picture may take: this camera computes what it sees, up to some seconds a megapixel."""

@@ -12,7 +12,7 @@ from typing import Any
 from service.core.errors import OrthocaptureError
 from service.core.protocol import Step
 
-_WAY_ON = "next: "  # how a message begins that says where to hold the camera
+_ASKS_FOR_A_PHOTOGRAPH = ("next: ", "take the photograph now")  # how such words begin
 _PATIENCE_S = 900  # a CT volume or a scan of the whole scene takes minutes on a busy machine
 
 
@@ -45,7 +45,7 @@ class SimulatedHands:
 
     def read(self, message: str) -> None:
         """The technician reads what the screen says."""
-        if self.address is not None and message.startswith(_WAY_ON):
+        if self.address is not None and message.startswith(_ASKS_FOR_A_PHOTOGRAPH):
             _ask_world(self.address, {"op": "act", "action": "read", "words": message})
 
 

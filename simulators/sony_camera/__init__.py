@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--exposures-log", type=Path, metavar="FILE", help="write one JSON line an exposure")
     parser.add_argument("--first-counter", type=int, default=1, help="number of the first file")
     parser.add_argument("--announce", choices=("event", "property", "both"), default="both", help="of a new file")
+    parser.add_argument("--send-to", type=Path, metavar="DIR", help="no cable: send every file into this folder")
     parser.add_argument("--fast", action="store_true", help="exposures take no time")
 
 
@@ -55,7 +56,7 @@ def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event)
 def serve(args: argparse.Namespace) -> None:
     """Announce the address and serve until SIGTERM."""
     termination = Termination(with_parent=args.with_parent)
-    options = BodyOptions(args.fast, args.first_counter, args.exposures_log, args.announce)
+    options = BodyOptions(args.fast, args.first_counter, args.exposures_log, args.announce, args.send_to)
     source, stop = _source(args), threading.Event()
     body = CameraBody(source, args.faults, options)
     if isinstance(source, WorldSource):

@@ -8,7 +8,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -28,6 +28,7 @@ from simulators.sony_camera.properties import (
     ExposureSettings,
     NotWritableError,
     PropertyTable,
+    shutter_code,
 )
 from simulators.sony_camera.scene import ImageSource, Moment
 
@@ -35,6 +36,13 @@ FORMAT_JPEG, FORMAT_ARW = 0x3801, 0xB101
 HANDLING_S = 0.2  # shutter lag, read-out and processing of a real body
 CARD_BYTES = 128_000_000_000
 FOCUSED, NOT_FOCUSED = 2, 1
+TRANSFER_PAUSE_S = 0.3
+DIALLED = {
+    Code.F_NUMBER: 2200,
+    Code.SHUTTER_SPEED: shutter_code(1, 15),
+    Code.ISO: 100,
+    Code.FOCUS_MODE: MANUAL_FOCUS,
+}
 _PRESSED = 2
 _LOG = logging.getLogger(__name__)
 
@@ -67,6 +75,7 @@ class BodyOptions:
     first_counter: int = 1
     exposures_log: Path | None = None
     announce: str = "both"  # event, property, both: how the client learns of a file
+    send_to: Path | None = None  # wireless transfer: files go into this folder, no client fetches them
 
 
 class CameraBody:
@@ -87,6 +96,10 @@ class CameraBody:
         self._half_pressed = False
         self._exposing = threading.Event()
         self._log_lock = threading.Lock()
+        if options.send_to is not None:
+            # Nobody can set this body from outside: a technician has dialled what a protocol asks for.
+            for code, value in DIALLED.items():
+                self.properties.put(code, value)
 
     @property
     def exposing(self) -> bool:
@@ -114,7 +127,9 @@ class CameraBody:
 
     def press(self, iso: int = 0) -> None:
         """The button on the body, perhaps after somebody turned the ISO dial; a busy or full body ignores it."""
-        if iso:
+        if self.options.send_to is not None:
+            self.properties.put(Code.ISO, iso or DIALLED[Code.ISO])  # told that it is wrong, he turns it back
+        elif iso:
             self.properties.put(Code.ISO, iso)
         try:
             self._shoot()
@@ -183,6 +198,9 @@ class CameraBody:
         if settings.capture_target != TARGET_COMPUTER:
             self.free_bytes = max(0, self.free_bytes - sum(len(file.data) for file in files))
         self._write_log(files, moment, settings, taken)
+        if self.options.send_to is not None:
+            send(files, self.options.send_to)
+            return
         with self._lock:
             self._waiting.extend(files)
             self._count()
@@ -234,6 +252,17 @@ class CameraBody:
         offset = 136
         head = offset.to_bytes(4, "little") + len(jpeg).to_bytes(4, "little")
         return head.ljust(offset, b"\0") + jpeg
+
+
+def send(files: Sequence[CameraFile], folder: Path) -> None:
+    """As a camera's wireless transfer writes files: under their final names, bit by bit."""
+    for file in files:
+        with (folder / file.name).open("wb") as stream:
+            half = len(file.data) // 2
+            stream.write(file.data[:half])
+            stream.flush()
+            time.sleep(TRANSFER_PAUSE_S)
+            stream.write(file.data[half:])
 
 
 def _damaged(file: CameraFile, kind: str) -> CameraFile:

@@ -1,4 +1,4 @@
-"""A capture by hand without a CT: photographs alone tell where the spheres are, better with each image."""
+"""By hand without a cable and without a CT: photographs come as files, and tell where the spheres are."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def without_ct(folder: Path) -> Path:
 def run(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """One run, shared by the tests of this file."""
     folder = tmp_path_factory.mktemp("without_ct")
-    options = ("--scene", "21", "--image-width", WIDTH, "--ct-voxel-mm", "1.0", "--hand", "steady")
+    options = ("--scene", "21", "--image-width", WIDTH, "--ct-voxel-mm", "1.0", "--hand", "usual", "--without-cable")
     with simulated_rig(folder, *options, host="127.0.0.12") as rig:
         answer = orthocapture(
             "run", str(without_ct(folder)), "--rig", rig["rig"], "--data", str(folder / "data"),
