@@ -546,7 +546,7 @@ def test_images_to_take_again_and_views_to_add_are_told_together_and_taken_by_on
     assert bench.run().status == "completed"
     first = asked[0].text
     assert "set the camera as the protocol has it" in first
-    assert "Confirm to take 1 image(s) again; all others are kept. predicted_target_error_mm is" in first
+    assert "Confirm to take 1 image again; all others are kept. predicted_target_error_mm is" in first
     assert "The same confirmation also takes" in first
     note = next(n.data for n in bench.payloads(StepNote) if n.note == "suggested_viewpoints")
     wanted = [view["viewpoint"] for view in note["viewpoints"]]

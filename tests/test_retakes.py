@@ -42,7 +42,7 @@ def test_images_with_other_settings_are_offered_to_be_taken_again_and_only_those
     assert state.status == "completed"
     assert len(asked) == 1
     assert "set the camera as the protocol has it" in asked[0]
-    assert "Confirm to take 1 image(s) again; all others are kept" in asked[0]
+    assert "Confirm to take 1 image again; all others are kept" in asked[0]
     assert [note.note for note in bench.payloads(StepNote) if note.note == "retakes"] == ["retakes"]
     assert bench.captured() == ["v001", "v002", "v003", "v004", "v002"]
     bench.must_verify()

@@ -45,7 +45,10 @@ def advise_retakes(context: StepContext, measures: Mapping[str, float], images: 
         return ""
     short = "; ".join(describe(verdict) for verdict in failed)
     words = "; ".join(TAKEN_AGAIN[verdict.measure] for verdict in failed)
-    advice = f"{short}. First {words}. Confirm to take {images} image(s) again; all others are kept"
+    confirm = "No image has to be taken again: confirm to judge the step anew"
+    if images:
+        confirm = f"Confirm to take {images} image{'s'[: images > 1]} again; all others are kept"
+    advice = f"{short}. First {words}. {confirm}"
     hands = CLEAN if any(verdict.measure == "images_spoilt" for verdict in failed) else []
     context.note("retakes", advice=advice, images=images, hands=hands)
     context.tell(advice)
