@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import os
 import signal
 import subprocess
 import sys
@@ -368,7 +369,9 @@ def _worker(data: Path, *, wanted: bool) -> Generator[None]:
     if not wanted:
         yield
         return
-    command = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(data), "--with-parent", "--json"]
+    command = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(data), "--json"]
+    # Its number is told, for a worker that looks who its parent is may look too late.
+    command += ["--parent", str(os.getpid())]
     # A session of its own: Ctrl-C is for the runner, which ends its worker in order.
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
     try:
