@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -20,12 +21,26 @@ from service.store.seam import Files
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0
 REVISIONS = ("0001", "0002", "0003", "0004")  # of migrations/versions, in order
+_RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
 _MIGRATIONS = Path(__file__).with_name("migrations")
 
 
 def database_path(data_dir: Path) -> Path:
     """Where the database of a data folder lies."""
     return data_dir / DATABASE_NAME
+
+
+@cache
+def fresh_schema() -> Mapping[tuple[str, str], str | None]:
+    """What a database is made of, as this software makes it: SQL by kind (table, index, trigger) and name."""
+    engine = create_engine("sqlite://")
+    try:
+        with engine.begin() as connection:
+            _upgrade(connection, Path(":memory:"))
+            made = connection.execute(text("SELECT type, name, sql FROM sqlite_master"))
+            return {(str(row.type), str(row.name)): row.sql for row in made}
+    finally:
+        engine.dispose()
 
 
 class Database:
@@ -183,6 +198,10 @@ def _store_errors(path: Path) -> Generator[None]:
         yield
     except DBAPIError as error:
         raise StoreError(_explain(error), where=str(path), remedy=_advise(error)) from error
+    except UnicodeDecodeError as error:  # of the driver, where damaged bytes are to be text
+        raise StoreError(
+            "the database is damaged: it holds text that is no UTF-8", where=str(path), remedy=_RESTORE
+        ) from error
     except SQLAlchemyError as error:
         raise StoreError(f"the database refused: {error}", where=str(path)) from error
     except OSError as error:
@@ -200,8 +219,8 @@ def _advise(error: DBAPIError) -> str:
     return {
         "SQLITE_BUSY": "Another process holds the database for too long; look for one that hangs",
         "SQLITE_FULL": "Free space on this disk; what was recorded before is safe",
-        "SQLITE_CORRUPT": "Restore the data folder from a copy; run `orthocapture audit verify` on the copy",
-        "SQLITE_NOTADB": "Restore the data folder from a copy; run `orthocapture audit verify` on the copy",
+        "SQLITE_CORRUPT": _RESTORE,
+        "SQLITE_NOTADB": _RESTORE,
         "SQLITE_READONLY": "Check the permissions of the data folder",
         "SQLITE_CANTOPEN": "Check that the data folder exists and its permissions",
     }.get(str(code), "Nothing of this action was recorded")
