@@ -50,6 +50,7 @@ class Database:
         self._engine = engine
         self._path = path
         self._files = files
+        self._opened: dict[Path, tuple[int, int]] = {}  # the files written to: device and inode
 
     @contextmanager
     def reading(self) -> Generator[Connection]:
@@ -64,7 +65,29 @@ class Database:
             connection = plain.execution_options(writes=True)
             with connection.begin() as transaction:
                 yield connection
+                self.require_in_place()
                 self._files.commit(transaction.commit)
+
+    def require_in_place(self) -> None:
+        """Raises StoreError unless the database and its log are the files that were written to before.
+
+        SQLite goes on writing to files that were moved away or deleted: what it wrote would be nowhere. The log beside the database is not removed by SQLite itself as long as this process has a connection.
+        """
+        for path in (self._path, self._path.with_name(self._path.name + "-wal")):
+            try:
+                found = path.stat()
+            except FileNotFoundError:
+                found = None
+            place = None if found is None else (found.st_dev, found.st_ino)
+            opened = self._opened.setdefault(path, place) if place is not None else self._opened.get(path)
+            if place is None or place != opened:
+                raise StoreError(
+                    f"{path.name} was {'removed' if place is None else 'replaced'} while it was in use; nothing is "
+                    "written any more",
+                    where=str(path),
+                    remedy="Put the file back as it was, with those of the same name beside it, then resume the run; "
+                    "files that were captured lie in the data folder",
+                )
 
     def close(self) -> None:
         """Close all connections."""
@@ -82,6 +105,7 @@ def open_database(data_dir: Path, files: Files) -> Database:
         if not is_current:
             with database.writing() as connection:
                 _upgrade(connection, path)
+        database.require_in_place()
     except BaseException:
         database.close()
         raise
