@@ -71,7 +71,8 @@ class Database:
     def require_in_place(self) -> None:
         """Raises StoreError unless the database and its log are the files that were written to before.
 
-        SQLite goes on writing to files that were moved away or deleted: what it wrote would be nowhere. The log beside the database is not removed by SQLite itself as long as this process has a connection.
+        SQLite goes on writing to files that were moved away or deleted: what it wrote would be nowhere. The log
+        beside the database is not removed by SQLite itself as long as this process has a connection.
         """
         for path in (self._path, self._path.with_name(self._path.name + "-wal")):
             try:
