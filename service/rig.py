@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import yaml
 from pydantic import Field, ValidationError
 
-from service.core.errors import ConfigurationError
+from service.core.errors import ConfigurationError, ProtocolError
 from service.core.imported import ImportList
 from service.core.model import Record
+from service.core.yaml_tree import parse_yaml
 
 if TYPE_CHECKING:  # the module brings scipy, for which a web process must not wait when it starts
     from service.core.geometry import Transform
@@ -144,11 +144,8 @@ def load_rig(path: Path) -> Rig:
 
 def parse_rig(source: bytes, path: Path) -> Rig:
     """The same for a file's bytes, such as a recorded artefact; ConfigurationError names the file and the field."""
-    try:
-        # The list of an import is JSON, of thousands of lines, which YAML would take seconds for.
-        data: object = json.loads(source) if source.startswith(b"{") else yaml.safe_load(source)
-    except (yaml.YAMLError, json.JSONDecodeError) as error:
-        raise ConfigurationError(f"the rig file is not YAML: {error}", where=str(path)) from error
+    # The list of an import is JSON, of thousands of lines, which YAML would take seconds for.
+    data = _parsed_json(source, path) if source.startswith(b"{") else _parsed_yaml(source, path)
     if not isinstance(data, Mapping):
         raise ConfigurationError("the rig file holds no mapping", where=str(path))
     try:
@@ -162,3 +159,39 @@ def parse_rig(source: bytes, path: Path) -> Rig:
                 f"station {name!r} names robot {station.robot!r}, which is not among the devices", where=str(path)
             )
     return Rig(section, path.resolve(), source)
+
+
+def _parsed_yaml(source: bytes, path: Path) -> object:
+    try:
+        tree = parse_yaml(source.decode(), name=str(path))
+    except UnicodeDecodeError as error:
+        raise ConfigurationError("the rig file is not UTF-8 text", where=str(path)) from error
+    except ProtocolError as error:
+        raise ConfigurationError(f"the rig file: {error.what}", where=error.where, remedy=error.remedy) from error
+    if tree.problems:
+        problems = "; ".join(f"line {p.line}, {p.field or 'the file'}: {p.message}" for p in tree.problems)
+        raise ConfigurationError(
+            f"the rig file is wrong: {problems}", where=f"{path}:{tree.problems[0].line}", remedy="Give each key once"
+        )
+    return tree.data
+
+
+def _parsed_json(source: bytes, path: Path) -> object:
+    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        data = dict(pairs)
+        if len(data) < len(pairs):
+            names = [name for name, _ in pairs]
+            double = next(name for name in names if names.count(name) > 1)
+            raise ConfigurationError(
+                f"the rig file gives {double!r} twice", where=str(path), remedy="Give each key once"
+            )
+        return data
+
+    try:
+        return json.loads(source, object_pairs_hook=once)
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ConfigurationError(f"the rig file is not JSON: {error}", where=str(path)) from error
+    except RecursionError as error:
+        raise ConfigurationError(
+            "the rig file is nested too deep", where=str(path), remedy="Look for brackets that are not closed"
+        ) from error

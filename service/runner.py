@@ -217,7 +217,7 @@ class Runner:
         if not self._pressed() or "confirm" not in question.options:
             return None
         earliest_s, latest_s = _PEDAL_SECOND_PRESS_S
-        if step_kinds()[self.protocol.step(question.step).kind].moves_robot:
+        if self.protocol.step(question.step).moves_robot:
             since_s = None if self._armed_s is None else self.monotonic_s() - self._armed_s
             if since_s is None or since_s < earliest_s:  # a bounce, or a foot that slipped, arms anew
                 self._armed_s = self.monotonic_s()

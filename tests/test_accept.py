@@ -310,6 +310,24 @@ def test_act_asks_for_the_password_of_an_account_of_that_role(web: WebSite) -> N
     assert (accepted.by, accepted.identified) == ("emmy", "password")
 
 
+def plainly(folder: Path, run: str, verb: str, name: str, typed: str | None = None) -> Result:
+    command = ["act", verb, "--run", run, "--data", folder / "data", "--operator", name]
+    return invoke(*command, *(["--password-stdin"] if typed is not None else []), typed=typed)
+
+
+def test_whoever_acts_in_the_name_of_an_account_gives_its_password(web: WebSite) -> None:
+    bench = failed_capture(web)
+    assert plainly(web.folder, bench.run_id, "confirm", "emmy", "guessed\n").exit_code == 1
+    assert not bench.state().step.retry_granted
+    assert plainly(web.folder, bench.run_id, "pause", "emmy").exit_code == 0, "nobody is kept from pausing"
+    assert plainly(web.folder, bench.run_id, "resume", "Emmy", password_of("emmy") + "\n").exit_code == 0
+    assert plainly(web.folder, bench.run_id, "confirm", "A Stranger").exit_code == 0
+    with Store.open(web.folder / "data") as store:
+        events = [event for event in store.events(bench.run_id) if isinstance(event.payload, OperatorAction)]
+    known = [(event.actor, event.payload.model_dump()["identified"]) for event in events[-3:]]
+    assert known == [("emmy", "claimed"), ("emmy", "password"), ("A Stranger", "claimed")]
+
+
 def test_without_accounts_a_name_is_a_claim_and_the_record_says_so(tmp_path: Path) -> None:
     run = record_reported_run(tmp_path, error_mm=0.9)
     assert act(tmp_path, run, "Emmy").exit_code == 1  # this protocol lets nobody accept it

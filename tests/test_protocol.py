@@ -144,6 +144,25 @@ def test_what_is_no_protocol_is_refused_with_a_line(text: str, place: str) -> No
     assert place in str(caught.value)
 
 
+BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 9)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("id: a\nsteps: " + "[" * 100_000, r"nested more than 50 deep \[lab.yaml:2\]"),
+        ("id: a\nsteps: " + "{a: " * 2_000, r"nested more than 50 deep \[lab.yaml:2\]"),
+        ("id: a\n" + BOMB, r"more than 200,000 values.* \[lab.yaml:2\]"),
+    ],
+    ids=["brackets", "braces", "aliases"],
+)
+def test_files_made_to_exhaust_the_reader_are_refused_at_once(text: str, message: str) -> None:
+    with pytest.raises(ProtocolError, match=message):
+        load(text)
+
+
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ProtocolError, match="cannot read the protocol"):
         load_protocol(tmp_path / "absent.yaml", KINDS)

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -49,8 +50,20 @@ def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> Non
         before = captured(data)
         assert 2 <= len(before) < 6
 
-        answer = orthocapture("resume", "latest", "--data", str(data), "--auto-confirm", "--json", timeout_s=240)
+        with (tmp_path / "resume.log").open("w") as log:
+            again = subprocess.Popen(
+                command("resume", "latest", "--data", str(data), "--screens"),
+                cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
+        wait_for(lambda: "session_started" in kinds(data)[-2:], again, tmp_path / "resume.log")
+        time.sleep(5)
+        assert captured(data) == before, "the arm moves for nobody"
+        answer = orthocapture("act", "confirm", "--data", str(data), "--operator", "Grace")
         assert answer.returncode == 0, answer.stdout + answer.stderr
+        assert again.wait(timeout=240) == 0, (tmp_path / "resume.log").read_text()
+    shown = events(data)
+    released = next(e for e in shown if e["kind"] == "operator_action" and e["actor"] == "Grace")
+    assert [e["seq"] > released["seq"] for e in shown if e["kind"] == "viewpoint_captured"].index(True) == len(before)
     after = captured(data)
     assert after[: len(before)] == before
     names = [event["artefacts"][0]["viewpoint"] for event in after]
@@ -60,19 +73,31 @@ def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> Non
 
 
 def wait_for_captures(data: Path, count: int, runner: subprocess.Popen[bytes], log: Path) -> None:
+    wait_for(lambda: len(captured(data)) >= count, runner, log)
+
+
+def wait_for(reached: Callable[[], bool], runner: subprocess.Popen[bytes], log: Path) -> None:
     deadline_s = time.monotonic() + 180
-    while len(captured(data)) < count:
+    while not reached():
         assert runner.poll() is None, log.read_text()
         assert time.monotonic() < deadline_s, log.read_text()
         time.sleep(0.3)
 
 
+def kinds(data: Path) -> list[str]:
+    return [event["kind"] for event in events(data)]
+
+
 def captured(data: Path) -> list[dict[str, Any]]:
-    """The capture events so far, read as an auditor reads them."""
+    """The capture events so far."""
+    return [event for event in events(data) if event["kind"] == "viewpoint_captured"]
+
+
+def events(data: Path) -> list[dict[str, Any]]:
+    """The events so far, read as an auditor reads them."""
     if not (data / "orthocapture.sqlite").exists():
         return []
     answer = orthocapture("audit", "show", "latest", "--data", str(data), "--json")
     if answer.returncode != 0:
         return []
-    events = json.loads(answer.stdout)["events"]
-    return [event for event in events if event["kind"] == "viewpoint_captured"]
+    return json.loads(answer.stdout)["events"]

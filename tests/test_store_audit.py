@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
+import random
 import sqlite3
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from service.cli.audit import audit_app
-from service.core.errors import StoreError
+from service.core.errors import OrthocaptureError, StoreError
 from service.core.model import StepNote
 from service.store.audit import show, verify
 from service.store.database import database_path
@@ -100,6 +101,23 @@ SQL_TAMPERING = {
     "job arguments": (5, "differs", ["UPDATE jobs SET arguments = '{\"a\":1}'"]),
     "job deleted": (5, "no row", ["DELETE FROM jobs"]),
     "run row": (1, "simulated", ["UPDATE runs SET simulated = 0"]),
+    "run's time": (1, "was made at", ["UPDATE runs SET created_utc = '2026-11-20T12:00:00.250000Z'"]),
+    "job priority": (5, "differs", ["UPDATE jobs SET priority = 0"]),
+    "job's beginning": (5, "differs", ["UPDATE jobs SET enqueued_utc = '2026-11-21T12:00:01.250000Z'"]),
+    "job's end": (6, "differs", ["UPDATE jobs SET ended_utc = '2026-11-21T12:00:01.250000Z'"]),
+    "job's error": (6, "differs", ["UPDATE jobs SET error = 'no memory'"]),
+    "row of the index deleted": (3, "missing from the index", ["DELETE FROM event_index WHERE seq = 3"]),
+    "row of the index edited": (
+        3,
+        "does not say what the event says",
+        ["UPDATE event_index SET kind = 'step_note' WHERE seq = 3"],
+    ),
+    "row of the index put elsewhere": (4, "does not say", ["UPDATE event_index SET step = 'x' WHERE seq = 4"]),
+    "row of the index invented": (
+        8,
+        "of an event that is not there",
+        [f"INSERT INTO event_index (run_id, seq, kind, actor) VALUES ('{RUN}', 8, 'run_completed', 'runner')"],
+    ),
 }
 
 
@@ -180,6 +198,54 @@ def test_missing_trigger_is_a_fault(data: Path) -> None:
     fault = verify(data).first_fault
     assert fault is not None
     assert "events_no_update" in fault.what
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        [
+            "DROP TRIGGER events_no_update",
+            "CREATE TRIGGER events_no_update BEFORE UPDATE ON events BEGIN SELECT 1; END",
+        ],
+        ["DROP INDEX jobs_open"],
+        ["CREATE TRIGGER forget AFTER INSERT ON events BEGIN DELETE FROM event_index; END"],
+    ],
+    ids=["trigger that does nothing", "index dropped", "foreign trigger"],
+)
+def test_a_schema_that_is_not_ours_is_a_fault(data: Path, statements: list[str]) -> None:
+    with closing(sqlite3.connect(database_path(data))) as connection:
+        for statement in statements:
+            connection.execute(statement)
+    fault = verify(data).first_fault
+    assert fault is not None
+    assert "software" in fault.what or "missing" in fault.what
+
+
+def test_an_account_that_nobody_made_is_a_fault(data: Path) -> None:
+    columns = "account, full_name, role, state, password_hash, pin_hash, failures, locked_until_utc_s, created_utc"
+    values = "'eve', 'Eve', 'administrator', 'active', 'x', '', 0, 0.0, '2026-11-21T12:00:00.250000Z'"
+    with closing(sqlite3.connect(database_path(data))) as connection:
+        connection.execute(f"INSERT INTO accounts ({columns}) VALUES ({values})")
+        connection.commit()
+    fault = verify(data).first_fault
+    assert fault is not None
+    assert "account eve (administrator) was made by nobody" in fault.what
+
+
+def test_no_flipped_bit_ends_in_anything_but_a_report_or_an_error_of_ours(data: Path) -> None:
+    path = database_path(data)
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    whole = path.read_bytes()
+    rng = random.Random(6)
+    for _ in range(120):
+        flipped = bytearray(whole)
+        flipped[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        path.write_bytes(flipped)
+        for left in ("-wal", "-shm"):
+            path.with_name(path.name + left).unlink(missing_ok=True)
+        with suppress(OrthocaptureError):
+            verify(data)
 
 
 def test_leftovers_of_a_crash_are_notes_and_foreign_files_faults(data: Path) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -145,6 +146,34 @@ def test_tables_refuse_update_delete_and_replace(store: Store, table: str) -> No
             with pytest.raises(sqlite3.IntegrityError, match=f"{table} is append-only"):
                 outsider.execute(statement)
     assert [str(fault) for fault in verify(store.database_path.parent).faults if "time stamp" not in fault.what] == []
+
+
+def moved_away(path: Path) -> None:
+    for each in path.parent.glob(path.name + "*"):
+        each.rename(each.with_name("gone-" + each.name))
+
+
+def replaced_by_a_copy(path: Path) -> None:
+    copy = path.with_name("copy")
+    shutil.copy(path, copy)
+    copy.replace(path)
+
+
+def its_log_removed(path: Path) -> None:
+    path.with_name(path.name + "-wal").unlink()
+
+
+@pytest.mark.parametrize("change", [moved_away, replaced_by_a_copy, its_log_removed])
+def test_a_database_that_is_taken_away_in_use_stops_the_run_loudly(
+    tmp_path: Path, change: Callable[[Path], None]
+) -> None:
+    with Store.open(tmp_path / "data", SteppedClock(), CountedIds()) as store:
+        run = start_run(store)
+        capture(store, run, "v1")
+        change(database_path(tmp_path / "data"))
+        with pytest.raises(StoreError, match=r"was (removed|replaced) while it was in use"):
+            capture(store, run, "v2")
+        assert len(list((tmp_path / "data" / "artefacts").rglob("*"))) > 3, "the image lies there all the same"
 
 
 def test_database_is_durable_and_strict(store: Store) -> None:

@@ -64,10 +64,7 @@ class Fakes:
     executed: list[str] = field(default_factory=list[str])
 
     def kinds(self) -> dict[str, Any]:
-        return {
-            name: dataclasses.replace(kind, execute=self.execute, moves_robot=False)
-            for name, kind in step_kinds().items()
-        }
+        return {name: dataclasses.replace(kind, execute=self.execute) for name, kind in step_kinds().items()}
 
     def execute(self, context: StepContext, _params: object) -> StepOutcome:
         self.executed.append(context.step.id)

@@ -208,7 +208,19 @@ def test_a_dead_runner_offers_to_go_on() -> None:
     assert (view.mode, view.main and view.main.verb, view.main and view.main.hold) == ("died", "go-on", False)
     moving = view_of(advance_to(DEMO, "viewpoint_capture_1"), Snapshot(), driven=False).main
     assert moving is not None
-    assert moving.hold
+    assert not moving.hold
+    assert "asked again before the robot moves" in moving.note
+
+
+def test_after_a_restart_the_robot_waits_for_a_confirmation_that_is_held() -> None:
+    log = advance_to(DEMO, "viewpoint_capture_1")
+    while log.state.phase != "running":
+        go(log, "on")
+    log.append(SessionStarted(resumed=True, software={}, host="h", pid=1))
+    view = view_of(log)
+    assert (view.mode, view.asked_anew) == ("ask", True)
+    assert view.main is not None
+    assert (view.main.verb, view.main.hold) == ("confirm", True)
 
 
 def test_the_time_left_is_measured_and_never_across_a_restart() -> None:

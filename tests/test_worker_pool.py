@@ -6,12 +6,14 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
-from service.core.errors import ComputeError
+from service.core.errors import ComputeError, StoreError
 from service.core.model import JobFailed, JobFinished, StepNote
 from service.core.priorities import EARLY, LATER, LIVE, WAITED
 from service.store.audit import verify
@@ -30,6 +32,11 @@ from pathlib import Path
 from service.store.store import Store
 Store.open(Path(sys.argv[1])).claim_job("child", 60.0)
 os._exit(9)
+"""
+LEAVE_A_WORKER = """
+import os, subprocess, sys
+command = [sys.executable, "-m", "service.cli.main", "worker", "--data", sys.argv[1], "--parent", str(os.getpid())]
+print(subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True).pid)
 """
 
 
@@ -141,3 +148,41 @@ def test_a_worker_that_is_told_to_stop_puts_its_jobs_back_untried(store: Store, 
     assert again is not None
     store.finish_job(again, measures={}, duration_s=0.1)
     assert isinstance(store.events(run)[-1].payload, JobFinished)
+
+
+def test_a_worker_whose_runner_died_before_it_looked_ends(tmp_path: Path) -> None:
+    with Store.open(tmp_path / "data"):
+        pass
+    answer = subprocess.run(
+        [sys.executable, "-c", LEAVE_A_WORKER, str(tmp_path / "data")], stdout=subprocess.PIPE, text=True, check=True
+    )
+    left = psutil.Process(int(answer.stdout))
+    _, alive = psutil.wait_procs([left], timeout=20)
+    assert [process for process in alive if process.status() != psutil.STATUS_ZOMBIE] == []
+
+
+def test_a_lease_is_renewed_although_the_store_failed_for_a_moment(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "_LEASE_S", 0.6)
+    renew, failures = store.renew_job, iter([StoreError("database is locked")])
+    renewed: list[str] = []
+
+    def sometimes(job: Job, lease_s: float) -> None:
+        for failure in failures:
+            raise failure
+        renew(job, lease_s)
+        renewed.append(job.job_id)
+
+    def slow(_context: JobContext) -> JobAnswer:
+        deadline_s = time.monotonic() + 10
+        while len(renewed) < 2 and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+        return JobAnswer({})
+
+    monkeypatch.setattr(store, "renew_job", sometimes)
+    monkeypatch.setattr(loop, "HANDLERS", {"layout": slow})
+    run = start_run(store)
+    job = enqueue(store, run, "a")
+    work(store, until_idle=True, stop=lambda: False, progress=silent)
+    assert renewed == [job.job_id] * 2

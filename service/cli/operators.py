@@ -25,7 +25,7 @@ from service.monitor.reporter import Reporter
 from service.monitor.snapshot import Doing
 from service.people.errors import PeopleError
 from service.people.people import People
-from service.people.proof import identity_for
+from service.people.proof import Identity, identity_for
 from service.runner import Spoken
 
 _MOST_MENDS = 4  # of one step: whoever has followed its advice so often decides by himself
@@ -139,6 +139,7 @@ class TerminalOperator(_Operator):
     descriptor: int = 0  # of the terminal
     preview: Callable[[str], str] = lambda _step: ""  # what a step is going to do, where that can be told
     people: People | None = None  # accounts of the site, for what demands a role
+    who: Identity | None = None  # the person who types
     _asked: AskOperator | None = None
     _typed: bytes = b""
     _accepting: _Accepting | None = None
@@ -247,6 +248,8 @@ class TerminalOperator(_Operator):
                 "checklist": question.checklist if verb == "confirm" else (),
                 "meaning": (reason or "checked and released") if verb == "sign" else "",
                 "signed_sha256": question.sign_sha256 if verb == "sign" else "",
+                "role": self.who.role if self.who else "",
+                "identified": self.who.identified if self.who else "",
             }
         )
 

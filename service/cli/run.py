@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import os
 import signal
 import subprocess
 import sys
@@ -43,7 +44,7 @@ from service.core.ways_on import takes_words, ways_on
 from service.evidence import RunLog, results_to_come
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.people import People
-from service.people.proof import identity_for
+from service.people.proof import Identity, identity_for, who_acts
 from service.rig import Rig, load_rig
 from service.runner import Runner
 from service.runs import (
@@ -82,6 +83,7 @@ def run_command(
     operator: OperatorOption = "",
     auto_confirm: AutoOption = False,
     worker: WorkerOption = True,
+    password_stdin: PasswordOption = False,
     json: JsonOption = False,
 ) -> None:
     """Run a protocol step by step. Nothing moves before you have confirmed it."""
@@ -89,10 +91,10 @@ def run_command(
         loaded = load_protocol(protocol, params_models())
         rig_file = load_rig(rig)
         with Store.open(data) as store:
-            run_id = start_run(
-                store, loaded, rig_file, operator=operator or getpass.getuser(), auto_confirm=auto_confirm
-            )
-            state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker)
+            name = operator or getpass.getuser()
+            who = who_acts(People(store), name, partial(_password, name, from_stdin=password_stdin))
+            run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm)
+            state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
         _report_end(run_id, state, json=json)
 
 
@@ -141,6 +143,7 @@ def act_command(
         state = fold(protocol, store.events(run_id))
         name = operator or getpass.getuser()
         if verb in _OF_A_CAPTURE:
+            name = who_acts(People(store), name, partial(_password, name, from_stdin=password_stdin)).name
             asked = step or state.current
             _ask_capture(
                 store,
@@ -155,7 +158,10 @@ def act_command(
         identity = identity_for(
             People(store), protocol, state, verb, name, partial(_password, name, from_stdin=password_stdin)
         )
-        name = identity.name if identity else name
+        if identity is None and verb == "pause":  # the safe direction: nobody is kept from it
+            identity = Identity(name, "", "claimed")
+        identity = identity or who_acts(People(store), name, partial(_password, name, from_stdin=password_stdin))
+        name = identity.name
         action = OperatorAction(
             action=verb,
             step=step or state.current,
@@ -164,8 +170,8 @@ def act_command(
             checklist=protocol.step(state.current).checklist if verb == "confirm" else (),
             meaning=meaning,
             signed_sha256=signed_by_verb(verb, protocol, state),
-            role=identity.role if identity else "",
-            identified=identity.identified if identity else "",
+            role=identity.role,
+            identified=identity.identified,
         )
         refusal = refuse(protocol, state, action, name)
         if refusal is not None:
@@ -303,8 +309,20 @@ def drive(
     auto_confirm: bool,
     worker: bool,
     screens: bool = False,
+    who: Identity | None = None,
 ) -> RunState:
-    """Run the runner in this process, with a worker beside it, until the run ends. `screens`: people answer there."""
+    """Run the runner in this process, with a worker beside it, until the run ends.
+
+    Args:
+        store: of the data folder `data`.
+        run_id: the run.
+        rig: its devices.
+        data: the data folder.
+        auto_confirm: a simulated technician answers every question.
+        worker: compute here.
+        screens: people answer in the browser.
+        who: the person at this terminal, where it is known; else the run's operator, who is asked for a password.
+    """
     protocol, root = recorded_run(store, run_id)
     require_rig_free(store, rig.path, run_id=run_id)
     station = Station(rig)
@@ -321,7 +339,9 @@ def drive(
         operator = ImportOperator(root.operator, protocol, display, hands, listing=rig.section.imported)
     else:
         preview = partial(_preview, protocol, rig)
-        operator = TerminalOperator(root.operator, protocol, display, hands, preview=preview, people=People(store))
+        people = People(store)
+        who = who or who_acts(people, root.operator, partial(_password, root.operator, from_stdin=False))
+        operator = TerminalOperator(who.name, protocol, display, hands, preview=preview, people=people, who=who)
     # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -368,7 +388,9 @@ def _worker(data: Path, *, wanted: bool) -> Generator[None]:
     if not wanted:
         yield
         return
-    command = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(data), "--with-parent", "--json"]
+    command = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(data), "--json"]
+    # Its number is told, for a worker that looks who its parent is may look too late.
+    command += ["--parent", str(os.getpid())]
     # A session of its own: Ctrl-C is for the runner, which ends its worker in order.
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
     try:

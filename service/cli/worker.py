@@ -26,11 +26,12 @@ def worker_command(
     jobs: Annotated[
         int, typer.Option("--jobs", min=0, help="How many to compute at once; 0: as many as there are cores.")
     ] = 0,
-    with_parent: Annotated[bool, typer.Option("--with-parent", hidden=True)] = False,
+    parent: Annotated[
+        int, typer.Option("--parent", hidden=True, help="End when this process is not the parent.")
+    ] = 0,
     json: JsonOption = False,
 ) -> None:
     """Compute: calibration, spheres, structure from motion, registration, as many jobs at once as there are cores."""
-    parent = os.getppid()
     stopped = False
 
     def on_terminate(_signal: int, _frame: object) -> None:
@@ -43,10 +44,10 @@ def worker_command(
             data,
             at_once=jobs or os.cpu_count() or 1,
             until_idle=until_idle,
-            stop=lambda: stopped or (with_parent and os.getppid() != parent),
+            stop=lambda: stopped or (parent != 0 and os.getppid() != parent),
             progress=progress,
         )
         if json:
             print_json({"jobs": done})
-        elif not with_parent:
+        elif not parent:
             console.print(f"{done} jobs done")

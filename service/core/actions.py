@@ -63,6 +63,11 @@ def capture_refusal(protocol: Protocol, state: RunState, step: str, attempt: int
     return None
 
 
+def needs_leave(protocol: Protocol, state: RunState) -> bool:
+    """Whether a person must confirm anew before the robot moves: the program that drove it before has ended."""
+    return state.restarted and protocol.step(state.current).moves_robot
+
+
 def unmet_requirements(step: Step, state: RunState) -> tuple[str, ...]:
     """Steps that `step` requires and that have not passed their gates (a skipped step has not)."""
     return tuple(name for name in step.requires if not state.steps[name].passed_its_gates)
@@ -146,13 +151,14 @@ def redoable_steps(protocol: Protocol, state: RunState) -> tuple[str, ...]:
 
 def _confirm(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return a rule
     step, now = protocol.step(state.current), state.step
+    anew = needs_leave(protocol, state)
     if state.phase == "recovering":
-        if now.retry_granted:
+        if now.retry_granted and not anew:
             return Refusal("already confirmed", where=step.id)
         return None
-    if state.phase != "ready":
+    if state.phase != "ready" and not (anew and state.phase == "running"):
         return Refusal(f"nothing to confirm while the step is {state.phase}", where=step.id)
-    if now.confirmed or not step.confirm:
+    if (now.confirmed and not anew) or not step.begins_confirmed:
         return Refusal("already confirmed" if now.confirmed else "this step starts by itself", where=step.id)
     refusal = _requirements_refusal(step, state)
     if refusal is not None:

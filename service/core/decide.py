@@ -10,6 +10,7 @@ from service.core.acceptance import describe_accepted
 from service.core.actions import (
     allowed_actions,
     check_action,
+    needs_leave,
     needs_signature_now,
     record_to_sign,
     redoable_steps,
@@ -19,7 +20,7 @@ from service.core.errors import IntegrityError
 from service.core.fold import advance, fold, initial_state
 from service.core.gates import describe, describe_judged, evaluate_gates
 from service.core.model import OperatorVerb, Uncertainty
-from service.core.protocol import Protocol
+from service.core.protocol import Protocol, Step
 from service.core.run_state import Deviation, JobState, Note, RunState, StepState, Superseded
 from service.core.ways_on import WayOn, ways_on
 
@@ -135,6 +136,8 @@ def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - 
     match state.phase:
         case "ready":
             return _decide_ready(protocol, state)
+        case "running" if needs_leave(protocol, state):
+            return _ask(protocol, state, "confirm", _what_goes_on(protocol.step(now.step), now))
         case "running":
             return RunStep(now.step, now.attempt, begin=False)
         case "checking":
@@ -147,6 +150,15 @@ def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - 
             return _decide_recovering(protocol, state)
         case "passed":
             return FinishRun(state.deviation_count)
+
+
+def _what_goes_on(step: Step, now: StepState) -> str:
+    kept = {0: "it had taken no image yet", 1: "its image is kept"}
+    images = kept.get(len(now.captured), f"its {len(now.captured)} images are kept")
+    return (
+        f"The program that drove the robot ended during this step ({step.title}); {images}. "
+        "Look whether anything has changed and nobody is in reach; the robot moves as soon as you confirm"
+    )
 
 
 def _what_is_signed(now: StepState) -> str:
@@ -165,14 +177,15 @@ def _decide_ready(protocol: Protocol, state: RunState) -> Decision:
             f"{step.title} cannot be undone. Its captures have passed: {', '.join(step.requires)}. Sign to release it"
         )
         return _ask(protocol, state, "sign", text)
-    if step.confirm and not now.confirmed:
+    if step.begins_confirmed and (not now.confirmed or needs_leave(protocol, state)):
         return _ask(protocol, state, "confirm", step.instructions or step.title)
     return RunStep(now.step, now.attempt, begin=True)
 
 
 def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
     step, now = protocol.step(state.current), state.step
-    if now.retry_granted:
+    anew = needs_leave(protocol, state)
+    if now.retry_granted and not anew:
         return Retry(now.step, now.attempt + 1, "the operator asked for it", 0.0)
     if now.failure is None:
         outside = any(not verdict.passed and not verdict.undecided for verdict in now.verdicts)
@@ -183,6 +196,8 @@ def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
         advice = str(now.mend.get("advice", ""))
         return _ask(protocol, state, "recovery", f"{found}: {failed}" + (f". {advice}" if advice else ""))
     why = f"{now.failure.error}: {now.failure.message}"
+    if anew and now.failure.recovery == "retry":
+        return _ask(protocol, state, "recovery", f"{why}. The robot moves again as soon as you confirm")
     match now.failure.recovery:
         case "retry":
             return Retry(now.step, now.attempt + 1, why, step.recovery.wait_s)

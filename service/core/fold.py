@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
-from service.core.actions import unmet_requirements
+from service.core.actions import needs_leave, unmet_requirements
 from service.core.errors import IllegalTransitionError, IntegrityError
 from service.core.gates import evaluate_gates
 from service.core.lifecycle import lifecycle
@@ -182,7 +182,9 @@ def _run_started(protocol: Protocol, state: RunState, event: Event, p: RunStarte
 
 
 def _session_started(protocol: Protocol, state: RunState, event: Event, p: SessionStarted) -> RunState:
-    return replace(state, sessions=state.sessions + 1)
+    state = replace(state, sessions=state.sessions + 1, restarted=p.resumed)
+    # Who lets the robot move again looks again: what was ticked was true before the program ended.
+    return change(state, state.current, ticked=()) if needs_leave(protocol, state) else state
 
 
 def _device_opened(protocol: Protocol, state: RunState, event: Event, p: DeviceOpened) -> RunState:
@@ -397,7 +399,8 @@ def _action_refused(protocol: Protocol, state: RunState, event: Event, p: Action
 
 def _item_ticked(protocol: Protocol, state: RunState, event: Event, p: ItemTicked) -> RunState:
     """A mark that comes too late, or for an item that the protocol does not have, has no effect."""
-    open_now = state.phase in ("ready", "recovering") and (p.step, p.attempt) == (state.current, state.step.attempt)
+    asked = state.phase in ("ready", "recovering") or needs_leave(protocol, state)
+    open_now = asked and (p.step, p.attempt) == (state.current, state.step.attempt)
     if state.terminal or not open_now:
         return _void(state, event)
     items = [item for item in protocol.step(p.step).checklist if item in state.step.ticked and item != p.item]

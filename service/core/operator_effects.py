@@ -25,11 +25,8 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
             state, event, "automatic", state.current, f"{p.action} given automatically on a simulated rig"
         )
     match p.action:
-        case "confirm" if state.phase == "recovering":
-            ticked = p.checklist or state.step.ticked  # a list that was left open is ticked now
-            return change(state, state.current, retry_granted=True, confirmed_by=event.actor, ticked=ticked)
         case "confirm":
-            return change(state, state.current, confirmed=True, confirmed_by=event.actor, ticked=p.checklist)
+            return _confirm(replace(state, restarted=False), event, p)
         case "sign":
             return change(state, state.current, signed=True, signed_by=event.actor)
         case "accept":
@@ -43,13 +40,27 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
             return pass_on(protocol, go(protocol, state, "skip", skipped=True, ended_utc=event.at_utc))
         case "abort":
             return replace(go(protocol, state, "abort"), stop_reason=p.reason or f"aborted by {event.actor}")
-        case "pause" | "resume":
-            return go(protocol, state, p.action)
+        case "pause":
+            return go(protocol, state, "pause")
+        case "resume":
+            return go(protocol, replace(state, restarted=False), "resume")
         case "redo" if p.viewpoint is not None:
             return replace(_redo_viewpoint(protocol, state, event, p.viewpoint, p.reason), last_redo_seq=event.seq)
         case "redo":
             target = p.step or state.current
             return replace(_redo_step(protocol, state, event, target, p.reason), last_redo_seq=event.seq)
+
+
+def _confirm(state: RunState, event: Event, p: OperatorAction) -> RunState:
+    ticked = p.checklist or state.step.ticked  # a list that was left open is ticked now
+    there = change(state, state.current, confirmed_by=event.actor, ticked=ticked)
+    match state.phase:
+        case "running":  # after a restart: the work goes on
+            return there
+        case "recovering":
+            return change(there, state.current, retry_granted=True)
+        case _:
+            return change(there, state.current, confirmed=True)
 
 
 def _redo_step(protocol: Protocol, state: RunState, event: Event, target: str, reason: str) -> RunState:

@@ -166,10 +166,29 @@ class StepFields(Record):
     simulated_hands: tuple[HandAction, ...] = ()  # without effect on a real rig
 
 
+class MovingParams(Record):
+    """Base of the params of a step kind whose work moves the robot: such work never begins by itself."""
+
+    @property
+    def moves_robot(self) -> bool:
+        """Whether it does so with these params."""
+        return True
+
+
 class Step(StepFields):
     """One step of the procedure; `params` is of the step kind's own model."""
 
     params: SerializeAsAny[BaseModel]
+
+    @property
+    def moves_robot(self) -> bool:
+        """Whether the robot moves while this step works: its confirmation is held, or the pedal pressed twice."""
+        return isinstance(self.params, MovingParams) and self.params.moves_robot
+
+    @property
+    def begins_confirmed(self) -> bool:
+        """Whether a person lets it begin: what moves the robot always, whatever the protocol says."""
+        return self.confirm or self.moves_robot
 
     def params_as(self, model: type[ParamsT]) -> ParamsT:
         """The params, typed. Raises ProtocolError when the step is of another kind."""

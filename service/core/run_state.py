@@ -206,6 +206,7 @@ class RunState:
     origin: Literal["captured", "imported"] = "captured"
     auto_confirm: bool = False
     sessions: int = 0
+    restarted: bool = False  # another process drives the run now, and nobody has let it go on since
     stop_reason: str = ""
     deviations: tuple[Deviation, ...] = ()
     superseded: tuple[Superseded, ...] = ()

@@ -14,6 +14,9 @@ from service.core.errors import ProtocolError
 FieldPath = tuple[str | int, ...]  # ("steps", 3, "gates", 0, "max")
 Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
 
+MOST_DEEP = 50
+MOST_VALUES = 200_000
+
 # The core schema of YAML 1.2 (section 10.3): unlike YAML 1.1, "on" and "12:30" stay text and 1e-3 is a number.
 _SCALARS: tuple[tuple[re.Pattern[str], Callable[[str], Plain]], ...] = (
     (re.compile(r"(null|Null|NULL|~|)"), lambda _: None),
@@ -53,8 +56,13 @@ def field_name(path: FieldPath) -> str:
 
 
 def parse_yaml(text: str, *, name: str) -> YamlTree:
-    """Read one YAML document. Raises ProtocolError with `name`:line where the text is not YAML."""
+    """Read one YAML document.
+
+    Raises ProtocolError with `name`:line where the text is not YAML, or no file that a person would write: nested
+    more than 50 deep, or of more than 200,000 values once every alias is replaced by what it stands for.
+    """
     try:
+        _check_depth(text, name)
         root = yaml.compose(text, Loader=yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -69,15 +77,30 @@ def parse_yaml(text: str, *, name: str) -> YamlTree:
         raise ProtocolError(
             f"not valid YAML: {error.reason}", where=f"{name}:{line}", remedy="Remove the unprintable character"
         ) from error
-    builder = _Builder()
+    builder = _Builder(name)
     data = None if root is None else builder.build(root, (), ())
     return YamlTree(data=data, lines=builder.lines, problems=tuple(builder.problems))
 
 
-class _Builder:
-    """Walks the compose tree once."""
+def _check_depth(text: str, name: str) -> None:
+    """The parser reads events one by one; what composes them recurses, and would end in a RecursionError."""
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MOST_DEEP:
+            raise ProtocolError(
+                f"nested more than {MOST_DEEP} deep",
+                where=f"{name}:{event.start_mark.line + 1}",
+                remedy="Look for brackets that are not closed",
+            )
 
-    def __init__(self) -> None:
+
+class _Builder:
+    """Walks the compose tree once; an alias is walked each time it stands somewhere."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._values = 0
         self.lines: dict[FieldPath, int] = {(): 1}
         self.problems: list[Problem] = []
 
@@ -85,6 +108,13 @@ class _Builder:
         if any(node is outer for outer in around):
             self._problem(node, path, "an alias that contains itself")
             return None
+        self._values += 1
+        if self._values > MOST_VALUES:
+            raise ProtocolError(
+                f"more than {MOST_VALUES:,} values, aliases replaced by what they stand for",
+                where=f"{self._name}:{node.start_mark.line + 1}",
+                remedy="Write the file without aliases of aliases",
+            )
         around = (*around, node)
         if isinstance(node, MappingNode):
             return self._mapping(node, path, around)

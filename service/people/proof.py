@@ -31,6 +31,19 @@ def identity_for(
     return identify(people, typed, role, password) if role else None
 
 
+def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identity:
+    """Who acts on the command line, where a name is a claim: that of an account needs its password.
+
+    Raises SignInRefusedError: name and password do not belong together, or the account is not in use.
+    """
+    name = plain_name(typed)
+    account = next((account for account in people.accounts.all() if account.account == name), None)
+    if account is None:
+        return Identity(typed.strip(), "", "claimed")
+    people.check_password(name, password())
+    return Identity(name, account.role, "password")
+
+
 def identify(people: People, typed: str, role: str, password: Callable[[], str]) -> Identity:
     """The person of this name, in this role.
 

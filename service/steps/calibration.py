@@ -11,6 +11,7 @@ from pydantic import model_validator
 from service.compute.calibration.board import Board
 from service.core.errors import ConfigurationError
 from service.core.model import Record
+from service.core.protocol import MovingParams
 from service.steps.board_capture import BoardCapture
 from service.steps.board_looks import board_arguments
 from service.steps.board_mend import mend_calibration
@@ -21,7 +22,7 @@ from service.steps.optics import departing_images, optics_departures
 from service.steps.viewpoints import ViewpointSet, plan_viewpoints
 
 
-class Params(Record):
+class Params(MovingParams):
     """Which board images, and what is computed from them."""
 
     solve: tuple[Literal["intrinsics", "hand_eye"], ...]
@@ -29,6 +30,11 @@ class Params(Record):
     viewpoints: tuple[ViewpointSet, ...] = ()  # or: as listed here
     images_of: str | None = None  # use the images of this earlier calibration step instead of new ones
     intrinsics_of: str | None = None  # hand-eye alone: the step that solved the intrinsics
+
+    @property
+    def moves_robot(self) -> bool:
+        """Not with images that are there."""
+        return self.images_of is None
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -142,4 +148,4 @@ def _solve(
     return answer
 
 
-KIND = StepKind("calibration", Params, Result, execute, moves_robot=True)
+KIND = StepKind("calibration", Params, Result, execute)

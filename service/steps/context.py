@@ -199,4 +199,3 @@ class StepKind(Generic[P]):
     params: type[P]
     result: type[Record]
     execute: Callable[[StepContext, P], StepOutcome]
-    moves_robot: bool = False  # its confirmation must be held, or the pedal pressed twice

@@ -8,6 +8,7 @@ from typing import Literal
 
 from service.compute.planning.motion_plan import Order
 from service.core.model import Record
+from service.core.protocol import MovingParams
 from service.steps.capture import CaptureTotals, capture_viewpoints
 from service.steps.context import StepContext, StepKind, StepOutcome
 from service.steps.front_end import EarlyFeatures
@@ -18,7 +19,7 @@ from service.steps.retakes import advise_retakes, to_take_again
 from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 
 
-class Params(Record):
+class Params(MovingParams):
     """Which viewpoints, what the images are for, and what is to be known of them while they are taken."""
 
     purpose: Literal["dataset", "control"]
@@ -112,4 +113,4 @@ def _of_images(context: StepContext, viewpoints: Sequence[Viewpoint], images: Co
     return [viewpoint for viewpoint in viewpoints if viewpoint.name in taken]
 
 
-KIND = StepKind("viewpoint_capture", Params, Result, execute, moves_robot=True)
+KIND = StepKind("viewpoint_capture", Params, Result, execute)

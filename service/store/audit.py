@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from sqlalchemy import Connection, Table, select, text
 
 from service.core.errors import StoreError
 from service.store import audit_checks as checks
+from service.store import audit_derived as derived
 from service.store import audit_signatures as signatures
 from service.store.artefacts import TEMPORARY, hash_file, read_artefacts, relative_path
 from service.store.audit_checks import ChainFacts, Fault, FileState
@@ -21,7 +22,7 @@ from service.store.events import read_events
 from service.store.records import SITE, Artefact, Checkpoint, RunRow, Timestamp
 from service.store.seam import DurableFiles
 from service.store.store import read_runs
-from service.store.tables import TRIGGERS, artefacts, checkpoints, events, heads, jobs, runs
+from service.store.tables import accounts, artefacts, checkpoints, events, heads, jobs, runs
 from service.store.timestamping import timestamp_findings
 
 Progress = Callable[[str, int, int], None]  # what is being done, done, total (bytes)
@@ -158,13 +159,9 @@ def _verify(
     faults = [Fault(None, None, "", problem) for problem in evidence.damage]
     faults += [fault for run in ordered for fault in found[run]]
     faults += foreign
-    faults += [
-        Fault(
-            None, None, database_path(data_dir).name, f"the trigger {name} is missing: the evidence could be changed"
-        )
-        for name in TRIGGERS
-        if name not in evidence.triggers
-    ]
+    faults += derived.schema_faults(connection)
+    faults += derived.index_faults(connection, ordered)
+    faults += derived.account_faults(evidence.accounts, site.account_changes)
     return AuditReport(
         data_dir=str(data_dir),
         runs=evidence.run_ids,
@@ -235,12 +232,12 @@ class _Evidence:
     checkpoints: Mapping[str, list[Checkpoint]]
     timestamps: Mapping[str, list[Timestamp]]
     every_sha256: frozenset[str]
-    triggers: frozenset[str]
+    accounts: Sequence[Mapping[str, Any]]
     damage: tuple[str, ...]
 
 
 def _read(connection: Connection, run_id: str | None) -> _Evidence:
-    damage = [str(row[0]) for row in connection.execute(text("PRAGMA quick_check(5)"))]
+    damage = [str(row[0]) for row in connection.execute(text("PRAGMA integrity_check(5)"))]
     known = set(connection.execute(select(runs.c.run_id)).scalars())
     # A run whose row was deleted is still there in its events, or in what signs them.
     known |= set(connection.execute(select(events.c.run_id).distinct()).scalars())
@@ -267,9 +264,7 @@ def _read(connection: Connection, run_id: str | None) -> _Evidence:
         checkpoints={run: read_checkpoints(connection, run) for run in read},
         timestamps={run: read_timestamps(connection, run) for run in read},
         every_sha256=frozenset(connection.execute(select(artefacts.c.sha256)).scalars()),
-        triggers=frozenset(
-            connection.execute(text("SELECT name FROM sqlite_master WHERE type = 'trigger'")).scalars()
-        ),
+        accounts=[dict(row) for row in connection.execute(select(accounts)).mappings()],
         damage=tuple(f"SQLite finds the database damaged: {line}" for line in damage if line != "ok"),
     )
 

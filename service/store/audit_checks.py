@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any
 
 from pydantic_core import ValidationError
@@ -16,6 +17,7 @@ from service.store.records import SITE
 
 Rows = Sequence[Mapping[str, Any]]
 _REF_COLUMNS = tuple(ArtefactRef.model_fields)
+_CLOCK_READ_TWICE_S = 5.0
 _OF_JOBS = frozenset({"job_enqueued", "job_finished", "job_failed"})
 _JOB_COLUMNS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
 
@@ -58,17 +60,22 @@ class ChainFacts:
 
     sha256_at: dict[int, str] = field(default_factory=dict[int, str])
     jobs: dict[int, Any] = field(default_factory=dict[int, Any])  # payloads that concern jobs
+    jobs_utc: dict[int, str] = field(default_factory=dict[int, str])  # when
     key_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
+    account_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
     heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of ServiceStarted
     first: Mapping[str, Any] | None = None
 
-    def add(self, seq: int, payload: Any) -> None:
+    def add(self, seq: int, payload: Any, at_utc: str) -> None:
         """An event whose content is as it was recorded."""
         kind = payload["kind"]
         if kind in _OF_JOBS:
             self.jobs[seq] = payload
+            self.jobs_utc[seq] = at_utc
         elif kind == "key_changed":
             self.key_changes.append((seq, payload))
+        elif kind == "account_changed":
+            self.account_changes.append((seq, payload))
         elif kind == "service_started":
             self.heads_at_start.append((seq, payload["heads"]))
 
@@ -100,7 +107,7 @@ def run_faults(
         if problem:
             yield Fault(run_id, seq, "", problem)
             continue
-        facts.add(seq, payload)
+        facts.add(seq, payload, str(row["at_utc"]))
         recorded |= {(str(item["sha256"]), int(item["size_bytes"])) for item in mine}
         yield from _artefact_faults(run_id, row, payload, named, mine, recorded=recorded, files=files)
     for left in by_seq.values():
@@ -108,7 +115,7 @@ def run_faults(
             what = f"artefact {item['original_name']} ({item['sha256']}) belongs to an event that is not there"
             yield Fault(run_id, int(item["seq"]), "", what)
     yield from _end_faults(run_id, run_rows, head_rows, facts.first, (seq, previous))
-    yield from _job_faults(run_id, job_rows, facts.jobs)
+    yield from _job_faults(run_id, job_rows, facts.jobs, facts.jobs_utc)
 
 
 def _link_faults(run_id: str, row: Mapping[str, Any], before: int, previous: str) -> Iterator[Fault]:
@@ -195,9 +202,21 @@ def _end_faults(
             row["simulated"]
         ):
             yield Fault(run_id, 1, "", "the run's row and its first event disagree on whether it was simulated")
+        if first is not None and not _same_moment(str(row["created_utc"]), str(first["at_utc"])):
+            what = f"the run's row says that it was made at {row['created_utc']}, its first event {first['at_utc']}"
+            yield Fault(run_id, 1, "", what)
 
 
-def _job_faults(run_id: str, rows: Rows, payloads: Mapping[int, Any]) -> Iterator[Fault]:
+def _same_moment(one_utc: str, other_utc: str) -> bool:
+    """To a few seconds: older versions read the clock twice."""
+    try:
+        apart = datetime.fromisoformat(one_utc) - datetime.fromisoformat(other_utc)
+    except (ValueError, TypeError):
+        return False
+    return abs(apart.total_seconds()) < _CLOCK_READ_TWICE_S
+
+
+def _job_faults(run_id: str, rows: Rows, payloads: Mapping[int, Any], at_utc: Mapping[int, str]) -> Iterator[Fault]:
     enqueued = {seq: payload for seq, payload in payloads.items() if payload["kind"] == "job_enqueued"}
     ended = {seq: payload for seq, payload in payloads.items() if payload["kind"] in ("job_finished", "job_failed")}
     ends_of: dict[str, dict[int, Any]] = {}
@@ -212,6 +231,8 @@ def _job_faults(run_id: str, rows: Rows, payloads: Mapping[int, Any]) -> Iterato
             any(payload[name] != row[column] for name, column in _JOB_COLUMNS.items())
             or payload["idempotency_key"] != row["idempotency_key"]
             or canonical_parsed(payload["arguments"]) != row["arguments"]
+            or payload.get("priority", row["priority"]) != row["priority"]
+            or at_utc.get(int(row["enqueued_seq"])) != row["enqueued_utc"]
         ):
             yield Fault(run_id, int(row["enqueued_seq"]), "", f"{shown} differs from its event job_enqueued")
         ends = ends_of.pop(row["job_id"], {})
@@ -220,10 +241,20 @@ def _job_faults(run_id: str, rows: Rows, payloads: Mapping[int, Any]) -> Iterato
         if found != ({} if expected is None else {row["ended_seq"]: expected}):
             what = f"{shown} is {row['state']}, but its ending events are {found or 'none'}"
             yield Fault(run_id, row["ended_seq"], "", what)
+        elif expected is not None:
+            yield from _end_of_job_faults(run_id, row, ends[row["ended_seq"]], at_utc)
     for seq, payload in enqueued.items():
         yield Fault(run_id, seq, "", f"job {payload['job']} was enqueued and has no row")
     for seq, payload in ((seq, end) for ends in ends_of.values() for seq, end in ends.items()):
         yield Fault(run_id, seq, "", f"job {payload['job']} ended and has no row")
+
+
+def _end_of_job_faults(
+    run_id: str, row: Mapping[str, Any], end: Mapping[str, Any], at_utc: Mapping[int, str]
+) -> Iterator[Fault]:
+    error = f"{end['error']}: {end['message']}" if end["kind"] == "job_failed" else None
+    if (row["error"], row["ended_utc"]) != (error, at_utc.get(row["ended_seq"])):
+        yield Fault(run_id, row["ended_seq"], "", f"job {row['job_id']} differs from its event {end['kind']}")
 
 
 def summary(payload: Mapping[str, Any]) -> str:

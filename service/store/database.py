@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -20,12 +21,26 @@ from service.store.seam import Files
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0
 REVISIONS = ("0001", "0002", "0003", "0004")  # of migrations/versions, in order
+_RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
 _MIGRATIONS = Path(__file__).with_name("migrations")
 
 
 def database_path(data_dir: Path) -> Path:
     """Where the database of a data folder lies."""
     return data_dir / DATABASE_NAME
+
+
+@cache
+def fresh_schema() -> Mapping[tuple[str, str], str | None]:
+    """What a database is made of, as this software makes it: SQL by kind (table, index, trigger) and name."""
+    engine = create_engine("sqlite://")
+    try:
+        with engine.begin() as connection:
+            _upgrade(connection, Path(":memory:"))
+            made = connection.execute(text("SELECT type, name, sql FROM sqlite_master"))
+            return {(str(row.type), str(row.name)): row.sql for row in made}
+    finally:
+        engine.dispose()
 
 
 class Database:
@@ -35,6 +50,7 @@ class Database:
         self._engine = engine
         self._path = path
         self._files = files
+        self._opened: dict[Path, tuple[int, int]] = {}  # the files written to: device and inode
 
     @contextmanager
     def reading(self) -> Generator[Connection]:
@@ -49,7 +65,30 @@ class Database:
             connection = plain.execution_options(writes=True)
             with connection.begin() as transaction:
                 yield connection
+                self.require_in_place()
                 self._files.commit(transaction.commit)
+
+    def require_in_place(self) -> None:
+        """Raises StoreError unless the database and its log are the files that were written to before.
+
+        SQLite goes on writing to files that were moved away or deleted: what it wrote would be nowhere. The log
+        beside the database is not removed by SQLite itself as long as this process has a connection.
+        """
+        for path in (self._path, self._path.with_name(self._path.name + "-wal")):
+            try:
+                found = path.stat()
+            except FileNotFoundError:
+                found = None
+            place = None if found is None else (found.st_dev, found.st_ino)
+            opened = self._opened.setdefault(path, place) if place is not None else self._opened.get(path)
+            if place is None or place != opened:
+                raise StoreError(
+                    f"{path.name} was {'removed' if place is None else 'replaced'} while it was in use; nothing is "
+                    "written any more",
+                    where=str(path),
+                    remedy="Put the file back as it was, with those of the same name beside it, then resume the run; "
+                    "files that were captured lie in the data folder",
+                )
 
     def close(self) -> None:
         """Close all connections."""
@@ -67,6 +106,7 @@ def open_database(data_dir: Path, files: Files) -> Database:
         if not is_current:
             with database.writing() as connection:
                 _upgrade(connection, path)
+        database.require_in_place()
     except BaseException:
         database.close()
         raise
@@ -183,6 +223,10 @@ def _store_errors(path: Path) -> Generator[None]:
         yield
     except DBAPIError as error:
         raise StoreError(_explain(error), where=str(path), remedy=_advise(error)) from error
+    except UnicodeDecodeError as error:  # of the driver, where damaged bytes are to be text
+        raise StoreError(
+            "the database is damaged: it holds text that is no UTF-8", where=str(path), remedy=_RESTORE
+        ) from error
     except SQLAlchemyError as error:
         raise StoreError(f"the database refused: {error}", where=str(path)) from error
     except OSError as error:
@@ -200,8 +244,8 @@ def _advise(error: DBAPIError) -> str:
     return {
         "SQLITE_BUSY": "Another process holds the database for too long; look for one that hangs",
         "SQLITE_FULL": "Free space on this disk; what was recorded before is safe",
-        "SQLITE_CORRUPT": "Restore the data folder from a copy; run `orthocapture audit verify` on the copy",
-        "SQLITE_NOTADB": "Restore the data folder from a copy; run `orthocapture audit verify` on the copy",
+        "SQLITE_CORRUPT": _RESTORE,
+        "SQLITE_NOTADB": _RESTORE,
         "SQLITE_READONLY": "Check the permissions of the data folder",
         "SQLITE_CANTOPEN": "Check that the data folder exists and its permissions",
     }.get(str(code), "Nothing of this action was recorded")

@@ -21,7 +21,7 @@ from service.store.errors import UnknownRunError
 from service.store.events import ROOT, append, read_events, to_event
 from service.store.leases import RunLease, acquire, check_lease, held_runs, is_held
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
-from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock, utc_text
+from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock
 from service.store.tables import event_index, events, heads, runs
 
 _ENDS = ("run_completed", "run_aborted")
@@ -176,7 +176,7 @@ class Store:
         connection.execute(
             insert(runs).values(
                 run_id=run_id,
-                created_utc=utc_text(self._clock.utc_now()),
+                created_utc=root.at_utc,
                 simulated=int(simulated),
                 root_sha256=root.sha256,
             )

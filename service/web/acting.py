@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Form, Path
 from fastapi.responses import RedirectResponse
 
-from service.core.actions import refuse
+from service.core.actions import needs_leave, refuse
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.model import (
     ActionRefused,
@@ -99,7 +99,8 @@ def tick(
     log = site.run(run_id)
     Control(site.store).require(run_id, person)
     now = log.state.step
-    if log.state.terminal or (step, attempt) != (now.step, now.attempt) or now.phase not in ("ready", "recovering"):
+    asked = now.phase in ("ready", "recovering") or needs_leave(log.protocol, log.state)
+    if log.state.terminal or (step, attempt) != (now.step, now.attempt) or not asked:
         raise _out_of_date(log.state)
     if item not in log.protocol.step(step).checklist:
         raise IllegalTransitionError("there is no such item in the checklist", where=step)

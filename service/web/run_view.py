@@ -8,7 +8,7 @@ from typing import Any
 from typing import Protocol as Interface
 
 from service.core.acceptance import acceptors, demanded_role, failed_gates
-from service.core.actions import needs_signature_now, record_to_sign, redoable_steps
+from service.core.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.decide import AskOperator, decide
 from service.core.dependence import AcceptedGate, dependent_steps, depends_on
 from service.core.model import Event, OperatorVerb
@@ -23,7 +23,6 @@ from service.web.run_words import (
     drawing_of,
     figure_line,
     irreversible_warning,
-    moves_robot,
     phase_words,
     planned_views,
     sentence,
@@ -205,6 +204,7 @@ class RunView:
     main: Main | None
     options: tuple[OperatorVerb, ...]  # besides the main one
     can_pause: bool
+    asked_anew: bool  # the program that drove the robot ended: nothing moves before a fresh confirmation
     standing: bool  # paused, and the robot stands still
     looker: Looker
     trouble: Trouble | None
@@ -254,6 +254,7 @@ def run_view(
         main=_main(protocol, state, decision, mode, stopped=snapshot.robot in _STOPPED),
         options=_options(decision, state),
         can_pause=mode not in ("ended", "died", "paused") and looker.may_operate,
+        asked_anew=needs_leave(protocol, state) and mode in ("ask", "recover"),
         standing=snapshot.doing == "paused" and snapshot.robot != "moving",
         looker=looker,
         trouble=_trouble(protocol, state, decision),
@@ -351,10 +352,10 @@ def _main(protocol: Protocol, state: RunState, decision: object, mode: str, *, s
 
 def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) -> Main | None:
     step, now = protocol.step(state.current), state.step
-    moves = moves_robot(step)
+    moves = step.moves_robot
     if mode == "died":
-        note = "The run goes on where it stopped." + (" The robot may move." if moves else " Nothing moves.")
-        return Main("go-on", "Go on", note, hold=moves)
+        asks = " You are asked again before the robot moves." if moves else " Nothing moves."
+        return Main("go-on", "Go on", "The run goes on where it stopped." + asks)
     if mode == "paused":
         under_way = now.phase == "running"
         note = "The robot goes on with its viewpoints." if moves and under_way else "The run goes on where it paused."

@@ -36,14 +36,6 @@ def drawing_of(step: Step) -> str:
     return step.drawing or _DRAWINGS_BY_ID.get(step.id) or _DRAWINGS_BY_KIND.get(step.kind, "")
 
 
-def moves_robot(step: Step) -> bool:
-    """Whether the robot moves while this step works."""
-    # Imported here: the step kinds load their numerics, which the start of the service does not wait for.
-    from service.steps import step_kinds  # noqa: PLC0415
-
-    return step_kinds()[step.kind].moves_robot
-
-
 def measure_name(measure: str) -> str:
     """`five_fold_rms_px` → `Five fold RMS`: the unit stands beside the number."""
     parts = measure.split("_")

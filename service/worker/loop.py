@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
+from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
 from service.core.priorities import Lane
 from service.store.errors import LeaseLostError
 from service.store.records import Job
@@ -161,3 +161,5 @@ class _Attempt:
                 self._store.renew_job(self._job, _LEASE_S)
             except LeaseLostError:
                 return
+            except StoreError as error:  # the disk was full or busy for a moment; the lease may outlive it
+                _log.warning("the lease of job %s was not renewed: %s", self._job.job_id, error)

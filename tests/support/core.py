@@ -23,14 +23,14 @@ from service.core.model import (
     ViewImported,
     ViewpointCaptured,
 )
-from service.core.protocol import LoadedProtocol, Protocol, parse_protocol
+from service.core.protocol import LoadedProtocol, MovingParams, Protocol, parse_protocol
 
 
 class ChecklistParams(Record):
     """Nothing to set."""
 
 
-class CaptureParams(Record):
+class CaptureParams(MovingParams):
     """Views to take."""
 
     views: int = Field(ge=1)
