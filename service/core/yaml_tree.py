@@ -90,7 +90,7 @@ def _check_depth(text: str, name: str) -> None:
         if depth > MOST_DEEP:
             raise ProtocolError(
                 f"nested more than {MOST_DEEP} deep",
-                where=f"{name}:{event.start_mark.line + 1}",
+                where=f"{name}:{event.start_mark.line + 1 if event.start_mark else 1}",
                 remedy="Look for brackets that are not closed",
             )
 
