@@ -440,6 +440,15 @@ class KeyChanged(Record):
     reason: str
 
 
+class RunSigned(Record):
+    """A run's chain was signed up to an event: written down here as well, at once."""
+
+    kind: Literal["run_signed"] = "run_signed"
+    run: str
+    seq: int
+    sha256: str  # of that event
+
+
 # --- end -----------------------------------------------------------------------------------------------------
 
 
@@ -491,7 +500,8 @@ Payload = Annotated[
     | ServiceStarted
     | AccountChanged
     | SignInRecorded
-    | KeyChanged,
+    | KeyChanged
+    | RunSigned,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)

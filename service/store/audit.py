@@ -21,6 +21,8 @@ from service.store.errors import UnknownRunError
 from service.store.events import read_events
 from service.store.records import SITE, Artefact, Checkpoint, RunRow, Timestamp
 from service.store.seam import DurableFiles
+from service.store.signature_log import NAME as LOG_NAME
+from service.store.signature_log import log_findings, read_log
 from service.store.store import read_runs
 from service.store.tables import accounts, artefacts, checkpoints, events, heads, jobs, runs
 from service.store.timestamping import timestamp_findings
@@ -145,6 +147,7 @@ def _verify(
         rows = evidence.artefacts.get(run, [])
         found[run] += signatures.checkpoint_faults(run, signed, facts, site, keys.periods, rows)
         found[run] += signatures.start_faults(run, facts, site)
+        found[run] += signatures.unsigned_end_faults(run, signed, facts)
         faults, said = timestamp_findings(signed, evidence.timestamps[run], certificates)
         found[run] += faults
         count, note = signatures.unsigned(run, signed, len(facts.sha256_at))
@@ -155,9 +158,16 @@ def _verify(
     orphans, foreign = _unlisted(folder, evidence.every_sha256) if with_files else ([], [])
     if not with_files:
         notes.append("the files were not read again: only records and signatures were checked")
+    public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
+    of_log, said_of_log = log_findings(
+        read_log(data_dir / LOG_NAME), evidence.checkpoints, public_keys, awaited=bool(site.runs_signed)
+    )
+    notes += said_of_log
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
     faults = [Fault(None, None, "", problem) for problem in evidence.damage]
     faults += [fault for run in ordered for fault in found[run]]
+    faults += signatures.signed_run_faults(site, chains, every_run=run_id is None)
+    faults += of_log
     faults += foreign
     faults += derived.schema_faults(connection)
     faults += derived.index_faults(connection, ordered)

@@ -64,6 +64,8 @@ class ChainFacts:
     key_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
     account_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
     heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of ServiceStarted
+    runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of the site's chain
+    to_sign: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # what is signed when it happens
     first: Mapping[str, Any] | None = None
 
     def add(self, seq: int, payload: Any, at_utc: str) -> None:
@@ -76,6 +78,10 @@ class ChainFacts:
             self.key_changes.append((seq, payload))
         elif kind == "account_changed":
             self.account_changes.append((seq, payload))
+        elif kind == "run_signed":
+            self.runs_signed.append((seq, payload))
+        elif kind in ("step_passed", "run_completed", "run_aborted"):
+            self.to_sign.append((seq, kind))
         elif kind == "service_started":
             self.heads_at_start.append((seq, payload["heads"]))
 
@@ -116,6 +122,21 @@ def run_faults(
             yield Fault(run_id, int(item["seq"]), "", what)
     yield from _end_faults(run_id, run_rows, head_rows, facts.first, (seq, previous))
     yield from _job_faults(run_id, job_rows, facts.jobs, facts.jobs_utc)
+
+
+def chain_fault(
+    run_id: str, event_rows: Iterable[Mapping[Any, Any]], end: tuple[int, str]
+) -> Fault | tuple[int, str]:
+    """The first fault of the events that follow `end` (number and hash), or where the chain ends now."""
+    seq, previous = end
+    for row in event_rows:
+        for fault in _link_faults(run_id, row, seq, previous):
+            return fault
+        seq, previous = int(row["seq"]), str(row["sha256"])
+        _, _, problem = _payload_of(row)
+        if problem:
+            return Fault(run_id, seq, "", problem)
+    return seq, previous
 
 
 def _link_faults(run_id: str, row: Mapping[str, Any], before: int, previous: str) -> Iterator[Fault]:

@@ -121,6 +121,34 @@ def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[F
                 yield Fault(run_id, int(seq), "", what)
 
 
+def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, every_run: bool) -> Iterator[Fault]:
+    """What the site's chain says of signed runs must be so: a run that is gone or shorter now was cut or deleted."""
+    gone: set[str] = set()
+    for at, payload in site.runs_signed:
+        run_id, seq = str(payload["run"]), int(payload["seq"])
+        if run_id not in chains:
+            if every_run and run_id not in gone:
+                what = f"the run was signed (event {at} of the site's chain) and is no longer here: it was deleted"
+                yield Fault(run_id, None, "", what)
+            gone.add(run_id)
+        elif chains[run_id].sha256_at.get(seq) != payload["sha256"]:
+            what = f"the site's chain says (event {at}) that another event was signed here: it was cut or rewritten"
+            yield Fault(run_id, seq, "", what)
+
+
+def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: ChainFacts) -> Iterator[Fault]:
+    """A step that passed, or a run that ended, is signed at once: without that, signatures were taken away.
+
+    The very last event may still wait for its signature.
+    """
+    signed = checkpoints[-1].seq if checkpoints else 0
+    last = max(chain.sha256_at, default=0)
+    for seq, kind in chain.to_sign:
+        if signed < seq < last:
+            what = f"{kind.replace('_', ' ')} was never signed, or its signature was taken away"
+            yield Fault(run_id, seq, "", what)
+
+
 def unsigned(run_id: str, checkpoints: Sequence[Checkpoint], events: int) -> tuple[int, str]:
     """How many events come after the last checkpoint, and a note on it, "" when there is none."""
     last = checkpoints[-1].seq if checkpoints else 0

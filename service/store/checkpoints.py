@@ -84,6 +84,12 @@ def read_checkpoints(connection: Connection, run_id: str) -> list[Checkpoint]:
     return [_to_checkpoint(row) for row in connection.execute(found)]
 
 
+def read_every_checkpoint(connection: Connection) -> list[Checkpoint]:
+    """Of all chains, in the order in which they were made."""
+    made = select(checkpoints).order_by(checkpoints.c.site_seq, checkpoints.c.run_id == SITE, checkpoints.c.seq)
+    return [_to_checkpoint(row) for row in connection.execute(made)]
+
+
 def read_timestamps(connection: Connection, run_id: str) -> list[Timestamp]:
     """All time stamps of a run's checkpoints, oldest first."""
     found = select(timestamps).where(timestamps.c.run_id == run_id).order_by(timestamps.c.seq, timestamps.c.authority)

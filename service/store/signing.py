@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from sqlalchemy import Connection, select
 
-from service.core.model import KeyChanged
+from service.core.model import KeyChanged, RunSigned
 from service.store.checkpoints import (
     artefacts_digest,
     insert_checkpoint,
     key_fingerprint,
     last_checkpoint,
     read_checkpoints,
+    read_every_checkpoint,
     read_key_changes,
     signed_by,
     statement,
@@ -24,6 +26,8 @@ from service.store.events import read_head
 from service.store.keys import KeyFolder, public_bytes
 from service.store.records import SITE, Checkpoint
 from service.store.seam import utc_text
+from service.store.signature_log import Line, SignatureLog
+from service.store.soundness import require_sound
 from service.store.store import Store
 from service.store.tables import runs
 
@@ -47,15 +51,34 @@ def checkpoint(store: Store, run_id: str) -> Checkpoint:
 
     The first signature of a data folder makes the key and records it in the site's chain.
 
+    What is signed is verified first: the chain, the earlier signatures, and what the log of signatures says of them.
+    The signature of a run goes into the site's chain, which is signed too, and all of them into the log.
+
     Raises:
         UnknownRunError: there is no such run.
-        IntegrityError: the chain does not end where it was left; nothing is signed.
+        IntegrityError: the chain does not verify, or does not end where it was left; nothing is signed.
         SigningKeyError: the private key is missing or cannot be used.
+        StoreError: the log of signatures cannot be written.
     """
+    log = _log_of(store)
     with store.database.writing() as connection:
         if run_id != SITE:
             _require_run(connection, run_id, store)
-        return _signed_end(connection, run_id) or _sign(store, connection, run_id, _present_key(store, connection))
+        lines = log.lines()
+        require_sound(store, connection, run_id, lines)
+        signed = _signed_end(connection, run_id)
+        if signed is not None:
+            return signed
+        key = _present_key(store, connection)
+        signed = _sign(store, connection, run_id, key)
+        if run_id != SITE:
+            require_sound(store, connection, SITE, lines)
+            entry = RunSigned(run=run_id, seq=signed.seq, sha256=signed.sha256)
+            store.append_site(connection, [entry], actor=_ACTOR)
+            _sign(store, connection, SITE, key)
+        unlogged = _unlogged(connection, lines)
+    log.add(unlogged, key)
+    return signed
 
 
 def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> PublicKey:
@@ -72,7 +95,10 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
         SigningKeyError: the old key cannot be used and `lost` is not given; or it can, and `lost` is.
     """
     folder = KeyFolder(store.database_path.parent)
+    log = _log_of(store)
     with store.database.writing() as connection:
+        lines = log.lines()
+        require_sound(store, connection, SITE, lines)
         if lost:
             _require_lost(connection, folder)
         old = None if lost else _present_key(store, connection)
@@ -82,6 +108,8 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
         new = folder.make()
         _record_key(store, connection, new, previous=changes[-1][1]["key_id"], reason=reason, actor=actor)
         _sign(store, connection, SITE, old or new)
+        unlogged = _unlogged(connection, lines)
+    log.add(unlogged, old or new)
     with store.database.writing() as connection:  # again under the lock: nobody else makes a key meanwhile
         folder.destroy_all_but(read_key_changes(connection)[-1][1]["key_id"])
     return public_keys(store)[-1]
@@ -110,6 +138,17 @@ def public_keys(store: Store) -> list[PublicKey]:
         raw = base64.b64decode(payload["public_key"])
         keys.append(PublicKey(payload["key_id"], raw, seq, after, payload["reason"], introduced))
     return keys
+
+
+def _log_of(store: Store) -> SignatureLog:
+    return SignatureLog(store.database_path.parent, store.second_logs)
+
+
+def _unlogged(connection: Connection, lines: Sequence[Line]) -> list[Checkpoint]:
+    """Signatures that the log does not hold: the new ones, and those before which a power cut came."""
+    held = {(line.checkpoint.run_id, line.checkpoint.seq) for line in lines if line.checkpoint is not None}
+    every = read_every_checkpoint(connection)
+    return [item for item in every if (item.run_id, item.seq) not in held]
 
 
 def _require_run(connection: Connection, run_id: str, store: Store) -> None:

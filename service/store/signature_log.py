@@ -1,0 +1,208 @@
+"""Everything that was ever signed, once more, in a file beside the database to which lines are only added.
+
+Who rewrites, cuts back or replaces the database leaves signatures behind that no longer fit it. Each line is signed
+itself and names the line before it, so that lines cannot be taken out, changed or exchanged; that the end was not cut
+off shows in a copy elsewhere (`second`), which gets every line as well.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import fcntl
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+from service.core.errors import StoreError
+from service.store.audit_checks import Fault
+from service.store.checkpoints import key_fingerprint
+from service.store.events import canonical
+from service.store.keys import public_bytes
+from service.store.records import Checkpoint
+
+NAME = "signatures.jsonl"
+PURPOSE = "orthocapture signature log v1"  # so that no signature of this key can be taken for one of another kind
+_FIRST = "0" * 64
+_COLUMNS = tuple(field.name for field in fields(Checkpoint))
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line: a checkpoint, and the signature that binds it to the line before.
+
+    Attributes:
+        number: from 1.
+        checkpoint: None for a line that cannot be read.
+        problem: why it cannot be read, or does not follow the line before it; "" for a sound one.
+        message: what is signed.
+        key_id: of the key that signed the line.
+        signature: base64.
+    """
+
+    number: int
+    checkpoint: Checkpoint | None
+    problem: str
+    message: bytes = b""
+    key_id: str = ""
+    signature: str = ""
+
+    def signed_by(self, public_key: bytes) -> bool:
+        """Whether the line's signature is this key's."""
+        try:
+            signature = base64.b64decode(self.signature, validate=True)
+            Ed25519PublicKey.from_public_bytes(public_key).verify(signature, self.message)
+        except (InvalidSignature, binascii.Error, ValueError):
+            return False
+        return True
+
+
+class SignatureLog:
+    """The log of one data folder, and its copies."""
+
+    def __init__(self, data_dir: Path, second: Sequence[Path] = ()) -> None:
+        self.path = data_dir / NAME
+        self._second = tuple(second)
+
+    def lines(self) -> list[Line]:
+        """Every line, oldest first; none where there is no log yet. Raises StoreError."""
+        return read_log(self.path)
+
+    def add(self, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
+        """Append those that the log does not hold yet, durably, here and in every second place. Raises StoreError."""
+        for path in (self.path, *self._second):
+            try:
+                _add(path, checkpoints, key)
+            except OSError as error:
+                raise StoreError(
+                    f"what was signed cannot be written down: {error.strerror or error}",
+                    where=str(path),
+                    remedy="Check free space, permissions and, of a share, whether it is there",
+                ) from error
+
+
+def read_log(path: Path) -> list[Line]:
+    """The lines of a log or of a copy. Raises StoreError when it cannot be read."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path)) from error
+    return list(_parsed(content))
+
+
+def _parsed(content: bytes) -> Iterator[Line]:
+    previous = _FIRST
+    # A line without its end is what a power cut left of one that was never reported as written.
+    whole = content[: content.rfind(b"\n") + 1]
+    for number, raw in enumerate(whole.splitlines(keepends=True), start=1):
+        yield _line(number, raw, previous)
+        previous = hashlib.sha256(raw).hexdigest()
+
+
+def _line(number: int, raw: bytes, previous: str) -> Line:
+    try:
+        data = json.loads(raw)
+        checkpoint = Checkpoint(**{name: data["checkpoint"][name] for name in _COLUMNS})
+        key_id, signature = str(data["key_id"]), str(data["signature"])
+        said_before, said_number = data["previous_sha256"], data["number"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return Line(number, None, "it cannot be read")
+    problem = "" if (said_before, said_number) == (previous, number) else "it does not follow the line before it"
+    return Line(number, checkpoint, problem, _message(number, previous, checkpoint, key_id), key_id, signature)
+
+
+def _message(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> bytes:
+    return canonical(_fields(number, previous, checkpoint, key_id) | {"purpose": PURPOSE}).encode()
+
+
+def _fields(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> dict[str, Any]:
+    return {"number": number, "previous_sha256": previous, "checkpoint": asdict(checkpoint), "key_id": key_id}
+
+
+def _add(path: Path, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
+    new = not path.exists()
+    with path.open("a+b") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)  # one process appends at a time
+        stream.seek(0)
+        content = stream.read()
+        end = content.rfind(b"\n") + 1
+        if end < len(content):
+            stream.truncate(end)  # half a line, of a write that a power cut ended
+        lines = list(_parsed(content[:end]))
+        held = {(line.checkpoint.run_id, line.checkpoint.seq) for line in lines if line.checkpoint is not None}
+        last = content[:end].splitlines(keepends=True)[-1:]
+        number, previous = len(lines), hashlib.sha256(last[0]).hexdigest() if last else _FIRST
+        key_id = key_fingerprint(public_bytes(key))
+        for checkpoint in checkpoints:
+            if (checkpoint.run_id, checkpoint.seq) in held:
+                continue
+            number += 1
+            signature = base64.b64encode(key.sign(_message(number, previous, checkpoint, key_id))).decode()
+            data = _fields(number, previous, checkpoint, key_id) | {"signature": signature}
+            raw = canonical(data).encode() + b"\n"
+            stream.write(raw)
+            previous = hashlib.sha256(raw).hexdigest()
+        stream.flush()
+        os.fsync(stream.fileno())
+    if new:
+        path.chmod(0o644)
+        descriptor = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def log_findings(
+    lines: Sequence[Line],
+    present: Mapping[str, Sequence[Checkpoint]],
+    public_keys: Mapping[str, bytes],
+    *,
+    awaited: bool,
+) -> tuple[list[Fault], list[str]]:
+    """Faults and notes: what does not fit between a log and the checkpoints of a database.
+
+    Args:
+        lines: of the log, oldest first.
+        present: the database's checkpoints, by run; runs that are not among them are left out.
+        public_keys: raw, by fingerprint.
+        awaited: whether there must be a log: this software, or a later one, has signed here.
+    """
+    if not lines and awaited:
+        return [Fault(None, None, NAME, "the log of signatures is missing: it was taken away")], []
+    faults: list[Fault] = []
+    held: set[tuple[str, int]] = set()
+    here = {(run_id, item.seq): item for run_id, items in present.items() for item in items}
+    for line in lines:
+        place, signed = f"{NAME}, line {line.number}", line.checkpoint
+        if signed is None or line.problem:
+            faults.append(Fault(None, None, place, line.problem))
+            continue
+        key = public_keys.get(line.key_id)
+        if key is None or not line.signed_by(key):
+            faults.append(Fault(None, None, place, "its own signature is not valid"))
+        held.add((signed.run_id, signed.seq))
+        if signed.run_id in present and here.get((signed.run_id, signed.seq)) != signed:
+            gone = (signed.run_id, signed.seq) not in here
+            change = "is no longer here: what it signed was taken away" if gone else "is another one here"
+            faults.append(Fault(signed.run_id, signed.seq, "", f"the signature of {place}, {change}"))
+    # A power cut between a signature and its line leaves the newest ones out, which the next signature makes good.
+    newest = max((line.checkpoint.site_seq for line in lines if line.checkpoint is not None), default=0)
+    notes: list[str] = []
+    for (run_id, seq), item in here.items():
+        if (run_id, seq) in held or not lines:
+            continue
+        if item.site_seq >= newest:
+            notes.append(f"{run_id}: the signature at event {seq} is not in {NAME} yet")
+        else:
+            faults.append(Fault(run_id, seq, "", f"its signature is not in {NAME}: it was made behind its back"))
+    return faults, notes
