@@ -78,7 +78,7 @@ def test_the_first_signature_makes_the_key_and_records_it(store: Store) -> None:
     assert stat.S_IMODE(private.stat().st_mode) == 0o600
     assert stat.S_IMODE(private.parent.stat().st_mode) == 0o700
     kinds = [event.payload.kind for event in store.events(SITE)]
-    assert kinds == ["site_opened", "key_changed"]
+    assert kinds == ["site_opened", "key_changed", "run_signed"]
     assert made.site_seq == 2
     assert store.checkpoints(SITE)[0].seq == 2
 
@@ -109,8 +109,9 @@ def test_a_chain_rewritten_to_its_end_is_found(store: Store) -> None:
     found = faults(store, RUN)
     assert found[0].startswith(f"run {RUN}, event 3: checkpoint: it signs an event with hash")
     assert "rewritten" in found[0]
-    # The index of events was not rewritten with them: it names who they were by.
-    assert all("checkpoint: " in fault or "index of events" in fault for fault in found)
+    # The index of events was not rewritten with them, nor what the site's chain says of them.
+    others = ("checkpoint: ", "index of events", "the site's chain says")
+    assert all(any(part in fault for part in others) for fault in found)
 
 
 def test_a_row_altered_together_with_its_hash_is_found(store: Store) -> None:
@@ -128,15 +129,16 @@ def test_the_sites_chain_is_protected_by_the_runs(store: Store) -> None:
     checkpoint(store, RUN)
     tamper(
         folder(store),
-        "DELETE FROM checkpoints WHERE run_id = 'site' AND seq = 3",
-        "DELETE FROM events WHERE run_id = 'site' AND seq = 3",
-        "DELETE FROM event_index WHERE run_id = 'site' AND seq = 3",
+        "DELETE FROM checkpoints WHERE run_id = 'site' AND seq >= 3",
+        "DELETE FROM events WHERE run_id = 'site' AND seq >= 3",
+        "DELETE FROM event_index WHERE run_id = 'site' AND seq >= 3",
         "UPDATE heads SET seq = 2, sha256 = (SELECT sha256 FROM events WHERE run_id = 'site' AND seq = 2) "
         "WHERE run_id = 'site'",
     )
-    assert faults(store, RUN) == [
-        f"run {RUN}, event 3: checkpoint: event 3 of the site's chain is not the one that it names"
-    ]
+    found = faults(store, RUN)
+    assert found[0] == f"run {RUN}, event 3: checkpoint: event 3 of the site's chain is not the one that it names"
+    assert all("signatures.jsonl" in fault for fault in found[1:]), "they were written down outside of the database"
+    assert found[1:]
 
 
 CHECKPOINT_TAMPERING = {
@@ -183,7 +185,7 @@ def test_a_new_key_is_vouched_for_by_the_old_one_which_is_destroyed(store: Store
     assert second.introduced
     assert [key.key_id for key in public_keys(store)] == [first.key_id, second.key_id]
     assert checkpoint(store, RUN).key_id == second.key_id
-    assert [item.key_id for item in store.checkpoints(SITE)] == [first.key_id, first.key_id]
+    assert [item.key_id for item in store.checkpoints(SITE)] == [*[first.key_id] * 3, second.key_id]
     site_event(store)
     assert checkpoint(store, SITE).key_id == second.key_id
     report = verify(folder(store))
@@ -202,7 +204,7 @@ def test_an_old_key_signs_nothing_new(store: Store, monkeypatch: pytest.MonkeyPa
     capture(store, RUN, "v3")
     monkeypatch.setattr(signing, "_present_key", lambda *_: stolen)
     checkpoint(store, RUN)
-    assert any("was not in use at event 3 of the site's chain" in fault for fault in faults(store, RUN))
+    assert any("was not in use at event 4 of the site's chain" in fault for fault in faults(store, RUN))
 
 
 def test_a_lost_key_is_replaced_and_the_gap_is_told(store: Store) -> None:
@@ -249,7 +251,7 @@ def test_a_crash_while_the_first_key_is_made_leaves_nothing_dangling(
             checkpoint(store, RUN)
     (left,) = [path.stem for path in (folder(store) / "keys").iterdir()]
     assert checkpoint(store, RUN).key_id == left
-    assert [event.payload.kind for event in store.events(SITE)] == ["site_opened", "key_changed"]
+    assert [event.payload.kind for event in store.events(SITE)] == ["site_opened", "key_changed", "run_signed"]
     assert faults(store) == []
 
 
@@ -293,7 +295,7 @@ def test_only_the_run_asked_for_and_the_site_are_read(store: Store) -> None:
     assert verify(folder(store), RUN).runs == (RUN,)
     tamper(folder(store), "UPDATE events SET actor = 'Eve' WHERE run_id = 'site' AND seq = 2")
     assert any(fault.startswith("run site, event 2: the content was altered") for fault in faults(store, RUN))
-    assert len(rows(folder(store), "SELECT * FROM checkpoints")) == 2
+    assert len(rows(folder(store), "SELECT * FROM checkpoints")) == 3
 
 
 # --- command line ---

@@ -160,7 +160,7 @@ def _verify(
         notes.append("the files were not read again: only records and signatures were checked")
     public_keys = {key_id: period.public_key for key_id, period in keys.periods.items()}
     of_log, said_of_log = log_findings(
-        read_log(data_dir / LOG_NAME), evidence.checkpoints, public_keys, awaited=bool(site.runs_signed)
+        read_log(data_dir / LOG_NAME), evidence.checkpoints, public_keys, awaited=bool(site.key_changes)
     )
     notes += said_of_log
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]

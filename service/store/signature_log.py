@@ -31,6 +31,7 @@ from service.store.records import Checkpoint
 NAME = "signatures.jsonl"
 PURPOSE = "orthocapture signature log v1"  # so that no signature of this key can be taken for one of another kind
 _FIRST = "0" * 64
+_MOST_AT_ONCE = 3  # signatures of one transaction: of a new key, of a run, of the site's chain that names it
 _COLUMNS = tuple(field.name for field in fields(Checkpoint))
 
 
@@ -71,9 +72,18 @@ class SignatureLog:
         self.path = data_dir / NAME
         self._second = tuple(second)
 
-    def lines(self) -> list[Line]:
-        """Every line, oldest first; none where there is no log yet. Raises StoreError."""
+    def lines(self) -> list[Line] | None:
+        """Every line, oldest first; None where there is no log. Raises StoreError."""
         return read_log(self.path)
+
+    def begin(self) -> None:
+        """Make the log before the first signature: from then on it is missed. Raises StoreError."""
+        for path in (self.path, *self._second):
+            try:
+                path.touch(exist_ok=True)
+                _sync_folder(path.parent)
+            except OSError as error:
+                raise _unwritten(path, error) from error
 
     def add(self, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
         """Append those that the log does not hold yet, durably, here and in every second place. Raises StoreError."""
@@ -81,19 +91,23 @@ class SignatureLog:
             try:
                 _add(path, checkpoints, key)
             except OSError as error:
-                raise StoreError(
-                    f"what was signed cannot be written down: {error.strerror or error}",
-                    where=str(path),
-                    remedy="Check free space, permissions and, of a share, whether it is there",
-                ) from error
+                raise _unwritten(path, error) from error
 
 
-def read_log(path: Path) -> list[Line]:
-    """The lines of a log or of a copy. Raises StoreError when it cannot be read."""
+def _unwritten(path: Path, error: OSError) -> StoreError:
+    return StoreError(
+        f"what is signed cannot be written down: {error.strerror or error}",
+        where=str(path),
+        remedy="Check free space, permissions and, of a share, whether it is there",
+    )
+
+
+def read_log(path: Path) -> list[Line] | None:
+    """The lines of a log or of a copy; None where there is no such file. Raises StoreError when it cannot be read."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
-        return []
+        return None
     except OSError as error:
         raise StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path)) from error
     return list(_parsed(content))
@@ -129,7 +143,6 @@ def _fields(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> 
 
 
 def _add(path: Path, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
-    new = not path.exists()
     with path.open("a+b") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)  # one process appends at a time
         stream.seek(0)
@@ -153,17 +166,18 @@ def _add(path: Path, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) 
             previous = hashlib.sha256(raw).hexdigest()
         stream.flush()
         os.fsync(stream.fileno())
-    if new:
-        path.chmod(0o644)
-        descriptor = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def log_findings(
-    lines: Sequence[Line],
+    lines: Sequence[Line] | None,
     present: Mapping[str, Sequence[Checkpoint]],
     public_keys: Mapping[str, bytes],
     *,
@@ -172,13 +186,14 @@ def log_findings(
     """Faults and notes: what does not fit between a log and the checkpoints of a database.
 
     Args:
-        lines: of the log, oldest first.
+        lines: of the log, oldest first; None where there is none.
         present: the database's checkpoints, by run; runs that are not among them are left out.
         public_keys: raw, by fingerprint.
         awaited: whether there must be a log: this software, or a later one, has signed here.
     """
-    if not lines and awaited:
-        return [Fault(None, None, NAME, "the log of signatures is missing: it was taken away")], []
+    if lines is None:
+        missing = Fault(None, None, NAME, "the log of signatures is missing: it was taken away")
+        return ([missing] if awaited else []), []
     faults: list[Fault] = []
     held: set[tuple[str, int]] = set()
     here = {(run_id, item.seq): item for run_id, items in present.items() for item in items}
@@ -197,12 +212,8 @@ def log_findings(
             faults.append(Fault(signed.run_id, signed.seq, "", f"the signature of {place}, {change}"))
     # A power cut between a signature and its line leaves the newest ones out, which the next signature makes good.
     newest = max((line.checkpoint.site_seq for line in lines if line.checkpoint is not None), default=0)
-    notes: list[str] = []
-    for (run_id, seq), item in here.items():
-        if (run_id, seq) in held or not lines:
-            continue
-        if item.site_seq >= newest:
-            notes.append(f"{run_id}: the signature at event {seq} is not in {NAME} yet")
-        else:
-            faults.append(Fault(run_id, seq, "", f"its signature is not in {NAME}: it was made behind its back"))
-    return faults, notes
+    unlogged = {place: item for place, item in here.items() if place not in held}
+    if len(unlogged) <= _MOST_AT_ONCE and all(item.site_seq >= newest for item in unlogged.values()):
+        return faults, [f"{run_id}: the signature at event {seq} is not in {NAME} yet" for run_id, seq in unlogged]
+    faults += [Fault(run_id, seq, "", f"its signature is not in {NAME}") for run_id, seq in unlogged]
+    return faults, []

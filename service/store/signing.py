@@ -66,6 +66,9 @@ def checkpoint(store: Store, run_id: str) -> Checkpoint:
             _require_run(connection, run_id, store)
         lines = log.lines()
         require_sound(store, connection, run_id, lines)
+        if lines is None:
+            log.begin()
+            lines = []
         signed = _signed_end(connection, run_id)
         if signed is not None:
             return signed
@@ -144,9 +147,9 @@ def _log_of(store: Store) -> SignatureLog:
     return SignatureLog(store.database_path.parent, store.second_logs)
 
 
-def _unlogged(connection: Connection, lines: Sequence[Line]) -> list[Checkpoint]:
+def _unlogged(connection: Connection, lines: Sequence[Line] | None) -> list[Checkpoint]:
     """Signatures that the log does not hold: the new ones, and those before which a power cut came."""
-    held = {(line.checkpoint.run_id, line.checkpoint.seq) for line in lines if line.checkpoint is not None}
+    held = {(line.checkpoint.run_id, line.checkpoint.seq) for line in lines or () if line.checkpoint is not None}
     every = read_every_checkpoint(connection)
     return [item for item in every if (item.run_id, item.seq) not in held]
 

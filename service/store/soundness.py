@@ -16,7 +16,7 @@ from service.store.store import Store
 from service.store.tables import checkpoints, events
 
 
-def require_sound(store: Store, connection: Connection, run_id: str, lines: Sequence[Line]) -> None:
+def require_sound(store: Store, connection: Connection, run_id: str, lines: Sequence[Line] | None) -> None:
     """The chain, its earlier signatures and the log of signatures must fit together. Raises IntegrityError.
 
     What this process has verified before is not read again; that it is still there is looked at.
@@ -25,7 +25,7 @@ def require_sound(store: Store, connection: Connection, run_id: str, lines: Sequ
         store: remembers how far each chain was verified.
         connection: within the transaction that signs.
         run_id: of the chain, or SITE.
-        lines: of the log of signatures.
+        lines: of the log of signatures; None where there is none.
     """
     found = _chain(store, connection, run_id)
     fault = found if isinstance(found, Fault) else _signature_fault(connection, run_id, lines)
@@ -49,7 +49,7 @@ def _chain(store: Store, connection: Connection, run_id: str) -> Fault | tuple[i
     return chain_fault(run_id, connection.execute(rows.where(events.c.seq > end[0])).mappings(), end)
 
 
-def _signature_fault(connection: Connection, run_id: str, lines: Sequence[Line]) -> Fault | None:
+def _signature_fault(connection: Connection, run_id: str, lines: Sequence[Line] | None) -> Fault | None:
     """What is wrong with the earlier signatures of a chain: with the events they sign, or with the log of them."""
     of_event = (events.c.run_id == checkpoints.c.run_id) & (events.c.seq == checkpoints.c.seq)
     joined = select(checkpoints.c.seq).outerjoin_from(checkpoints, events, of_event)
@@ -57,11 +57,11 @@ def _signature_fault(connection: Connection, run_id: str, lines: Sequence[Line])
     wrong = connection.execute(other.limit(1)).scalar()
     if wrong is not None:
         return Fault(run_id, wrong, "", "a signature is for another event than the one that is here")
-    was_signed = select(events.c.seq).where(events.c.run_id == SITE, events.c.kind == "run_signed").limit(1)
-    if not lines and connection.execute(was_signed).first() is not None:
+    has_signed = select(events.c.seq).where(events.c.run_id == SITE, events.c.kind == "key_changed").limit(1)
+    if lines is None and connection.execute(has_signed).first() is not None:
         return Fault(None, None, NAME, "the log of signatures is missing: it was taken away")
     signed = {item.seq: item for item in read_checkpoints(connection, run_id)}
-    for line in lines:
+    for line in lines or ():
         if line.checkpoint is None or line.problem:
             return Fault(None, None, f"{NAME}, line {line.number}", line.problem)
         if line.checkpoint.run_id == run_id and signed.get(line.checkpoint.seq) != line.checkpoint:

@@ -1,0 +1,217 @@
+"""What a database cannot hide: signatures stand in a log beside it too, and nothing forged is signed."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from service.core.errors import IntegrityError
+from service.core.model import StepPassed, StepStarted
+from service.store.audit import verify
+from service.store.database import database_path
+from service.store.records import SITE
+from service.store.signature_log import NAME, read_log
+from service.store.signing import checkpoint, rotate_key
+from service.store.store import Store
+from tests.support.store import CountedIds, SteppedClock, capture, start_run, tamper
+from tests.support.tampering import rewrite_to_the_end
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """Two runs, each of four events, signed after the third and at the end."""
+    folder = tmp_path / "data"
+    with Store.open(folder, SteppedClock(), CountedIds()) as store:
+        for _ in range(2):
+            run = start_run(store)
+            capture(store, run, "v1")
+            capture(store, run, "v2")
+            checkpoint(store, run)
+            capture(store, run, "v3")
+            checkpoint(store, run)
+    return folder
+
+
+def run_of(data: Path) -> str:
+    with Store.open(data) as store:
+        return store.runs()[0].run_id
+
+
+def faults(data: Path) -> list[str]:
+    return [str(fault) for fault in verify(data).faults]
+
+
+def sign_again(data: Path) -> None:
+    """What the next program does, which has verified nothing yet."""
+    with Store.open(data) as store:
+        capture(store, run_of(data), "v9")
+        checkpoint(store, run_of(data))
+
+
+def without_signatures_from(run: str, seq: int) -> list[str]:
+    return [f"DELETE FROM checkpoints WHERE run_id = '{run}' AND seq >= {seq}"]
+
+
+def cut(run: str, seq: int) -> list[str]:
+    """The chain ends before `seq`, and everything says so."""
+    of = f"run_id = '{run}' AND seq >= {seq}"
+    last = f"(SELECT sha256 FROM events WHERE run_id = '{run}' AND seq = {seq - 1})"
+    return [
+        *without_signatures_from(run, seq),
+        f"DELETE FROM artefacts WHERE {of}",
+        f"DELETE FROM event_index WHERE {of}",
+        f"DELETE FROM events WHERE {of}",
+        f"UPDATE heads SET seq = {seq - 1}, sha256 = {last} WHERE run_id = '{run}'",
+    ]
+
+
+def deleted(run: str) -> list[str]:
+    tables = ("checkpoints", "artefacts", "event_index", "heads", "events", "runs")
+    return [f"DELETE FROM {table} WHERE run_id = '{run}'" for table in tables]
+
+
+def forge(data: Path) -> None:
+    """Rewrite the captures with all hashes, and take the run's signatures away."""
+    run = run_of(data)
+    rewrite_to_the_end(data, run, 2, actor="Eve")
+    tamper(data, f"UPDATE event_index SET actor = 'Eve' WHERE run_id = '{run}'", *without_signatures_from(run, 1))
+
+
+def forge_with_the_site(data: Path) -> None:
+    forge(data)
+    tamper(data, *cut(SITE, 3))
+
+
+def cut_a_run(data: Path) -> None:
+    tamper(data, *cut(run_of(data), 4))
+
+
+def cut_a_run_and_the_site(data: Path) -> None:
+    tamper(data, *cut(run_of(data), 4), *cut(SITE, 4))
+
+
+def delete_a_run(data: Path) -> None:
+    tamper(data, *deleted(run_of(data)))
+
+
+def delete_a_run_and_cut_the_site(data: Path) -> None:
+    tamper(data, *deleted(run_of(data)), *cut(SITE, 3))
+
+
+def take_the_log_away(data: Path) -> None:
+    (data / NAME).unlink()
+
+
+def empty_the_log(data: Path) -> None:
+    (data / NAME).write_bytes(b"")
+
+
+def cut_the_log(data: Path) -> None:
+    lines = (data / NAME).read_bytes().splitlines(keepends=True)
+    (data / NAME).write_bytes(b"".join(lines[:3]))
+
+
+def take_a_line_out(data: Path) -> None:
+    lines = (data / NAME).read_bytes().splitlines(keepends=True)
+    (data / NAME).write_bytes(b"".join([*lines[:2], *lines[3:]]))
+
+
+def alter_a_line(data: Path) -> None:
+    (data / NAME).write_bytes((data / NAME).read_bytes().replace(b'"number":2', b'"number": 2', 1))
+
+
+ATTACKS = [
+    forge,
+    forge_with_the_site,
+    cut_a_run,
+    cut_a_run_and_the_site,
+    delete_a_run,
+    delete_a_run_and_cut_the_site,
+    take_the_log_away,
+    empty_the_log,
+    cut_the_log,
+    take_a_line_out,
+    alter_a_line,
+]
+
+
+@pytest.mark.parametrize("attack", ATTACKS, ids=lambda attack: attack.__name__)
+def test_every_attack_shows(data: Path, attack: Callable[[Path], None]) -> None:
+    assert faults(data) == []
+    attack(data)
+    assert faults(data)
+
+
+@pytest.mark.parametrize("attack", [forge, forge_with_the_site, cut_a_run, take_the_log_away, alter_a_line])
+def test_nothing_is_signed_after_it(data: Path, attack: Callable[[Path], None]) -> None:
+    attack(data)
+    with pytest.raises(IntegrityError, match="nothing is signed, because the record does not verify"):
+        sign_again(data)
+
+
+def test_a_database_put_back_as_it_was_shows(data: Path, tmp_path: Path) -> None:
+    with Store.open(data) as store:
+        store.database.close()
+    copy = tmp_path / "copy"
+    shutil.copy(database_path(data), copy)
+    sign_again(data)
+    for left in data.glob("orthocapture.sqlite*"):
+        left.unlink()
+    shutil.copy(copy, database_path(data))
+    assert any("is no longer here: what it signed was taken away" in fault for fault in faults(data))
+
+
+def test_the_log_follows_the_key(data: Path) -> None:
+    with Store.open(data) as store:
+        rotate_key(store, reason="yearly", actor="ada")
+    sign_again(data)
+    assert faults(data) == []
+    lines = read_log(data / NAME)
+    assert lines is not None
+    assert len({line.key_id for line in lines}) == 2
+
+
+def test_a_second_log_gets_every_line(data: Path, tmp_path: Path) -> None:
+    second = tmp_path / "elsewhere" / NAME
+    second.parent.mkdir()
+    with Store.open(data) as store:
+        store.second_logs = (second,)
+        capture(store, run_of(data), "v9")
+        checkpoint(store, run_of(data))
+    assert [line.checkpoint for line in read_log(second) or []] == [
+        line.checkpoint for line in (read_log(data / NAME) or [])[-2:]
+    ]
+
+
+def test_half_a_line_of_a_power_cut_is_taken_away_by_the_next_signature(data: Path) -> None:
+    whole = (data / NAME).read_bytes()
+    (data / NAME).write_bytes(whole + b'{"number":')
+    assert faults(data) == []
+    sign_again(data)
+    assert faults(data) == []
+    assert (data / NAME).read_bytes().startswith(whole)
+
+
+def test_a_signature_whose_line_a_crash_prevented_is_written_down_with_the_next(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr("service.store.signature_log.SignatureLog.add", lambda *_: None)
+        sign_again(data)
+    assert faults(data) == []
+    assert any("is not in signatures.jsonl yet" in note for note in verify(data).notes)
+    sign_again(data)
+    assert verify(data).notes == ()
+
+
+def test_a_passed_step_that_is_followed_by_another_has_its_signature(data: Path) -> None:
+    run = run_of(data)
+    with Store.open(data) as store:
+        for step in ("a", "b"):
+            store.record(run, [StepStarted(step=step, attempt=1), StepPassed(step=step, attempt=1)], actor="runner")
+        assert any("step passed was never signed" in fault for fault in faults(data))
+        checkpoint(store, run)
+    assert faults(data) == []
