@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import ctypes
 import importlib
 import logging
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Protocol, cast
 
 from simulators.faults import FaultPlan
@@ -58,6 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one simulator; 0 after SIGTERM, 1 with a reason on stderr, 2 for wrong usage."""
     # Linear algebra in one thread: its threads wait for one another where many processes share the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _keep_freed_memory()
     words = list(sys.argv[1:] if argv is None else argv)
     chosen = words[0] if words and words[0] in SIMULATORS else None
     try:
@@ -76,6 +79,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"simulators {args.simulator}: {error}\n")
         return 1
     return 0
+
+
+def _keep_freed_memory() -> None:
+    """Rendering makes and frees arrays of megabytes by the thousand; glibc would give each back to the system."""
+    with suppress(OSError, AttributeError):
+        libc = ctypes.CDLL("libc.so.6")
+        for option, value in ((-3, 32 << 20), (-1, 1 << 30)):  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD of malloc.h
+            libc.mallopt(option, value)
 
 
 if __name__ == "__main__":

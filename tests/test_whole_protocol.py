@@ -26,7 +26,6 @@ class Whole:
     """The run that the tests of this file share."""
 
     data: Path
-    told: str
     summary: RunSummary
     true_mm: dict[str, float]
 
@@ -47,7 +46,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Generator[Whole]:
     with Store.open(data, create=False) as store:
         run_id = store.find_run("latest")
         summary = summarise(store, run_id, recorded_run(store, run_id)[0])
-        yield Whole(data, answer.stderr, summary, true_errors_mm(summary, Path(rig["truth"])))
+        yield Whole(data, summary, true_errors_mm(summary, Path(rig["truth"])))
 
 
 def test_it_comes_to_its_end_without_a_person(whole: Whole) -> None:

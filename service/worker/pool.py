@@ -21,6 +21,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
+from service.compute.memory import keep_freed_memory
 from service.core.priorities import Lane
 from service.store.store import Store
 from service.worker.loop import work
@@ -155,6 +156,7 @@ def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int)
     os.setsid()  # Ctrl-C is for the worker, which ends its children and what they have started
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     tempfile.tempdir = str(scratch)
+    keep_freed_memory()
     if lane == "background" and hasattr(os, "nice"):
         os.nice(_NICE)
 

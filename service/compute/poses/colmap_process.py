@@ -13,11 +13,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from service.compute.memory import keep_freed_memory
 from service.compute.poses.sfm_options import Progress
 from service.core.errors import ComputeError, OrthocaptureError
 
 
 def _child(log: str, seed: int, pipe: Connection) -> None:
+    keep_freed_memory()
     importlib.import_module("service.compute.poses.sfm_process").main(log, seed, pipe)
 
 
