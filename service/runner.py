@@ -138,6 +138,8 @@ class Runner:
                     self._seal()  # the authority did not answer, or this process died before it was asked
                 return self._log.state
             resumed = self._log.state.sessions > 0
+            if resumed:
+                self._seal()  # what the runner before could not sign any more
             self._append(
                 SessionStarted(resumed=resumed, software=software_versions(), host=socket.gethostname(), pid=getpid())
             )

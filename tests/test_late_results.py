@@ -51,6 +51,7 @@ from service.steps.sources import PLANNED
 from service.steps.time_left import missing_results
 from service.store.audit import verify
 from service.store.records import NewArtefact, NewJob
+from service.store.signing import checkpoint
 from service.store.store import Store
 from tests.support.reported_run import evaluation
 from tests.support.rig import REPOSITORY, command, orthocapture
@@ -140,6 +141,7 @@ def record(folder: Path, store: Store) -> Run:
     signed = OperatorAction(action="sign", step="evaluation", meaning="reviewed", signed_sha256=judged)
     run.add(signed, actor="Ada")
     run.add(StepPassed(step="evaluation", attempt=1), RunCompleted(deviations=0))
+    checkpoint(store, run_id)
     return run
 
 

@@ -84,13 +84,13 @@ def test_the_first_signature_makes_the_key_and_records_it(store: Store) -> None:
 
 
 def test_the_key_file_is_never_readable_by_others(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[tuple[int, int]] = []
+    seen: dict[str, tuple[int, int]] = {}
     really = os.open
 
     def watched(path: str, flags: int, mode: int = 0o777) -> int:
         descriptor = really(path, flags, mode)
         if flags & os.O_CREAT:
-            seen.append((flags & os.O_EXCL, stat.S_IMODE(os.fstat(descriptor).st_mode)))
+            seen[Path(path).parent.name] = (flags & os.O_EXCL, stat.S_IMODE(os.fstat(descriptor).st_mode))
         return descriptor
 
     monkeypatch.setattr(os, "open", watched)
@@ -99,7 +99,7 @@ def test_the_key_file_is_never_readable_by_others(store: Store, monkeypatch: pyt
         checkpoint(store, RUN)
     finally:
         os.umask(before)
-    assert seen == [(os.O_EXCL, 0o600)]
+    assert seen["keys"] == (os.O_EXCL, 0o600)
 
 
 def test_a_chain_rewritten_to_its_end_is_found(store: Store) -> None:

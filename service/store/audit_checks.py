@@ -66,11 +66,14 @@ class ChainFacts:
     heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of ServiceStarted
     runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of the site's chain
     to_sign: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # what is signed when it happens
+    last_own: int = 0  # number of the last event that does not come from a job
     first: Mapping[str, Any] | None = None
 
     def add(self, seq: int, payload: Any, at_utc: str) -> None:
         """An event whose content is as it was recorded."""
         kind = payload["kind"]
+        if kind not in _OF_JOBS:
+            self.last_own = seq
         if kind in _OF_JOBS:
             self.jobs[seq] = payload
             self.jobs_utc[seq] = at_utc

@@ -139,12 +139,11 @@ def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, eve
 def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: ChainFacts) -> Iterator[Fault]:
     """A step that passed, or a run that ended, is signed at once: without that, signatures were taken away.
 
-    The very last event may still wait for its signature.
+    The last event may still wait for its signature, also when a worker has reported since.
     """
     signed = checkpoints[-1].seq if checkpoints else 0
-    last = max(chain.sha256_at, default=0)
     for seq, kind in chain.to_sign:
-        if signed < seq < last:
+        if signed < seq < chain.last_own:
             what = f"{kind.replace('_', ' ')} was never signed, or its signature was taken away"
             yield Fault(run_id, seq, "", what)
 

@@ -32,6 +32,7 @@ from service.rig import load_rig
 from service.runs import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
+from service.store.signing import checkpoint
 from tests.support.board_sessions import BOARD, Session, noisy_session
 from tests.support.web import WebSite
 
@@ -104,6 +105,7 @@ def begin_calibrated_run(site: WebSite, known: Mapping[str, Uncertainty] | None 
     store.record(run_id, [measured], actor="runner", artefacts=[NewArtefact(ref, "worker", "calibration", 1)])
     gates = evaluate_gates(loaded.protocol.step("calibration"), 1, measures, (), known)
     store.record(run_id, [gates, StepPassed(step="calibration", attempt=1)], actor="runner")
+    checkpoint(store, run_id)
     store.record(run_id, [StepStarted(step="capture", attempt=1)], actor="runner")
     return run_id
 

@@ -40,6 +40,7 @@ from service.steps import params_models
 from service.store.database import database_path
 from service.store.records import NewArtefact, NewJob
 from service.store.seam import DurableFiles
+from service.store.signing import checkpoint
 from service.store.store import Store
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "demo.yaml"
@@ -170,6 +171,8 @@ def write_large_run(data: Path, sizes: Sizes) -> str:
                 brought = _captures(run, step, sizes)
             run.end(step, brought)
         run.add(RunCompleted(deviations=run.state.deviation_count))
+        run.flush()
+        checkpoint(store, run_id)
         head = run.store.runs()[-1]
         for number in range(sizes.corrections):
             run.add(

@@ -26,6 +26,7 @@ from service.runner import software_versions
 from service.runs import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact, NewJob
+from service.store.signing import checkpoint
 from service.store.store import Store
 from service.worker.loop import work
 from tests.support.sphere_images import RADIUS_M, REGISTRATION_M, exact_outlines, scene
@@ -84,6 +85,7 @@ def record_run(folder: Path, *, complete: bool = True) -> str:
         run.register(second)
         if complete:
             store.record(run_id, [RunCompleted(deviations=1)], actor="runner")
+        checkpoint(store, run_id)
     return run_id
 
 

@@ -32,6 +32,7 @@ from service.rig import load_rig
 from service.runs import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
+from service.store.signing import checkpoint
 from service.store.store import Store
 from tests.support.core import EYE
 
@@ -152,9 +153,11 @@ def record_reported_run(
         if accepted_by:
             run.accept("evaluation", judged, accepted_by)
         elif error_mm > 0.35 or undecided:  # the gate has failed: nobody can sign, and the run waits
+            checkpoint(store, run_id)
             return run_id
         run.act("sign", step="evaluation", meaning="reviewed and accepted", signed_sha256=judged)
         run.add(StepPassed(step="evaluation", attempt=1), RunCompleted(deviations=3))
+        checkpoint(store, run_id)
     return run_id
 
 
