@@ -101,6 +101,9 @@ class RigSection(Record):
     optics: OpticsSection | None = None  # None: depth of field is not judged
     lens: LensSection | None = None  # needed where the software plans the board poses
     timestamp: TimestampSection | None = None  # None: nobody outside is asked
+    signature_copy: str | None = (
+        None  # a file elsewhere, on a share say, that gets each line of the log of signatures
+    )
     imported: ImportList | None = None  # of a run that captures nothing: what was captured earlier
 
 

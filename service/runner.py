@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import distributions
 from os import getpid
+from pathlib import Path
 from typing import Any, NamedTuple
 from typing import Protocol as Interface
 
@@ -53,6 +54,7 @@ from service.monitor.snapshot import Doing
 from service.steps import step_kinds
 from service.steps.context import Devices, StepContext, StepInterruptedError, StepOutcome
 from service.store.leases import RunLease
+from service.store.signature_copy import keep_elsewhere
 from service.store.store import Store
 from service.store.timestamping import Authority, stamp_end
 
@@ -115,6 +117,7 @@ class Runner:
     devices: Devices
     operator: Operator
     authority: Authority | None = None  # asked for a time stamp when the run ends
+    signature_copy: Path | None = None  # second place of the log of signatures
     monotonic_s: Callable[[], float] = time.monotonic
     wait: Callable[[float], None] = time.sleep
     _log: RunLog = field(init=False)
@@ -327,6 +330,7 @@ class Runner:
             stamp_end(self.store, self.run_id, self.authority if self._log.state.terminal else None)
         except StoreError as error:
             self.operator.tell(f"the record could not be signed: {error}")
+        keep_elsewhere(self.store.database_path.parent, self.signature_copy, self.operator.tell)
 
     def _keep_lease(self) -> None:
         if self.monotonic_s() > self._renew_at_s:

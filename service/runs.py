@@ -81,6 +81,12 @@ def time_stamp_authority(rig: Rig) -> Authority | None:
     return None if section is None else Authority(section.url, rig.folder / section.certificates, section.timeout_s)
 
 
+def signature_copy(rig: Rig) -> Path | None:
+    """The second place of the log of signatures; None: there is none."""
+    named = rig.section.signature_copy
+    return None if named is None else rig.folder / named
+
+
 def require_rig_free(store: Store, rig: Path, *, run_id: str = "") -> None:
     """Refuse to drive a run (`run_id`, or a new one) while a living process drives another with the same rig file.
 

@@ -7,15 +7,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from service.cli.main import app
 from service.core.errors import IntegrityError
 from service.core.model import StepPassed, StepStarted
+from service.rig import load_rig
+from service.runs import signature_copy
 from service.store.audit import verify
 from service.store.database import database_path
 from service.store.records import SITE
+from service.store.signature_copy import bring_up_to_date, keep_elsewhere
 from service.store.signature_log import NAME, read_log
 from service.store.signing import checkpoint, rotate_key
 from service.store.store import Store
+from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.store import CountedIds, SteppedClock, capture, start_run, tamper
 from tests.support.tampering import rewrite_to_the_end
 
@@ -174,16 +180,39 @@ def test_the_log_follows_the_key(data: Path) -> None:
     assert len({line.key_id for line in lines}) == 2
 
 
-def test_a_second_log_gets_every_line(data: Path, tmp_path: Path) -> None:
-    second = tmp_path / "elsewhere" / NAME
-    second.parent.mkdir()
-    with Store.open(data) as store:
-        store.second_logs = (second,)
-        capture(store, run_of(data), "v9")
-        checkpoint(store, run_of(data))
-    assert [line.checkpoint for line in read_log(second) or []] == [
-        line.checkpoint for line in (read_log(data / NAME) or [])[-2:]
-    ]
+def test_a_log_that_was_cut_or_changed_shows_against_its_copy(data: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "elsewhere.jsonl"
+    bring_up_to_date(data, copy)
+    assert copy.read_bytes() == (data / NAME).read_bytes()
+    sign_again(data)
+    report = verify(data, signatures_copy=copy)
+    assert report.faults == ()
+    assert f"{copy} has not the last 2 lines of {NAME} yet" in report.notes
+    bring_up_to_date(data, copy)
+    # Everything cut back to the first run, log and all: within the folder nothing tells.
+    lines = (data / NAME).read_bytes().splitlines(keepends=True)
+    (data / NAME).write_bytes(b"".join(lines[:-2]))
+    tamper(data, *cut(run_of(data), 5), *cut(SITE, 7))
+    assert faults(data) == []
+    (fault,) = verify(data, signatures_copy=copy).faults
+    assert f"{NAME} ends before line {len(lines) - 1} of its copy: it was cut" in str(fault)
+    with pytest.raises(IntegrityError, match="is not the beginning of the log"):
+        bring_up_to_date(data, copy)
+    (data / NAME).write_bytes(b"".join([*lines[:1], *lines[:1]]))
+    assert str(verify(data, signatures_copy=copy).faults[-1]).startswith(f"{NAME}, line 2: it is not the line that")
+
+
+def test_a_copy_that_cannot_be_written_is_told_and_caught_up_with(data: Path, tmp_path: Path) -> None:
+    told: list[str] = []
+    copy = tmp_path / "share" / "signatures.jsonl"
+    keep_elsewhere(data, copy, told.append)
+    assert "the copy of the log of signatures cannot be written: No such file or directory" in told[0]
+    copy.parent.mkdir()
+    copy.write_bytes((data / NAME).read_bytes()[:100])  # half a line, of a share that went away
+    keep_elsewhere(data, copy, told.append)
+    assert len(told) == 1
+    assert copy.read_bytes() == (data / NAME).read_bytes()
+    keep_elsewhere(data, None, told.append)
 
 
 def test_half_a_line_of_a_power_cut_is_taken_away_by_the_next_signature(data: Path) -> None:
@@ -215,3 +244,24 @@ def test_a_passed_step_that_is_followed_by_another_has_its_signature(data: Path)
         assert any("step passed was never signed" in fault for fault in faults(data))
         checkpoint(store, run)
     assert faults(data) == []
+
+
+def test_a_run_keeps_the_copy_that_its_rig_file_names(tmp_path: Path) -> None:
+    rig_file = tmp_path / "rig.yaml"
+    rig_file.write_text("name: r\ndevices: {}\nsignature_copy: share/signatures.jsonl\n")
+    copy = signature_copy(load_rig(rig_file))
+    assert copy is not None
+    assert copy == tmp_path / "share" / "signatures.jsonl"
+    copy.parent.mkdir()
+    data = tmp_path / "data"
+    with Store.open(data) as store:
+        bench = begin_run(store, PROTOCOL, tmp_path)
+        bench.signature_copy = copy
+        assert bench.run().status == "completed"
+    assert copy.read_bytes() == (data / NAME).read_bytes()
+    words = ["audit", "verify", "--data", str(data), "--signatures", str(copy)]
+    assert CliRunner().invoke(app, words).exit_code == 0
+    (data / NAME).write_bytes(b"".join((data / NAME).read_bytes().splitlines(keepends=True)[:1]))
+    cut_off = CliRunner().invoke(app, [*words, "--json"])
+    assert cut_off.exit_code == 1
+    assert f"{NAME} ends before line 2 of its copy" in cut_off.output

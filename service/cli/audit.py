@@ -48,6 +48,16 @@ CertificatesOption = Annotated[
     ),
 ]
 
+SignaturesOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Copy of signatures.jsonl that was kept elsewhere: what was cut off since shows against it.",
+        exists=True,
+        dir_okay=False,
+    ),
+]
+
 
 @audit_app.command("show")
 def show_command(
@@ -70,6 +80,7 @@ def verify_command(
     run: Annotated[str, typer.Argument(help=_RUN_HELP + " `all` checks every run of the folder.")] = "latest",
     data: DataOption = DEFAULT_DATA,
     certificates: CertificatesOption = None,
+    signatures: SignaturesOption = None,
     json: JsonOption = False,
 ) -> None:
     """Check the evidence: read every file again, follow the chain, check the signatures, and name the first fault.
@@ -79,7 +90,9 @@ def verify_command(
     with reporting_errors(json):
         run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
         with progress_bar(quiet=json) as report_progress:
-            report = audit.verify(data, run_id, report_progress, certificates=certificates)
+            report = audit.verify(
+                data, run_id, report_progress, certificates=certificates, signatures_copy=signatures
+            )
     if json:
         print_json(report_json(report))
     else:

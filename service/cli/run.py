@@ -52,6 +52,7 @@ from service.runs import (
     recorded_run,
     require_rig_free,
     require_simulated,
+    signature_copy,
     start_run,
     time_stamp_authority,
 )
@@ -59,6 +60,7 @@ from service.station import Station, layout_of
 from service.steps import params_models
 from service.steps.live import describe_view
 from service.steps.preview import preview_board_poses, preview_plans
+from service.store.signature_copy import keep_elsewhere
 from service.store.store import Store
 from service.store.timestamping import stamp_end
 
@@ -346,9 +348,9 @@ def drive(
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _worker(data, wanted=worker):
-            authority = time_stamp_authority(rig)
+            authority, copy = time_stamp_authority(rig), signature_copy(rig)
             try:
-                state = Runner(store, run_id, protocol, station, operator, authority).run()
+                state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
             finally:
                 reporter.end()
                 display.clear()
@@ -357,6 +359,7 @@ def drive(
             if worker and state.status == "completed":
                 wait_for_results(store, run_id, protocol, display)
                 stamp_end(store, run_id, authority)
+                keep_elsewhere(data, copy, error_console.print)
                 state = fold(protocol, store.events(run_id))
             return state
     finally:

@@ -21,14 +21,17 @@ from service.cli.common import (
     DataOption,
     JsonOption,
     console,
+    error_console,
     print_json,
     reporting_errors,
 )
 from service.core.errors import ConfigurationError
 from service.people.people import People
 from service.rig import load_rig
+from service.runs import signature_copy
 from service.steps import params_models
 from service.store.records import SITE
+from service.store.signature_copy import keep_elsewhere
 from service.store.signing import checkpoint
 from service.store.store import Store
 from service.web.app import create_app
@@ -85,6 +88,7 @@ def serve_command(
             record_start(store, rig_file, site.protocol_files(), address)
             link = people.first_link()
             checkpoint(store, SITE)
+            keep_elsewhere(data, signature_copy(rig_file), error_console.print)
             config = uvicorn.Config(
                 create_app(site),
                 log_level="warning",
@@ -101,6 +105,7 @@ def serve_command(
                 threading.Thread(target=params_models, daemon=True).start()
                 server.run(sockets=[listener])
             checkpoint(store, SITE)
+            keep_elsewhere(data, signature_copy(rig_file), error_console.print)
 
 
 class _Server(uvicorn.Server):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from service.store.errors import UnknownRunError
 from service.store.events import read_events
 from service.store.records import SITE, Artefact, Checkpoint, RunRow, Timestamp
 from service.store.seam import DurableFiles
+from service.store.signature_copy import copy_faults
 from service.store.signature_log import NAME as LOG_NAME
 from service.store.signature_log import log_findings, read_log
 from service.store.store import read_runs
@@ -84,6 +85,7 @@ def verify(
     *,
     certificates: Path | None = None,
     files: bool = True,
+    signatures_copy: Path | None = None,
 ) -> AuditReport:
     """Walk the chain and hash every file again, of one run or of all, and check every signature.
 
@@ -96,6 +98,7 @@ def verify(
         progress: told how many bytes were hashed.
         certificates: of the time-stamp authorities (PEM). Without it only what a time stamp was given for is checked.
         files: False leaves the files alone, which a note tells.
+        signatures_copy: of the log of signatures, kept elsewhere: a log that was cut shows against it.
 
     Raises:
         UnknownRunError: there is no such run.
@@ -104,9 +107,13 @@ def verify(
     database = open_read_only(data_dir, DurableFiles())
     try:
         with database.reading() as connection:
-            return _verify(data_dir, connection, run_id, progress, certificates, with_files=files)
+            report = _verify(data_dir, connection, run_id, progress, certificates, with_files=files)
     finally:
         database.close()
+    if signatures_copy is None:
+        return report
+    faults, notes = copy_faults(data_dir, signatures_copy)
+    return replace(report, faults=(*report.faults, *faults), notes=(*report.notes, *notes))
 
 
 def _verify(

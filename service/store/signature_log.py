@@ -2,7 +2,7 @@
 
 Who rewrites, cuts back or replaces the database leaves signatures behind that no longer fit it. Each line is signed
 itself and names the line before it, so that lines cannot be taken out, changed or exchanged; that the end was not cut
-off shows in a copy elsewhere (`second`), which gets every line as well.
+off shows in a copy elsewhere (service.store.signature_copy).
 """
 
 from __future__ import annotations
@@ -66,11 +66,10 @@ class Line:
 
 
 class SignatureLog:
-    """The log of one data folder, and its copies."""
+    """The log of one data folder."""
 
-    def __init__(self, data_dir: Path, second: Sequence[Path] = ()) -> None:
+    def __init__(self, data_dir: Path) -> None:
         self.path = data_dir / NAME
-        self._second = tuple(second)
 
     def lines(self) -> list[Line] | None:
         """Every line, oldest first; None where there is no log. Raises StoreError."""
@@ -78,32 +77,30 @@ class SignatureLog:
 
     def begin(self) -> None:
         """Make the log before the first signature: from then on it is missed. Raises StoreError."""
-        for path in (self.path, *self._second):
-            try:
-                path.touch(exist_ok=True)
-                _sync_folder(path.parent)
-            except OSError as error:
-                raise _unwritten(path, error) from error
+        try:
+            self.path.touch(exist_ok=True)
+            _sync_folder(self.path.parent)
+        except OSError as error:
+            raise _unwritten(self.path, error) from error
 
     def add(self, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
-        """Append those that the log does not hold yet, durably, here and in every second place. Raises StoreError."""
-        for path in (self.path, *self._second):
-            try:
-                _add(path, checkpoints, key)
-            except OSError as error:
-                raise _unwritten(path, error) from error
+        """Append those that the log does not hold yet, durably. Raises StoreError."""
+        try:
+            _add(self.path, checkpoints, key)
+        except OSError as error:
+            raise _unwritten(self.path, error) from error
 
 
 def _unwritten(path: Path, error: OSError) -> StoreError:
     return StoreError(
         f"what is signed cannot be written down: {error.strerror or error}",
         where=str(path),
-        remedy="Check free space, permissions and, of a share, whether it is there",
+        remedy="Check free space and permissions of the data folder",
     )
 
 
 def read_log(path: Path) -> list[Line] | None:
-    """The lines of a log or of a copy; None where there is no such file. Raises StoreError when it cannot be read."""
+    """The lines of a log; None where there is no such file. Raises StoreError when it cannot be read."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:

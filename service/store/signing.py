@@ -144,7 +144,7 @@ def public_keys(store: Store) -> list[PublicKey]:
 
 
 def _log_of(store: Store) -> SignatureLog:
-    return SignatureLog(store.database_path.parent, store.second_logs)
+    return SignatureLog(store.database_path.parent)
 
 
 def _unlogged(connection: Connection, lines: Sequence[Line] | None) -> list[Checkpoint]:

@@ -40,7 +40,6 @@ class Store:
         self._clock = clock
         self._ids = ids
         self.database_path = path
-        self.second_logs: tuple[Path, ...] = ()  # further places for the log of signatures
         self.sound_until: dict[str, tuple[int, str]] = {}  # chain → the last event that was verified before signing
 
     @classmethod

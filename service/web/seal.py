@@ -9,8 +9,10 @@ from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
 
 from service.core.errors import OrthocaptureError
+from service.runs import signature_copy
 from service.store.errors import UnknownRunError
 from service.store.records import SITE
+from service.store.signature_copy import keep_elsewhere
 from service.store.signing import checkpoint
 from service.web.site import Here, Site
 
@@ -37,6 +39,7 @@ def seal(site: Site) -> None:
         if seq != site.sealed_seq:
             checkpoint(site.store, SITE)
             site.sealed_seq = seq
+            keep_elsewhere(site.data, signature_copy(site.rig), _log.error)
     except UnknownRunError:
         return  # nothing has happened here yet
     except OrthocaptureError as error:

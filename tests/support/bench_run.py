@@ -71,6 +71,7 @@ class Bench:
     rig: BenchRig = field(default_factory=BenchRig)
     operator: ScriptedOperator = field(default_factory=ScriptedOperator)
     authority: Authority | None = None
+    signature_copy: Path | None = None
     ahead_s: float = 0.0  # how far the runner's clock is put forward
 
     def run(self) -> RunState:
@@ -83,6 +84,7 @@ class Bench:
             self.rig,
             self.operator,
             self.authority,
+            self.signature_copy,
             monotonic_s=lambda: time.monotonic() + self.ahead_s,
             wait=lambda s: time.sleep(min(s, 0.002)),
         ).run()
