@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import signal
 import socket
 import threading
-from collections.abc import Generator
-from contextlib import contextmanager
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated
 
 import typer
-import uvicorn
 from rich.markup import escape
 
 from service.audit.start_up import record_start
@@ -35,10 +31,15 @@ from service.store.signature_copy import keep_elsewhere
 from service.store.signing import checkpoint
 from service.store.store import Store
 from service.web.app import create_app
+from service.web.connections import ConnectionLimits
 from service.web.launch import Launcher
+from service.web.listener import affordable_connections
+from service.web.server import known_proxies, listening, server
 from service.web.site import Site
+from service.web.sparing_log import sparing_log
 
 _PROTOCOLS = Path(__file__).parents[2] / "protocols"
+_LIMITS = ConnectionLimits()
 
 
 def serve_command(
@@ -58,6 +59,25 @@ def serve_command(
     idle_lock_min: Annotated[
         float, typer.Option("--idle-lock-min", help="Minutes without a touch until the PIN is asked for.", min=0.05)
     ] = 10.0,
+    trusted_proxy: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--trusted-proxy",
+            help="Address of a proxy before this one, whose word on where requests come from counts.",
+        ),
+    ] = None,
+    connections: Annotated[
+        int, typer.Option("--connections", help="Most connections at once, in all.", min=1)
+    ] = _LIMITS.in_all,
+    address_connections: Annotated[
+        int, typer.Option("--address-connections", help="Most connections at once from one address.", min=1)
+    ] = _LIMITS.per_address,
+    client_wait_s: Annotated[
+        float,
+        typer.Option(
+            "--client-wait-s", help="Seconds that a client may take to send a request, and to go on reading.", min=0.1
+        ),
+    ] = _LIMITS.wait_s,
     json: JsonOption = False,
 ) -> None:
     """Serve the guided screen and the audit. Runs go on when this ends; stop them on the screen."""
@@ -71,7 +91,9 @@ def serve_command(
                 remedy="Give --tls-certificate and --tls-key, or say --insecure-lan in a network you trust",
             )
         rig_file = load_rig(rig)
-        with _listening(host, port) as listener, Store.open(data) as store:
+        proxies = known_proxies(trusted_proxy or [])
+        limits = ConnectionLimits(affordable_connections(connections), address_connections, client_wait_s)
+        with listening(host, port, limits, proxies) as listener, Store.open(data) as store, sparing_log() as log:
             address = f"{'https' if tls else 'http'}://{_shown(host)}:{listener.getsockname()[1]}"
             people = People(store)
             site = Site(
@@ -89,34 +111,14 @@ def serve_command(
             link = people.first_link()
             checkpoint(store, SITE)
             keep_elsewhere(data, signature_copy(rig_file), error_console.print)
-            config = uvicorn.Config(
-                create_app(site),
-                log_level="warning",
-                access_log=False,
-                server_header=False,
-                timeout_graceful_shutdown=2,  # streams of news never end by themselves
-                ssl_certfile=tls and str(tls[0]),
-                ssl_keyfile=tls and str(tls[1]),
-            )
-            server = _Server(config)
-            with server.capture_signals():
+            http = server(create_app(site), listener, proxies, tls, log)
+            with http.capture_signals():
                 _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
                 # The numerics behind steps and protocols take seconds to load: while the first page is being read.
                 threading.Thread(target=params_models, daemon=True).start()
-                server.run(sockets=[listener])
+                http.run(sockets=[listener])
             checkpoint(store, SITE)
             keep_elsewhere(data, signature_copy(rig_file), error_console.print)
-
-
-class _Server(uvicorn.Server):
-    """Ends in order when told to; uvicorn's own would raise the signal again, past what is left to do here."""
-
-    @contextmanager
-    def capture_signals(self) -> Generator[None]:
-        """Ctrl-C and SIGTERM end the server."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self.handle_exit)
-        yield
 
 
 def _announce(address: str, set_up: str, *, json: bool) -> None:
@@ -159,21 +161,3 @@ def _shown(host: str) -> str:
     if host in ("0.0.0.0", "::"):
         return socket.gethostname()
     return f"[{host}]" if ":" in host else host
-
-
-@contextmanager
-def _listening(host: str, port: int) -> Generator[socket.socket]:
-    """The socket, bound before anything is recorded: a second server on the port changes nothing."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as listener:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind((host, port))
-        except OSError as error:
-            raise ConfigurationError(
-                f"cannot listen on {host}:{port}: {error.strerror or error}",
-                where="--host, --port",
-                remedy="Another program may use the port; choose one with --port, or 0 for any",
-            ) from error
-        listener.listen(128)
-        yield listener

@@ -17,6 +17,10 @@ class SignInRefusedError(PeopleError):
     """Name or password is wrong, or the account may not sign in now; on purpose it is not told which."""
 
 
+class AccountJustChangedError(SignInRefusedError):
+    """The password was right, but the account was changed while it was checked; this counts as no failed try."""
+
+
 class TooManyTriesError(PeopleError):
     """Too many failed tries from one address; `wait_s` says how long to wait."""
 

@@ -10,7 +10,13 @@ from argon2 import PasswordHasher
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from service.people.accounts import Accounts
-from service.people.errors import AccountError, NotSignedInError, PinRefusedError, SignInRefusedError
+from service.people.errors import (
+    AccountError,
+    AccountJustChangedError,
+    NotSignedInError,
+    PinRefusedError,
+    SignInRefusedError,
+)
 from service.people.passwords import Passwords, new_token, token_sha256
 from service.people.person import Person, Screen
 from service.people.rows import SERVICE, SESSION_S, find_account, get_account, plain_name, record_sign_in, to_person
@@ -139,7 +145,9 @@ class People:
         """The account is still what its password was checked against."""
         present = find_account(connection, row.account)
         if present is None or present.state != "active" or present.password_hash != row.password_hash:
-            raise SignInRefusedError("the account has just been changed", where="password", remedy="Sign in again")
+            raise AccountJustChangedError(
+                "the account has just been changed", where="password", remedy="Sign in again"
+            )
 
     def _reset_failures(self, connection: Connection, row: Row[Any], password: str) -> None:
         values: dict[str, object] = {"failures": 0, "locked_until_utc_s": 0.0}

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Depends, Form, Path, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
 from service.core.errors import OrthocaptureError
-from service.people.errors import AccountError, SignInRefusedError
+from service.people.errors import AccountError, AccountJustChangedError, SignInRefusedError
 from service.web import administration_pages
 from service.web.administration_pages import utc_of
 from service.web.errors import status_of, wants_json
@@ -81,7 +81,8 @@ def sign_in(
     try:
         token = site.people.sign_in(account, password, address=address, replaces=token_of(request, site))
     except SignInRefusedError as error:
-        if limiter.failed(address):
+        # What is counted is what is recorded, so that a restart counts the same.
+        if not isinstance(error, AccountJustChangedError) and limiter.failed(address):
             site.people.refuse_address(address)
         if wants_json(request):
             raise

@@ -47,7 +47,7 @@ def create_app(site: Site) -> FastAPI:
         title="orthocapture",
         docs_url=None,
         redoc_url=None,
-        openapi_url="/openapi.json",
+        openapi_url=None,  # the pages are for people; a list of all addresses helps strangers only
         dependencies=[Depends(sealed, scope="function")],
     )
     app.state.site = site

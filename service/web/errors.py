@@ -44,6 +44,7 @@ _WORDS = {
     400: ("the request cannot be read", "Load the page again and repeat"),
     404: ("there is no such page", "Go to the first page and choose from there"),
     405: ("this address does not do that", "Go to the first page and choose from there"),
+    408: ("the request did not arrive in time", "Check the network, then send it again"),
     413: ("the request is too large", "Send less"),
 }
 

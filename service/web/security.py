@@ -13,8 +13,10 @@ from service.people.control import Control
 from service.people.errors import NotAllowedError, NotSignedInError, ScreenLockedError
 from service.people.person import Person
 from service.people.roles import Permission
+from service.people.tries import failed_tries
+from service.web.connections import Connection
 from service.web.errors import install_errors
-from service.web.shield import Limiter, Shield
+from service.web.shield import TRIES_WINDOW_S, Limiter, Shield
 from service.web.site import Here, Site
 
 SAFE_METHODS = frozenset({"GET", "HEAD"})
@@ -24,7 +26,7 @@ THEFT_REMEDY = "Load the page again and repeat; nothing was done"
 def install_security(app: FastAPI) -> None:
     """Headers, limits and errors of the whole application. `app.state.site` is set before."""
     site = cast(Site, app.state.site)
-    app.state.limiter = Limiter(site.store.clock)
+    app.state.limiter = Limiter(site.store.clock, failed_tries(site.store, TRIES_WINDOW_S))
     app.add_middleware(Shield, hosts=site.hosts)
     install_errors(app)
 
@@ -73,6 +75,7 @@ class Guard:
         if person is None:
             raise NotSignedInError("nobody is signed in on this screen", remedy="Sign in")
         request.state.person = person
+        _keep_connection(request)
         form = FormData()
         if request.method not in SAFE_METHODS:
             form = await request.form()
@@ -127,6 +130,13 @@ def _require_own_form(request: Request, form: FormData, person: Person) -> None:
         raise NotAllowedError(
             "this form does not belong to the present sign-in", where=request.url.path, remedy=THEFT_REMEDY
         )
+
+
+def _keep_connection(request: Request) -> None:
+    """It makes no room for strangers' any more."""
+    connection = getattr(request.state, "connection", None)  # none where no `Reception` stands before the application
+    if isinstance(connection, Connection):
+        connection.known = True
 
 
 def _is_deliberate(request: Request) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, deque
+from collections.abc import Iterable
 from ipaddress import ip_address
 from urllib.parse import urlsplit
 
@@ -15,6 +16,7 @@ from service.people.errors import TooManyTriesError
 from service.store.seam import Clock
 
 BODY_LIMIT_BYTES = 1_000_000
+TRIES_WINDOW_S = 300.0  # over which failed tries of an address are counted
 CONTENT_SECURITY_POLICY = "; ".join(
     (
         "default-src 'none'",
@@ -133,13 +135,24 @@ async def _plain(send: Send, status: int, text: str) -> None:
 class Limiter:
     """Counts failed tries of each client address over the last minutes, in memory."""
 
-    def __init__(self, clock: Clock, *, tries: int = 20, window_s: float = 300.0, addresses: int = 10_000) -> None:
+    def __init__(
+        self,
+        clock: Clock,
+        failed_tries: Iterable[tuple[str, float]] = (),
+        *,
+        tries: int = 20,
+        window_s: float = TRIES_WINDOW_S,
+        addresses: int = 10_000,
+    ) -> None:
+        """`failed_tries`: address and age in s, oldest first, of those before the service started."""
         self._clock = clock
         self._tries = tries
         self._window_s = window_s
         self._addresses = addresses
         self._failed: OrderedDict[str, deque[float]] = OrderedDict()
         self._lock = threading.Lock()
+        for address, age_s in failed_tries:
+            self._count(address, clock.monotonic_s() - age_s)
 
     def require(self, address: str) -> None:
         """Raises TooManyTriesError while an address has failed too often."""
@@ -160,9 +173,12 @@ class Limiter:
     def failed(self, address: str) -> bool:
         """Count one; whether it was the one too many."""
         with self._lock:
-            failed = self._failed.setdefault(address, deque(maxlen=self._tries))
-            failed.append(self._clock.monotonic_s())
-            self._failed.move_to_end(address)
-            while len(self._failed) > self._addresses:
-                self._failed.popitem(last=False)
-            return len(failed) == self._tries
+            return self._count(address, self._clock.monotonic_s())
+
+    def _count(self, address: str, at_s: float) -> bool:
+        failed = self._failed.setdefault(address, deque(maxlen=self._tries))
+        failed.append(at_s)
+        self._failed.move_to_end(address)
+        while len(self._failed) > self._addresses:
+            self._failed.popitem(last=False)
+        return len(failed) == self._tries

@@ -15,6 +15,7 @@ from service.rig import Rig
 from service.runs import recorded_run
 from service.store.store import Store
 from service.web.launch import Launcher
+from service.web.open_streams import OpenStreams
 
 
 @dataclass
@@ -31,6 +32,7 @@ class Site:
     idle_lock_s: float = 600.0
     hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask
     sealed_seq: int = 0  # last event of the site's chain that is known to be signed
+    streams: OpenStreams = field(default_factory=OpenStreams)
     _logs: dict[str, RunLog] = field(default_factory=dict[str, RunLog])
     _lock: Lock = field(default_factory=Lock)
 

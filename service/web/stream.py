@@ -14,7 +14,7 @@ from starlette.concurrency import run_in_threadpool
 
 from service.monitor.snapshot import read_snapshot
 from service.people.person import Person
-from service.web.security import requires, token_of
+from service.web.security import Signed, requires, token_of
 from service.web.site import Here, Site
 
 router = APIRouter(tags=["stream"])
@@ -26,37 +26,45 @@ RunId = Annotated[str, Path(max_length=64)]
 
 
 @router.get("/runs/{run_id}/stream", name="stream", dependencies=[Depends(requires("read"))])
-async def stream(request: Request, site: Here, run_id: RunId) -> StreamingResponse:
-    """`changed` with {"seq", "monitor", "locked"} whenever one of them is another than before."""
+async def stream(request: Request, site: Here, person: Signed, run_id: RunId) -> StreamingResponse:
+    """`changed` with {"seq", "monitor", "locked"} whenever one of them is another than before.
+
+    `replaced` is the end: the sign-in has opened more streams than it may have, and this is the oldest.
+    """
     await run_in_threadpool(site.store.head, run_id)  # an unknown run is refused before the stream begins
     return StreamingResponse(
-        _news(request, site, run_id),
+        _news(request, site, person.screen, run_id),
         media_type="text/event-stream",
         headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
     )
 
 
-async def _news(request: Request, site: Site, run_id: str) -> AsyncGenerator[str]:
+async def _news(request: Request, site: Site, screen: str, run_id: str) -> AsyncGenerator[str]:
     told: tuple[int, int, bool] | None = None
     beat_s = checked_s = time.monotonic()
     token, locked = token_of(request, site), False
-    while not await request.is_disconnected():
-        now_s = time.monotonic()
-        if now_s - checked_s > _CHECK_S:
-            checked_s = now_s
-            person = await run_in_threadpool(_signed_in, site, token)
-            if person is None:
-                yield "event: signed_out\ndata: {}\n\n"
+    with site.streams.opened(screen) as place:
+        while not await request.is_disconnected():
+            now_s = time.monotonic()
+            if place.replaced:
+                yield "event: replaced\ndata: {}\n\n"
                 return
-            locked = person.locked
-        news = (*await run_in_threadpool(_newest, site, run_id), locked)
-        if news != told:
-            told, beat_s = news, now_s
-            yield f"event: changed\ndata: {json.dumps({'seq': news[0], 'monitor': news[1], 'locked': locked})}\n\n"
-        elif now_s - beat_s > _BEAT_S:
-            beat_s = now_s
-            yield "event: beat\ndata: {}\n\n"
-        await asyncio.sleep(_LOOK_S)
+            if now_s - checked_s > _CHECK_S:
+                checked_s = now_s
+                person = await run_in_threadpool(_signed_in, site, token)
+                if person is None:
+                    yield "event: signed_out\ndata: {}\n\n"
+                    return
+                locked = person.locked
+            news = (*await run_in_threadpool(_newest, site, run_id), locked)
+            if news != told:
+                told, beat_s = news, now_s
+                data = {"seq": news[0], "monitor": news[1], "locked": locked}
+                yield f"event: changed\ndata: {json.dumps(data)}\n\n"
+            elif now_s - beat_s > _BEAT_S:
+                beat_s = now_s
+                yield "event: beat\ndata: {}\n\n"
+            await asyncio.sleep(_LOOK_S)
 
 
 def _signed_in(site: Site, token: str) -> Person | None:

@@ -114,8 +114,10 @@
   let heardAt = Date.now();
   let known = "";
   let opening = 0;
+  let replaced = false;
   function connect() {
     opening = Date.now();
+    replaced = false;
     stream?.close();
     stream = new EventSource(body.dataset.stream);
     const heard = () => { heardAt = Date.now(); if (offline) backOnline(); };
@@ -128,8 +130,11 @@
     });
     stream.addEventListener("beat", heard);
     stream.addEventListener("signed_out", () => location.reload());
+    // Newer pages of this sign-in have taken the places of the oldest: one that nobody looks at waits until somebody does.
+    stream.addEventListener("replaced", () => { stream.close(); replaced = true; });
   }
   function watch() {
+    if (replaced && document.hidden) { if (!offline) goOffline(); return; }
     const now = Date.now();
     if (now - heardAt > LOST_AFTER_MS && !offline) goOffline();
     if (now - heardAt > 1500 && now - opening > 2500) connect();

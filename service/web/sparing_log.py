@@ -1,0 +1,102 @@
+"""What a server says on stderr: each kind of message now and then, and how many were left out; never a flood."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TextIO
+
+EVERY_S = 60.0
+_KINDS = 200  # all further ones count as one
+_FAULTS = 10  # of the software in a time: people are told a reference that is to be found
+
+Kind = tuple[str | int, ...]
+
+
+@dataclass(slots=True)
+class _Told:
+    """What was said of one kind since `since_s`."""
+
+    since_s: float
+    name: str
+    words: str
+    written: int = 0
+    left_out: int = 0
+
+
+class SparingHandler(logging.StreamHandler[TextIO]):
+    """Writes a kind of message, which is a line of code and the error's own, once a minute at most."""
+
+    def __init__(self, stream: TextIO, *, every_s: float = EVERY_S) -> None:
+        super().__init__(stream)
+        words = logging.Formatter("%(asctime)s %(name)s %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%SZ")
+        words.converter = time.gmtime
+        self.setFormatter(words)
+        self._every_s = every_s
+        self._told: dict[Kind, _Told] = {}
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See logging.Handler, which holds the lock meanwhile."""
+        now_s = time.monotonic()
+        self._tell(now_s)
+        kind = _kind(record)
+        if kind not in self._told and len(self._told) >= _KINDS:
+            kind = ("others",)
+        told = self._told.setdefault(kind, _Told(now_s, record.name, record.getMessage().partition("\n")[0][:200]))
+        if told.written < (_FAULTS if record.exc_info and record.name.startswith("orthocapture") else 1):
+            told.written += 1
+            super().emit(record)
+        else:
+            told.left_out += 1
+
+    async def tell(self) -> None:
+        """Say how many were left out in times that are over; to be called now and then."""
+        self.acquire()
+        try:
+            self._tell(time.monotonic())
+        finally:
+            self.release()
+
+    def close(self) -> None:
+        """Say how many were left out at all."""
+        self._tell(float("inf"))
+        super().close()
+
+    def _tell(self, now_s: float) -> None:
+        over = [kind for kind, told in self._told.items() if now_s - told.since_s >= self._every_s]
+        for told in map(self._told.pop, over):
+            if told.left_out:
+                words = f"{told.left_out} more messages like this were left out: {told.words}"
+                super().emit(logging.makeLogRecord({"name": told.name, "levelname": "WARNING", "msg": words}))
+
+
+def _kind(record: logging.LogRecord) -> Kind:
+    place = (record.name, record.pathname, record.lineno)
+    _, error, traceback = record.exc_info or (None, None, None)
+    while traceback is not None and traceback.tb_next is not None:
+        traceback = traceback.tb_next
+    if error is None or traceback is None:
+        return place
+    return (*place, type(error).__name__, traceback.tb_frame.f_code.co_filename, traceback.tb_lineno)
+
+
+@contextmanager
+def sparing_log() -> Generator[SparingHandler]:
+    """All messages of this process go through one such handler to stderr, and through no other."""
+    handler = SparingHandler(sys.stderr)
+    root = logging.getLogger()
+    usual = root.handlers[:]
+    for each in usual:
+        root.removeHandler(each)
+    root.addHandler(handler)
+    try:
+        yield handler
+    finally:
+        root.removeHandler(handler)
+        for each in usual:
+            root.addHandler(each)
+        handler.close()
