@@ -82,7 +82,6 @@ PAGES: dict[str, tuple[tuple[Role | None, str], ...]] = {
 }
 # What a GET answers with that is no page of its own.
 NO_PAGES = {
-    "/openapi.json",
     "/vendor/plotly.js",
     "/robots",
     "/runs/{run_id}/parts/{names}",

@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import datetime
-import json
 import socket
 import ssl
-import subprocess
-from collections.abc import Generator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from ipaddress import ip_address
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import pytest
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import NameOID
 
 from service.core.model import ServiceStarted
 from service.store.audit import verify
 from service.store.records import SITE
 from service.store.store import Store
-from tests.support.rig import REPOSITORY, command, orthocapture
+from tests.support.certificates import self_signed
+from tests.support.rig import orthocapture
+from tests.support.serving import serving
 
 
 @pytest.fixture
@@ -33,28 +24,6 @@ def rig(tmp_path: Path) -> Path:
     path = tmp_path / "rig.yaml"
     path.write_text("name: a small site\nsimulated: true\ndevices: {}\n")
     return path
-
-
-@dataclass
-class Server:
-    url: str
-    set_up: str
-    process: subprocess.Popen[str]
-
-
-@contextmanager
-def serving(rig: Path, *options: str) -> Generator[Server]:
-    words = ["serve", "--rig", str(rig), "--data", str(rig.parent / "data"), "--port", "0", "--json", *options]
-    with subprocess.Popen(command(*words), cwd=REPOSITORY, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            line = process.stdout.readline()
-            assert line, "it did not start"
-            ready = json.loads(line)
-            yield Server(ready["url"], ready["set_up"], process)
-        finally:
-            process.terminate()
-        assert process.wait(timeout=20) == 0
 
 
 def test_it_serves_this_machine_records_its_start_and_signs_at_its_end(rig: Path) -> None:
@@ -110,28 +79,3 @@ def test_tls(rig: Path) -> None:
     half = orthocapture("serve", "--rig", str(rig), "--data", str(rig.parent / "data"), "--tls-key", str(key))
     assert half.returncode == 1
     assert "certificate and its key" in half.stderr
-
-
-def self_signed(folder: Path) -> tuple[Path, Path]:
-    private = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "table 3")])
-    now = datetime.datetime.now(datetime.UTC)
-    made = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(private.public_key())
-        .serial_number(7)
-        .not_valid_before(now - datetime.timedelta(hours=1))
-        .not_valid_after(now + datetime.timedelta(hours=1))
-        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ip_address("127.0.0.1"))]), critical=False)
-        .sign(private, hashes.SHA256())
-    )
-    certificate, key = folder / "certificate.pem", folder / "key.pem"
-    certificate.write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    key.write_bytes(
-        private.private_bytes(
-            serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-        )
-    )
-    return certificate, key

@@ -26,7 +26,6 @@ PUBLIC = {
     ("POST", "/set-up/{token}"),
     ("GET", "/vendor/plotly.js"),
     ("GET", "/health"),
-    ("GET", "/openapi.json"),
 }
 # What a locked screen may do beside looking.
 OPEN_WHILE_LOCKED = {("POST", "/sign-out"), ("POST", "/lock"), ("POST", "/unlock"), ("POST", "/theme")}

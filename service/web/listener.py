@@ -12,6 +12,8 @@ from weakref import finalize
 
 from service.web.connections import Connections
 
+_BACKLOG = 128  # connections that wait in the kernel
+ACCEPTED_AT_ONCE = 8  # before the event loop reads what the last ones have sent: their requests may be there already
 _EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
@@ -22,6 +24,10 @@ class Listener(socket.socket):
         super().__init__(family, socket.SOCK_STREAM)
         self.connections = connections
         self._exhausted = False
+
+    def listen(self, backlog: int = _BACKLOG, /) -> None:
+        """See socket. asyncio gives the number that it accepts at once, which is no reason for a short queue."""
+        super().listen(max(backlog, _BACKLOG))
 
     def accept(self) -> tuple[socket.socket, Any]:
         """The next connection that there is room for. Raises BlockingIOError when there is none, and OSError."""

@@ -14,11 +14,9 @@ from fastapi import FastAPI
 
 from service.core.errors import ConfigurationError
 from service.web.connections import ConnectionLimits, Connections, plain_address
-from service.web.listener import Listener
+from service.web.listener import ACCEPTED_AT_ONCE, Listener
 from service.web.reception import Forwarded, Reception
 from service.web.sparing_log import EVERY_S, SparingHandler
-
-_BACKLOG = 128
 
 
 def known_proxies(addresses: Sequence[str]) -> frozenset[str]:
@@ -49,7 +47,7 @@ def listening(host: str, port: int, limits: ConnectionLimits, proxies: frozenset
                 where="--host, --port",
                 remedy="Another program may use the port; choose one with --port, or 0 for any",
             ) from error
-        listener.listen(_BACKLOG)
+        listener.listen()
         yield listener
 
 
@@ -61,7 +59,7 @@ def server(
         Reception(Forwarded(app, proxies), listener.connections),
         loop="asyncio",  # its servers accept through the listener
         ws="none",
-        backlog=_BACKLOG,
+        backlog=ACCEPTED_AT_ONCE,
         proxy_headers=False,  # it believes everybody on this machine; see Forwarded
         log_config=None,
         log_level="warning",
