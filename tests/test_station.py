@@ -113,9 +113,7 @@ def test_an_arm_is_driven_by_one_process_whatever_rig_file_names_it(tmp_path: Pa
     ):
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
-        with pytest.raises(
-            DeviceUnavailableError, match=f"another process drives .*: process {holder.pid}"
-        ):
+        with pytest.raises(DeviceUnavailableError, match=f"another process drives .*: process {holder.pid}"):
             station.robot("station_1")
         holder.kill()
         holder.wait()
