@@ -34,7 +34,7 @@ RIG = """\
 name: one arm
 simulated: true
 devices:
-  robot: {{driver: ur, host: {host}}}
+  robot: {{driver: ur, host: {host}, watchdog_s: 1.0}}
 stations:
   station_1: {{robot: robot, scene_centre_m: [0.75, 0.0, -0.1], approach_azimuth_deg: 180}}
 T_flange_camera_nominal: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]]

@@ -39,6 +39,7 @@ PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
 
 @contextlib.contextmanager
 def opened(host: str, **config: float) -> Generator[RobotArm]:
+    config = {"watchdog_s": 1.0, **config}  # these tests share their machine; tests/test_watchdog.py tests the usual
     arm = hosted(RobotArm, "drivers.ur:DRIVER", UrConfig(host=host, **config), call_timeout_s=30, name="robot")
     try:
         arm.open()

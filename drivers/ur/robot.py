@@ -36,6 +36,7 @@ from drivers.ur import UrConfig
 from drivers.ur import vendor as library
 from drivers.ur.latch import Latch
 from drivers.ur.link import VENDOR_ERRORS, ControllerFacts, connect_dashboard, probe, read_facts, vendor
+from drivers.ur.script import ControlScript, wait
 from drivers.ur.stream import STREAM_HZ, PoseStream, driven, judge, ringing_s, safety_state
 from drivers.ur.watchdog import Watchdog
 from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
@@ -67,8 +68,6 @@ VARIABLES = (
     "actual_digital_output_bits",
 )
 READ_BACK_S = 1.0
-SCRIPT_START_S = 5.0
-STOP_S = 5.0
 TOOL_CHANGE_S = 0.05  # of the controller's clock, for a new tool to show in the stream
 LONGEST_RINGING_S = 10.0  # after a motion; how far back its end is looked for
 MOTION_START_S = 0.06  # for the target velocity to show in the stream
@@ -87,8 +86,6 @@ class UrRobot:
         self._dashboard: library.Dashboard | None = None
         self._receive: library.Receive | None = None
         self._io: library.InputOutput | None = None
-        self._control: library.Control | None = None
-        self._abandoned: list[library.Control] = []  # kept from their destructors
         self._stream: PoseStream | None = None
         self._T_flange_tcp: Transform = np.eye(4)
         self._controller_time_s = -1.0
@@ -100,6 +97,8 @@ class UrRobot:
             unattended_s=config.unattended_s,
             newest=self._newest,
         )
+        self._script = ControlScript(config, self._latch, self._watchdog)
+        self._tool_read = 0  # the sending of the script after which the tool was read
 
     # --- device ------------------------------------------------------------------------------------------
 
@@ -124,8 +123,8 @@ class UrRobot:
         )
         with vendor(self._where, "connecting the input/output interface"):
             self._io = library.input_output(self._config.host)
-        if not self._obstacle():
-            self._connect_control()
+        if not (self._obstacle() or self._latch.stop):
+            self._perform("starting the control script", lambda _: None)  # which sends it and reads the tool
         return self._identity()
 
     def heartbeat(self, sent_monotonic_s: float) -> None:
@@ -135,22 +134,19 @@ class UrRobot:
     def close(self) -> None:
         """End a motion that is under way, then the script and the connections; a dead link is no error."""
         self._latch.close()
-        stream, control = self._stream, self._control
+        stream = self._stream
         alive = stream is not None and stream.alive
-        if alive and control is not None:  # on a dead link these calls wait for ever, or crash
+        if alive:
             with contextlib.suppress(*VENDOR_ERRORS, DeviceError):
-                self._stop_running(control)
-        self._watchdog.release()
-        self._stream = self._control = None
+                self._script.stop_motion(self._driven_next)
+        self._stream = None
         if stream is not None:
             stream.close()
-        if alive and control is not None:
+        if alive:
             with contextlib.suppress(*VENDOR_ERRORS):
-                if control.isConnected() and control.isProgramRunning():
-                    control.stopScript()
-                control.disconnect()
-        elif control is not None:
-            self._abandoned.append(control)
+                self._script.end()
+        else:
+            self._script.abandon()
         for client in (self._io, self._receive, self._dashboard):
             with contextlib.suppress(*VENDOR_ERRORS):
                 if client is not None and client.isConnected():
@@ -163,7 +159,7 @@ class UrRobot:
         problems: list[str] = []
         if obstacle := self._obstacle() or self._latch.stop:
             problems.append(str(obstacle))
-        elif self._control is None or not state.program_running:
+        elif not self._script.connected or not state.program_running:
             problems.append("The control script does not run. Reconnect")
         if state.speed_fraction < 1.0:
             problems.append(
@@ -203,12 +199,15 @@ class UrRobot:
     def configure(self, payload: Payload, T_flange_tcp: Transform) -> None:
         """See RobotArm. DeviceRefusedError when not taken, DeviceFaultError when read back differently."""
         pose = to_rotation_vector(np.asarray(T_flange_tcp, dtype=np.float64))
-        with self._commanding("setting payload and tool") as control:
+
+        def set_both(control: library.Control) -> None:
             if not control.setTcp(pose.tolist()):
                 raise self._refusal("the tool centre point was not taken")
             if not control.setPayload(payload.mass_kg, list(payload.centre_of_gravity_m)):
                 raise self._refusal(f"the payload of {payload.mass_kg:g} kg was not taken")
-            self._read_tool()
+            self._read_tool(control)
+
+        self._perform("setting payload and tool", set_both)
         # The stream runs behind the answer: poses of the former tool are still under way.
         settled_s = self._streaming().latest().controller_time_s + TOOL_CHANGE_S
         while self._streaming().next().controller_time_s < settled_s:
@@ -246,7 +245,8 @@ class UrRobot:
     def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
         """See RobotArm. Asks first whether there is a solution: an unreachable pose kills the control script."""
         near = _joints(near_rad, self._where)
-        with self._commanding("inverse kinematics") as control:
+
+        def ask(control: library.Control) -> list[float]:
             pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
             if not control.getInverseKinematicsHasSolution(pose, near):
                 self._raise_unless_running(control)
@@ -258,10 +258,14 @@ class UrRobot:
                 )
             joints = control.getInverseKinematics(pose, near)
             if len(joints) != 6:
+                self._raise_unless_running(control)
                 raise DeviceFaultError("inverse kinematics returned no joints", where=self._where)
             if not control.isJointsWithinSafetyLimits(joints):
+                self._raise_unless_running(control)
                 raise UnreachablePoseError("the pose lies beyond the controller's safety limits", where=self._where)
-        return np.asarray(joints, dtype=np.float64)
+            return joints
+
+        return np.asarray(self._perform("inverse kinematics", ask), dtype=np.float64)
 
     def move_joints(self, target_rad: Array, *, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """See RobotArm."""
@@ -279,10 +283,9 @@ class UrRobot:
 
     def stop(self) -> None:
         """See RobotArm. Returns when the arm stands; without a running script the dashboard stops the program."""
-        control = self._control
         with vendor(self._where, "stopping the motion"):
             self._watchdog.look()
-            if control is None or not self._stop_running(control):
+            if not self._script.stop_motion(self._driven_next):
                 _opened(self._dashboard, self._where).stop()
 
     def is_moving(self) -> bool:
@@ -290,14 +293,8 @@ class UrRobot:
         self._watchdog.attend()
         if self._driven(self._streaming().latest()) or time.monotonic() - self._motion_started_s < MOTION_START_S:
             return True
-        control = self._control
-        with vendor(self._where, "asking for the motion's progress"):
-            if (
-                control is not None
-                and control.isProgramRunning()
-                and control.getAsyncOperationProgressEx().isAsyncOperationRunning()
-            ):
-                return True
+        if self._script.moves():
+            return True
         # On a link that has just died the newest sample is one from before the motion, and no program seems to
         # run: only a sample that arrives from now on proves that the arm is at rest.
         if self._driven(self._streaming().next()):
@@ -315,6 +312,9 @@ class UrRobot:
         if not sample.safety.may_move:
             raise self._safety_error(sample)
         return driven(sample)
+
+    def _driven_next(self) -> bool:
+        return driven(self._streaming().next())
 
     def settle(self, criteria: SettleCriteria) -> SettleReport:
         """See RobotArm."""
@@ -393,64 +393,35 @@ class UrRobot:
         return SafetyStopError(f"the arm is in {name}", where=self._where, remedy=remedy)
 
     @contextlib.contextmanager
-    def _commanding(self, doing: str, *, moving: bool = False) -> Generator[library.Control]:
-        """The control interface with its script running, for commands. Raises what keeps the arm from moving."""
-        with self._watchdog.commanding():
-            control = self._ready(self._latch.hold if moving else self._latch.stop)
+    def _commanding(self, doing: str, hold: DeviceError | None) -> Generator[library.Control]:
+        with self._script.commanding(doing, hold) as control:
+            if self._tool_read != self._script.sent:
+                self._read_tool(control)
+            yield control
+
+    def _perform(self, doing: str, commands: Callable[[library.Control], T]) -> T:
+        """Give commands that move nothing; once more where the script lapsed meanwhile, as the watchdog says."""
+        try:
+            with self._commanding(doing, self._obstacle() or self._latch.stop) as control:
+                return commands(control)
+        except DeviceError:
             with vendor(self._where, doing):
-                yield control
+                if not self._watchdog.lapsed():
+                    raise
+        with self._commanding(doing, self._obstacle() or self._latch.stop) as control:
+            return commands(control)
 
-    def _ready(self, hold: DeviceError | None) -> library.Control:
-        obstacle = self._obstacle() or hold
-        if obstacle is not None:
-            raise obstacle
-        control = self._control
-        if control is None:
-            return self._connect_control()
-        with vendor(self._where, "starting the control script"):
-            if not control.isConnected():
-                raise DeviceUnavailableError("the control connection is lost", where=self._where, remedy="Reconnect")
-            self._watchdog.look()
-            if stop := self._latch.stop:
-                raise stop
-            running = control.isProgramRunning()
-            if not running:
-                _LOG.info("%s: the control script had ended and is sent again", self._where)
-                control.reuploadScript()
-                self._wait(control.isProgramRunning, SCRIPT_START_S, "the control script to start")
-            self._watchdog.guard(control)
-        if not running:
-            self._read_tool()
-        return control
-
-    def _connect_control(self) -> library.Control:
-        with self._watchdog.commanding(), vendor(self._where, "starting the control script"):
-            control = library.control(self._config.host, STREAM_HZ)
-            self._watchdog.guard(control)
-            self._control = control
-            self._read_tool()
-        return control
-
-    def _stop_running(self, control: library.Control) -> bool:
-        """Stop a motion of the control script and wait until the arm stands; False when the script does not run."""
-        with self._watchdog.commanding():
-            if not control.isConnected() or not control.isProgramRunning():
-                return False
-            control.stopJ(self._config.stop_deceleration_rad_s2, True)
-        # The watchdog is kicked while the arm slows down, which a call that waits for its end would prevent.
-        self._wait(lambda: not driven(self._streaming().next()), STOP_S, "the arm to stand still")
-        self._watchdog.arrive()
-        return True
-
-    def _read_tool(self) -> None:
+    def _read_tool(self, control: library.Control) -> None:
         with vendor(self._where, "reading the tool centre point"):
-            pose = _opened(self._control, self._where).getTCPOffset()
+            pose = control.getTCPOffset()
         if len(pose) != 6:
+            self._raise_unless_running(control)
             raise DeviceFaultError("the tool centre point cannot be read back", where=self._where)
         self._T_flange_tcp = from_rotation_vector(np.array(pose))
+        self._tool_read = self._script.sent
 
     def _begin(self, what: str, start: Callable[[library.Control], bool]) -> None:
-        with self._commanding(f"starting the {what}", moving=True) as control:
+        with self._commanding(f"starting the {what}", self._obstacle() or self._latch.hold) as control:
             self._motion_started_s = time.monotonic()
             self._watchdog.begin()
             if start(control):
@@ -474,18 +445,11 @@ class UrRobot:
     def _read_back(self, agrees: Callable[[], bool], what: str) -> None:
         with vendor(self._where, f"reading back the {what}"):
             try:
-                self._wait(agrees, READ_BACK_S, what)
+                wait(agrees, READ_BACK_S, what, self._where)
             except DeviceTimeoutError:
                 raise DeviceFaultError(
                     f"the {what} reads back differently from what was set", where=self._where
                 ) from None
-
-    def _wait(self, done: Callable[[], bool], timeout_s: float, what: str) -> None:
-        deadline = time.monotonic() + timeout_s
-        while not done():
-            if time.monotonic() > deadline:
-                raise DeviceTimeoutError(f"waited {timeout_s:g} s for {what}", where=self._where)
-            time.sleep(0.01)
 
 
 def _opened(part: T | None, where: str) -> T:

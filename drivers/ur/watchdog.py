@@ -42,7 +42,7 @@ class Watchdog:
         self._beaten = threading.Event()
         self._beat_s = self._kicked_s = self._attended_s = -float("inf")
         self._moving = False
-        self._left_alone = False
+        self._left_alone = self._lapsed = False
         threading.Thread(target=self._run, name="ur watchdog", daemon=True).start()
 
     def beat(self, sent_monotonic_s: float) -> None:
@@ -69,6 +69,7 @@ class Watchdog:
                 raise RuntimeError("the control script did not take its watchdog")
             self._kicked_s = time.monotonic()
             self._control = control
+            self._lapsed = False
 
     def release(self) -> None:
         """The script is about to be ended on purpose."""
@@ -115,6 +116,7 @@ class Watchdog:
             late = late_s > LATE * self._watchdog_s
             if not self._moving and late and late_s < LAPSE_S:
                 _LOG.info("the control script ended while the arm stood: no kick for %.2f s", late_s)
+                self._lapsed = True
                 return
             if self._left_alone:
                 what = f"the arm was stopped: nobody had looked at it for {self._unattended_s:g} s"
@@ -123,6 +125,15 @@ class Watchdog:
             else:
                 what = "the arm was stopped: its program was ended at the controller"
             self._latch.end(what)
+
+    def lapsed(self) -> bool:
+        """Whether the script has ended, while the arm stood, because this machine was busy for a moment.
+
+        Raises the vendor's errors.
+        """
+        with self._commands:
+            self.look()
+            return self._lapsed
 
     def _run(self) -> None:
         while True:
