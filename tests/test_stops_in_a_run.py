@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from drivers.host import HostedDevice
-from drivers.interfaces import Camera, Lightbox
+from drivers.interfaces import Camera, Device, Lightbox
 from service.core.decide import AskOperator
 from service.core.model import OperatorAction, StepFailed, ViewpointCaptured
 from service.core.protocol import parse_protocol
@@ -30,11 +30,13 @@ from tests.support.ur_rtde_protocol import RtdeClient
 from tests.support.ur_simulator import address, simulated_ur
 from tests.support.waiting import until
 
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+
 RIG = """\
 name: one arm
 simulated: true
 devices:
-  robot: {{driver: ur, host: {host}, watchdog_s: 1.0}}
+  robot: {{driver: ur, host: {host}, watchdog_s: 1.0, stale_after_s: 10}}  # on a machine that is shared
 stations:
   station_1: {{robot: robot, scene_centre_m: [0.75, 0.0, -0.1], approach_azimuth_deg: 180}}
 T_flange_camera_nominal: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]]
@@ -76,6 +78,12 @@ class OneArm(Station):
 
     def camera(self) -> Camera:
         return self.shutter
+
+    def reopen(self, device: Device) -> None:
+        if device is self.shutter:
+            self.shutter.open()
+        else:
+            super().reopen(device)
 
     def lightbox(self) -> Lightbox | None:
         return None

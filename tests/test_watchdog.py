@@ -21,6 +21,7 @@ from tests.support.stubborn_program import GOAL_RAD
 from tests.support.ur_simulator import address, simulated_ur
 from tests.support.waiting import until
 
+pytestmark = pytest.mark.slow
 AT_REST_WITHIN_S = 0.5
 WATCHED_S = 4.0  # what moved by itself did so after 2.3 s
 

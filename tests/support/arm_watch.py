@@ -28,7 +28,7 @@ class ArmWatch:
 
     def __init__(self, host: str) -> None:
         self._client = RtdeClient(host)
-        self._client.output_setup(["timestamp", "target_qd", "actual_q", "runtime_state"], 250.0)
+        self._client.output_setup(["timestamp", "target_qd", "actual_q", "runtime_state"], 125.0)
         self._client.start()
         self._seen: list[Seen] = []
         self._thread = threading.Thread(target=self._run, daemon=True)
