@@ -186,7 +186,7 @@ def test_a_driver_killed_in_mid_motion_is_asked_about_before_the_arm_moves_on(tm
         killed: list[int] = []
 
         def kill(_doing: str) -> None:
-            if not killed and len(run.captured()) >= 1 and arm.now.speed_rad_s > 0.2:
+            if not killed and run.station.shutter.exposures >= 1 and arm.now.speed_rad_s > 0.2:
                 killed.append(arm.mark())
                 os.kill(run.station.driver_pid, signal.SIGKILL)
 
