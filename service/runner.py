@@ -122,7 +122,6 @@ class Runner:
     wait: Callable[[float], None] = time.sleep
     _log: RunLog = field(init=False)
     _lease: RunLease = field(init=False)
-    _renew_at_s: float = field(init=False, default=0.0)
     _asked: AskOperator | None = field(init=False, default=None)
     _pedal: int | None = field(init=False, default=None)  # presses when the open question was first asked
     _pedal_again_s: float = field(init=False, default=0.0)
@@ -149,7 +148,6 @@ class Runner:
             self.devices.watch(self._opened)
             try:
                 while True:
-                    self._keep_lease()
                     state = self._log.refresh()
                     if state.terminal:
                         return state
@@ -178,11 +176,8 @@ class Runner:
                 self._append(StepPassed(step=step, attempt=attempt))
                 self._seal()
                 self.operator.tell(f"{self.protocol.step(step).title}: passed")
-            case Retry(step, attempt, why, wait_s):
-                self.wait(wait_s)
-                if state.step.retry_granted:
-                    self.operator.mend(step, attempt, state.step.mend.get("hands", ()))
-                self._append(StepRetried(step=step, attempt=attempt, why=why))
+            case Retry():
+                self._retry(decision, state)
             case FinishRun(deviations):
                 self._append(RunCompleted(deviations=deviations))
             case AbortRun(reason):
@@ -191,6 +186,20 @@ class Runner:
                 self.operator.show("paused", 0, 0)
                 self.operator.attend("paused", state, pedal_armed=False)
                 self.wait(_POLL_S)
+
+    def _retry(self, decision: Retry, state: RunState) -> None:
+        """Begin again after the wait, unless a pause or an abort is what is to be done by then."""
+        left_s = decision.wait_s
+        while left_s > 0:
+            self.wait(min(_POLL_S, left_s))
+            left_s -= _POLL_S
+            now = self._log.refresh()
+            if decide(self.protocol, now) != decision:
+                return
+            self.operator.attend("working", now, pedal_armed=False)
+        if state.step.retry_granted:
+            self.operator.mend(decision.step, decision.attempt, state.step.mend.get("hands", ()))
+        self._append(StepRetried(step=decision.step, attempt=decision.attempt, why=decision.why))
 
     # --- operator ---
 
@@ -311,8 +320,7 @@ class Runner:
         self.operator.tell(f"{step_id}: {error}. What was {kept} is safe")
 
     def _checkpoint(self, step: str, attempt: int) -> None:
-        """Called by steps wherever they may stop: keeps the lease, and notices what operators have asked for."""
-        self._keep_lease()
+        """Called by steps wherever they may stop: notices what operators have asked for."""
         state = self._log.refresh()
         self.operator.attend("pausing" if state.paused else "working", state, pedal_armed=False)
         if state.paused:
@@ -333,11 +341,6 @@ class Runner:
         except StoreError as error:
             self.operator.tell(f"the record could not be signed: {error}")
         keep_elsewhere(self.store.database_path.parent, self.signature_copy, self.operator.tell)
-
-    def _keep_lease(self) -> None:
-        if self.monotonic_s() > self._renew_at_s:
-            self._lease.renew()
-            self._renew_at_s = self.monotonic_s() + _LEASE_S / 3
 
 
 def software_versions() -> dict[str, str]:

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from pydantic import ValidationError
 
+from drivers.device_lock import DeviceLock
 from drivers.errors import DeviceUnavailableError
 from drivers.host import hosted
 from drivers.interfaces import (
@@ -39,6 +40,8 @@ INTERFACES: Mapping[str, type[Any]] = {
     "lightbox": Lightbox,
 }
 _PATH_FIELDS = ("folder", "port", "path")
+_ADDRESS_FIELDS = ("host", "port")
+_ACTING = ("robot", "camera", "lightbox")
 
 D = TypeVar("D", bound=Device)
 
@@ -54,6 +57,7 @@ class Station:
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
         self._open: dict[str, Device] = {}
+        self._locks: dict[str, DeviceLock] = {}
         self._on_open: Callable[[str, DeviceReport], None] | None = None
         self._leave: LeaveToMove | None = None
         self._told: dict[str, int] = {}  # arm → seq of the leave that it was given last
@@ -66,7 +70,12 @@ class Station:
         """An open device. Raises ConfigurationError or DeviceError."""
         if name not in self._open:
             device = self._build(name)
-            self._connect(name, device)
+            self._lock(name)
+            try:
+                self._connect(name, device)
+            except BaseException:
+                self._unlock(name)
+                raise
             self._open[name] = device
         return self._open[name]
 
@@ -93,8 +102,9 @@ class Station:
 
     def close(self) -> None:
         """Let go of every device."""
-        for device in self._open.values():
+        for name, device in self._open.items():
             device.close()
+            self._unlock(name)
         self._open.clear()
 
     # --- roles, as steps ask for them (service.steps.context.Devices) ---
@@ -158,8 +168,25 @@ class Station:
         name = next(name for name, known in self._open.items() if known is device)
         del self._open[name]  # if it stays away, whoever asks next begins from scratch
         device.close()
-        self._connect(name, device)
+        try:
+            self._connect(name, device)
+        except BaseException:
+            self._unlock(name)
+            raise
         self._open[name] = device
+
+    def _lock(self, name: str) -> None:
+        """What acts is driven by one process; folders may be read by many."""
+        spec, _ = self._spec(name)
+        settings = self._config(name, spec).model_dump()
+        where = next((str(settings[field]) for field in _ADDRESS_FIELDS if settings.get(field)), "")
+        if spec.kind in _ACTING:
+            self._locks[name] = DeviceLock.take(f"{self.rig.section.devices[name]['driver']} {where}".strip(), name)
+
+    def _unlock(self, name: str) -> None:
+        lock = self._locks.pop(name, None)
+        if lock is not None:
+            lock.release()
 
     # --- building ---
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 import subprocess
 import sys
@@ -73,11 +72,13 @@ def run(server: Served, browser: Browser) -> str:
         expect(tablet.page.get_by_role("checkbox").first).to_be_visible(timeout=60_000)
         name = tablet.page.url.rpartition("/")[2]
         technician = Technician(tablet)
-        deadline_s = time.monotonic() + 700
+        deadline_s, missed = time.monotonic() + 700, "nothing"
         while tablet.page.get_by_role("heading", name="The run is complete").count() == 0:
-            assert time.monotonic() < deadline_s, server.log()
-            with contextlib.suppress(PlaywrightTimeoutError):  # the page went on between two looks: look again
+            assert time.monotonic() < deadline_s, f"{server.log()}\n{tablet.words()}\nmissed last: {missed}"
+            try:
                 technician.do_what_is_asked()
+            except PlaywrightTimeoutError as error:  # the page went on between two looks: look again
+                missed = str(error)
         assert technician.held >= 5  # calibration and four captures
         assert technician.signed >= 3  # before the scene is changed for good
     return name

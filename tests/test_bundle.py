@@ -356,6 +356,11 @@ FORGERIES: dict[str, tuple[str, Callable[[list[dict[str, Any]]], Any], str]] = {
     "events exchanged": ("events.jsonl", lambda r: r.insert(2, r.pop(3)), "missing or out of order"),
     "rewritten": ("events.jsonl", rewrite, "the chain was cut or rewritten"),
     "key": ("site_events.jsonl", lambda r: r[1]["payload"].update(key_id="0" * 64), "fingerprint"),
+    "signed before": (
+        "site_events.jsonl",
+        lambda r: [e["payload"].update(sha256="0" * 64) for e in r if e["payload"]["kind"] == "run_signed"],
+        "was signed once",
+    ),
     "account": ("site_events.jsonl", lambda r: r[-1].update(actor="Eve"), "its content was altered"),
     "device of a file": ("artefacts.jsonl", lambda r: r[1].update(device="phone"), "the row was altered"),
     "row left out": ("artefacts.jsonl", lambda r: r.pop(3), "has no row"),

@@ -198,6 +198,9 @@ RUN_ELSEWHERE = {
     "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
         "tests/test_handheld.py::test_the_evidence_verifies"
     ),
+    "orthocapture audit verify --signatures FILE": (
+        "tests/test_signature_log.py::test_a_run_keeps_the_copy_that_its_rig_file_names"
+    ),
     "orthocapture act release": "tests/test_web_held.py::test_the_buttons_ask_the_step",
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"

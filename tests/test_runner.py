@@ -22,6 +22,7 @@ from service.core.model import (
     SessionStarted,
     StepFailed,
     StepNote,
+    StepRetried,
     ViewpointCaptured,
     ViewpointFailed,
 )
@@ -326,6 +327,30 @@ def test_a_camera_that_fails_twice_is_reopened_and_loses_nothing(bench: Bench) -
     assert bench.rig.shutter.opened == 3
     assert len(bench.payloads(DeviceOpened)) == 4  # the record shows each reopening
     assert not bench.payloads(StepFailed)
+
+
+@pytest.mark.parametrize("verb", ["abort", "pause"])
+def test_a_wait_before_a_retry_heeds_an_abort_and_a_pause(begin: Callable[[str], Bench], verb: str) -> None:
+    bench = begin(PROTOCOL.replace("recovery: {retries: 2, wait_s: 0}", "recovery: {retries: 9, wait_s: 600}"))
+    waited_s: list[float] = []
+
+    def fail(exposure: int) -> None:
+        if exposure > 1:
+            raise DeviceTimeoutError("no answer", where="camera")
+
+    def wait(seconds: float) -> None:
+        if not bench.payloads(StepFailed):
+            return
+        waited_s.append(seconds)
+        if len(waited_s) == 5:
+            bench.act(verb, reason="someone stepped in")
+        if len(waited_s) == 10 and verb == "pause":
+            bench.act("abort", reason="that is all")
+
+    bench.rig.shutter.on_capture, bench.on_wait = fail, wait
+    assert bench.run().status == "aborted"
+    assert sum(waited_s) < 3
+    assert not bench.payloads(StepRetried)
 
 
 def test_a_camera_that_stays_away_ends_in_a_question_and_the_run_goes_on_from_there(bench: Bench) -> None:

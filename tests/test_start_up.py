@@ -119,6 +119,6 @@ def test_a_run_cut_back_with_its_checkpoints_is_found(store: Store, rig: Rig) ->
         f"UPDATE heads SET seq = 2, sha256 = (SELECT sha256 FROM events WHERE run_id = '{run}' AND seq = 2) "
         f"WHERE run_id = '{run}'",
     )
-    (fault,) = verify(data, run).faults
-    assert (fault.run_id, fault.seq) == (run, 3)
-    assert "the chain was cut or rewritten since" in fault.what
+    found = verify(data, run).faults
+    assert {fault.seq for fault in found if fault.run_id == run} == {3}
+    assert any("the chain was cut or rewritten since" in fault.what for fault in found)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, DeviceUnavailableError
 from drivers.interfaces import DeviceReport
 from service.core.errors import ConfigurationError
 from service.rig import load_rig
 from service.station import Station
 
+ROOT = Path(__file__).parents[1]
 RIG = """\
 name: folders
 devices:
@@ -92,3 +95,29 @@ def test_what_a_rig_lacks_is_named(tmp_path: Path) -> None:
 def test_a_wrong_rig_file_says_where(tmp_path: Path, old: str, new: str, words: str) -> None:
     with pytest.raises(ConfigurationError, match=words), station_of(tmp_path, RIG.replace(old, new)):
         pass
+
+
+HOLDER = """
+import sys, time
+from drivers.device_lock import DeviceLock
+lock = DeviceLock.take("ur 127.0.0.9", "arm")
+print("held", flush=True)
+time.sleep(100)
+"""
+
+
+def test_an_arm_is_driven_by_one_process_whatever_rig_file_names_it(tmp_path: Path) -> None:
+    with (
+        station_of(tmp_path) as (station, _),
+        subprocess.Popen([sys.executable, "-c", HOLDER], cwd=ROOT, stdout=subprocess.PIPE, text=True) as holder,
+    ):
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(DeviceUnavailableError, match=f"another process drives .*: process {holder.pid}"):
+            station.robot("station_1")
+        holder.kill()
+        holder.wait()
+        for _ in range(2):  # a device that could not be opened is let go of
+            with pytest.raises(DeviceError) as refused:
+                station.robot("station_1")
+            assert "another process" not in str(refused.value)

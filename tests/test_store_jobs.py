@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,9 +16,11 @@ from service.core.errors import DataError, StoreError
 from service.core.model import JobFailed, JobFinished, StepNote
 from service.store.audit import verify
 from service.store.errors import LeaseHeldError, LeaseLostError
+from service.store.leases import RunLease
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
 from tests.support.store import CountedIds, SteppedClock, start_run
+from tests.support.waiting import until
 
 ROOT_DIR = Path(__file__).parents[1]
 JOB = NewJob("registration", "register", 1, "register-1", {"sigma_px": 0.5, "views": [1, 2]})
@@ -159,10 +162,12 @@ def test_racing_workers_do_each_job_once(tmp_path: Path) -> None:
     assert verify(tmp_path).ok
 
 
-def test_one_runner_drives_a_run(store: Store, clock: SteppedClock) -> None:
+def test_one_runner_drives_a_run(store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch) -> None:
     run = start_run(store)
     note = StepNote(step="s", attempt=1, note="n")
-    first = store.lease(run, "runner 1", 10)
+    with monkeypatch.context() as elsewhere:  # of another host nothing is known but the time
+        elsewhere.setattr(socket, "gethostname", lambda: "the other computer")
+        first = store.lease(run, "runner 1", 10)
     with pytest.raises(LeaseHeldError, match="runner 1"):
         store.lease(run, "runner 2", 10)
     clock.passed_s = 9
@@ -181,6 +186,35 @@ def test_one_runner_drives_a_run(store: Store, clock: SteppedClock) -> None:
     assert len(store.events(run)) == 3
     with pytest.raises(StoreError, match="no run"):
         store.lease("nowhere", "r", 10)
+
+
+def test_a_runner_that_lives_keeps_its_run_whatever_the_clock_says(store: Store, clock: SteppedClock) -> None:
+    run = start_run(store)
+    with store.lease(run, "runner 1", 10) as first:
+        clock.passed_s = 120  # somebody set it, or the runner waits for long
+        assert store.driven(run)
+        with pytest.raises(LeaseHeldError, match="runner 1"):
+            store.lease(run, "runner 2", 10)
+        store.record(run, [StepNote(step="s", attempt=1, note="n")], actor="runner", lease=first)
+    assert not store.driven(run)
+
+
+def test_a_lease_is_renewed_by_itself_also_after_a_store_that_failed(
+    store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = start_run(store)
+    renewals: list[float] = []
+    really = RunLease.renew
+
+    def renew(lease: RunLease) -> None:
+        renewals.append(clock.passed_s)
+        if len(renewals) == 1:
+            raise StoreError("the disk is full")
+        really(lease)
+
+    monkeypatch.setattr(RunLease, "renew", renew)
+    with store.lease(run, "runner", 0.03):
+        until(lambda: len(renewals) > 2, "the lease is not renewed again")
 
 
 HOLDER = """
@@ -207,6 +241,9 @@ def test_leases_of_a_killed_process_are_taken_over_at_once(tmp_path: Path) -> No
             with pytest.raises(LeaseHeldError, match="the killed one"):
                 store.lease(run, "next", 10)
             assert store.claim_job("next", 10) is None
+            os.kill(holder.pid, signal.SIGSTOP)  # continued, it would go on with the arm
+            with pytest.raises(LeaseHeldError, match="the killed one"):
+                store.lease(run, "next", 10)
             os.kill(holder.pid, signal.SIGKILL)
         with store.lease(run, "next", 10):
             job = store.claim_job("next", 10)

@@ -17,7 +17,7 @@ from service.cli.main import app
 from service.core.model import CaptureAsked, DeviceOpened
 from tests.support.bench_run import Bench
 from tests.support.held_run import left_held_run
-from tests.support.web import Browser, WebSite, web_site
+from tests.support.web import Browser, WebSite, password_of, web_site
 
 
 @pytest.fixture
@@ -65,10 +65,11 @@ def test_the_buttons_ask_the_step(shown: tuple[WebSite, Browser, Bench]) -> None
         assert answer.status_code == 303
     assert [asked.what for asked in bench.payloads(CaptureAsked)] == ["release", "finish"]
     assert bench.state().steps["capture"].asked == ("release", "finish")
-    typed = ["act", "release", "--data", str(bench.data), "--operator", "Grace"]
-    assert CliRunner().invoke(app, typed).exit_code == 0, "and so does the command line"
+    typed = ["act", "release", "--data", str(bench.data), "--operator", "Grace", "--password-stdin"]
+    secret = password_of("grace") + "\n"
+    assert CliRunner().invoke(app, typed, input=secret).exit_code == 0, "and so does the command line"
     assert bench.state().steps["capture"].asked == ("release", "finish", "release")
-    refused = CliRunner().invoke(app, [*typed, "--step", "ct"])
+    refused = CliRunner().invoke(app, [*typed, "--step", "ct"], input=secret)
     assert refused.exit_code == 1
     assert "takes no images now" in refused.output
     assert bench.state().steps["capture"].asked == ("release", "finish", "release")

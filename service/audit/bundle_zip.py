@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.core.errors import DataError, StoreError
+from service.store.seam import DurableFiles
 
 ZipTime = tuple[int, int, int, int, int, int]
 
@@ -75,7 +76,7 @@ def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | 
         if leaving is not None:
             leaving(part)
         os.link(part, target)  # unlike a rename, never replaces what another process has put there meanwhile
-        _sync(target.parent)
+        DurableFiles().sync_directory(target.parent)
     except FileExistsError as error:
         raise DataError("the file exists already", where=str(target), remedy="Name a new one") from error
     except OSError as error:
@@ -86,11 +87,3 @@ def writing_bundle(target: Path, at: ZipTime, leaving: Callable[[Path], None] | 
         ) from error
     finally:
         part.unlink(missing_ok=True)
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

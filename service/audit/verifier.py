@@ -410,6 +410,12 @@ class Check:
             if seq and run.hashes.get(seq) != sha256:
                 what = f"the service saw another event {seq} when it started (event {start} of the site's chain)"
                 self.fault(run.file, what)
+        for at, signed in site.signed:
+            seq = signed.get("seq")
+            known = run.hashes.get(seq) if isinstance(seq, int) else None
+            if signed.get("run") == run.run_id and known != signed.get("sha256"):
+                what = f"another event {seq} was signed once (event {at} of the site's chain): cut or rewritten"
+                self.fault(run.file, what)
 
     # --- artefacts ---
 
@@ -642,6 +648,7 @@ class Chain:
         self.references: dict[int, list[bytes]] = {}
         self.key_changes: list[tuple[int, dict[str, Any]]] = []
         self.starts: list[tuple[int, dict[str, tuple[int, str]]]] = []
+        self.signed: list[tuple[int, dict[str, Any]]] = []  # runs, up to which event
         self.jobs: list[tuple[int, dict[str, Any]]] = []
         self.accepted: list[tuple[int, dict[str, Any], str]] = []  # figures outside their limits, and by whom
         self.first: dict[str, Any] | None = None
@@ -673,6 +680,8 @@ class Chain:
         kind = payload.get("kind")
         if kind == "key_changed" and self.run_id == SITE:
             self.key_changes.append((seq, payload))
+        elif kind == "run_signed":
+            self.signed.append((seq, payload))
         elif kind == "service_started":
             self.starts.append((seq, _heads(payload.get("heads"))))
         elif kind == "operator_action" and payload.get("action") == "accept":

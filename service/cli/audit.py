@@ -38,24 +38,19 @@ audit_app = typer.Typer(
 _RUN_HELP = "Name of the run, its first characters, or `latest`."
 
 RunArgument = Annotated[str, typer.Argument(help=_RUN_HELP)]
+
+
+def _existing_file(text: str) -> Any:
+    return typer.Option(metavar="FILE", help=text, exists=True, dir_okay=False)
+
+
 CertificatesOption = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Certificates of the time-stamp authority (PEM), to check its signatures too.",
-        exists=True,
-        dir_okay=False,
-    ),
+    _existing_file("Certificates of the time-stamp authority (PEM), to check its signatures too."),
 ]
-
 SignaturesOption = Annotated[
     Path | None,
-    typer.Option(
-        metavar="FILE",
-        help="Copy of signatures.jsonl that was kept elsewhere: what was cut off since shows against it.",
-        exists=True,
-        dir_okay=False,
-    ),
+    _existing_file("Copy of signatures.jsonl that was kept elsewhere: what was cut off since shows against it."),
 ]
 
 

@@ -72,12 +72,12 @@ class ChainFacts:
     def add(self, seq: int, payload: Any, at_utc: str) -> None:
         """An event whose content is as it was recorded."""
         kind = payload["kind"]
-        if kind not in _OF_JOBS:
-            self.last_own = seq
         if kind in _OF_JOBS:
             self.jobs[seq] = payload
             self.jobs_utc[seq] = at_utc
-        elif kind == "key_changed":
+            return
+        self.last_own = seq
+        if kind == "key_changed":
             self.key_changes.append((seq, payload))
         elif kind == "account_changed":
             self.account_changes.append((seq, payload))

@@ -114,7 +114,7 @@ def claim(
         statement = statement.where(jobs.c.run_id == run_id)
     for row in connection.execute(statement).all():
         if row.state == "running":
-            if now.timestamp() < row.until_utc_s and not identity_of(row).is_surely_dead():
+            if now.timestamp() < row.until_utc_s and identity_of(row).life() != "dead":
                 continue
             _note(connection, clock, row, actor=ACTOR, note="job_lease_lost", data={"worker": row.worker})
             if row.tries >= row.try_limit:

@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives.serialization import (
 
 from service.store.checkpoints import key_fingerprint
 from service.store.errors import SigningKeyError
+from service.store.seam import DurableFiles
 
 FOLDER = "keys"
 _SUFFIX, _PART = ".pem", ".part"
@@ -50,7 +51,7 @@ class KeyFolder:
                 handle.flush()
                 os.fsync(descriptor)
             part.replace(target)
-            _sync(self._folder)
+            DurableFiles().sync_directory(self._folder)
         except OSError as error:
             raise SigningKeyError(
                 f"the signing key cannot be stored: {error.strerror or error}",
@@ -92,7 +93,7 @@ class KeyFolder:
             for path in others:
                 path.unlink(missing_ok=True)
             if others:
-                _sync(self._folder)
+                DurableFiles().sync_directory(self._folder)
         except OSError as error:
             raise SigningKeyError(
                 f"an old signing key cannot be destroyed: {error.strerror or error}",
@@ -106,12 +107,4 @@ class KeyFolder:
     def _prepare(self) -> None:
         if not self._folder.exists():
             self._folder.mkdir(mode=0o700)
-            _sync(self._folder.parent)
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+            DurableFiles().sync_directory(self._folder.parent)

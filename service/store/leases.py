@@ -1,16 +1,23 @@
-"""Leases: one runner a run, with a time limit, taken over at once from a dead process of this host."""
+"""Leases: one runner a run. A process of this host has one for as long as it lives, others for a time.
+
+No clock takes a run away from a runner that lives on this host: its clock may be set, its waits may be long, and a
+process that was stopped (SIGSTOP) would go on moving the arm when it is continued.
+"""
 
 from __future__ import annotations
 
+import logging
 import socket
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import psutil
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
+from service.core.errors import StoreError
 from service.store.database import Database
 from service.store.errors import LeaseHeldError, LeaseLostError
 from service.store.seam import Clock, Ids
@@ -18,6 +25,7 @@ from service.store.tables import leases
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _SAME_START_S = 1.5  # boot time is known to a second
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,21 +46,22 @@ class ProcessIdentity:
         process = psutil.Process()
         return cls(socket.gethostname(), _boot(), process.pid, _started_s(process))
 
-    def is_surely_dead(self) -> bool:
-        """True only for a process of this host that is gone; nothing is known of other hosts."""
+    def life(self) -> Literal["lives", "dead", "unknown"]:
+        """What is known of it; of a process of another host nothing is. A stopped process lives."""
         if self.host != socket.gethostname():
-            return False
+            return "unknown"
         if self.boot != _boot():
-            return True
+            return "dead"
         try:
             process = psutil.Process(self.pid)
             if process.status() == psutil.STATUS_ZOMBIE:
-                return True
-            return abs(_started_s(process) - self.process_started_s) > _SAME_START_S
+                return "dead"
+            same = abs(_started_s(process) - self.process_started_s) <= _SAME_START_S
         except psutil.NoSuchProcess:
-            return True
+            return "dead"
         except psutil.AccessDenied:
-            return False
+            return "unknown"
+        return "lives" if same else "dead"
 
 
 def _boot() -> str:
@@ -79,7 +88,7 @@ def identity_values(identity: ProcessIdentity) -> dict[str, Any]:
 
 
 class RunLease:
-    """The right to drive one run, until it expires, is released, or this process dies. Use it in a `with`."""
+    """The right to drive one run, until it is released or this process dies; renewed by itself within a `with`."""
 
     def __init__(self, run_id: str, token: str, seconds: float, database: Database, clock: Clock) -> None:
         self.run_id = run_id
@@ -87,6 +96,8 @@ class RunLease:
         self._seconds = seconds
         self._database = database
         self._clock = clock
+        self._over = threading.Event()
+        self._keeper = threading.Thread(target=self._keep, name=f"lease of {run_id}", daemon=True)
 
     def renew(self) -> None:
         """Push the time limit out again. Raises LeaseLostError when another process has taken over."""
@@ -100,12 +111,24 @@ class RunLease:
         with self._database.writing() as connection:
             connection.execute(delete(leases).where(leases.c.token == self.token))
 
+    def _keep(self) -> None:
+        while not self._over.wait(self._seconds / 3):
+            try:
+                self.renew()
+            except LeaseLostError:
+                return  # the next write is refused, and says so
+            except StoreError as error:  # the disk was full or busy for a moment; the lease may outlive it
+                _log.warning("the lease of %s was not renewed: %s", self.run_id, error)
+
     def __enter__(self) -> Self:
+        self._keeper.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        self._over.set()
+        self._keeper.join()
         self.release()
 
 
@@ -123,7 +146,8 @@ def held_runs(connection: Connection, clock: Clock) -> list[str]:
 
 
 def _is_live(row: Row[Any], now_utc_s: float) -> bool:
-    return now_utc_s < row.until_utc_s and not identity_of(row).is_surely_dead()
+    life = identity_of(row).life()
+    return life == "lives" or (life == "unknown" and now_utc_s < row.until_utc_s)
 
 
 def acquire(database: Database, clock: Clock, ids: Ids, *, run_id: str, holder: str, seconds: float) -> RunLease:
@@ -134,10 +158,12 @@ def acquire(database: Database, clock: Clock, ids: Ids, *, run_id: str, holder: 
         row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
         if row is not None:
             if _is_live(row, now):
+                here = row.host == socket.gethostname()
+                left_s = max(0.0, row.until_utc_s - now)
                 raise LeaseHeldError(
                     f"another process drives this run: {row.holder}",
                     where=f"process {row.pid} on {row.host}",
-                    remedy=f"Stop it, or wait {row.until_utc_s - now:.0f} s after it has stopped answering",
+                    remedy="End it" if here else f"End it, or wait {left_s:.0f} s after it has stopped answering",
                 )
             connection.execute(delete(leases).where(leases.c.run_id == run_id))
         identity = ProcessIdentity.of_this_process()

@@ -34,7 +34,7 @@ def bring_up_to_date(data_dir: Path, copy: Path) -> None:
         raise IntegrityError(
             "the copy of the log of signatures is not the beginning of the log: one of the two was changed",
             where=str(copy),
-            remedy="Keep both; see `orthocapture audit verify --signatures FILE`. Each data folder needs its own copy",
+            remedy="Keep both; see `orthocapture audit verify --signatures`. Each data folder needs its own copy",
         )
     try:
         with copy.open("r+b" if copy.exists() else "wb") as stream:

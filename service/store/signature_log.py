@@ -27,6 +27,7 @@ from service.store.checkpoints import key_fingerprint
 from service.store.events import canonical
 from service.store.keys import public_bytes
 from service.store.records import Checkpoint
+from service.store.seam import DurableFiles
 
 NAME = "signatures.jsonl"
 PURPOSE = "orthocapture signature log v1"  # so that no signature of this key can be taken for one of another kind
@@ -79,7 +80,7 @@ class SignatureLog:
         """Make the log before the first signature: from then on it is missed. Raises StoreError."""
         try:
             self.path.touch(exist_ok=True)
-            _sync_folder(self.path.parent)
+            DurableFiles().sync_directory(self.path.parent)
         except OSError as error:
             raise _unwritten(self.path, error) from error
 
@@ -163,14 +164,6 @@ def _add(path: Path, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) 
             previous = hashlib.sha256(raw).hexdigest()
         stream.flush()
         os.fsync(stream.fileno())
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def log_findings(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -26,7 +25,7 @@ from service.store.events import read_head
 from service.store.keys import KeyFolder, public_bytes
 from service.store.records import SITE, Checkpoint
 from service.store.seam import utc_text
-from service.store.signature_log import Line, SignatureLog
+from service.store.signature_log import SignatureLog
 from service.store.soundness import require_sound
 from service.store.store import Store
 from service.store.tables import runs
@@ -79,8 +78,8 @@ def checkpoint(store: Store, run_id: str) -> Checkpoint:
             entry = RunSigned(run=run_id, seq=signed.seq, sha256=signed.sha256)
             store.append_site(connection, [entry], actor=_ACTOR)
             _sign(store, connection, SITE, key)
-        unlogged = _unlogged(connection, lines)
-    log.add(unlogged, key)
+        every = read_every_checkpoint(connection)  # also those before whose lines a power cut came
+    log.add(every, key)
     return signed
 
 
@@ -100,8 +99,7 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
     folder = KeyFolder(store.database_path.parent)
     log = _log_of(store)
     with store.database.writing() as connection:
-        lines = log.lines()
-        require_sound(store, connection, SITE, lines)
+        require_sound(store, connection, SITE, log.lines())
         if lost:
             _require_lost(connection, folder)
         old = None if lost else _present_key(store, connection)
@@ -111,8 +109,8 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
         new = folder.make()
         _record_key(store, connection, new, previous=changes[-1][1]["key_id"], reason=reason, actor=actor)
         _sign(store, connection, SITE, old or new)
-        unlogged = _unlogged(connection, lines)
-    log.add(unlogged, old or new)
+        every = read_every_checkpoint(connection)
+    log.add(every, old or new)
     with store.database.writing() as connection:  # again under the lock: nobody else makes a key meanwhile
         folder.destroy_all_but(read_key_changes(connection)[-1][1]["key_id"])
     return public_keys(store)[-1]
@@ -145,13 +143,6 @@ def public_keys(store: Store) -> list[PublicKey]:
 
 def _log_of(store: Store) -> SignatureLog:
     return SignatureLog(store.database_path.parent)
-
-
-def _unlogged(connection: Connection, lines: Sequence[Line] | None) -> list[Checkpoint]:
-    """Signatures that the log does not hold: the new ones, and those before which a power cut came."""
-    held = {(line.checkpoint.run_id, line.checkpoint.seq) for line in lines or () if line.checkpoint is not None}
-    every = read_every_checkpoint(connection)
-    return [item for item in every if (item.run_id, item.seq) not in held]
 
 
 def _require_run(connection: Connection, run_id: str, store: Store) -> None:

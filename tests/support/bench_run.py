@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -73,6 +74,7 @@ class Bench:
     authority: Authority | None = None
     signature_copy: Path | None = None
     ahead_s: float = 0.0  # how far the runner's clock is put forward
+    on_wait: Callable[[float], None] = lambda _seconds: None
 
     def run(self) -> RunState:
         """A runner process's life."""
@@ -86,8 +88,12 @@ class Bench:
             self.authority,
             self.signature_copy,
             monotonic_s=lambda: time.monotonic() + self.ahead_s,
-            wait=lambda s: time.sleep(min(s, 0.002)),
+            wait=self._wait,
         ).run()
+
+    def _wait(self, seconds: float) -> None:
+        self.on_wait(seconds)
+        time.sleep(min(seconds, 0.002))
 
     def act(self, verb: str, **fields: object) -> None:
         """What another terminal appends."""

@@ -220,6 +220,10 @@ class Screen:
         self.page.get_by_role("button", name="Sign in").click()
         expect(self.page.get_by_role("button", name="Sign out")).to_be_visible()
 
+    def words(self) -> str:
+        """What the page says."""
+        return self.page.locator("body").inner_text()
+
     def hold(self, name: str, seconds: float = 1.8) -> None:
         """Press a button of that name and keep it pressed."""
         button = self.page.get_by_role("button", name=name)

@@ -1,0 +1,70 @@
+"""A device is driven by one process of this machine at a time, whatever data folder and rig file it was named in."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+from typing import Self
+
+from drivers.errors import DeviceUnavailableError
+
+_PLACES = (Path("/run/lock"), Path(tempfile.gettempdir()))
+_NETWORK = Path("/proc/self/ns/net")
+
+
+class DeviceLock:
+    """The sole right to a device. The system lets go of it when the process ends, however it ends."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    @classmethod
+    def take(cls, address: str, name: str) -> Self:
+        """Take it.
+
+        Args:
+            address: what tells the device from every other: its driver and where it is connected.
+            name: the device's name in the rig file, for messages.
+
+        Raises:
+            DeviceUnavailableError: another process drives it.
+        """
+        path = _folder() / f"{hashlib.sha256(f'{_network()} {address}'.encode()).hexdigest()[:32]}.lock"
+        # Never deleted: a process that has just opened a deleted file would have a lock of its own.
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.pread(descriptor, 100, 0).decode(errors="replace").strip() or "unknown"
+            os.close(descriptor)
+            raise DeviceUnavailableError(
+                f"another process drives this device ({address}): process {holder}",
+                where=name,
+                remedy="End the run or the command that uses it; see `orthocapture status`",
+            ) from error
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+        return cls(descriptor)
+
+    def release(self) -> None:
+        """Let the next process in; releasing twice does nothing."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def _folder() -> Path:
+    place = next((place for place in _PLACES if place.is_dir() and os.access(place, os.W_OK)), _PLACES[-1])
+    folder = place / "orthocapture"
+    folder.mkdir(exist_ok=True)
+    if folder.stat().st_uid == os.getuid():
+        folder.chmod(0o1777)  # every user of the machine
+    return folder
+
+
+def _network() -> str:
+    """An address names a device within one network namespace."""
+    return os.readlink(_NETWORK) if _NETWORK.exists() else ""
