@@ -10,7 +10,9 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from drivers.host import HostedDevice
 from drivers.interfaces import Camera, Device, Lightbox
@@ -25,7 +27,7 @@ from service.station import Station
 from service.steps import params_models
 from service.store.store import Store
 from tests.support.arm_watch import ArmWatch, watched_arm
-from tests.support.bench_rig import BenchCamera, ScriptedOperator, answer
+from tests.support.bench_rig import BenchCamera, ScriptedOperator, answer, numbered
 from tests.support.ur_rtde_protocol import RtdeClient
 from tests.support.ur_simulator import address, simulated_ur
 from tests.support.waiting import until
@@ -66,6 +68,12 @@ steps:
 VIEWS = ["v001", "v002", "v003"]
 
 
+def slowly(number: int) -> NDArray[np.uint8]:
+    """A picture that takes as long as a real one: samples of the arm arrive meanwhile."""
+    time.sleep(0.5)
+    return numbered(number)
+
+
 class OneArm(Station):
     """A station whose camera is in memory; its arm is the real driver's."""
 
@@ -73,7 +81,7 @@ class OneArm(Station):
         path = folder / "rig.yaml"
         path.write_text(RIG.format(host=host))
         super().__init__(load_rig(path))
-        self.shutter = BenchCamera()
+        self.shutter = BenchCamera(picture=slowly)
         self.shutter.open()
 
     def camera(self) -> Camera:
