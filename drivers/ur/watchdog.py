@@ -21,6 +21,7 @@ from drivers.ur.stream import driven
 
 LATE = 0.8  # of the watchdog's time: a longer gap between two kicks explains that it ended the program
 LAPSE_S = 2.0  # longest gap that counts as a busy machine, where the arm stood
+NEWS_S = 1.0  # after a gap, for what the controller did meanwhile to arrive here
 
 _LOG = logging.getLogger(__name__)
 
@@ -40,7 +41,8 @@ class Watchdog:
         self._newest = newest
         self._control: library.Control | None = None
         self._beaten = threading.Event()
-        self._beat_s = self._kicked_s = self._attended_s = -float("inf")
+        self._beat_s = self._kicked_s = self._attended_s = self._gap_end_s = -float("inf")
+        self._gap_s = 0.0  # the newest one that was too long, and when it ended
         self._moving = False
         self._left_alone = self._lapsed = False
         threading.Thread(target=self._run, name="ur watchdog", daemon=True).start()
@@ -58,7 +60,7 @@ class Watchdog:
         """
         with self._commands:
             yield
-            self._kicked_s = time.monotonic()
+            self._note_kick()
 
     def guard(self, control: library.Control) -> None:
         """Watch the control script that runs now, unless it is watched already. Raises the vendor's errors."""
@@ -67,7 +69,7 @@ class Watchdog:
                 return
             if not control.setWatchdog(1.0 / self._watchdog_s):
                 raise RuntimeError("the control script did not take its watchdog")
-            self._kicked_s = time.monotonic()
+            self._kicked_s, self._gap_s = time.monotonic(), 0.0
             self._control = control
             self._lapsed = False
 
@@ -83,7 +85,7 @@ class Watchdog:
             control = self._control
             if control is None or control.isProgramRunning():
                 return
-            if time.monotonic() - self._kicked_s > LATE * self._watchdog_s:
+            if self._unkicked_s() > LATE * self._watchdog_s:
                 self.look()
             self.release()
 
@@ -111,7 +113,7 @@ class Watchdog:
             control = self._control
             if control is None or control.isProgramRunning():
                 return
-            late_s = time.monotonic() - self._kicked_s
+            late_s = self._unkicked_s()
             self._control = None
             late = late_s > LATE * self._watchdog_s
             if not self._moving and late and late_s < LAPSE_S:
@@ -159,4 +161,15 @@ class Watchdog:
         unattended_s = now_s - self._attended_s
         self._left_alone = self._moving and driven(sample) and unattended_s > self._unattended_s
         if not self._left_alone and control.kickWatchdog():
-            self._kicked_s = time.monotonic()
+            self._note_kick()
+
+    def _note_kick(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._kicked_s > LATE * self._watchdog_s:
+            self._gap_s, self._gap_end_s = now_s - self._kicked_s, now_s
+        self._kicked_s = now_s
+
+    def _unkicked_s(self) -> float:
+        """How long there was no kick; also before the newest one, when its effect may not be known here yet."""
+        now_s = time.monotonic()
+        return max(now_s - self._kicked_s, self._gap_s if now_s - self._gap_end_s < NEWS_S else 0.0)
