@@ -33,8 +33,7 @@ class DeviceLock:
             DeviceUnavailableError: another process drives it.
         """
         path = _folder() / f"{hashlib.sha256(f'{_network()} {address}'.encode()).hexdigest()[:32]}.lock"
-        # Never deleted: a process that has just opened a deleted file would have a lock of its own.
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        descriptor = _open(path)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -63,6 +62,20 @@ def _folder() -> Path:
     if folder.stat().st_uid == os.getuid():
         folder.chmod(0o1777)  # every user of the machine
     return folder
+
+
+def _open(path: Path) -> int:
+    """A descriptor of the file, which every user of the machine may lock.
+
+    It is never deleted: a process that has just opened a deleted file would have a lock of its own.
+    """
+    flags = os.O_RDWR | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL)
+    except FileExistsError:
+        return os.open(path, flags)  # without O_CREAT, which Linux refuses for another user's file in such a folder
+    os.fchmod(descriptor, 0o666)
+    return descriptor
 
 
 def _network() -> str:

@@ -45,6 +45,10 @@ class SafetyStopError(DeviceError):
     """Protective, emergency or safeguard stop: only a person clears it."""
 
 
+class LeaveNeededError(DeviceError):
+    """Nobody has let the arm move since it was connected, or since its program ended unasked: a person confirms."""
+
+
 class UnreachablePoseError(DeviceError):
     """The controller has no joint solution for this pose."""
 

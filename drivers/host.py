@@ -23,8 +23,9 @@ from typing import Any, TypeVar, cast
 from pydantic import BaseModel
 
 from drivers.errors import DeviceError, DeviceFaultError, DeviceTimeoutError, DeviceUnavailableError
+from drivers.heartbeat import BEAT, Line
 from drivers.interfaces import Device, DeviceIdentity
-from drivers.plugin import DriverSpec
+from drivers.plugin import DriverSpec, NeedsHeartbeat
 from service.core.errors import ConfigurationError, OrthocaptureError
 
 T = TypeVar("T")
@@ -82,7 +83,7 @@ class _Child:
     """A running child process and the parent's end of everything that connects to it."""
 
     process: subprocess.Popen[str]
-    connection: Connection
+    line: Line
     log_reader: threading.Thread
 
 
@@ -172,7 +173,7 @@ class HostedDevice:
             raise self._unavailable()
         self._sequence += 1
         try:
-            child.connection.send((self._sequence, method, args, kwargs))
+            child.line.send((self._sequence, method, args, kwargs))
             ok, value = self._receive(child, timeout_s)
         except TimeoutError:
             child.process.kill()
@@ -194,9 +195,9 @@ class HostedDevice:
     def _receive(self, child: _Child, timeout_s: float) -> tuple[bool, Any]:
         deadline = time.monotonic() + timeout_s
         while True:
-            if not child.connection.poll(max(0.0, deadline - time.monotonic())):
+            if not child.line.poll(max(0.0, deadline - time.monotonic())):
                 raise TimeoutError
-            sequence, ok, value = cast("tuple[int, bool, Any]", child.connection.recv())
+            sequence, ok, value = cast("tuple[int, bool, Any]", child.line.receive())
             if sequence == self._sequence:  # anything older answers a call that was interrupted by the keyboard
                 return ok, value
 
@@ -224,11 +225,12 @@ class HostedDevice:
         theirs.close()
         reader = threading.Thread(target=_log_output, args=(process, self._name), daemon=True)
         reader.start()
-        self._child = _Child(process, Connection(ours.detach()), reader)
+        self._child = _Child(process, Line(Connection(ours.detach())), reader)
         self._suspect = False
         start = (self._spec_path, self._config_json, self._call_timeout_s)
         try:
-            self._exchange("start", start, {}, START_TIMEOUT_S)
+            if self._exchange("start", start, {}, START_TIMEOUT_S):
+                self._child.line.begin()
         except OrthocaptureError:
             self._bury()
             raise
@@ -240,7 +242,7 @@ class HostedDevice:
         child, self._child = self._child, None
         if child is None:
             return
-        child.connection.close()  # the child exits at the end of its connection
+        child.line.close()  # the child exits at the end of its connection
         try:
             status = child.process.wait(CLOSE_TIMEOUT_S)
         except subprocess.TimeoutExpired:
@@ -313,7 +315,11 @@ class _Server:
     def _read(self) -> None:
         try:
             while True:
-                self._requests.put(self._connection.recv())
+                request = cast("tuple[int, str, tuple[Any, ...], dict[str, Any]]", self._connection.recv())
+                if request[1] != BEAT:
+                    self._requests.put(request)
+                elif isinstance(self._device, NeedsHeartbeat):
+                    self._device.heartbeat(*request[2])
         except (EOFError, OSError):
             self._requests.put(None)
         time.sleep(CLOSE_TIMEOUT_S)
@@ -339,7 +345,7 @@ class _Server:
             spec_path, config_json, self._call_timeout_s = cast("tuple[str, str, float]", args)
             spec = load_spec(spec_path)
             self._device = spec.build(spec.config.model_validate_json(config_json))
-            return None
+            return isinstance(self._device, NeedsHeartbeat)
         return getattr(self._device, method)(*args, **kwargs)
 
 

@@ -138,7 +138,21 @@ class SettleReport:
 
 
 class RobotArm(Device, Protocol):
-    """A six- or seven-axis arm. Motion is asynchronous so that `stop` always works."""
+    """A six- or seven-axis arm. Motion is asynchronous so that `stop` always works, and needs a person's leave."""
+
+    def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
+        """Let the arm move, because this person has looked and confirmed; stops that are over are forgotten.
+
+        Without it nothing moves: since `open`, since a stop seen anywhere in the stream, since the controller's
+        program ended unasked. Whoever calls this has the confirmation on record; no program gives it to itself.
+
+        Args:
+            confirmed_by: name of the person.
+            not_before_monotonic_s: host time.monotonic() at which the confirmation was not given yet.
+
+        Raises SafetyStopError or LeaveNeededError for what happened, or still went on, after that time.
+        """
+        ...
 
     def configure(self, payload: Payload, T_flange_tcp: Transform) -> None:
         """Set payload and tool centre point and read them back."""
@@ -157,7 +171,11 @@ class RobotArm(Device, Protocol):
         ...
 
     def move_joints(self, target_rad: Array, *, speed_rad_s: float, acceleration_rad_s2: float) -> None:
-        """Start a joint motion and return at once. Raises SafetyStopError when a stop is active."""
+        """Start a joint motion and return at once.
+
+        Raises SafetyStopError when a stop is active or nobody has confirmed since one, LeaveNeededError when nobody
+        has let the arm move.
+        """
         ...
 
     def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
@@ -169,7 +187,7 @@ class RobotArm(Device, Protocol):
         ...
 
     def is_moving(self) -> bool:
-        """Whether the last motion is still under way."""
+        """Whether the last motion is still under way. Raises what has cut it short, for then it did not arrive."""
         ...
 
     def settle(self, criteria: SettleCriteria) -> SettleReport:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from pydantic import BaseModel, ConfigDict
 
@@ -20,6 +20,15 @@ class DriverConfig(BaseModel):
     def longest_call_s(self) -> float:
         """Time that one call may take by this configuration, where that may exceed the driver's usual time."""
         return 0.0
+
+
+@runtime_checkable
+class NeedsHeartbeat(Protocol):
+    """A hosted driver that must know at every moment that the program which uses it is alive."""
+
+    def heartbeat(self, sent_monotonic_s: float) -> None:
+        """A sign of life, sent at that host time; called in a thread of its own, and must return at once."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -39,13 +41,18 @@ def recorded_protocol(store: Store, root: RunStarted) -> Protocol:
 
 @dataclass
 class RunLog:
-    """The events of one run, kept up to date with the database, and their fold."""
+    """The events of one run, kept up to date with the database, and their fold.
+
+    `leave_not_before_s` is the host's time.monotonic() when the newest leave to move was not in the record yet.
+    """
 
     store: Store
     run_id: str
     protocol: Protocol
     events: list[Event] = field(default_factory=list[Event])
     state: RunState = field(init=False)
+    leave_not_before_s: float = field(init=False, default=-math.inf)
+    _looked_s: float = field(init=False, default=-math.inf)
 
     def __post_init__(self) -> None:
         self.state = fold(self.protocol, [])
@@ -53,9 +60,13 @@ class RunLog:
 
     def refresh(self) -> RunState:
         """Read what other processes (worker, command line, web) have appended meanwhile."""
+        leave, looked_s = self.state.leave, time.monotonic()
         for event in self.store.events(self.run_id, after_seq=len(self.events)):
             self.events.append(event)
             self.state = advance(self.protocol, self.state, event)
+        if self.state.leave != leave:
+            self.leave_not_before_s = self._looked_s
+        self._looked_s = looked_s
         return self.state
 
     def captures(self, step_id: str) -> tuple[View, ...]:

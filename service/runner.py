@@ -52,7 +52,7 @@ from service.core.run_state import RunState
 from service.evidence import RunLog, StepEvidence
 from service.monitor.snapshot import Doing
 from service.steps import step_kinds
-from service.steps.context import Devices, StepContext, StepInterruptedError, StepOutcome
+from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
 from service.store.leases import RunLease
 from service.store.signature_copy import keep_elsewhere
 from service.store.store import Store
@@ -283,6 +283,8 @@ class Runner:
             operator=self.operator.name,
             tell=self.operator.tell,
         )
+        if (leave := self._log.state.leave) is not None:
+            self.devices.let_move(LeaveToMove(leave.seq, leave.by, self._log.leave_not_before_s))
         try:
             checkpoint()
             outcome = kind.execute(context, step.params)

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from drivers.device_lock import DeviceLock
+from drivers.errors import DeviceUnavailableError
 from drivers.host import hosted
 from drivers.interfaces import (
     Camera,
@@ -28,7 +29,7 @@ from drivers.plugin import DriverConfig, DriverSpec
 from service.core.errors import ConfigurationError
 from service.core.imported import ImportList
 from service.rig import CollisionSection, LensSection, OpticsSection, Rig
-from service.steps.context import StationLayout
+from service.steps.context import LeaveToMove, StationLayout
 
 GROUP = "orthocapture.drivers"
 INTERFACES: Mapping[str, type[Any]] = {
@@ -58,6 +59,8 @@ class Station:
         self._open: dict[str, Device] = {}
         self._locks: dict[str, DeviceLock] = {}
         self._on_open: Callable[[str, DeviceReport], None] | None = None
+        self._leave: LeaveToMove | None = None
+        self._told: dict[str, int] = {}  # arm → seq of the leave that it was given last
 
     def names(self) -> tuple[str, ...]:
         """Devices of the rig file, in its order."""
@@ -108,7 +111,20 @@ class Station:
 
     def robot(self, station: str) -> RobotArm:
         """The arm that stands at a station."""
-        return cast(RobotArm, self.device(self.layout(station).robot))
+        name, leave = self.layout(station).robot, self._leave
+        arm = cast(RobotArm, self.device(name))
+        if leave is not None and self._told.get(name) != leave.seq:
+            try:
+                arm.let_move(leave.by, leave.not_before_monotonic_s)
+            except DeviceUnavailableError:  # its link died while it had no leave of this person
+                self.reopen(arm)
+                arm.let_move(leave.by, leave.not_before_monotonic_s)
+            self._told[name] = leave.seq
+        return arm
+
+    def let_move(self, leave: LeaveToMove) -> None:
+        """See service.steps.context.Devices. What opens an arm anew never renews a leave that it had."""
+        self._leave = leave
 
     def camera(self) -> Camera:
         """The only camera of the rig."""

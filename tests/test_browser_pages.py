@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import re
+import threading
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from fastapi.routing import iter_route_contexts
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from service.core.model import OperatorAction
 from service.people.roles import Role
@@ -321,6 +322,35 @@ def test_a_checklist_is_worked_through_without_script(desk: Desk) -> None:
         expect(page.get_by_role("button", name="Sign in")).to_be_visible()
         page.goto(address)
         expect(page.get_by_role("button", name="Sign in")).to_be_visible()
+
+
+def test_a_page_that_cannot_fetch_the_news_says_so_and_goes_on_trying(desk: Desk) -> None:
+    """A run that waits for a person tells nothing more: what a page misses once it would never show."""
+    asked: list[Route] = []
+    repaired = threading.Event()
+
+    def answer(route: Route) -> None:
+        asked.append(route)
+        if repaired.is_set():
+            route.continue_()
+        elif len(asked) > 1:  # the first is never answered
+            route.fulfill(status=503)
+
+    fields = dict(STANDING)
+    run = desk.site.moving
+    with screen(desk.browser, desk.server.url) as shown, attended(desk.server.data, {run: fields}):
+        shown.sign_in(ACCOUNTS["auditor"], password_of(ACCOUNTS["auditor"]))
+        shown.go(f"/runs/{run}")
+        banner = shown.page.locator("#robot-banner")
+        expect(banner).to_contain_text(re.compile("stands", re.IGNORECASE))
+        shown.page.wait_for_timeout(1_000)  # for the page's own first look
+        shown.page.route("**/parts/**", answer)
+        fields.update(WORKING)
+        lost = shown.page.get_by_text("Connection lost")
+        expect(lost).to_be_visible(timeout=40_000)
+        repaired.set()
+        expect(lost).to_be_hidden(timeout=20_000)
+        expect(banner).to_contain_text(re.compile("moves", re.IGNORECASE))
 
 
 def actions(desk: Desk, run_id: str) -> list[str]:

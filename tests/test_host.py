@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import psutil
 import pytest
 
+from drivers import heartbeat
 from drivers.errors import DeviceFaultError, DeviceTimeoutError, DeviceUnavailableError, SafetyStopError
 from drivers.host import HostedDevice, hosted
 from service.core.errors import ConfigurationError
@@ -98,6 +100,57 @@ def test_heartbeat_finds_a_child_that_died_between_calls(caplog: pytest.LogCaptu
     until(
         lambda: any("SIGSEGV" in r.message for r in caplog.records if r.levelno == logging.ERROR), "it is logged", 10
     )
+    device.close()
+
+
+def test_the_child_is_told_that_its_parent_lives_during_long_calls_too(fake: Fake) -> None:
+    fake.beats()
+    fake.hang(1.0)
+    time.sleep(1.0)
+    beats = fake.beats()
+    assert len(beats) > 10
+    assert all(0.0 <= arrived_s - sent_s < 1.0 for sent_s, arrived_s in beats)
+    gaps = np.diff([sent_s for sent_s, _ in beats])
+    assert np.all(gaps > 0)
+    assert np.median(gaps) < 0.1
+
+
+def test_no_beat_while_the_parent_stands_still() -> None:
+    program = (
+        "import sys, time\n"
+        "from drivers.host import hosted\n"
+        "from tests.support.host_fake_driver import Fake, FakeConfig\n"
+        f"d = hosted(Fake, {SPEC!r}, FakeConfig(), call_timeout_s=20, name='watched')\n"
+        "d.open()\n"
+        "print('open', flush=True)\n"
+        "sys.stdin.readline()\n"
+        "arrived = [at for _, at in d.beats()]\n"
+        "print(max(b - a for a, b in zip(arrived, arrived[1:])), flush=True)\n"
+        "d.close()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdin is not None
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "open\n"
+        time.sleep(0.3)
+        parent.send_signal(signal.SIGSTOP)
+        time.sleep(2.0)
+        parent.send_signal(signal.SIGCONT)
+        parent.stdin.write("\n")
+        parent.stdin.flush()
+        assert float(parent.stdout.readline()) > 1.5
+
+
+def test_a_child_that_does_not_read_holds_its_parent_up_for_no_beat(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(heartbeat, "BEAT_S", 0.001)
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=20.0, name="stopped")
+    pid = int(device.open().serial)
+    os.kill(pid, signal.SIGSTOP)
+    time.sleep(2.0)  # for more beats than a socket holds
+    threading.Timer(1.0, lambda: os.kill(pid, signal.SIGCONT)).start()
+    np.testing.assert_array_equal(device.double(np.ones(1)), [2])
     device.close()
 
 

@@ -9,6 +9,7 @@ import pytest
 from service.core.decide import AskOperator, Retry, RunStep, check_action
 from service.core.errors import IllegalTransitionError
 from service.core.model import OperatorAction, SessionStarted, StepFailed, StepStarted
+from service.core.recovery import recovery_policy
 from tests.support.core import TOY, Log, captured, toy_protocol
 
 CHECKED = TOY.replace("    title: Capture\n", "    title: Capture\n    checklist: [nobody in reach]\n")
@@ -90,6 +91,33 @@ def test_who_resumes_a_paused_run_has_let_it_go_on() -> None:
     restart(log)
     log.act("resume", actor="Grace")
     assert log.decision == RunStep("capture", 1, begin=False)
+
+
+def test_each_confirmation_and_resumption_is_a_leave_of_its_own_and_a_restart_ends_it() -> None:
+    log = confirmed()
+    first = log.state.leave
+    assert first is not None
+    log.append(StepStarted(step="capture", attempt=1))
+    log.act("pause")
+    assert log.state.leave == first
+    log.act("resume", actor="Grace")
+    second = log.state.leave
+    assert second is not None
+    assert (second.by, second.seq > first.seq) == ("Grace", True)
+    restart(log)
+    assert log.state.leave is None
+
+
+def test_an_action_that_is_refused_is_no_leave() -> None:
+    log = at_the_capture(CHECKED)
+    log.act("confirm", step="capture")
+    assert log.state.leave is None, "the item is not ticked"
+
+
+@pytest.mark.parametrize("error", ["SafetyStopError", "LeaveNeededError"])
+def test_what_took_the_leave_is_never_tried_again_without_a_person(error: str) -> None:
+    recovery = toy_protocol(TOY).step("capture").recovery.model_copy(update={"retries": 3, "on_failure": "abort"})
+    assert recovery_policy(recovery, error, 1) == "ask"
 
 
 def test_a_step_that_moves_nothing_goes_on_by_itself() -> None:

@@ -98,12 +98,36 @@ def test_a_wrong_rig_file_says_where(tmp_path: Path, old: str, new: str, words: 
 
 
 HOLDER = """
-import sys, time
+import os, time
 from drivers.device_lock import DeviceLock
+os.umask(0o077)
 lock = DeviceLock.take("ur 127.0.0.9", "arm")
 print("held", flush=True)
 time.sleep(100)
 """
+
+
+ANOTHER_USER = """
+import os
+from drivers.device_lock import DeviceLock
+from drivers.errors import DeviceUnavailableError
+if os.getuid() == 0:
+    os.setuid(65534)
+try:
+    DeviceLock.take("ur 127.0.0.9", "arm")
+except DeviceUnavailableError as error:
+    print(error)
+"""
+
+
+def test_a_user_of_the_machine_is_told_that_another_user_drives_the_arm() -> None:
+    with subprocess.Popen([sys.executable, "-c", HOLDER], cwd=ROOT, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        other = [sys.executable, "-c", ANOTHER_USER]
+        told = subprocess.run(other, cwd=ROOT, capture_output=True, text=True, timeout=60, check=True).stdout
+        assert f"another process drives this device (ur 127.0.0.9): process {holder.pid}" in told
+        holder.kill()
 
 
 def test_an_arm_is_driven_by_one_process_whatever_rig_file_names_it(tmp_path: Path) -> None:

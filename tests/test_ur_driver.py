@@ -17,6 +17,7 @@ from drivers.errors import (
     DeviceError,
     DeviceRefusedError,
     DeviceUnavailableError,
+    LeaveNeededError,
     SafetyStopError,
     UnreachablePoseError,
 )
@@ -25,6 +26,8 @@ from drivers.interfaces import Array, Payload, RobotArm, RobotSample, SafetyStat
 from drivers.ur import UrConfig
 from drivers.ur.stream import judge, ringing_s, safety_state
 from service.core.geometry import inverse, rotation_angle_rad, transform
+from tests.support.arm_watch import watched_arm
+from tests.support.ur_rtde_protocol import RtdeClient
 from tests.support.ur_simulator import address, simulated_ur
 from tests.support.waiting import until
 
@@ -36,12 +39,18 @@ PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
 
 @contextlib.contextmanager
 def opened(host: str, **config: float) -> Generator[RobotArm]:
+    config = {"watchdog_s": 1.0, **config}  # these tests share their machine; tests/test_watchdog.py tests the usual
     arm = hosted(RobotArm, "drivers.ur:DRIVER", UrConfig(host=host, **config), call_timeout_s=30, name="robot")
     try:
         arm.open()
+        let_move(arm)
         yield arm
     finally:
         arm.close()
+
+
+def let_move(arm: RobotArm) -> None:
+    arm.let_move("Ada", time.monotonic())
 
 
 @pytest.fixture(scope="module")
@@ -214,10 +223,77 @@ def test_protective_stop_is_surfaced_and_cleared_by_a_person_only() -> None:
                 "Protective stop rel"
             )
 
+        with pytest.raises(SafetyStopError):
+            let_move(arm)
         wait_for(unlocked)
         wait_for(lambda: arm.state().sample.safety is SafetyState.NORMAL)
-        move(arm, turned(arm, 0.1))
-        wait_for(lambda: not arm.is_moving())
+        with pytest.raises(SafetyStopError, match="nobody has confirmed since"):
+            move(arm, turned(arm, 0.1))
+        let_move(arm)
+        travel(arm, turned(arm, 0.1))
+
+
+def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten() -> None:
+    host = address(62)
+    # The plan sets the stop off at a message that only this test sends: nobody asks the arm anything meanwhile.
+    with faulty(62, {"on": "rtde_P", "kind": "protective_stop"}), opened(host) as arm, watched_arm(host) as watch:
+        travel(arm, turned(arm, 0.1))
+        client = RtdeClient(host)
+        client.pause()
+        client.close()
+        begin = time.monotonic()
+
+        def unlocked() -> bool:
+            return dashboard(host, "unlock protective stop")[0].startswith("Protective stop rel")
+
+        wait_for(unlocked)
+        over = time.monotonic()
+        assert over - begin > 1.0, "a person took a while"
+        time.sleep(0.1)
+        assert arm.state().sample.safety is SafetyState.NORMAL
+        assert not arm.is_moving(), "nothing was cut short"
+        since = watch.mark()
+        for _ in range(3):
+            with pytest.raises(SafetyStopError, match=r"was in protective stop .* nobody has confirmed since"):
+                move(arm, turned(arm, 0.1))
+        assert any("nobody has confirmed since" in problem for problem in arm.report().problems)
+        with pytest.raises(SafetyStopError, match="nobody has confirmed since"):
+            arm.let_move("Ada", begin)  # she confirmed before it was over
+        time.sleep(0.5)
+        assert watch.moved_for_s(since) == 0.0
+        assert not watch.now.program_runs, "nothing is sent anew either"
+        arm.let_move("Ada", over + 0.05)
+        travel(arm, turned(arm, 0.1))
+        assert watch.moved_for_s(since) > 0.0
+
+
+def test_a_motion_ended_at_the_controller_did_not_arrive_and_waits_for_a_person() -> None:
+    host = address(63)
+    with simulated_ur(host), opened(host) as arm, watched_arm(host) as watch:
+        move(arm, turned(arm, 2.0))
+        watch.wait_moving(0.5)
+        dashboard(host, "stop")
+        with pytest.raises(LeaveNeededError, match="ended at the controller"):
+            wait_for(lambda: not arm.is_moving())
+        since = watch.mark()
+        with pytest.raises(LeaveNeededError, match="ended at the controller"):
+            move(arm, turned(arm, 0.1))
+        assert watch.moved_for_s(since) == 0.0
+        let_move(arm)
+        travel(arm, turned(arm, 0.1))
+
+
+def test_what_was_connected_anew_is_let_move_anew() -> None:
+    with simulated_ur(address(64), "--speed-up", SPEED_UP), opened(address(64)) as arm:
+        travel(arm, turned(arm, 0.1))
+        arm.open()
+        arm.configure(PAYLOAD, T_FLANGE_TCP)
+        sample = arm.state().sample
+        arm.solve_ik(sample.T_base_flange, sample.joints_rad)
+        with pytest.raises(LeaveNeededError, match="nobody has let the arm move since it was connected"):
+            move(arm, turned(arm, 0.1))
+        let_move(arm)
+        travel(arm, turned(arm, 0.1))
 
 
 def test_emergency_stop() -> None:
@@ -234,8 +310,10 @@ def test_emergency_stop() -> None:
             move(arm, turned(arm, 0.1))
         dashboard(host, "brake release")
         wait_for(lambda: arm.state().robot_mode == "RUNNING")
-        move(arm, turned(arm, 0.1))
-        wait_for(lambda: not arm.is_moving())
+        with pytest.raises(SafetyStopError, match=r"emergency stop .* nobody has confirmed since"):
+            move(arm, turned(arm, 0.1))
+        let_move(arm)
+        travel(arm, turned(arm, 0.1))
 
 
 def test_refused_motion_is_an_error_and_the_next_one_works() -> None:
@@ -258,8 +336,8 @@ def test_reconnect_after_the_controller_restarted() -> None:
             arm.open()
         with simulated_ur(host, "--speed-up", SPEED_UP):
             arm.open()
-            move(arm, turned(arm, 0.1))
-            wait_for(lambda: not arm.is_moving())
+            let_move(arm)
+            travel(arm, turned(arm, 0.1))
             arm.close()
 
 
@@ -269,8 +347,8 @@ def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
         with pytest.raises(DeviceUnavailableError):
             travel(arm, turned(arm, 0.5))
         arm.open()
-        move(arm, turned(arm, 0.1))
-        wait_for(lambda: not arm.is_moving())
+        let_move(arm)
+        travel(arm, turned(arm, 0.1))
 
 
 def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() -> None:
@@ -279,6 +357,7 @@ def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() ->
         with pytest.raises(DeviceUnavailableError, match="no new sample"):
             travel(arm, turned(arm, 0.1))
         arm.open()
+        let_move(arm)
         travel(arm, turned(arm, 0.1))
 
 

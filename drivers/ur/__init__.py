@@ -24,6 +24,17 @@ class UrConfig(DriverConfig):
         default=1.0, gt=0, description="age of the newest sample beyond which the link is dead"
     )
     stop_deceleration_rad_s2: float = Field(default=2.0, gt=0)
+    watchdog_s: float = Field(
+        default=0.2,
+        ge=0.1,
+        le=1.0,
+        description="without a sign of life of the program that drives the arm for so long, its controller stops it",
+    )
+    unattended_s: float = Field(
+        default=5.0,
+        gt=0,
+        description="the same where that program lives but does not look at the moving arm (it may store an image)",
+    )
 
 
 _LIBRARY = ("dashboard_client", "rtde_control", "rtde_io", "rtde_receive")

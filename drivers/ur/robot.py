@@ -7,7 +7,7 @@ import dataclasses
 import importlib.metadata
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import TypeVar
 
 import numpy as np
@@ -34,8 +34,11 @@ from drivers.interfaces import (
 )
 from drivers.ur import UrConfig
 from drivers.ur import vendor as library
+from drivers.ur.latch import Latch
 from drivers.ur.link import VENDOR_ERRORS, ControllerFacts, connect_dashboard, probe, read_facts, vendor
+from drivers.ur.script import ControlScript, wait
 from drivers.ur.stream import STREAM_HZ, PoseStream, driven, judge, ringing_s, safety_state
+from drivers.ur.watchdog import Watchdog
 from service.core.geometry import from_rotation_vector, inverse, to_rotation_vector
 
 DRIVER_VERSION = "1"
@@ -65,7 +68,6 @@ VARIABLES = (
     "actual_digital_output_bits",
 )
 READ_BACK_S = 1.0
-SCRIPT_START_S = 5.0
 TOOL_CHANGE_S = 0.05  # of the controller's clock, for a new tool to show in the stream
 LONGEST_RINGING_S = 10.0  # after a motion; how far back its end is looked for
 MOTION_START_S = 0.06  # for the target velocity to show in the stream
@@ -75,7 +77,7 @@ T = TypeVar("T")
 
 
 class UrRobot:
-    """One arm. Motions are asynchronous: only so can `stop` interrupt them."""
+    """One arm. Motions are asynchronous: only so can `stop` interrupt them and the watchdog be kicked meanwhile."""
 
     def __init__(self, config: UrConfig) -> None:
         self._config = config
@@ -84,17 +86,24 @@ class UrRobot:
         self._dashboard: library.Dashboard | None = None
         self._receive: library.Receive | None = None
         self._io: library.InputOutput | None = None
-        self._control: library.Control | None = None
-        self._abandoned: list[library.Control] = []  # kept from their destructors
         self._stream: PoseStream | None = None
         self._T_flange_tcp: Transform = np.eye(4)
         self._controller_time_s = -1.0
         self._motion_started_s = -np.inf
+        self._latch = Latch(config.host)
+        self._watchdog = Watchdog(
+            self._latch,
+            watchdog_s=config.watchdog_s,
+            unattended_s=config.unattended_s,
+            newest=self._newest,
+        )
+        self._script = ControlScript(config, self._latch, self._watchdog)
+        self._tool_read = 0  # the sending of the script after which the tool was read
 
     # --- device ------------------------------------------------------------------------------------------
 
     def open(self) -> DeviceIdentity:
-        """Connect; in a safety stop the arm can be watched but not moved until a person has cleared it."""
+        """Connect; the arm can be watched, but moves after `let_move`, and never in a safety stop."""
         self.close()
         probe(self._config.host, self._config.connect_timeout_s)
         self._dashboard = dashboard = connect_dashboard(self._config.host)
@@ -114,25 +123,30 @@ class UrRobot:
         )
         with vendor(self._where, "connecting the input/output interface"):
             self._io = library.input_output(self._config.host)
-        if not self._obstacle():
-            self._connect_control()
+        if not (self._obstacle() or self._latch.stop):
+            self._perform("starting the control script", lambda _: None)  # which sends it and reads the tool
         return self._identity()
+
+    def heartbeat(self, sent_monotonic_s: float) -> None:
+        """See drivers.plugin.NeedsHeartbeat."""
+        self._watchdog.beat(sent_monotonic_s)
 
     def close(self) -> None:
         """End a motion that is under way, then the script and the connections; a dead link is no error."""
-        stream, self._stream = self._stream, None
-        control, self._control = self._control, None
+        self._latch.close()
+        stream = self._stream
         alive = stream is not None and stream.alive
+        if alive:
+            with contextlib.suppress(*VENDOR_ERRORS, DeviceError):
+                self._script.stop_motion(self._driven_next)
+        self._stream = None
         if stream is not None:
             stream.close()
-        if alive and control is not None:  # on a dead link these calls wait for ever, or crash
+        if alive:
             with contextlib.suppress(*VENDOR_ERRORS):
-                if control.isConnected() and control.isProgramRunning():
-                    control.stopJ(self._config.stop_deceleration_rad_s2)
-                    control.stopScript()
-                control.disconnect()
-        elif control is not None:
-            self._abandoned.append(control)
+                self._script.end()
+        else:
+            self._script.abandon()
         for client in (self._io, self._receive, self._dashboard):
             with contextlib.suppress(*VENDOR_ERRORS):
                 if client is not None and client.isConnected():
@@ -143,9 +157,9 @@ class UrRobot:
         """Versions, clock offset, and what keeps the arm from moving."""
         state = self.state()
         problems: list[str] = []
-        if obstacle := self._obstacle():
+        if obstacle := self._obstacle() or self._latch.stop:
             problems.append(str(obstacle))
-        elif self._control is None or not state.program_running:
+        elif not self._script.connected or not state.program_running:
             problems.append("The control script does not run. Reconnect")
         if state.speed_fraction < 1.0:
             problems.append(
@@ -174,16 +188,26 @@ class UrRobot:
 
     # --- arm -----------------------------------------------------------------------------------------------
 
+    def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
+        """See RobotArm."""
+        sample = self._streaming().next()
+        if not sample.safety.may_move:
+            raise self._safety_error(sample)
+        self._latch.let_move(confirmed_by, not_before_monotonic_s)
+        self._watchdog.arrive()
+
     def configure(self, payload: Payload, T_flange_tcp: Transform) -> None:
         """See RobotArm. DeviceRefusedError when not taken, DeviceFaultError when read back differently."""
-        control = self._ready()
         pose = to_rotation_vector(np.asarray(T_flange_tcp, dtype=np.float64))
-        with vendor(self._where, "setting payload and tool"):
+
+        def set_both(control: library.Control) -> None:
             if not control.setTcp(pose.tolist()):
                 raise self._refusal("the tool centre point was not taken")
             if not control.setPayload(payload.mass_kg, list(payload.centre_of_gravity_m)):
                 raise self._refusal(f"the payload of {payload.mass_kg:g} kg was not taken")
-        self._read_tool()
+            self._read_tool(control)
+
+        self._perform("setting payload and tool", set_both)
         # The stream runs behind the answer: poses of the former tool are still under way.
         settled_s = self._streaming().latest().controller_time_s + TOOL_CHANGE_S
         while self._streaming().next().controller_time_s < settled_s:
@@ -202,6 +226,7 @@ class UrRobot:
 
     def state(self) -> RobotState:
         """See RobotArm."""
+        self._watchdog.attend()
         sample = self._streaming().latest()
         receive = _opened(self._receive, self._where)
         with vendor(self._where, "reading the state"):
@@ -219,10 +244,10 @@ class UrRobot:
 
     def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
         """See RobotArm. Asks first whether there is a solution: an unreachable pose kills the control script."""
-        control = self._ready()
-        pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
         near = _joints(near_rad, self._where)
-        with vendor(self._where, "inverse kinematics"):
+
+        def ask(control: library.Control) -> list[float]:
+            pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
             if not control.getInverseKinematicsHasSolution(pose, near):
                 self._raise_unless_running(control)
                 x, y, z = T_base_flange[:3, 3]
@@ -233,47 +258,54 @@ class UrRobot:
                 )
             joints = control.getInverseKinematics(pose, near)
             if len(joints) != 6:
+                self._raise_unless_running(control)
                 raise DeviceFaultError("inverse kinematics returned no joints", where=self._where)
             if not control.isJointsWithinSafetyLimits(joints):
+                self._raise_unless_running(control)
                 raise UnreachablePoseError("the pose lies beyond the controller's safety limits", where=self._where)
-        return np.asarray(joints, dtype=np.float64)
+            return joints
+
+        return np.asarray(self._perform("inverse kinematics", ask), dtype=np.float64)
 
     def move_joints(self, target_rad: Array, *, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """See RobotArm."""
-        control = self._ready()
         target = _joints(target_rad, self._where)
-        self._begin("joint motion", lambda: control.moveJ(target, speed_rad_s, acceleration_rad_s2, True))
+        self._begin("joint motion", lambda control: control.moveJ(target, speed_rad_s, acceleration_rad_s2, True))
 
     def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
         """See RobotArm."""
-        control = self._ready()
-        pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
-        self._begin("linear motion", lambda: control.moveL(pose, speed_m_s, acceleration_m_s2, True))
+
+        def start(control: library.Control) -> bool:
+            pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
+            return control.moveL(pose, speed_m_s, acceleration_m_s2, True)
+
+        self._begin("linear motion", start)
 
     def stop(self) -> None:
         """See RobotArm. Returns when the arm stands; without a running script the dashboard stops the program."""
-        control = self._control
         with vendor(self._where, "stopping the motion"):
-            if control is not None and control.isConnected() and control.isProgramRunning():
-                control.stopJ(self._config.stop_deceleration_rad_s2)
-            else:
+            self._watchdog.look()
+            if not self._script.stop_motion(self._driven_next):
                 _opened(self._dashboard, self._where).stop()
 
     def is_moving(self) -> bool:
-        """See RobotArm. Raises SafetyStopError when a stop has ended the motion."""
+        """See RobotArm."""
+        self._watchdog.attend()
         if self._driven(self._streaming().latest()) or time.monotonic() - self._motion_started_s < MOTION_START_S:
             return True
-        control = self._control
-        with vendor(self._where, "asking for the motion's progress"):
-            if (
-                control is not None
-                and control.isProgramRunning()
-                and control.getAsyncOperationProgressEx().isAsyncOperationRunning()
-            ):
-                return True
+        if self._script.moves():
+            return True
         # On a link that has just died the newest sample is one from before the motion, and no program seems to
         # run: only a sample that arrives from now on proves that the arm is at rest.
-        return self._driven(self._streaming().next())
+        if self._driven(self._streaming().next()):
+            return True
+        if self._watchdog.moving:
+            with vendor(self._where, "asking for the program"):
+                self._watchdog.look()
+            if stop := self._latch.stop:
+                raise stop
+            self._watchdog.arrive()
+        return False
 
     def _driven(self, sample: RobotSample) -> bool:
         """Whether the controller drives the arm in this sample. Raises SafetyStopError when a stop has ended it."""
@@ -281,8 +313,12 @@ class UrRobot:
             raise self._safety_error(sample)
         return driven(sample)
 
+    def _driven_next(self) -> bool:
+        return driven(self._streaming().next())
+
     def settle(self, criteria: SettleCriteria) -> SettleReport:
         """See RobotArm."""
+        self._watchdog.attend()
         stream = self._streaming()
         now_s = stream.latest().monotonic_s
         report = judge(stream.between(now_s - criteria.window_s, now_s), criteria)
@@ -306,6 +342,10 @@ class UrRobot:
     def _streaming(self) -> PoseStream:
         return _opened(self._stream, self._where)
 
+    def _newest(self) -> RobotSample | None:
+        stream = self._stream  # another thread closes it
+        return stream.newest() if stream is not None else None
+
     def _read_sample(self) -> RobotSample | None:
         receive = self._receive
         if receive is None:
@@ -318,6 +358,7 @@ class UrRobot:
             sample = self._take(receive, before_s)
             if receive.getTimestamp() == before_s:
                 self._controller_time_s = before_s
+                self._latch.see(sample.safety, sample.monotonic_s)
                 return sample
         return None
 
@@ -351,52 +392,51 @@ class UrRobot:
         remedy = "A person must find and clear the cause and release the stop on the pendant; then try again"
         return SafetyStopError(f"the arm is in {name}", where=self._where, remedy=remedy)
 
-    def _ready(self) -> library.Control:
-        """The control interface with its script running. Raises what keeps the arm from moving."""
-        obstacle = self._obstacle()
-        if obstacle is not None:
-            raise obstacle
-        control = self._control
-        if control is None:
-            return self._connect_control()
-        with vendor(self._where, "starting the control script"):
-            if not control.isConnected():
-                raise DeviceUnavailableError("the control connection is lost", where=self._where, remedy="Reconnect")
-            if control.isProgramRunning():
-                return control
-            _LOG.info("%s: the control script had ended and is sent again", self._where)
-            control.reuploadScript()
-            self._wait(control.isProgramRunning, SCRIPT_START_S, "the control script to start")
-        self._read_tool()
-        return control
+    @contextlib.contextmanager
+    def _commanding(self, doing: str, hold: DeviceError | None) -> Generator[library.Control]:
+        with self._script.commanding(doing, hold) as control:
+            if self._tool_read != self._script.sent:
+                self._read_tool(control)
+            yield control
 
-    def _connect_control(self) -> library.Control:
-        with vendor(self._where, "starting the control script"):
-            self._control = control = library.control(self._config.host, STREAM_HZ)
-        self._read_tool()
-        return control
+    def _perform(self, doing: str, commands: Callable[[library.Control], T]) -> T:
+        """Give commands that move nothing; once more where the script lapsed meanwhile, as the watchdog says."""
+        try:
+            with self._commanding(doing, self._obstacle() or self._latch.stop) as control:
+                return commands(control)
+        except DeviceError:
+            with vendor(self._where, doing):
+                if not self._watchdog.lapsed():
+                    raise
+        with self._commanding(doing, self._obstacle() or self._latch.stop) as control:
+            return commands(control)
 
-    def _read_tool(self) -> None:
+    def _read_tool(self, control: library.Control) -> None:
         with vendor(self._where, "reading the tool centre point"):
-            pose = _opened(self._control, self._where).getTCPOffset()
+            pose = control.getTCPOffset()
         if len(pose) != 6:
+            self._raise_unless_running(control)
             raise DeviceFaultError("the tool centre point cannot be read back", where=self._where)
         self._T_flange_tcp = from_rotation_vector(np.array(pose))
+        self._tool_read = self._script.sent
 
-    def _begin(self, what: str, start: Callable[[], bool]) -> None:
-        self._motion_started_s = time.monotonic()
-        with vendor(self._where, f"starting the {what}"):
-            started = start()
-        if not started:
+    def _begin(self, what: str, start: Callable[[library.Control], bool]) -> None:
+        with self._commanding(f"starting the {what}", self._obstacle() or self._latch.hold) as control:
+            self._motion_started_s = time.monotonic()
+            self._watchdog.begin()
+            if start(control):
+                return
             self._motion_started_s = -np.inf
+            self._watchdog.arrive()
             raise self._refusal(f"the controller did not start the {what}")
 
     def _refusal(self, what: str) -> DeviceError:
         """The reason behind a call that just returned False: a lost link (raised), a stop, or a plain no."""
         self._streaming().next()
-        return self._obstacle() or DeviceRefusedError(
-            what, where=self._where, remedy="See the log of the pendant for the reason"
-        )
+        self._watchdog.excuse()
+        if stop := self._obstacle() or self._latch.stop:
+            return stop
+        return DeviceRefusedError(what, where=self._where, remedy="See the log of the pendant for the reason")
 
     def _raise_unless_running(self, control: library.Control) -> None:
         if not control.isProgramRunning():
@@ -405,18 +445,11 @@ class UrRobot:
     def _read_back(self, agrees: Callable[[], bool], what: str) -> None:
         with vendor(self._where, f"reading back the {what}"):
             try:
-                self._wait(agrees, READ_BACK_S, what)
+                wait(agrees, READ_BACK_S, what, self._where)
             except DeviceTimeoutError:
                 raise DeviceFaultError(
                     f"the {what} reads back differently from what was set", where=self._where
                 ) from None
-
-    def _wait(self, done: Callable[[], bool], timeout_s: float, what: str) -> None:
-        deadline = time.monotonic() + timeout_s
-        while not done():
-            if time.monotonic() > deadline:
-                raise DeviceTimeoutError(f"waited {timeout_s:g} s for {what}", where=self._where)
-            time.sleep(0.01)
 
 
 def _opened(part: T | None, where: str) -> T:

@@ -73,9 +73,14 @@ class PoseStream:
     @property
     def alive(self) -> bool:
         """Whether samples come in."""
+        return self.newest() is not None
+
+    def newest(self) -> RobotSample | None:
+        """The newest sample, None when it is too old; does not wait."""
         with self._lock:
             newest = self._samples[-1] if self._samples else None
-        return newest is not None and time.monotonic() - newest.monotonic_s <= self._stale_after_s
+        fresh = newest is not None and time.monotonic() - newest.monotonic_s <= self._stale_after_s
+        return newest if fresh else None
 
     def latest(self) -> RobotSample:
         """The newest sample. Raises DeviceUnavailableError when it is too old."""

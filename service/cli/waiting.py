@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
 
 from service.cli.operators import Display
 from service.core.protocol import Protocol
@@ -14,9 +16,7 @@ from service.store.store import Store
 _LOOK_S = 2.0  # a look at a whole run costs a sixth of a second, which the results themselves need
 
 
-def wait_for_results(
-    store: Store, run_id: str, protocol: Protocol, display: Display, wait: Callable[[float], None] = time.sleep
-) -> None:
+def wait_for_results(store: Store, run_id: str, protocol: Protocol, display: Display) -> None:
     """Show what is still computed until nothing is; Ctrl-C leaves it to another worker, and loses nothing."""
     log = RunLog(store, run_id, protocol)
     pending = [one for one in results_to_come(log) if not one.failed]
@@ -26,19 +26,34 @@ def wait_for_results(
     seen: set[str] = set()
     total = len(pending)
     try:
-        while store.open_jobs(run_id):
-            left = results_to_come(log)
-            for one in left:
-                if one.failed and one.name not in seen:
-                    seen.add(one.name)
-                    display.tell(one.text)
-            pending = [one for one in left if not one.failed]
-            last_s = max((one.seconds for one in pending), default=0.0)
-            names = ", ".join(one.name for one in pending[:3]) + (" …" if len(pending) > 3 else "")
-            display.show(f"{names or 'computing'}: about {duration_words(last_s)} left", total - len(pending), total)
-            wait(_LOOK_S)
-    except KeyboardInterrupt:
-        data = store.database_path.parent
-        display.tell(f"Left for later: `orthocapture worker --data {data} --until-idle` computes what is missing")
+        with _told_to_leave() as leave:
+            while store.open_jobs(run_id) and not leave.is_set():
+                left = results_to_come(log)
+                for one in left:
+                    if one.failed and one.name not in seen:
+                        seen.add(one.name)
+                        display.tell(one.text)
+                pending = [one for one in left if not one.failed]
+                last_s = max((one.seconds for one in pending), default=0.0)
+                names = ", ".join(one.name for one in pending[:3]) + (" …" if len(pending) > 3 else "")
+                display.show(
+                    f"{names or 'computing'}: about {duration_words(last_s)} left", total - len(pending), total
+                )
+                leave.wait(_LOOK_S)
     finally:
         display.clear()
+    if leave.is_set():
+        data = store.database_path.parent
+        display.tell(f"Left for later: `orthocapture worker --data {data} --until-idle` computes what is missing")
+
+
+@contextmanager
+def _told_to_leave() -> Generator[threading.Event]:
+    """Set by Ctrl-C and SIGTERM. As exceptions they would be lost where they fall into a finaliser or a callback."""
+    leave = threading.Event()
+    before = {number: signal.signal(number, lambda *_: leave.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield leave
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

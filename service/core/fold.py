@@ -182,7 +182,7 @@ def _run_started(protocol: Protocol, state: RunState, event: Event, p: RunStarte
 
 
 def _session_started(protocol: Protocol, state: RunState, event: Event, p: SessionStarted) -> RunState:
-    state = replace(state, sessions=state.sessions + 1, restarted=p.resumed)
+    state = replace(state, sessions=state.sessions + 1, restarted=p.resumed, leave=None if p.resumed else state.leave)
     # Who lets the robot move again looks again: what was ticked was true before the program ended.
     return change(state, state.current, ticked=()) if needs_leave(protocol, state) else state
 

@@ -11,7 +11,7 @@ from service.core.lifecycle import redo
 from service.core.model import Event, OperatorAction
 from service.core.moves import UNMEASURED, change, deviate, go, pass_on, supersede
 from service.core.protocol import Protocol
-from service.core.run_state import Accepted, DeviationKind, RunState, StepState
+from service.core.run_state import Accepted, DeviationKind, Leave, RunState, StepState
 
 
 def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return a verb
@@ -26,7 +26,7 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
         )
     match p.action:
         case "confirm":
-            return _confirm(replace(state, restarted=False), event, p)
+            return _confirm(_let_move(state, event), event, p)
         case "sign":
             return change(state, state.current, signed=True, signed_by=event.actor)
         case "accept":
@@ -43,12 +43,16 @@ def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorA
         case "pause":
             return go(protocol, state, "pause")
         case "resume":
-            return go(protocol, replace(state, restarted=False), "resume")
+            return go(protocol, _let_move(state, event), "resume")
         case "redo" if p.viewpoint is not None:
             return replace(_redo_viewpoint(protocol, state, event, p.viewpoint, p.reason), last_redo_seq=event.seq)
         case "redo":
             target = p.step or state.current
             return replace(_redo_step(protocol, state, event, target, p.reason), last_redo_seq=event.seq)
+
+
+def _let_move(state: RunState, event: Event) -> RunState:
+    return replace(state, restarted=False, leave=Leave(event.seq, event.actor))
 
 
 def _confirm(state: RunState, event: Event, p: OperatorAction) -> RunState:

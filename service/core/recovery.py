@@ -13,7 +13,9 @@ Policy = Literal["retry", "ask", "abort"]
 PASSING = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "DeviceBusyError", "StaleImageError"})
 # Only a person at the table can put these right, whatever the protocol says.
 # (a damaged file of the evidence is put back from a copy; what is read again is checked against its hash again).
-NEEDS_A_PERSON = frozenset({"SafetyStopError", "DeviceStorageFullError", "IntegrityError", "ImagesSpoiltError"})
+NEEDS_A_PERSON = frozenset(
+    {"SafetyStopError", "LeaveNeededError", "DeviceStorageFullError", "IntegrityError", "ImagesSpoiltError"}
+)
 
 
 def recovery_policy(recovery: Recovery, error: str, failures: int) -> Policy:

@@ -179,6 +179,14 @@ class Trouble:
 
 
 @dataclass(frozen=True, slots=True)
+class Leave:
+    """Who has let the robot move, and in which event."""
+
+    seq: int
+    by: str
+
+
+@dataclass(frozen=True, slots=True)
 class Correction:
     """A RecordCorrected with who and when."""
 
@@ -207,6 +215,7 @@ class RunState:
     auto_confirm: bool = False
     sessions: int = 0
     restarted: bool = False  # another process drives the run now, and nobody has let it go on since
+    leave: Leave | None = None  # the newest one in this session; each arm takes it once
     stop_reason: str = ""
     deviations: tuple[Deviation, ...] = ()
     superseded: tuple[Superseded, ...] = ()

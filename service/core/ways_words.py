@@ -49,6 +49,7 @@ REMEDIES: Mapping[str, str] = {
     "DeviceFaultError": "Switch the device off and on; put another one in its place if it stays so",
     "DeviceStorageFullError": "Make room where the device stores its data, or put in another card",
     "SafetyStopError": "Look at the robot and the people around it, then clear the stop at the robot",
+    "LeaveNeededError": "Look whether the robot stands as it should and nobody is in reach",
     "UnreachablePoseError": "Move what stands in the way, or the robot's foot, so that it reaches the pose",
     "ReleasedElsewhereError": "Press the camera's own button, or connect a camera that the software can release",
     "StaleImageError": "Look at the camera: it delivered an earlier image instead of a new one",

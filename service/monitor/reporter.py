@@ -13,7 +13,7 @@ from os import getpid
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import DeviceError
+from drivers.errors import DeviceError, LeaveNeededError, SafetyStopError
 from drivers.interfaces import Camera, Lightbox, RobotArm, SafetyState
 from service.core.errors import OrthocaptureError
 from service.core.run_state import WAITING_FOR_HAND
@@ -122,10 +122,11 @@ class Reporter:
     def _robot(self, devices: OpenDevices) -> dict[str, Any]:
         for name, robot in devices.robots.items():
             try:
-                state, moving = robot.state(), robot.is_moving()
+                state = robot.state()
+                stop = _STOPS.get(state.sample.safety)
+                moving = stop is None and _moves(robot)
             except DeviceError:
                 return {"robot": "unknown", "robot_name": name}
-            stop = _STOPS.get(state.sample.safety)
             phase: RobotPhase = stop or (
                 "moving" if moving or _turns(state.sample.joint_velocities_rad_s) else "standing"
             )
@@ -181,6 +182,13 @@ class Reporter:
             write()
         except OSError as error:
             _log.warning("the screens cannot be told: %s", error)
+
+
+def _moves(robot: RobotArm) -> bool:
+    try:
+        return robot.is_moving()
+    except (SafetyStopError, LeaveNeededError):  # its motion was cut short, and whoever began it is told the same
+        return False
 
 
 def _turns(velocities_rad_s: Any) -> bool:

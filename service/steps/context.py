@@ -36,11 +36,26 @@ class StationLayout:
     approach: tuple[float, float, float]  # horizontal unit vector from the scene towards the base
 
 
+@dataclass(frozen=True, slots=True)
+class LeaveToMove:
+    """A person's recorded confirmation, for the arms: each takes it once, so an arm that has lost it needs another.
+
+    `not_before_monotonic_s` is the host's time.monotonic() when it was not given yet.
+    """
+
+    seq: int  # of its event
+    by: str
+    not_before_monotonic_s: float
+
+
 class Devices(Protocol):
     """The open devices of a rig, by role; opened on first use. Raises ConfigurationError if the rig has none."""
 
     def robot(self, station: str) -> RobotArm:
-        """The arm at a station, configured with its payload."""
+        """The arm at a station, configured with its payload, and let move if a person has.
+
+        Raises SafetyStopError, LeaveNeededError where it was stopped after that person had confirmed.
+        """
         ...
 
     def camera(self) -> Camera:
@@ -83,8 +98,12 @@ class Devices(Protocol):
         """Have every device that is opened from now on reported, by its name in rig.yaml."""
         ...
 
+    def let_move(self, leave: LeaveToMove) -> None:
+        """A person lets the arms move: each is told when it is next asked for by its station, once."""
+        ...
+
     def reopen(self, device: Device) -> None:
-        """Open a device again after its link dropped."""
+        """Open a device again after its link dropped. An arm moves again after a new leave only."""
         ...
 
 

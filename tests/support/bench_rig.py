@@ -43,7 +43,7 @@ from service.core.run_state import RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
 from service.runner import Spoken
-from service.steps.context import StationLayout
+from service.steps.context import LeaveToMove, StationLayout
 
 TRAVEL_S = 0.02
 _RATE_HZ = 500.0
@@ -69,6 +69,7 @@ class BenchArm:
     stops: int = 0
     stopped_short: int = 0
     configured: int = 0
+    let_by: list[str] = field(default_factory=list[str])
     _legs: list[tuple[float, Array, float, Array]] = field(default_factory=list[tuple[float, Array, float, Array]])
 
     def __post_init__(self) -> None:
@@ -84,6 +85,9 @@ class BenchArm:
 
     def report(self) -> DeviceReport:
         return DeviceReport(DeviceIdentity("robot", "Bench arm", "A-1", "5.12", "bench", "1", "memory"))
+
+    def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
+        self.let_by.append(confirmed_by)
 
     def configure(self, payload: Payload, T_flange_tcp: Transform) -> None:
         self.configured += 1
@@ -303,6 +307,9 @@ class BenchRig:
     def lens(self) -> LensSection | None:
         return LensSection(focal_length_mm=50, sensor_width_mm=35.7, image_px=(900, 600))
 
+    def let_move(self, leave: LeaveToMove) -> None:
+        self.arm.let_move(leave.by, leave.not_before_monotonic_s)
+
     def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
         self._on_open = on_open
 
@@ -345,6 +352,8 @@ class ScriptedOperator:
     script: Mapping[tuple[str, str], list[Answer]] = field(default_factory=dict[tuple[str, str], list[Answer]])
     name: str = "Ada"
     on_show: Callable[[str], None] = lambda _what: None
+    on_attend: Callable[[Doing], None] = lambda _doing: None
+    on_prepare: Callable[[], None] = lambda: None
     asked: list[AskOperator] = field(default_factory=list[AskOperator])
     told: list[str] = field(default_factory=list[str])
     attended: list[tuple[Doing, bool]] = field(default_factory=list[tuple[Doing, bool]])
@@ -367,12 +376,14 @@ class ScriptedOperator:
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
         if not self.attended or self.attended[-1] != (doing, pedal_armed):
             self.attended.append((doing, pedal_armed))
+        self.on_attend(doing)
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
         return question.checklist
 
     def prepare(self, step: str, attempt: int) -> None:
         self.prepared.append((step, attempt))
+        self.on_prepare()
 
     def mend(self, step: str, attempt: int, hands: Sequence[Mapping[str, Any]]) -> None:
         self.mended.append((step, attempt, tuple(hands)))

@@ -38,6 +38,7 @@ class Fake(Device, Protocol):
     def unpicklable(self) -> object: ...
     def talk(self) -> None: ...
     def stdin_target(self) -> str: ...
+    def beats(self) -> tuple[tuple[float, float], ...]: ...
 
 
 class FakeDriver:
@@ -46,6 +47,15 @@ class FakeDriver:
     def __init__(self, config: FakeConfig) -> None:
         self._config = config
         self._opened = 0
+        self._beats: list[tuple[float, float]] = []
+
+    def heartbeat(self, sent_monotonic_s: float) -> None:
+        self._beats.append((sent_monotonic_s, time.monotonic()))
+
+    def beats(self) -> tuple[tuple[float, float], ...]:
+        """When each was sent and when it arrived, since the last question."""
+        beats, self._beats = self._beats, []
+        return tuple(beats)
 
     def open(self) -> DeviceIdentity:
         if self._config.die_on_open:

@@ -30,6 +30,10 @@ class RtdeClient:
     def close(self) -> None:
         self.socket.close()
 
+    def shutdown(self) -> None:
+        """End the connection under a thread that waits for data: that raises OSError there."""
+        self.socket.shutdown(socket.SHUT_RDWR)
+
     def send(self, kind: str, payload: bytes = b"") -> None:
         self.socket.sendall(struct.pack(">HB", len(payload) + 3, ord(kind)) + payload)
 

@@ -5,6 +5,9 @@
 (() => {
   const LOST_AFTER_MS = 3500;
   const POLL_MS = 2000;
+  const PART_MS = 8000; // for a part to arrive
+  const RETRY_MS = 1000;
+  const ANSWER_MS = 60000; // for what a person asked for to be done
   const body = document.body;
   const by = (id) => document.getElementById(id);
   let offline = false;
@@ -68,18 +71,24 @@
 
   let fetching = false;
   let again = false;
+  let outdatedSince = 0; // news has come that could not be fetched; 0: the page is up to date
+  let retry = 0;
   async function refresh() {
     if (fetching) { again = true; return; }
     fetching = true;
+    clearTimeout(retry);
     do {
       again = false;
       try {
         // Fetched together and shown at once: no button of one step beside the words of another.
         const news = await Promise.all([...gathered()].map(([address, parts]) => fetchParts(address, parts)));
         for (const [part, fresh] of news.flat()) if (part.isConnected) showPart(part, fresh);
-      } catch { /* the stream tells that the connection is lost */ }
+        outdatedSince = 0;
+      } catch { outdatedSince ||= Date.now(); }
     } while (again);
     fetching = false;
+    // A run that waits for a person sends no further news: the page must not miss this one.
+    if (outdatedSince) retry = setTimeout(refresh, RETRY_MS);
     announce();
     followLock();
     if (offline) setControls(true);
@@ -95,9 +104,9 @@
   }
   async function fetchParts(address, parts) {
     const names = [...parts.keys()].join(",");
-    const answer = await fetch(address.replace("*", names), { headers: { Accept: "text/html" }, cache: "no-store" });
+    const answer = await fetch(address.replace("*", names), { headers: { Accept: "text/html" }, cache: "no-store", signal: AbortSignal.timeout(PART_MS) });
     if (answer.redirected && new URL(answer.url).pathname === "/sign-in") { location.reload(); return []; }
-    if (!answer.ok) return [];
+    if (!answer.ok) throw new Error(answer.statusText);
     const fresh = document.createElement("template");
     fresh.innerHTML = await answer.text();
     return [...fresh.content.children].map((each) => [parts.get(each.dataset.part), each]);
@@ -120,7 +129,7 @@
     replaced = false;
     stream?.close();
     stream = new EventSource(body.dataset.stream);
-    const heard = () => { heardAt = Date.now(); if (offline) backOnline(); };
+    const heard = () => { heardAt = Date.now(); if (offline && !outdatedSince) backOnline(); };
     stream.addEventListener("changed", (event) => {
       const fresh = event.data !== known;
       known = event.data;
@@ -136,7 +145,8 @@
   function watch() {
     if (replaced && document.hidden) { if (!offline) goOffline(); return; }
     const now = Date.now();
-    if (now - heardAt > LOST_AFTER_MS && !offline) goOffline();
+    const lost = now - heardAt > LOST_AFTER_MS || (outdatedSince && now - outdatedSince > LOST_AFTER_MS);
+    if (lost && !offline) goOffline();
     if (now - heardAt > 1500 && now - opening > 2500) connect();
   }
 
@@ -265,7 +275,7 @@
     button?.setAttribute("aria-disabled", "true");
     say(form, "");
     try {
-      const answer = await fetch(action, { method: "POST", body: fields, headers: { Accept: "application/json", "X-CSRF-Token": body.dataset.csrf || "" } });
+      const answer = await fetch(action, { method: "POST", body: fields, headers: { Accept: "application/json", "X-CSRF-Token": body.dataset.csrf || "" }, signal: AbortSignal.timeout(ANSWER_MS) });
       if (answer.ok) await succeed(form, action, answer);
       else await fail(form, answer);
     } catch {

@@ -1,0 +1,91 @@
+"""What keeps an arm from being moved until a person lets it: a latch that no program takes off by itself."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+
+from drivers.errors import DeviceError, LeaveNeededError, SafetyStopError
+from drivers.interfaces import SafetyState
+
+_LOG = logging.getLogger(__name__)
+_LOOK = "Look for the cause, and whether anybody is in reach; the arm moves on after a person has confirmed"
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """Why the arm is held, and until when that went on (host time.monotonic())."""
+
+    what: str
+    last_s: float
+
+
+class Latch:
+    """Holds the arm from the moment it is opened, and again after every stop; safe to use from several threads.
+
+    It is set from what the controller streams, so a stop that came and was released while nobody asked counts too.
+    """
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._lock = threading.Lock()
+        self._let_by = ""
+        self._stop: _Held | None = None  # of the safety system
+        self._ended: _Held | None = None  # of the controller's program, which nobody here had asked to end
+
+    def close(self) -> None:
+        """Take back the leave: what is opened anew needs a new one."""
+        with self._lock:
+            self._let_by = ""
+
+    def see(self, safety: SafetyState, at_s: float) -> None:
+        """Note one sample of the stream."""
+        if safety.may_move:
+            return
+        with self._lock:
+            if self._stop is None:
+                _LOG.warning("%s: %s; nothing moves until a person confirms", self._where, _name(safety))
+            self._stop = _Held(_name(safety), at_s)
+
+    def end(self, what: str) -> None:
+        """Note that the controller's program ended unasked: `what` says so in a sentence."""
+        with self._lock:
+            _LOG.warning("%s: %s; nothing moves until a person confirms", self._where, what)
+            self._ended = _Held(what, time.monotonic())
+
+    def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
+        """Forget what was over by then. Raises SafetyStopError, LeaveNeededError for what was not."""
+        with self._lock:
+            for held in (self._stop, self._ended):
+                if held is not None and held.last_s > not_before_monotonic_s:
+                    raise self._error()
+            _LOG.info("%s: %s lets the arm move", self._where, confirmed_by)
+            self._let_by, self._stop, self._ended = confirmed_by, None, None
+
+    @property
+    def stop(self) -> DeviceError | None:
+        """The stop, or the end of the program, that nobody has confirmed since."""
+        with self._lock:
+            return None if self._stop is None and self._ended is None else self._error()
+
+    @property
+    def hold(self) -> DeviceError | None:
+        """What keeps the arm from being moved: `stop`, or that nobody has let it move yet."""
+        with self._lock:
+            return None if self._let_by and self._stop is None and self._ended is None else self._error()
+
+    def _error(self) -> DeviceError:
+        if self._stop is not None:
+            ago_s = time.monotonic() - self._stop.last_s
+            what = f"the arm was in {self._stop.what} {ago_s:.0f} s ago, and nobody has confirmed since"
+            return SafetyStopError(what, where=self._where, remedy=_LOOK)
+        if self._ended is not None:
+            what = f"{self._ended.what}, and nobody has confirmed since"
+            return LeaveNeededError(what, where=self._where, remedy=_LOOK)
+        return LeaveNeededError("nobody has let the arm move since it was connected", where=self._where, remedy=_LOOK)
+
+
+def _name(safety: SafetyState) -> str:
+    return safety.value.replace("_", " ")

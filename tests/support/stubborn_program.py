@@ -1,0 +1,78 @@
+"""A program that drives an arm to and fro and, whatever happens, tries to go on: a process that tests kill.
+
+Each line that it reads is the name of a person who lets the arm move. It says in lines of JSON what it sees.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from typing import Any
+
+from drivers.errors import DeviceError, DeviceUnavailableError
+from drivers.host import HostedDevice, hosted
+from drivers.interfaces import RobotArm
+from drivers.ur import UrConfig
+
+SPEED_RAD_S, ACCELERATION_RAD_S2 = 1.0, 1.5  # of protocols/demo.yaml, the fastest
+GOAL_RAD = 2.5
+
+
+def say(**words: object) -> None:
+    sys.stdout.write(json.dumps(words) + "\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    host, hangs, unattended_s = sys.argv[1], sys.argv[2] == "hangs", float(sys.argv[3])
+    config = UrConfig(host=host, unattended_s=unattended_s)
+    arm = hosted(RobotArm, "drivers.ur:DRIVER", config, call_timeout_s=30, name="robot")
+    arm.open()
+    persons: list[tuple[str, float]] = []
+    threading.Thread(target=_listen, args=(persons,), daemon=True).start()
+    device: HostedDevice = vars(arm)["hosted_device"]
+    say(driver=device.pid)
+    said: Any = None
+    sign = 1.0
+    while True:
+        try:
+            if persons:
+                name, asked_s = persons.pop()
+                arm.let_move(name, asked_s)
+                say(let_by=name)
+            target = arm.state().sample.joints_rad.copy()
+            target[0] = sign * GOAL_RAD
+            arm.move_joints(target, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2)
+            said = None
+            say(moves_to=target[0])
+            if hangs:
+                time.sleep(3600)
+            while arm.is_moving():
+                time.sleep(0.02)
+            say(arrived=target[0])
+            sign = -sign
+        except DeviceError as error:
+            if type(error).__name__ != said:
+                said = type(error).__name__
+                say(error=said, message=str(error), driver=device.pid)
+            time.sleep(0.1)
+            if isinstance(error, DeviceUnavailableError):
+                _reopen(arm)
+
+
+def _reopen(arm: RobotArm) -> None:
+    try:
+        arm.open()
+    except DeviceError as error:
+        say(reopening=str(error))
+
+
+def _listen(persons: list[tuple[str, float]]) -> None:
+    for line in sys.stdin:
+        persons.append((line.strip(), time.monotonic()))
+
+
+if __name__ == "__main__":
+    main()
