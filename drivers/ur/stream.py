@@ -19,6 +19,7 @@ from service.core.geometry import transform
 BUFFER_S = 300.0  # an image's pose is looked up once its files have arrived, which takes a while for 60 megapixels
 STREAM_HZ = 125.0
 POLL_S = 0.004
+STALL_S = 0.25  # without a look: this process itself stood still
 MINIMUM_COVERAGE = 0.8  # of the settle window by samples
 TARGET_AT_REST_RAD_S = 1e-9  # the controller's target velocity, beyond which it drives the arm
 
@@ -62,6 +63,7 @@ class PoseStream:
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._death = ""
+        self._looked_s = self._looking_since_s = -float("inf")  # the newest look; from when on without a pause
         self._thread = threading.Thread(target=self._run, name="ur pose stream", daemon=True)
         self._thread.start()
 
@@ -84,20 +86,26 @@ class PoseStream:
 
     def latest(self) -> RobotSample:
         """The newest sample. Raises DeviceUnavailableError when it is too old."""
-        deadline = time.monotonic() + self._stale_after_s
+        deadline_s = time.monotonic() + self._stale_after_s
         while True:
             with self._lock:
                 newest = self._samples[-1] if self._samples else None
-            if newest is not None and time.monotonic() - newest.monotonic_s <= self._stale_after_s:
+            now_s = time.monotonic()
+            if newest is not None and now_s - newest.monotonic_s <= self._stale_after_s:
                 return newest
-            if newest is not None or self._death or time.monotonic() > deadline:  # only the first one is waited for
-                age = f"for {time.monotonic() - newest.monotonic_s:.1f} s" if newest else "yet"
+            waits = newest is None or self._not_looking(now_s)
+            if self._death or now_s > deadline_s or not waits:
+                age = f"for {now_s - newest.monotonic_s:.1f} s" if newest else "yet"
                 raise DeviceUnavailableError(
                     f"the robot's stream brought no new sample {age}{self._death}",
                     where=self._where,
                     remedy="Check the cable and the controller, then reconnect",
                 )
             time.sleep(POLL_S)
+
+    def _not_looking(self, now_s: float) -> bool:
+        """Whether this process has stood still: then the age of a sample says nothing of the link."""
+        return now_s - self._looked_s > STALL_S or now_s - self._looking_since_s <= self._stale_after_s
 
     def next(self) -> RobotSample:
         """A sample that arrives from now on. Raises DeviceUnavailableError when none does."""
@@ -128,6 +136,10 @@ class PoseStream:
 
     def _run(self) -> None:
         while not self._stop.wait(POLL_S):
+            now_s = time.monotonic()
+            if now_s - self._looked_s > STALL_S:
+                self._looking_since_s = now_s
+            self._looked_s = now_s
             try:
                 sample = self._read()
             except self._vendor_errors as error:
