@@ -153,7 +153,7 @@ def test_when_no_more_files_can_be_opened_it_neither_spins_nor_floods_the_log(ri
             assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S).status_code == 200
         log = server.log.read_text()
     assert log.count("out of system resource") == 1
-    assert len(log) < 3000
+    assert len(log) < 10_000  # a traceback or two; the flood was of megabytes a second
 
 
 def test_what_is_no_http_is_told_once_and_counted(rig: Path) -> None:
