@@ -8,9 +8,12 @@ import socket
 import struct
 from collections.abc import Generator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from drivers.errors import DeviceFaultError, DeviceUnavailableError
-from drivers.ur import vendor as library
+
+if TYPE_CHECKING:
+    from drivers.ur import vendor as library
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 VENDOR_ERRORS = (RuntimeError, ValueError, TypeError)
@@ -72,6 +75,9 @@ def _ask(host: str, port: int, question: bytes | None, timeout_s: float, name: s
 
 def connect_dashboard(host: str) -> library.Dashboard:
     """A connected dashboard client."""
+    # Imported here: what this module reads of a controller needs no vendor's library.
+    from drivers.ur import vendor as library  # noqa: PLC0415
+
     client = library.dashboard(host)
     with vendor(host, "connecting to the dashboard"):
         client.connect(2000)
