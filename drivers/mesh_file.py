@@ -187,6 +187,8 @@ def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
         AttributeError,
         EOFError,
         NotImplementedError,
+        OverflowError,
+        RecursionError,
         struct.error,
         UnicodeDecodeError,
     ) as error:
@@ -203,6 +205,12 @@ def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
 
 
 def _validate(path: Path, vertices: Array, faces: IntArray) -> None:
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise UnreadableFileError(
+            f"vertices have {vertices.shape[-1]} coordinates and faces {faces.shape[-1]} corners, each must have 3",
+            where=str(path),
+            remedy="Open it in the scanner's software and export it again as triangles",
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise UnreadableFileError(
             f"a face refers to vertex {int(faces.max())} of {len(vertices)}",

@@ -44,7 +44,7 @@ def is_point_cloud(path: Path) -> bool:
         for line in stream:
             words = line.split()
             if words[:2] == [b"element", b"face"]:
-                return int(words[2]) == 0
+                return words[2:3] == [b"0"]
             if words[:2] == [b"element", b"tristrips"]:
                 return False  # a mesh, of a kind that is not read
             if words[:1] == [b"end_header"]:
@@ -62,7 +62,17 @@ def read_point_cloud(path: Path, unit: MeshUnit = "auto") -> PointCloud:
     """
     try:
         points, normals = _text(path) if path.suffix.lower() in TEXT_SUFFIXES else _ply(path)
-    except (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, EOFError, struct.error) as error:
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+        IndexError,
+        AttributeError,
+        EOFError,
+        OverflowError,
+        struct.error,
+    ) as error:
         raise UnreadableFileError(
             f"this is not a point cloud that can be parsed ({error})",
             where=str(path),

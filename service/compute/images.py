@@ -77,13 +77,19 @@ def _decode(path: Path, how: int) -> NDArray[np.uint8]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise DataError(f"the image cannot be read: {error.strerror}", where=str(path)) from error
+        raise DataError(
+            f"the image cannot be read: {error.strerror}",
+            where=str(path),
+            remedy="Check the path and its permissions",
+        ) from error
     if path.suffix.lower() in {".jpg", ".jpeg"} or data[:2] == b"\xff\xd8":
         check_jpeg(data, str(path))
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), how | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
-        raise DataError(f"the image cannot be decoded: {error.err}", where=str(path)) from error
+        raise DataError(
+            f"the image cannot be decoded: {error.err}", where=str(path), remedy="Copy the file from the camera again"
+        ) from error
     if image is None:
         raise DataError(
             "the file is not an image that can be decoded", where=str(path), remedy="Use JPEG or PNG images"
