@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from bench.machine import REPOSITORY, commit, machine
-from bench.torture.fuzz.table import Group, table
+from bench.torture.fuzz.table import table
 from bench.torture.fuzz.target import Target
 from bench.torture.fuzz.watch import Engine, Finding, Outcome, Sweep, all_findings
 
@@ -56,7 +56,7 @@ def keep(finding: Finding, folder: Path) -> Path:
 
 
 def swept(
-    target: Target, group: Group, with_engines: Sequence[Engine], options: argparse.Namespace
+    target: Target, group: str, with_engines: Sequence[Engine], options: argparse.Namespace
 ) -> dict[Engine, Outcome]:
     """One target under each engine, for its share of the time."""
     share_s: float = options.seconds_per_target / len(with_engines)
@@ -107,9 +107,10 @@ def markdown(rows: Sequence[dict[str, object]], head: dict[str, object]) -> str:
         found = one["findings"]
         assert isinstance(found, list)
         counts = " | ".join(str(inputs.get(engine, "–")) for engine in ("hypothesis", "atheris"))
+        bound, faults = f"{one['bound_mib']} MiB, {one['bound_s']} s", "; ".join(map(str, found)) or "none"
         lines.append(
             f"| {one['target']} | `{one['entry']}` | {counts} | {one['refused']} | {one['per_second']} | "
-            f"{one['peak_mib']} | {one['bound_mib']} MiB, {one['bound_s']} s | {'; '.join(map(str, found)) or 'none'} |"
+            f"{one['peak_mib']} | {bound} | {faults} |"
         )
     return "\n".join(lines) + "\n"
 

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -96,17 +97,18 @@ def _obj_parts() -> list[tuple[str, bytes]]:
     return encode("obj", "scan.obj", np.asarray(ball.vertices), np.asarray(ball.faces), None)
 
 
-def _exported(kind: str) -> list[bytes]:
-    written = _ball().export(file_type=kind)
-    return [written.encode() if isinstance(written, str) else bytes(written)]
+def _exported(shape: Any, kind: str, **options: Any) -> bytes:
+    """As trimesh writes it, which has other habits than the simulated scanner."""
+    written = shape.export(file_type=kind, **options)
+    return written.encode() if isinstance(written, str) else bytes(written)
 
 
 def _plys(_: Path) -> list[bytes]:
-    return [*_scan("ply"), bytes(_ball().export(file_type="ply", encoding="ascii"))]
+    return [*_scan("ply"), _exported(_ball(), "ply", encoding="ascii")]
 
 
 def _stls(_: Path) -> list[bytes]:
-    return [_scan("stl")[0], *_exported("stl_ascii")]
+    return [_scan("stl")[0], _exported(_ball(), "stl_ascii")]
 
 
 def _mesh(kind: str) -> Callable[[bytes, Path], None]:
@@ -138,7 +140,7 @@ def _clouds(_: Path) -> list[bytes]:
 
 def _cloud_plys(_: Path) -> list[bytes]:
     cloud = trimesh.PointCloud(_ball().vertices)
-    return [bytes(cloud.export(file_type="ply")), *_scan("ply")]
+    return [_exported(cloud, "ply"), *_scan("ply")]
 
 
 def _cloud(suffix: str) -> Callable[[bytes, Path], None]:

@@ -17,13 +17,12 @@ from typing import Any, Literal
 
 from bench.torture.fuzz.minimise import minimised
 from bench.torture.fuzz.slot import Reading, Slot
-from bench.torture.fuzz.table import Group
 
 Engine = Literal["hypothesis", "atheris"]
 START_S = 240.0  # imports and seeds on a busy machine
 CLOCK_FACTOR = 10  # on the clock an input may take so many times its processor time: machines are shared
 _POLL_S = 0.05
-_REDUCING_TRIES, _REDUCING_S = 24, 60.0  # each try is a process of its own
+_REDUCING_S = 120.0  # each try is a process of its own
 _MOST_STARTS = 40
 _TICK = os.sysconf("SC_CLK_TCK")
 _FRAME = re.compile(r'File "([^"]+)", line (\d+) in (\S+)')
@@ -71,9 +70,11 @@ class _Death:
 class Sweep:
     """Reads inputs of one group's targets in processes, and begins anew after each death."""
 
-    def __init__(self, group: Group, engine: Engine, folder: Path) -> None:
+    def __init__(self, group: str, engine: Engine, folder: Path, *, reducing_tries: int = 24) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self._group, self._engine, self._folder = group, engine, folder
+        self._group, self._folder = group, folder
+        self._engine: Engine = engine
+        self._reducing_tries = reducing_tries
         self.outcomes: dict[str, Outcome] = {}
 
     def run_each(self, *, inputs: int, seconds: float, seed: int = 0) -> dict[str, Outcome]:
@@ -198,7 +199,7 @@ class Sweep:
             again = trial._process(plan)
             return again is not None and again.fault.split()[0] == kind
 
-        return minimised(death.at.data, shows, tries=_REDUCING_TRIES, seconds=_REDUCING_S)
+        return minimised(death.at.data, shows, tries=self._reducing_tries, seconds=_REDUCING_S)
 
 
 def _processor_s(pid: int) -> float:

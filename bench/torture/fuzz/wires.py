@@ -233,7 +233,7 @@ def _world(data: bytes, _: Path) -> None:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.005})
         thread.start()
         try:
-            host, _, port = server.address.rpartition(":")
+            host, port = server.address.split(":")
             _say((host, int(port)), data)
         finally:
             server.shutdown()
