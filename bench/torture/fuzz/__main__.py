@@ -3,7 +3,7 @@
     python -m bench.torture.fuzz --seconds-per-target 60 [--target NAME …] [--engine both|hypothesis|atheris]
 
 Two engines read mutated files that this project's own simulators and exporters wrote: hypothesis, and atheris, which
-follows the lines that an input reaches (`pip install atheris`; where it is missing, that is said and hypothesis has
+follows the lines that an input reaches (the extra `fuzz`; where it is missing, that is said and hypothesis has
 the whole time). Each target runs in a process of its own. A finding's smallest input is kept in the folder --keep.
 Exit status: 0 without findings, 1 with.
 """
@@ -33,9 +33,9 @@ def engines(wanted: str) -> tuple[Engine, ...]:
     """Those that are wanted and there. Raises SystemExit when the only one that is wanted is missing."""
     there = importlib.util.find_spec("atheris") is not None
     if wanted == "atheris" and not there:
-        raise SystemExit("atheris is not installed: python -m pip install atheris")
+        raise SystemExit("atheris is not installed: python -m pip install '.[fuzz]'")
     if wanted == "both" and not there:
-        print("atheris is not installed: hypothesis alone reads (python -m pip install atheris)", file=sys.stderr)
+        print("atheris is not installed: hypothesis alone reads (python -m pip install '.[fuzz]')", file=sys.stderr)
     return (
         ("hypothesis", "atheris")
         if wanted == "both" and there

@@ -8,7 +8,7 @@ from typing import cast
 from bench.torture.fuzz.target import Target
 
 # Modules with a tuple TARGETS.
-GROUPS = tuple(f"bench.torture.fuzz.{name}" for name in ("written", "delivered", "records", "wires"))
+GROUPS = tuple(f"bench.torture.fuzz.{name}" for name in ("written", "delivered", "records", "wires", "hostile"))
 
 
 def targets_of(group: str) -> tuple[Target, ...]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from bench.machine import REPOSITORY
 from bench.torture.fuzz.minimise import minimised
 from bench.torture.fuzz.slot import Reading, Slot
 
@@ -118,7 +119,9 @@ class Sweep:
         slot = Slot(self._folder / "slot")
         command = [sys.executable, "-m", "bench.torture.fuzz.child", str(self._folder)]
         with (self._folder / "output").open("wb") as output:
-            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=output)
+            process = subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, cwd=REPOSITORY
+            )
         try:
             death = self._watched(slot, process)
         finally:
