@@ -109,9 +109,13 @@ def dicom_files(folder: Path) -> list[Path]:
 class _NoFurther(io.BufferedReader):
     """A file that is never asked for more than it has left: a wrong length would set gigabytes aside first."""
 
+    def __init__(self, raw: io.FileIO) -> None:
+        super().__init__(raw)
+        self._bytes = os.fstat(raw.fileno()).st_size
+
     def read(self, size: int | None = -1, /) -> bytes:
         """See io.BufferedReader."""
-        left = max(os.fstat(self.fileno()).st_size - self.tell(), 0)
+        left = max(self._bytes - self.tell(), 0)
         return super().read(left if size is None or size < 0 else min(size, left))
 
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import re
+import struct
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from bench.torture.fuzz.table import GROUPS, targets_of
 from bench.torture.fuzz.target import fault_of
 from bench.torture.fuzz.watch import Sweep
+from service.compute.images import read_image
 from service.core.errors import DataError
 
 FOUND = Path(__file__).parent / "data" / "fuzz"  # by target, inputs that showed a fault once
@@ -48,6 +52,20 @@ def test_a_cell_longer_than_tables_have_is_told_with_its_line(name: str, head: s
     (target,) = [one for one in targets_of(GROUPS[0]) if one.name == name]
     with pytest.raises(DataError, match=r"no row of a table .*csv:2\]"):
         target.parse(f"{head}\n{'a' * 200_000}\n".encode(), tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_an_image_that_claims_a_gigapixel_is_refused_before_memory_is_set_aside(suffix: str, tmp_path: Path) -> None:
+    done, encoded = cv2.imencode(suffix, np.zeros((32, 48, 3), np.uint8))
+    data = bytearray(encoded.tobytes())
+    at = data.index(b"\xff\xc0") + 5 if suffix == ".jpg" else 16  # height and width, or width and height
+    size = struct.pack(">HH" if suffix == ".jpg" else ">II", 30_000, 30_000)
+    data[at : at + len(size)] = size
+    path = tmp_path / f"image{suffix}"
+    path.write_bytes(data)
+    assert done
+    with pytest.raises(DataError, match=r"claims to have 30000 × 30000 pixels"):
+        read_image(path)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from typing import Any
 
 # What a terminal or a page would obey rather than show, and what cannot be encoded: quoted from files it stays text.
 _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
-_LONGEST = 4_000  # characters; nobody reads more, and a file may hold a word of a megabyte
+_LONGEST, _LONGEST_LINE = 20_000, 4_000  # characters: a file may hold a word of a megabyte
 
 
 class OrthocaptureError(Exception):
@@ -37,7 +37,11 @@ class OrthocaptureError(Exception):
 
 def _shown(text: str) -> str:
     plain = _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
-    return plain if len(plain) <= _LONGEST else f"{plain[: _LONGEST // 2]} … {plain[-_LONGEST // 4 :]}"
+    return _cut("\n".join(_cut(line, _LONGEST_LINE) for line in plain.split("\n")), _LONGEST)
+
+
+def _cut(text: str, longest: int) -> str:
+    return text if len(text) <= longest else f"{text[: longest // 2]} … {text[-longest // 4 :]}"
 
 
 def _rebuild(cls: type[OrthocaptureError], what: str, where: str, remedy: str) -> OrthocaptureError:

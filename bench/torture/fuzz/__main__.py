@@ -75,6 +75,7 @@ def row(target: Target, outcomes: dict[Engine, Outcome]) -> dict[str, object]:
     seconds, inputs = sum(one.seconds for one in each), sum(one.inputs for one in each)
     return {
         "target": target.name,
+        "commit": commit(),
         "entry": target.entry,
         "inputs": {engine: one.inputs for engine, one in outcomes.items()},
         "refused": sum(one.refused for one in each),
@@ -86,13 +87,26 @@ def row(target: Target, outcomes: dict[Engine, Outcome]) -> dict[str, object]:
     }
 
 
-def markdown(rows: Sequence[dict[str, object]], head: dict[str, object]) -> str:
+def record(new: dict[str, object], order: Sequence[str]) -> None:
+    """Write a row into today's results; rows of other targets stay as they were measured."""
+    stem = RESULTS / f"fuzz-{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
+    path = stem.with_suffix(".json")
+    before = json.loads(path.read_text())["targets"] if path.exists() else []
+    rows = {one["target"]: one for one in before} | {str(new["target"]): new}
+    ordered = [rows[name] for name in order if name in rows]
+    path.write_text(json.dumps({"machine": machine(), "targets": ordered}, indent=1) + "\n")
+    stem.with_suffix(".md").write_text(markdown(ordered))
+
+
+def markdown(rows: Sequence[dict[str, object]]) -> str:
     """The table as people read it."""
+    total = sum(sum(counts.values()) for one in rows if isinstance(counts := one["inputs"], dict))
+    here = machine()
     lines = [
         "# Bad input for every parser",
         "",
-        f"`python -m bench.torture.fuzz --seconds-per-target {head['seconds_per_target']:g}`, revision "
-        f"{head['commit']}, {head['machine']}.",
+        f"`python -m bench.torture.fuzz --record`: {total:,} inputs; {here['cores']} cores, {here['memory_gb']} GB, "
+        f"Python {here['python']}. The revision of each row is in the file beside this one.",
         "",
         "Inputs are mutated files that the simulators and exporters of this project wrote. Memory is what a process "
         "grew by at most, beside its bound. A finding is a crash, a hang, memory beyond the bound, an exception that "
@@ -139,14 +153,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps(rows[-1]), flush=True)
         for finding in all_findings(list(outcomes.values())):
             print(f"  {finding.fault}\n    input: {keep(finding, options.keep)}", flush=True)
-    if options.record:
-        head: dict[str, object] = {
-            "seconds_per_target": options.seconds_per_target, "commit": commit(), "machine": machine(),
-            "engines": list(with_engines), "seed": options.seed,
-        }  # fmt: skip
-        stem = RESULTS / f"fuzz-{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
-        stem.with_suffix(".json").write_text(json.dumps({**head, "targets": rows}, indent=1) + "\n")
-        stem.with_suffix(".md").write_text(markdown(rows, head))
+        if options.record:
+            record(rows[-1], list(targets))
     return 1 if any(one["findings"] for one in rows) else 0
 
 

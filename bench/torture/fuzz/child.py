@@ -70,7 +70,7 @@ class Reader:
     def close(self) -> None:
         """Say how much was read, and leave nothing behind."""
         slot = self._slot
-        self._tell({"inputs": slot.inputs, "refused": slot.refused, "peak_kib": slot.peak_kib})
+        self._tell({"counts": [slot.inputs, slot.refused, slot.spent_s, slot.peak_kib]})
         shutil.rmtree(self._scratch, ignore_errors=True)
 
     def _timed(self, data: bytes) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from bench.torture.fuzz.mutations import BYTES, Mutation
 from service.core.errors import OrthocaptureError
 
-LONGEST_MESSAGE = 6_000  # characters of an error as people read it
+LONGEST_LINE = 6_000  # characters of an error as people read it
 
 
 class MisbehavedError(Exception):
@@ -65,4 +65,4 @@ def _wrong_words(text: str) -> str:
         return "cannot be printed"
     if any(ord(c) < 32 and c not in "\n\t" for c in text):
         return "carries control characters"
-    return "is longer than anybody reads" if len(text) > LONGEST_MESSAGE else ""
+    return "is longer than anybody reads" if max(map(len, text.split("\n"))) > LONGEST_LINE else ""

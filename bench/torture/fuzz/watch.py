@@ -53,8 +53,9 @@ class Outcome:
     peak_mib: float = 0.0
     findings: list[Finding] = field(default_factory=list[Finding])
 
-    def add(self, inputs: int, refused: int, peak_kib: int) -> None:
+    def add(self, inputs: int, refused: int, spent_s: float, peak_kib: int) -> None:
         """What one process read of it."""
+        self.seconds += spent_s
         self.inputs += inputs
         self.refused += refused
         self.peak_mib = max(self.peak_mib, peak_kib / 1024)
@@ -98,12 +99,11 @@ class Sweep:
             if death is None:
                 break
             self._keep(death)
-        outcome.seconds = time.monotonic() - began_s
         return outcome
 
     def _keep(self, death: _Death) -> None:
         outcome = self.outcomes.setdefault(death.at.target, Outcome())
-        outcome.add(death.at.inputs, death.at.refused, death.at.peak_kib)
+        outcome.add(death.at.inputs, death.at.refused, death.at.spent_s, death.at.peak_kib)
         if death.fault not in self._known():
             outcome.findings.append(Finding(death.at.target, death.fault, self._reduced(death)))
 
@@ -186,9 +186,9 @@ class Sweep:
                 outcome.findings.append(Finding(told["target"], told["fault"], data, told["traceback"]))
             else:
                 ended.add(told["target"])
-                outcome.add(told["inputs"], told["refused"], told["peak_kib"])
+                outcome.add(*told["counts"])
         if at is not None and at.target and at.target not in ended:
-            self.outcomes.setdefault(at.target, Outcome()).add(at.inputs, at.refused, at.peak_kib)
+            self.outcomes.setdefault(at.target, Outcome()).add(at.inputs, at.refused, at.spent_s, at.peak_kib)
 
     def _reduced(self, death: _Death) -> bytes:
         """The input at which a process died or hung, made smaller."""

@@ -17,7 +17,7 @@ from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Transform
 
-_SPARE_BYTES = 512 << 20  # beyond what the library itself takes
+_SPARE_BYTES = 1 << 30  # beyond what the library itself takes
 _PER_BYTE = 40  # of a model's files, once read: observations are 24 bytes in a file and some 60 in memory
 
 
