@@ -60,7 +60,7 @@ def _photographs(_: Path) -> list[bytes]:
 def _pictures(_: Path) -> list[bytes]:
     import cv2  # noqa: PLC0415 - only this needs its encoders
 
-    picture, _ = _shot()
+    picture = _shot()[0]
     others = [cv2.imencode(suffix, picture)[1].tobytes() for suffix in (".png", ".tiff")]
     return [encode_jpeg(*_shot()), *others]
 

@@ -83,10 +83,10 @@ class Slot:
 
     def read(self) -> Reading:
         """From the other side."""
-        name, inputs, refused, busy, length, *times, peak_kib = _HEAD.unpack_from(self._map)
+        name, inputs, refused, busy, length, clock_s, cpu_s, bound_s, spent_s, kib = _HEAD.unpack_from(self._map)
         data = self._map[_INPUT_AT : _INPUT_AT + length]
         target = name.rstrip(b"\0").decode()
-        return Reading(target, inputs, refused, bool(busy), data, *times, peak_kib)
+        return Reading(target, inputs, refused, bool(busy), data, clock_s, cpu_s, bound_s, spent_s, kib)
 
     def close(self) -> None:
         """Let go of the memory."""
