@@ -27,6 +27,12 @@ MESH_SUFFIXES = (".obj", ".ply", ".stl")
 
 IntArray = NDArray[np.int64]
 
+# What trimesh and NumPy raise for a file that is not what it says; trimesh has names without values for some.
+PARSE_ERRORS = (
+    *(ValueError, TypeError, LookupError, AttributeError, NameError, EOFError, AssertionError, ArithmeticError),
+    *(RuntimeError, struct.error),
+)
+
 
 def export_of(path: Path) -> ScanExport:
     """The export that this mesh file and its companions make. Raises as `mesh_format.companions` does."""
@@ -179,19 +185,7 @@ def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
             normals = None
             if suffix != "stl" and file_has_normals(path) and len(mesh.vertex_normals) == len(vertices):
                 normals = np.array(mesh.vertex_normals, dtype=np.float64)
-    except (
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        AttributeError,
-        EOFError,
-        NotImplementedError,
-        OverflowError,
-        RecursionError,
-        struct.error,
-        UnicodeDecodeError,
-    ) as error:
+    except PARSE_ERRORS as error:
         raise UnreadableFileError(
             f"this is not a {suffix.upper()} mesh that can be parsed ({error})",
             where=str(path),

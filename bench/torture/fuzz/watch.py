@@ -77,6 +77,9 @@ class Sweep:
         self._group, self._folder = group, folder
         self._engine: Engine = engine
         self._reducing_tries = reducing_tries
+        # What a killed process leaves behind goes with the folder.
+        (folder / "tmp").mkdir(exist_ok=True)
+        self._environment = {**os.environ, "TMPDIR": str(folder / "tmp")}
         self.outcomes: dict[str, Outcome] = {}
 
     def run_each(self, *, inputs: int, seconds: float, seed: int = 0) -> dict[str, Outcome]:
@@ -120,7 +123,7 @@ class Sweep:
         command = [sys.executable, "-m", "bench.torture.fuzz.child", str(self._folder)]
         with (self._folder / "output").open("wb") as output:
             process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, cwd=REPOSITORY
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, cwd=REPOSITORY, env=self._environment
             )
         try:
             death = self._watched(slot, process)
