@@ -69,13 +69,13 @@ def swept(
         }
 
 
-def row(target: Target, outcomes: dict[Engine, Outcome]) -> dict[str, object]:
+def row(target: Target, outcomes: dict[Engine, Outcome], revision: str) -> dict[str, object]:
     """What is recorded of a target."""
     each = list(outcomes.values())
     seconds, inputs = sum(one.seconds for one in each), sum(one.inputs for one in each)
     return {
         "target": target.name,
-        "commit": commit(),
+        "commit": revision,
         "entry": target.entry,
         "inputs": {engine: one.inputs for engine, one in outcomes.items()},
         "refused": sum(one.refused for one in each),
@@ -145,11 +145,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown:
         parser.error(f"there is no target {unknown[0]}; there are {', '.join(targets)}")
     with_engines = engines(options.engine)
+    revision = commit()  # before results make a difference
     rows: list[dict[str, object]] = []
     for name in options.target or targets:
         group, target = targets[name]
         outcomes = swept(target, group, with_engines, options)
-        rows.append(row(target, outcomes))
+        rows.append(row(target, outcomes, revision))
         print(json.dumps(rows[-1]), flush=True)
         for finding in all_findings(list(outcomes.values())):
             print(f"  {finding.fault}\n    input: {keep(finding, options.keep)}", flush=True)

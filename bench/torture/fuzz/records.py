@@ -16,6 +16,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import httpx
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from rfc3161_client import HashAlgorithm, TimestampRequestBuilder
 
@@ -324,7 +325,7 @@ def _web(data: bytes, _: Path) -> None:
     browser = site.browsers.get(role, site.browsers[""])
     address = "/" + path.replace(_RUN, site.run_id).lstrip("/")[:2000]
     form, query = request.get("form"), request.get("query")
-    with contextlib.suppress(ValueError, TypeError, UnicodeError):  # what no client could send
+    with contextlib.suppress(ValueError, TypeError, httpx.InvalidURL):  # what no client could send
         if isinstance(form, dict):
             csrf = browser.person.csrf if role in site.browsers and role else ""
             answer = browser.post(address, data={**form, "csrf": csrf}, follow_redirects=False)
