@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-versions lint format docs bench lock clean
+.PHONY: demo test test-versions lint format docs bench torture-fuzz lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -42,6 +42,12 @@ bench: $(TOOLS)
 	$(BIN)/python -m bench.accuracy
 	$(BIN)/python -m bench.marker_speed
 	$(BIN)/python -m bench.register_scale
+
+# Bad input for every parser: so many seconds for each (an hour: make torture-fuzz FUZZ_S=3600). What is found is kept in
+# build/fuzz. With `$(BIN)/python -m pip install ".[fuzz]"` a second engine follows the lines that an input reaches.
+FUZZ_S = 60
+torture-fuzz: $(TOOLS)
+	$(BIN)/python -m bench.torture.fuzz --seconds-per-target $(FUZZ_S) --record
 
 # New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \

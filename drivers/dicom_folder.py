@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from pydicom.dataset import FileDataset
 
-from drivers.dicom_slices import SliceHeader, arrange, dicom_files, problems_of, read_dicom, read_header
+from drivers.dicom_slices import PARSE_ERRORS, SliceHeader, arrange, dicom_files, problems_of, read_dicom, read_header
 from drivers.errors import UnreadableFileError
 from drivers.export_watch import ExportWatch
 from drivers.interfaces import CtSeries, CtVolume, DeviceIdentity, DeviceReport, ScanExport, ScannedMesh
@@ -23,7 +23,7 @@ from drivers.scan_folder import free_bytes, require_folder
 
 _ARRIVING = "still arriving"
 # What pydicom, its plug-ins and Pillow raise for pixels that are cut short, damaged or of a codec that is missing.
-_DECODE_ERRORS = (ValueError, RuntimeError, AttributeError, KeyError, IndexError, OSError, EOFError, TypeError)
+_DECODE_ERRORS = (*PARSE_ERRORS, RuntimeError, OSError)
 
 
 class DicomFolderConfig(DriverConfig):

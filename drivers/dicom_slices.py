@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import os
+import struct
 import warnings
+import zlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,16 +34,22 @@ _IGNORED_SUFFIXES = (
     ".pdf",
     ".html",
 )
-_PARSE_ERRORS = (
+PARSE_ERRORS = (
     InvalidDicomError,
     BytesLengthException,
     ValueError,
+    ArithmeticError,
     AttributeError,
-    KeyError,
+    LookupError,
     TypeError,
     EOFError,
     NotImplementedError,
+    RecursionError,
+    struct.error,
+    zlib.error,
 )
+_DEFLATED = "1.2.840.10008.1.2.1.99"  # the whole file compressed: what it unpacks to has no bound
+_LARGEST_PIXELS = 8192 * 8192  # of one image; a CT slice has a sixteenth
 _UNCOMPRESSED = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.2")
 _ORIENTATION_TOLERANCE = 1e-3
 # Positions are decimal strings of a few digits; a slice missing moves the next one by a whole spacing.
@@ -96,11 +106,24 @@ def dicom_files(folder: Path) -> list[Path]:
         ) from error
 
 
+class _NoFurther(io.BufferedReader):
+    """A file that is never asked for more than it has left: a wrong length would set gigabytes aside first."""
+
+    def __init__(self, raw: io.FileIO) -> None:
+        super().__init__(raw)
+        self._bytes = os.fstat(raw.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """See io.BufferedReader."""
+        left = max(self._bytes - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
 def read_dicom(path: Path, *, header_only: bool = False) -> FileDataset:
     """pydicom's dataset, also of a file without preamble; its warnings are about details that do not matter here."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), path.open("rb", buffering=0) as raw, _NoFurther(raw) as file:
         warnings.simplefilter("ignore")
-        dataset = pydicom.dcmread(path, force=True, stop_before_pixels=header_only)
+        dataset = pydicom.dcmread(file, force=True, stop_before_pixels=header_only)
         # The elements decode when they are looked at, which warns too.
         dataset.decode()
     return dataset
@@ -110,6 +133,8 @@ def read_header(path: Path) -> SliceHeader | str:
     """The header of an image, or why it has none."""
     again = "export it again, or take it out of the folder"
     try:
+        if _is_deflated(path):
+            return f"{path}: is compressed as a whole (deflated); export it again, uncompressed"
         dataset = read_dicom(path, header_only=True)
         if "SOPClassUID" not in dataset and "Rows" not in dataset:
             return f"{path}: is not a DICOM file, or is damaged; {again}"
@@ -118,8 +143,13 @@ def read_header(path: Path) -> SliceHeader | str:
             return _header(path, dataset)
     except OSError as error:
         return f"{path}: cannot be opened ({error.strerror or error}); {again}"
-    except _PARSE_ERRORS as error:
+    except PARSE_ERRORS as error:
         return f"{path}: is not a DICOM file, or is damaged ({error}); {again}"
+
+
+def _is_deflated(path: Path) -> bool:
+    with path.open("rb") as file:
+        return _DEFLATED.encode() in file.read(2048)  # the transfer syntax is among the first elements
 
 
 def _header(path: Path, dataset: FileDataset) -> SliceHeader:
@@ -167,6 +197,10 @@ def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
         ("files that hold no image, perhaps cut short", [h for h in headers if h.rows * h.columns == 0]),
         ("files that are cut short", [h for h in headers if h.cut_short]),
         ("multi-frame images, which are not read", [h for h in headers if h.frames > 1]),
+        (
+            f"images of more than {_LARGEST_PIXELS:,} pixels",
+            [h for h in headers if h.rows * h.columns > _LARGEST_PIXELS],
+        ),
         ("colour images", [h for h in headers if h.samples > 1]),
         ("images that are not CT", [h for h in headers if h.modality != "CT"]),
         ("no rescale slope and intercept, so no Hounsfield units, in", [h for h in headers if not h.rescaled]),

@@ -15,6 +15,7 @@ banner, a late reply or noise is recognised and skipped. Lines that begin with #
 
 from __future__ import annotations
 
+import math
 import termios
 import time
 from importlib.metadata import version
@@ -197,7 +198,7 @@ class SerialLightbox:
                 return None
             if name in ("SHUTTER", "PEDAL") and not value.isdigit():
                 return None
-            return None if number != number else value  # noqa: PLR0124 - only NaN differs from itself
+            return value if math.isfinite(number) else None
         return value
 
 

@@ -27,6 +27,12 @@ MESH_SUFFIXES = (".obj", ".ply", ".stl")
 
 IntArray = NDArray[np.int64]
 
+# What trimesh and NumPy raise for a file that is not what it says; trimesh has names without values for some.
+PARSE_ERRORS = (
+    *(ValueError, TypeError, LookupError, AttributeError, NameError, EOFError, AssertionError, ArithmeticError),
+    *(RuntimeError, struct.error),
+)
+
 
 def export_of(path: Path) -> ScanExport:
     """The export that this mesh file and its companions make. Raises as `mesh_format.companions` does."""
@@ -179,17 +185,7 @@ def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
             normals = None
             if suffix != "stl" and file_has_normals(path) and len(mesh.vertex_normals) == len(vertices):
                 normals = np.array(mesh.vertex_normals, dtype=np.float64)
-    except (
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        AttributeError,
-        EOFError,
-        NotImplementedError,
-        struct.error,
-        UnicodeDecodeError,
-    ) as error:
+    except PARSE_ERRORS as error:
         raise UnreadableFileError(
             f"this is not a {suffix.upper()} mesh that can be parsed ({error})",
             where=str(path),
@@ -203,6 +199,12 @@ def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
 
 
 def _validate(path: Path, vertices: Array, faces: IntArray) -> None:
+    if vertices.shape[1:] != (3,) or faces.shape[1:] != (3,):
+        raise UnreadableFileError(
+            f"vertices have {vertices.shape[-1]} coordinates and faces {faces.shape[-1]} corners, each must have 3",
+            where=str(path),
+            remedy="Open it in the scanner's software and export it again as triangles",
+        )
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise UnreadableFileError(
             f"a face refers to vertex {int(faces.max())} of {len(vertices)}",

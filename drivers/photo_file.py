@@ -15,6 +15,7 @@ from drivers.interfaces import CameraSettings
 # Without types of its own; see docs/decisions/0002-strict-typing.md.
 exiv2: Any = importlib.import_module("exiv2")
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
+_LONGEST_TEXT = 500  # of a name or a time; no camera writes a tenth of it
 _STANDALONE = {0x01, *range(0xD0, 0xD8)}
 
 
@@ -119,7 +120,11 @@ def _find(exif: Any, name: str) -> Any:
 
 def _text(exif: Any, name: str) -> str:
     found = _find(exif, name)
-    return "" if found is None else str(found.toString()).strip("\0 ")
+    if found is None:
+        return ""
+    # A file may hold any bytes for a text; what is no UTF-8 comes as lone surrogates, which nothing can write down.
+    words = str(found.toString()).encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    return words[:_LONGEST_TEXT].replace("\0", " ").strip()
 
 
 def _number(exif: Any, name: str) -> float | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -12,7 +11,7 @@ import trimesh
 
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import Array
-from drivers.mesh_file import METRES_PER_UNIT, MeshUnit, credible_unit
+from drivers.mesh_file import METRES_PER_UNIT, PARSE_ERRORS, MeshUnit, credible_unit
 
 TEXT_SUFFIXES = (".xyz", ".asc", ".pts", ".txt", ".csv")
 
@@ -44,7 +43,7 @@ def is_point_cloud(path: Path) -> bool:
         for line in stream:
             words = line.split()
             if words[:2] == [b"element", b"face"]:
-                return int(words[2]) == 0
+                return words[2:3] == [b"0"]
             if words[:2] == [b"element", b"tristrips"]:
                 return False  # a mesh, of a kind that is not read
             if words[:1] == [b"end_header"]:
@@ -62,7 +61,7 @@ def read_point_cloud(path: Path, unit: MeshUnit = "auto") -> PointCloud:
     """
     try:
         points, normals = _text(path) if path.suffix.lower() in TEXT_SUFFIXES else _ply(path)
-    except (OSError, ValueError, TypeError, KeyError, IndexError, AttributeError, EOFError, struct.error) as error:
+    except (OSError, *PARSE_ERRORS) as error:
         raise UnreadableFileError(
             f"this is not a point cloud that can be parsed ({error})",
             where=str(path),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field, ValidationError
 
-from service.core.errors import ConfigurationError, ProtocolError
+from service.core.errors import ConfigurationError, DataError, ProtocolError
 from service.core.imported import ImportList
+from service.core.json_text import parse_json
 from service.core.model import Record
 from service.core.yaml_tree import parse_yaml
+
+_REMEDY = "Compare it with the example in docs/your_hardware.md"
 
 if TYPE_CHECKING:  # the module brings scipy, for which a web process must not wait when it starts
     from service.core.geometry import Transform
@@ -132,7 +134,11 @@ class Rig:
             )
         T = np.array(rows, dtype=np.float64)
         if T.shape != (4, 4) or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-4):
-            raise ConfigurationError("T_flange_camera_nominal is not a rigid 4×4 transform", where=where)
+            raise ConfigurationError(
+                "T_flange_camera_nominal is not a rigid 4×4 transform",
+                where=where,
+                remedy="Give four rows of four numbers: a rotation, and the translation in metres",
+            )
         return T
 
 
@@ -141,7 +147,11 @@ def load_rig(path: Path) -> Rig:
     try:
         source = path.read_bytes()
     except OSError as error:
-        raise ConfigurationError(f"cannot read the rig file: {error.strerror}", where=str(path)) from error
+        raise ConfigurationError(
+            f"cannot read the rig file: {error.strerror}",
+            where=str(path),
+            remedy="Check the path and its permissions",
+        ) from error
     return parse_rig(source, path)
 
 
@@ -150,16 +160,18 @@ def parse_rig(source: bytes, path: Path) -> Rig:
     # The list of an import is JSON, of thousands of lines, which YAML would take seconds for.
     data = _parsed_json(source, path) if source.startswith(b"{") else _parsed_yaml(source, path)
     if not isinstance(data, Mapping):
-        raise ConfigurationError("the rig file holds no mapping", where=str(path))
+        raise ConfigurationError("the rig file holds no mapping", where=str(path), remedy=_REMEDY)
     try:
         section = RigSection.model_validate(data)
     except ValidationError as error:
         problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise ConfigurationError(f"the rig file is wrong: {problems}", where=str(path)) from error
+        raise ConfigurationError(f"the rig file is wrong: {problems}", where=str(path), remedy=_REMEDY) from error
     for name, station in section.stations.items():
         if station.robot not in section.devices:
             raise ConfigurationError(
-                f"station {name!r} names robot {station.robot!r}, which is not among the devices", where=str(path)
+                f"station {name!r} names robot {station.robot!r}, which is not among the devices",
+                where=str(path),
+                remedy=f"Name one of the devices: {', '.join(section.devices) or 'there are none'}",
             )
     return Rig(section, path.resolve(), source)
 
@@ -168,7 +180,9 @@ def _parsed_yaml(source: bytes, path: Path) -> object:
     try:
         tree = parse_yaml(source.decode(), name=str(path))
     except UnicodeDecodeError as error:
-        raise ConfigurationError("the rig file is not UTF-8 text", where=str(path)) from error
+        raise ConfigurationError(
+            "the rig file is not UTF-8 text", where=str(path), remedy="Save the file as UTF-8"
+        ) from error
     except ProtocolError as error:
         raise ConfigurationError(f"the rig file: {error.what}", where=error.where, remedy=error.remedy) from error
     if tree.problems:
@@ -180,21 +194,7 @@ def _parsed_yaml(source: bytes, path: Path) -> object:
 
 
 def _parsed_json(source: bytes, path: Path) -> object:
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        data = dict(pairs)
-        if len(data) < len(pairs):
-            names = [name for name, _ in pairs]
-            double = next(name for name in names if names.count(name) > 1)
-            raise ConfigurationError(
-                f"the rig file gives {double!r} twice", where=str(path), remedy="Give each key once"
-            )
-        return data
-
     try:
-        return json.loads(source, object_pairs_hook=once)
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ConfigurationError(f"the rig file is not JSON: {error}", where=str(path)) from error
-    except RecursionError as error:
-        raise ConfigurationError(
-            "the rig file is nested too deep", where=str(path), remedy="Look for brackets that are not closed"
-        ) from error
+        return parse_json(source, name=str(path))
+    except DataError as error:
+        raise ConfigurationError(f"the rig file: {error.what}", where=error.where, remedy=error.remedy) from error

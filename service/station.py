@@ -209,10 +209,14 @@ class Station:
         settings = self.rig.section.devices.get(name)
         where = f"{self.rig.path}, device {name}"
         if settings is None:
-            raise ConfigurationError(f"the rig has no device {name!r}", where=str(self.rig.path))
+            raise ConfigurationError(
+                f"the rig has no device {name!r}",
+                where=str(self.rig.path),
+                remedy=f"Devices: {', '.join(self.names()) or 'none'}",
+            )
         driver = settings.get("driver")
         points = _installed()
-        if driver not in points:
+        if not isinstance(driver, str) or driver not in points:
             raise ConfigurationError(
                 f"no driver {driver!r} is installed", where=where, remedy=f"Installed: {', '.join(sorted(points))}"
             )

@@ -54,8 +54,9 @@ class FaultPlan:
         if not source.startswith(("[", "{")):
             try:
                 source = Path(source).read_text(encoding="utf-8").strip()
-            except OSError as error:
-                raise SimulatorError(f"the fault plan {text} cannot be read: {error.strerror}") from error
+            except (OSError, ValueError) as error:  # ValueError: no such path can be, or no text is in it
+                why = getattr(error, "strerror", None) or error
+                raise SimulatorError(f"the fault plan {text[:80]!a} cannot be read: {why}") from error
         if source.startswith("{"):
             source = f"[{source}]"
         try:
@@ -63,7 +64,7 @@ class FaultPlan:
         except ValidationError as error:
             first = error.errors()[0]
             field = ".".join(str(part) for part in first["loc"])
-            raise SimulatorError(f"the fault plan is wrong at {field or 'its start'}: {first['msg']}") from error
+            raise SimulatorError(f"the fault plan is wrong at {field or 'its start'!a}: {first['msg']}") from error
 
     def to_json(self) -> str:
         """The plan as parse() reads it (counters are not part of it)."""

@@ -34,6 +34,7 @@ _TABLE_M = (0.215, 0.150)  # half: posts stand on the board
 _ROOM_M = 2.3 * RADIUS_M  # between two centres
 
 _LONGEST_WAIT_S = 1.0
+_LONGEST_REQUEST = 1 << 20  # bytes; what is longer is cut, and no JSON any more
 
 Act = Callable[[Mapping[str, Any]], dict[str, Any]]
 
@@ -214,7 +215,7 @@ class _Client(socketserver.StreamRequestHandler):
         server = self.server
         assert isinstance(server, WorldServer)
         try:
-            for line in self.rfile:
+            while line := self.rfile.readline(_LONGEST_REQUEST):
                 answer = _answer(server, line)
                 if answer is not None:
                     self.wfile.write(json.dumps(answer).encode() + b"\n")
@@ -232,7 +233,7 @@ def _answer(server: WorldServer, line: bytes) -> dict[str, Any] | None:
             server.world.arm_moved(str(request["arm"]), np.array(request["q"], dtype=np.float64))
             return None
         return _operation(server, request)
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, LookupError, TypeError, ArithmeticError, RecursionError) as error:
         return {"ok": False, "error": f"bad request: {error}"}
 
 

@@ -308,7 +308,9 @@ def test_correction_keeps_the_original_and_reads_the_old_value_itself(tmp_path: 
         ]
         assert original.payload["host"] == "here"
         assert verify(tmp_path / "data").ok
+        redo = next(event.seq for event in store.events(run) if event.payload.kind == "operator_action")
         for of_seq, field, new, reason in (
+            (redo, "viewpoint", "1" + "0" * 400, "a number that no computer holds"),
             (2, "host", "here", "same"),
             (2, "pid", "seven", "not a number"),
             (2, "pid", "nan", "not finite"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -289,3 +290,26 @@ def test_a_series_in_transfer_is_not_taken_for_a_short_one(tmp_path: Path) -> No
     assert series.problems == ()
     assert series.slices == SHAPE[0]
     assert folder.report().problems == ()
+
+
+def test_images_larger_than_any_slice_are_a_problem_before_memory_is_set_aside(tmp_path: Path) -> None:
+    def huge(image: Dataset, k: int) -> None:
+        if k == 2:
+            image.Rows = image.Columns = 60_000
+
+    write_series(tmp_path, change=huge)
+    (series,) = source(tmp_path).series()
+    assert any("more than 67,108,864 pixels" in problem for problem in series.problems), series.problems
+
+
+def test_a_length_of_four_gigabytes_asks_for_no_more_than_the_file_holds(tmp_path: Path) -> None:
+    meta = b"\2\0\x10\0UI\x14\0" + str(ImplicitVRLittleEndian).encode().ljust(20, b"\0")
+    data = b"\0" * 128 + b"DICM" + meta + b"\x08\0\x18\0\xf0\xff\xff\xff" + b"1.2"
+    (tmp_path / "CT00001.dcm").write_bytes(data)
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + (1 << 30), hard))
+    try:
+        assert source(tmp_path).series() == ()
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

@@ -8,12 +8,18 @@ import socket
 import struct
 from collections.abc import Generator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from drivers.errors import DeviceFaultError, DeviceUnavailableError
-from drivers.ur import vendor as library
+
+if TYPE_CHECKING:
+    from drivers.ur import vendor as library
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 VENDOR_ERRORS = (RuntimeError, ValueError, TypeError)
+_LONGEST_SERIAL = 20
+_LONGEST_LINE = 1000  # of the dashboard's answers: none of them is a tenth as long
+_REMEDY = "Check that this address is that of a Universal Robots controller, then restart it"
 MINIMUM_VERSION = {3: (3, 15), 5: (5, 10)}  # get_inverse_kin_has_solution() came with these
 
 
@@ -72,6 +78,9 @@ def _ask(host: str, port: int, question: bytes | None, timeout_s: float, name: s
 
 def connect_dashboard(host: str) -> library.Dashboard:
     """A connected dashboard client."""
+    # Imported here: what this module reads of a controller needs no vendor's library.
+    from drivers.ur import vendor as library  # noqa: PLC0415
+
     client = library.dashboard(host)
     with vendor(host, "connecting to the dashboard"):
         client.connect(2000)
@@ -82,9 +91,9 @@ def read_facts(dashboard: library.Dashboard, host: str, timeout_s: float) -> Con
     """Version, serial number and model. Raises DeviceFaultError for software that is too old."""
     with vendor(host, "reading the version"):
         software = dashboard.polyscopeVersion()
-    match = re.search(r"(\d+)\.(\d+)", software)
+    match = re.search(r"([0-9]{1,3})\.([0-9]{1,3})", software)
     if match is None:
-        raise DeviceFaultError(f"the controller names no version: {software!r}", where=host)
+        raise DeviceFaultError(f"the controller names no version: {software!r}", where=host, remedy=_REMEDY)
     version = (int(match.group(1)), int(match.group(2)))
     minimum = MINIMUM_VERSION.get(version[0], (0, 0))
     if version < minimum:
@@ -95,8 +104,8 @@ def read_facts(dashboard: library.Dashboard, host: str, timeout_s: float) -> Con
         )
     # The vendor's client refuses these two questions for a CB3, which answers them all the same.
     serial, model = _questions(host, "get serial number", "get robot model", timeout_s=timeout_s)
-    if not serial.isdigit():
-        raise DeviceFaultError(f"the controller names no serial number: {serial!r}", where=host)
+    if not (serial.isascii() and serial.isdigit() and len(serial) <= _LONGEST_SERIAL):
+        raise DeviceFaultError(f"the controller names no serial number: {serial!r}", where=host, remedy=_REMEDY)
     remote = True
     if version[0] >= 5:  # CB3 has no local mode
         with vendor(host, "asking for remote control"):
@@ -109,13 +118,13 @@ def _questions(host: str, *questions: str, timeout_s: float) -> list[str]:
     try:
         with (
             socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection,
-            connection.makefile("rw", encoding="utf-8", newline="\n") as lines,
+            connection.makefile("rw", encoding="utf-8", errors="replace", newline="\n") as lines,
         ):
-            lines.readline()  # welcome
+            lines.readline(_LONGEST_LINE)  # welcome
             for question in questions:
                 lines.write(f"{question}\n")
                 lines.flush()
-                answers.append(lines.readline().strip())
+                answers.append(lines.readline(_LONGEST_LINE).strip())
     except OSError as error:
-        raise DeviceUnavailableError(f"the dashboard server failed: {error}", where=host) from error
+        raise DeviceUnavailableError(f"the dashboard server failed: {error}", where=host, remedy=_REMEDY) from error
     return answers

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 from service.audit.findings import value_at, value_text
 from service.audit.queries import one_event
 from service.core.errors import DataError
+from service.core.json_text import parse_json
 from service.core.model import Event, RecordCorrected
 from service.store.store import Store
 
@@ -108,8 +108,8 @@ def _number(text: str) -> float | int | None:
 
 def _json(text: str) -> str | float | None:
     try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
+        value = parse_json(text, name="the new value")
+    except DataError:
         return None
     if isinstance(value, str) or (isinstance(value, int | float) and math.isfinite(value)):
         return value

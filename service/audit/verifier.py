@@ -23,12 +23,13 @@ import re
 import stat
 import sys
 import zipfile
+import zlib
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 try:
     from cryptography import x509
-    from cryptography.exceptions import InvalidSignature
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -50,6 +51,7 @@ CHUNK = 1 << 20
 LARGEST_MANIFEST = 64 << 20
 LARGEST_LINE = 64 << 20
 LARGEST_EXPANSION = 200  # of a compressed file; records compress twentyfold at most
+MOST_DEEP = 100  # of JSON within JSON; records have a tenth of it
 SAFE_INTEGER = 2**53 - 1
 REFERENCE = frozenset({"sha256", "kind", "media_type", "size_bytes", "original_name"})
 # What a record must have, and of which kind; everything else is compared, not used.
@@ -62,6 +64,13 @@ KINDS: dict[str, dict[str, type]] = {
     "timestamps.jsonl": {"run_id": str, "seq": int, "token": str},
     "keys.jsonl": {"key_id": str},
 }
+# What reading a file of a bundle may end in, whatever its bytes are.
+UNREADABLE = (OSError, zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError, RuntimeError)
+# What a time stamp and the certificates in it may end in.
+UNPROVEN = (
+    *(ValueError, IndexError, KeyError, TypeError, OverflowError, AttributeError, InvalidSignature),
+    *(UnsupportedAlgorithm, x509.ExtensionNotFound, x509.DuplicateExtension, x509.InvalidVersion),
+)
 JOB_FIELDS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
 
 
@@ -72,6 +81,7 @@ class NotABundleError(Exception):
 # --- RFC 8785 canonical JSON ------------------------------------------------------------------------------------
 
 _ESCAPES = {"\b": "\\b", "\t": "\\t", "\n": "\\n", "\f": "\\f", "\r": "\\r", '"': '\\"', "\\": "\\\\"}
+_UNPRINTABLE = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 _ESCAPED = re.compile(r'[\x00-\x1f"\\]')
 
 
@@ -146,11 +156,19 @@ def number(value: float) -> str:
 def parse(text: bytes) -> Any:
     """JSON without duplicate names, NaN and infinity. Raises ValueError."""
     try:
-        return json.loads(
+        found = json.loads(
             text.decode("utf-8"), object_pairs_hook=_pairs, parse_int=_integer, parse_constant=_constant
         )
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+    # How deep the parser itself goes depends on the version of Python, and everything behind it recurses too.
+    level = [found] if isinstance(found, (dict, list)) else []
+    for _ in range(MOST_DEEP):
+        inside = [holder.values() if isinstance(holder, dict) else holder for holder in level]
+        level = [item for items in inside for item in items if isinstance(item, (dict, list))]
+        if not level:
+            return found
+    raise ValueError("it is nested too deeply")
 
 
 def _pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -207,7 +225,7 @@ class ZipBundle(Bundle):
     def __init__(self, path: Path, fault: Callable[[str, str], None]) -> None:
         try:
             self._zip = zipfile.ZipFile(path)
-        except (OSError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             raise NotABundleError(f"{path} cannot be read as a zip file: {error}") from error
         self._infos: dict[str, zipfile.ZipInfo] = {}
         self.sizes = {}
@@ -265,6 +283,8 @@ def _entry_problem(info: zipfile.ZipInfo) -> str:
         return "it is a folder, a link or a device, not a file"
     if info.flag_bits & 1:
         return "it is encrypted"
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        return "it is compressed in a way that no bundle is"  # others may ask for gigabytes to unpack a kilobyte
     return ""
 
 
@@ -326,6 +346,7 @@ class Check:
             content = bundle.read(MANIFEST, LARGEST_MANIFEST)
             manifest = parse(content)
             files = {str(item["path"]): (str(item["sha256"]), int(item["size_bytes"])) for item in manifest["files"]}
+            canonical(manifest)  # what has no canonical form cannot be shown either
             if manifest["format"] != FORMAT:
                 raise NotABundleError(f"this verifier does not know the format {manifest['format']!r}")
             for name in ("run_id", "simulated", "hashes_only", "made_by_key"):
@@ -333,7 +354,7 @@ class Check:
             for name in ("head", "site_head"):
                 if not isinstance(manifest[name], dict):
                     raise TypeError(f"{name} is no object")  # noqa: TRY301
-        except (ValueError, KeyError, TypeError, OSError, zipfile.BadZipFile) as error:
+        except (*UNREADABLE, KeyError, TypeError, OverflowError, AttributeError) as error:
             raise NotABundleError(f"manifest.json cannot be read: {error!r}") from error
         if len(files) != len(manifest["files"]):
             self.fault(MANIFEST, "it lists a file twice")
@@ -368,7 +389,7 @@ class Check:
             with bundle.open(name) as stream:
                 while chunk := stream.read(CHUNK):
                     digest.update(chunk)
-        except (OSError, zipfile.BadZipFile, ValueError, EOFError, NotImplementedError) as error:
+        except UNREADABLE as error:
             return f"unreadable ({error})"
         return digest.hexdigest()
 
@@ -389,7 +410,7 @@ class Check:
                     self.fault(f"{name}, line {index}", str(error))
                 else:
                     yield record
-        except (OSError, zipfile.BadZipFile, ValueError, EOFError, NotImplementedError) as error:
+        except UNREADABLE as error:
             self.fault(name, f"it cannot be read to its end: {error}")
 
     def _check_heads(self, run: Chain, site: Chain) -> None:
@@ -549,7 +570,7 @@ class Check:
             return
         try:
             signature = base64.b64decode(bundle.read(SIGNATURE, 4096).strip(), validate=True)
-        except (ValueError, OSError, zipfile.BadZipFile) as error:
+        except UNREADABLE as error:
             self.fault(SIGNATURE, f"it cannot be read: {error}")
             return
         if key is None or key["replaced_seq"] is not None:
@@ -603,7 +624,7 @@ class Check:
         try:
             graph = parse(bundle.read(name, LARGEST_MANIFEST))["@graph"]
             listed = {str(item["@id"]): str(item.get("sha256", "")) for item in graph if "File" in str(item["@type"])}
-        except (ValueError, KeyError, TypeError) as error:
+        except (*UNREADABLE, KeyError, TypeError, AttributeError) as error:
             self.fault(name, f"it cannot be read: {error!r}")
             return
         for path, sha256 in listed.items():
@@ -625,13 +646,13 @@ class Check:
             item = signed.get((stamp.get("run_id"), stamp.get("seq")))
             try:
                 if item is None:
-                    raise ValueError("it belongs to a checkpoint that is not there")  # noqa: TRY301
+                    raise ValueError("it belongs to a checkpoint that is not there")
                 message = statement(item) + b"\n" + str(item.get("signature")).encode()
                 token = Token(base64.b64decode(str(stamp.get("token")), validate=True))
                 token.check_message(message)
                 if roots:
                     token.check_signature(roots)
-            except (ValueError, IndexError, InvalidSignature, TypeError) as error:
+            except UNPROVEN as error:
                 self.fault(shown, f"the time stamp does not hold: {error or 'its signature is not valid'}")
             else:
                 checked = "" if roots else " (its signature was not checked: give the authority's --certificates)"
@@ -879,7 +900,7 @@ def _issued(above: x509.Certificate, below: x509.Certificate) -> bool:
         if not above.extensions.get_extension_for_class(x509.BasicConstraints).value.ca:
             return False
         below.verify_directly_issued_by(above)
-    except (ValueError, TypeError, InvalidSignature, x509.ExtensionNotFound):
+    except UNPROVEN:
         return False
     return True
 
@@ -894,7 +915,7 @@ def load_certificates(path: Path | None) -> list[x509.Certificate]:
         return []
     try:
         return x509.load_pem_x509_certificates(path.read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, *UNPROVEN) as error:
         raise NotABundleError(f"{path} cannot be read as certificates: {error}") from error
 
 
@@ -915,9 +936,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         check.run(options.bundle, options.key, options.certificates)
     except NotABundleError as error:
-        sys.stderr.write(f"{error}\n")
+        sys.stderr.write(shown(f"{error}\n"))
         for fault in check.faults:
-            sys.stderr.write(f"  {fault['where']}: {fault['what']}\n")
+            sys.stderr.write(shown(f"  {fault['where']}: {fault['what']}\n"))
         return 2
     if options.json:
         result = {
@@ -954,7 +975,12 @@ def report(check: Check) -> str:
         lines += [f"  {fault['where']}: {fault['what']}" for fault in check.faults]
     else:
         lines.append("WHOLE AND UNALTERED: every file, record, link and signature is as it was recorded.")
-    return "\n".join(lines) + "\n"
+    return "".join(shown(f"{line}\n") for line in lines)
+
+
+def shown(text: str) -> str:
+    """A line without what a terminal would obey rather than show: names in a bundle are whatever somebody chose."""
+    return _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 if __name__ == "__main__":

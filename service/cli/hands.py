@@ -10,9 +10,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.core.errors import OrthocaptureError
+from service.core.json_text import parse_json
 from service.core.protocol import Step
 
 _ASKS_FOR_A_PHOTOGRAPH = ("next: ", "take the photograph now")  # how such words begin
+_LONGEST_ANSWER = 1 << 20  # characters
 _PATIENCE_S = 900  # a CT volume or a scan of the whole scene takes minutes on a busy machine
 
 
@@ -40,6 +42,7 @@ class SimulatedHands:
                 raise OrthocaptureError(
                     f"the simulated technician could not {action.get('action')}: {answer.get('error')}",
                     where=f"step {step}",
+                    remedy="Give the step an action that simulators/rig_world.py lists",
                 )
         self._done.add((step, attempt))
 
@@ -56,9 +59,11 @@ def _ask_world(address: str, request: dict[str, Any]) -> dict[str, Any]:
         with socket.create_connection((host, int(port)), timeout=10) as link:
             link.settimeout(deadline_s - time.monotonic())
             link.sendall(json.dumps(request).encode() + b"\n")
-            with link.makefile("r", encoding="utf-8") as answers:
-                return json.loads(answers.readline() or '{"ok": false, "error": "no answer"}')
-    except OSError as error:
+            with link.makefile("r", encoding="utf-8", errors="replace") as answers:
+                line = answers.readline(_LONGEST_ANSWER) or '{"ok": false, "error": "no answer"}'
+                answer = parse_json(line, name=address, remedy="Start the rig again")
+                return answer if isinstance(answer, dict) else {}
+    except (OSError, ValueError) as error:
         raise OrthocaptureError(
             f"the simulated technician does not answer: {error}", where=address, remedy="Start the rig again"
         ) from error

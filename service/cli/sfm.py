@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json as json_module
 import os
 import shutil
@@ -29,6 +28,7 @@ from service.compute.poses.pose_files import (
     write_camera_json,
     write_poses_csv,
 )
+from service.compute.poses.robot_files import read_hand_eye, read_stations
 from service.compute.poses.sfm import SfmModel, reconstruct
 from service.compute.poses.sfm_options import Effort, Refine, SfmOptions, options_for
 from service.compute.surfaces.mesh_spheres import locate_spheres
@@ -93,7 +93,7 @@ def sfm_command(
         files = {file.name: file for file in image_files(images)}
         model = read_camera_json(camera)
         prior = _robot_poses(robot_poses, hand_eye, files)
-        station = _stations(stations, files)
+        station = None if stations is None else read_stations(stations, files)
         options = options_for(effort, model, refine=refine, threads=os.cpu_count() or 1)
         known = _spheres(mesh, spheres, radius_mm, mesh_unit) if hybrid else None
         with _workspace(workspace) as folder, progress_bar(quiet=json) as progress:
@@ -121,33 +121,10 @@ def _robot_poses(path: Path | None, hand_eye: Path | None, files: Mapping[str, P
     if path is None:
         return None
     given = read_poses_csv(path)
-    T_flange_camera = np.eye(4)
-    if hand_eye is not None:
-        try:
-            T_flange_camera = np.array(
-                json_module.loads(hand_eye.read_text(encoding="utf-8"))["T_flange_camera"], dtype=np.float64
-            )
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise DataError("no T_flange_camera can be read", where=str(hand_eye)) from error
-        if T_flange_camera.shape != (4, 4):
-            raise DataError("T_flange_camera is not 4 × 4", where=str(hand_eye))
+    T_flange_camera = np.eye(4) if hand_eye is None else read_hand_eye(hand_eye)
     found = {name: T @ T_flange_camera for name, T in given.items() if name in files}
     if not found:
         raise DataError("no image of the folder has a robot pose", where=str(path), remedy="check the names")
-    return found
-
-
-def _stations(path: Path | None, files: Mapping[str, Path]) -> dict[str, str] | None:
-    if path is None:
-        return None
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            found = {row["image"]: row["station"] for row in csv.DictReader(file)}
-    except (OSError, KeyError) as error:
-        raise DataError("no columns image, station can be read", where=str(path)) from error
-    missing = sorted(set(files) - set(found))
-    if missing:
-        raise DataError(f"{len(missing)} images have no station: {', '.join(missing[:5])}", where=str(path))
     return found
 
 

@@ -16,6 +16,9 @@ from service.core.errors import DataError
 # In entropy-coded data 0xFF is followed by 0x00 (stuffing) or a restart marker; anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # headers that give the size
+_PNG = b"\x89PNG\r\n\x1a\n"
+_MOST_PIXELS = 400_000_000  # the largest cameras take a third; a damaged header may claim four gigabytes more
 _REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
 
 
@@ -46,6 +49,9 @@ def check_jpeg(data: bytes, where: str) -> None:
             return
         if at + 4 > len(data):
             break
+        if marker in _FRAMES:
+            height, width = (int.from_bytes(data[at + k : at + k + 2], "big") for k in (5, 7))
+            _check_size(width, height, where)
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         if marker == _START_OF_SCAN:
             end = _END_OF_SCAN.search(data, at)
@@ -53,6 +59,15 @@ def check_jpeg(data: bytes, where: str) -> None:
                 break
             at = end.start()
     raise truncated
+
+
+def _check_size(width: int, height: int, where: str) -> None:
+    if width * height > _MOST_PIXELS:
+        raise DataError(
+            f"the image claims to have {width} × {height} pixels",
+            where=where,
+            remedy="Copy the file from the camera again; no camera takes such images",
+        )
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -77,13 +92,22 @@ def _decode(path: Path, how: int) -> NDArray[np.uint8]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise DataError(f"the image cannot be read: {error.strerror}", where=str(path)) from error
+        raise DataError(
+            f"the image cannot be read: {error.strerror}",
+            where=str(path),
+            remedy="Check the path and its permissions",
+        ) from error
     if path.suffix.lower() in {".jpg", ".jpeg"} or data[:2] == b"\xff\xd8":
         check_jpeg(data, str(path))
+    elif data.startswith(_PNG):
+        width, height = (int.from_bytes(data[k : k + 4], "big") for k in (16, 20))
+        _check_size(width, height, str(path))
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), how | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
-        raise DataError(f"the image cannot be decoded: {error.err}", where=str(path)) from error
+        raise DataError(
+            f"the image cannot be decoded: {error.err}", where=str(path), remedy="Copy the file from the camera again"
+        ) from error
     if image is None:
         raise DataError(
             "the file is not an image that can be decoded", where=str(path), remedy="Use JPEG or PNG images"

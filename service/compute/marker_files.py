@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -12,6 +11,8 @@ from service.compute.images import read_image_of
 from service.compute.markers.paper_chain import Box, detect_by_masks
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.core.errors import DataError
+from service.core.file_text import file_text
+from service.core.json_text import parse_json
 
 _FORM = 'Write {"image.jpg": [[left, top, right, bottom], …], …} in pixels of the image'
 
@@ -44,10 +45,7 @@ def read_boxes(path: Path, names: Sequence[str]) -> dict[str, list[Box]]:
     Raises:
         DataError: no JSON of this form, a box without area, or an image that is none of `names`.
     """
-    try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"cannot read the boxes: {error}", where=str(path), remedy=_FORM) from error
+    data = parse_json(file_text(path), name=str(path), remedy=_FORM)
     if not isinstance(data, dict):
         raise DataError("the file holds no boxes by image name", where=str(path), remedy=_FORM)
     known = cast(dict[str, Any], data)

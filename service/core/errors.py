@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
+
+# What a terminal or a page would obey rather than show, and what cannot be encoded: quoted from files it stays text.
+_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+_LONGEST, _LONGEST_LINE = 20_000, 4_000  # characters: a file may hold a word of a megabyte
 
 
 class OrthocaptureError(Exception):
@@ -16,9 +21,9 @@ class OrthocaptureError(Exception):
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
         super().__init__(what)
-        self.what = what
-        self.where = where
-        self.remedy = remedy
+        self.what = _shown(what)
+        self.where = _shown(where)
+        self.remedy = _shown(remedy)
 
     def __str__(self) -> str:
         place = f" [{self.where}]" if self.where else ""
@@ -28,6 +33,15 @@ class OrthocaptureError(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         # Keyword arguments are lost by the default reduction; errors cross process borders in drivers.host.
         return _rebuild, (type(self), self.what, self.where, self.remedy)
+
+
+def _shown(text: str) -> str:
+    plain = _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
+    return _cut("\n".join(_cut(line, _LONGEST_LINE) for line in plain.split("\n")), _LONGEST)
+
+
+def _cut(text: str, longest: int) -> str:
+    return text if len(text) <= longest else f"{text[: longest // 2]} … {text[-longest // 4 :]}"
 
 
 def _rebuild(cls: type[OrthocaptureError], what: str, where: str, remedy: str) -> OrthocaptureError:

@@ -16,12 +16,13 @@ Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
 
 MOST_DEEP = 50
 MOST_VALUES = 200_000
+_LONGEST_INTEGER = 18  # characters; a longer number counts as a float
 
 # The core schema of YAML 1.2 (section 10.3): unlike YAML 1.1, "on" and "12:30" stay text and 1e-3 is a number.
 _SCALARS: tuple[tuple[re.Pattern[str], Callable[[str], Plain]], ...] = (
     (re.compile(r"(null|Null|NULL|~|)"), lambda _: None),
     (re.compile(r"(true|True|TRUE|false|False|FALSE)"), lambda text: text.lower() == "true"),
-    (re.compile(r"[-+]?[0-9]+"), int),
+    (re.compile(r"[-+]?[0-9]+"), lambda text: int(text) if len(text) <= _LONGEST_INTEGER else float(text)),
     (re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"), float),
 )
 
@@ -76,6 +77,12 @@ def parse_yaml(text: str, *, name: str) -> YamlTree:
         line = text.count("\n", 0, error.position) + 1
         raise ProtocolError(
             f"not valid YAML: {error.reason}", where=f"{name}:{line}", remedy="Remove the unprintable character"
+        ) from error
+    except (ValueError, OverflowError, RecursionError) as error:  # of the reader, for an escape that is no character
+        raise ProtocolError(
+            f"not valid YAML: {error}",
+            where=f"{name}:1",
+            remedy="Look for an escape such as \\U… that is no character",
         ) from error
     builder = _Builder(name)
     data = None if root is None else builder.build(root, (), ())

@@ -55,7 +55,10 @@ def canonical_parsed(value: object) -> str:
 
 def parse_canonical(text: str) -> Any:
     """Read canonical JSON back; canonical(parse_canonical(t)) == t. Raises ValueError."""
-    return _READER.decode(text)
+    try:
+        return _READER.decode(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
 
 
 def _integer(digits: str) -> int | float:

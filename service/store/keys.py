@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import (
     Encoding,
@@ -74,7 +75,7 @@ class KeyFolder:
             key = load_pem_private_key(path.read_bytes(), password=None)
         except FileNotFoundError as error:
             raise SigningKeyError("the signing key is missing", where=str(path), remedy=_REMEDY) from error
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, TypeError, UnsupportedAlgorithm) as error:
             raise SigningKeyError(
                 f"the signing key cannot be read: {error}", where=str(path), remedy=_REMEDY
             ) from error

@@ -33,7 +33,7 @@ NAME = "signatures.jsonl"
 PURPOSE = "orthocapture signature log v1"  # so that no signature of this key can be taken for one of another kind
 _FIRST = "0" * 64
 _MOST_AT_ONCE = 3  # signatures of one transaction: of a new key, of a run, of the site's chain that names it
-_COLUMNS = tuple(field.name for field in fields(Checkpoint))
+_COLUMNS = {field.name: int if field.type == "int" else str for field in fields(Checkpoint)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,11 @@ def read_log(path: Path) -> list[Line] | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path)) from error
+        raise StoreError(
+            f"the log of signatures cannot be read: {error.strerror}",
+            where=str(path),
+            remedy="Check the permissions of the data folder",
+        ) from error
     return list(_parsed(content))
 
 
@@ -123,13 +127,17 @@ def _parsed(content: bytes) -> Iterator[Line]:
 def _line(number: int, raw: bytes, previous: str) -> Line:
     try:
         data = json.loads(raw)
-        checkpoint = Checkpoint(**{name: data["checkpoint"][name] for name in _COLUMNS})
+        values = {name: data["checkpoint"][name] for name in _COLUMNS}
+        if any(type(values[name]) is not kind for name, kind in _COLUMNS.items()):
+            raise TypeError("a field is of another kind")  # noqa: TRY301
+        checkpoint = Checkpoint(**values)
         key_id, signature = str(data["key_id"]), str(data["signature"])
         said_before, said_number = data["previous_sha256"], data["number"]
-    except (ValueError, TypeError, KeyError, RecursionError):
+        message = _message(number, previous, checkpoint, key_id)
+    except (ValueError, TypeError, KeyError, RecursionError, StoreError):
         return Line(number, None, "it cannot be read")
     problem = "" if (said_before, said_number) == (previous, number) else "it does not follow the line before it"
-    return Line(number, checkpoint, problem, _message(number, previous, checkpoint, key_id), key_id, signature)
+    return Line(number, checkpoint, problem, message, key_id, signature)
 
 
 def _message(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> bytes:

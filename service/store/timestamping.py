@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
 from rfc3161_client import (
     HashAlgorithm,
     TimestampRequestBuilder,
@@ -36,6 +37,8 @@ from service.store.tables import timestamps
 
 _DEVICE = "time-stamp authority"
 _LARGEST_REPLY = 1 << 20
+# What a token and the certificates in it may end in.
+_UNREADABLE = (ValueError, TypeError, UnsupportedAlgorithm, x509.ExtensionNotFound, x509.DuplicateExtension)
 _TYPE, _REPLY_TYPE = "application/timestamp-query", "application/timestamp-reply"
 
 
@@ -71,7 +74,7 @@ def timestamp(store: Store, checkpoint: Checkpoint, authority: Authority) -> Tim
         roots, others = _certificates(authority.certificates)
         builder = VerifierBuilder.from_request(request)
         _verify(builder, roots, others, response, message)
-    except (OSError, ValueError, VerificationError) as error:
+    except (OSError, *_UNREADABLE, VerificationError) as error:
         raise TimestampError(
             f"the time-stamp authority gave no valid answer: {error}",
             where=authority.url,
@@ -124,7 +127,7 @@ def timestamp_findings(
     for stamp in stamps:
         try:
             said = _check(signed.get(stamp.seq), stamp, certificates)
-        except (ValueError, VerificationError) as error:
+        except (*_UNREADABLE, VerificationError) as error:
             faults.append(Fault(stamp.run_id, stamp.seq, "", f"time stamp of {stamp.authority}: {error}"))
         else:
             notes.append(f"{stamp.run_id}: {stamp.authority} says that the checkpoint at event {stamp.seq} {said}")
@@ -167,13 +170,13 @@ def _certificates(path: Path) -> tuple[list[x509.Certificate], list[x509.Certifi
     """Self-issued certificates are roots, the others lie between."""
     try:
         found = x509.load_pem_x509_certificates(path.read_bytes())
-    except (OSError, ValueError) as error:
+        roots = [certificate for certificate in found if certificate.issuer == certificate.subject]
+    except (OSError, *_UNREADABLE) as error:
         raise TimestampError(
             f"the certificates of the time-stamp authority cannot be read: {error}",
             where=str(path),
             remedy="Name a PEM file that holds the authority's root certificate",
         ) from error
-    roots = [certificate for certificate in found if certificate.issuer == certificate.subject]
     return roots, [certificate for certificate in found if certificate not in roots]
 
 

@@ -57,6 +57,9 @@ class Mark:
     outline_px: NDArray[np.float64]
 
 
+_REMEDY = "Download the recorded file and look at it; it is in evidence as it came"
+
+
 def nearest_width(width: int, among: Sequence[int] = WIDTHS) -> int:
     """The smallest size on offer that is at least `width`, or the largest."""
     return next((known for known in among if known >= width), among[-1])
@@ -89,7 +92,11 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = ()) -> bytes:
     data = np.fromfile(path, np.uint8)
     full = picture_size(data.tobytes())
     if full[0] * full[1] > _MOST_PIXELS:
-        raise DataError(f"the picture has {full[0]} × {full[1]} pixels, which is too many to show", where=path.name)
+        raise DataError(
+            f"the picture has {full[0]} × {full[1]} pixels, which is too many to show",
+            where=path.name,
+            remedy=_REMEDY,
+        )
     how = cv2.IMREAD_COLOR
     for flag, k in (
         (cv2.IMREAD_REDUCED_COLOR_8, 8),
@@ -103,9 +110,9 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = ()) -> bytes:
         try:
             image = cv2.imdecode(data, how | cv2.IMREAD_IGNORE_ORIENTATION)
         except cv2.error as error:
-            raise DataError("the picture cannot be decoded", where=path.name) from error
+            raise DataError("the picture cannot be decoded", where=path.name, remedy=_REMEDY) from error
         if image is None:
-            raise DataError("the file is not a picture that can be decoded", where=path.name)
+            raise DataError("the file is not a picture that can be decoded", where=path.name, remedy=_REMEDY)
         height, present = image.shape[:2]
         if present > width:
             image = cv2.resize(image, (width, max(1, round(height * width / present))), interpolation=cv2.INTER_AREA)
@@ -115,7 +122,7 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = ()) -> bytes:
         quality = 80 if width <= WIDTHS[-1] else 88
         done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
-        raise DataError("the picture cannot be encoded", where=path.name)
+        raise DataError("the picture cannot be encoded", where=path.name, remedy=_REMEDY)
     return encoded.tobytes()
 
 
@@ -165,7 +172,7 @@ def picture_size(data: bytes) -> tuple[int, int]:
             if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
                 return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
             at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    raise DataError("the file is not a picture", remedy="Only JPEG and PNG are shown")
+    raise DataError("the file is not a picture", where="its first bytes", remedy="Only JPEG and PNG are shown")
 
 
 def safe_name(name: str, sha256: str) -> str:

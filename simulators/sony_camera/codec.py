@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 HEADER_BYTES = 8
-MAX_PACKET_BYTES = 1 << 30
+MAX_PACKET_BYTES = 1 << 26  # of a client, which sends settings and no pictures
 DATA_CHUNK_BYTES = 1 << 20
 
 

@@ -11,6 +11,8 @@ from simulators.ur_controller.motion import Stop
 
 _LOG = logging.getLogger(__name__)
 _WRITE = re.compile(r"\bwrite_output_integer_register\(\s*(\d+)\s*(?:\+\s*(\d+)\s*)?,\s*(-?\d+)\s*\)")
+_SCRIPT_ERRORS = (ValueError, IndexError, ArithmeticError)  # of a text that is no such program
+_LONGEST_SCRIPT = 1 << 20  # characters
 _OTHER_S = 0.1  # that a program which is not interpreted is seen to run
 
 
@@ -19,21 +21,29 @@ class ScriptReader:
 
     def __init__(self) -> None:
         self._lines: list[str] = []
+        self._length = 0
         self._rest = ""
 
     def feed(self, data: bytes) -> list[str]:
         """Add bytes; returns the programs that are complete."""
         programs: list[str] = []
-        *lines, self._rest = (self._rest + data.decode("utf-8", "replace")).split("\n")
+        *lines, rest = (self._rest + data.decode("utf-8", "replace")).split("\n")
+        self._rest = rest[-_LONGEST_SCRIPT:]
         for line in lines:
             if not self._lines and not line.startswith(("def ", "sec ")):
                 if line.strip():
                     programs.append(line)
                 continue
             self._lines.append(line)
+            self._length += len(line)
+            if self._length > _LONGEST_SCRIPT:
+                self._lines.clear()
+                self._length = 0
+                continue
             if line.rstrip() == "end":
                 programs.append("\n".join(self._lines))
                 self._lines.clear()
+                self._length = 0
         return programs
 
 
@@ -45,7 +55,7 @@ class OtherProgram:
         self.name = match.group(1) if match else "unnamed"
         self._c = controller
         self._ends_s = controller.time_s + _OTHER_S
-        self._writes = [(int(at) + int(more or 0), int(value)) for at, more, value in _WRITE.findall(text)]
+        self._writes = [(int(at) + int(more or 0), _int32(value)) for at, more, value in _WRITE.findall(text)]
 
     def step(self) -> None:
         """See ControlProgram."""
@@ -55,6 +65,10 @@ class OtherProgram:
             self._c.generation += 1
         elif self._c.time_s >= self._ends_s:
             raise StopProgram("at its end; the rest of it is not modelled")
+
+
+def _int32(digits: str) -> int:
+    return (int(digits) + (1 << 31)) % (1 << 32) - (1 << 31)
 
 
 class PendantProgram:
@@ -82,7 +96,12 @@ class Interpreter:
             _LOG.info("program ignored: %s, %s", self._c.robot_mode.name, self._c.safety.name)
             return
         known = "reg_offset_int" in text
-        self._run(ControlProgram(self._c, text) if known else OtherProgram(self._c, text))
+        try:
+            program = ControlProgram(self._c, text) if known else OtherProgram(self._c, text)
+        except _SCRIPT_ERRORS as error:  # as a controller that cannot compile it
+            _LOG.warning("program refused: %s", error)
+            return
+        self._run(program)
 
     def play(self) -> bool:
         """Start the loaded program file, or go on with a paused program; False where that is not possible."""
@@ -121,6 +140,9 @@ class Interpreter:
             self._program.step()
         except StopProgram as end:
             _LOG.info("program %s ends: %s", self._program.name, end)
+            self.stop()
+        except _SCRIPT_ERRORS as error:  # as a controller, which ends a program at its first runtime error
+            _LOG.warning("program %s fails: %s", self._program.name, error)
             self.stop()
 
     def stop(self) -> None:

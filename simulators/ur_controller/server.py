@@ -21,6 +21,8 @@ _LOG = logging.getLogger(__name__)
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 MAX_BACKLOG_BYTES = 1 << 18  # a client that does not read loses data packages beyond this
+MOST_RECIPES = 255  # a recipe's number is one byte
+LONGEST_LINE = 1 << 16
 WORLD_MOVING_S, WORLD_STILL_S = 0.016, 0.1
 
 
@@ -129,7 +131,7 @@ class RtdeLink(Link):
             for name in names
         ]
         number = len(self._inputs) + 1
-        if not names or "NOT_FOUND" in types or "IN_USE" in types:
+        if not names or "NOT_FOUND" in types or "IN_USE" in types or number > MOST_RECIPES:
             number = 0
         else:
             self._inputs[number] = codec.Recipe(number, names, types)
@@ -182,7 +184,8 @@ class LineLink(Link):
 
     def receive(self, data: bytes) -> None:
         """Lines."""
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        *lines, rest = (self._rest + data).split(b"\n")
+        self._rest = rest[-LONGEST_LINE:]
         for raw in lines:
             line = raw.decode("utf-8", "replace").strip()
             if not line or self._server.faulty(self, "dashboard"):

@@ -21,6 +21,10 @@ N_GEAR = 6 * 2 * len(HARMONICS)
 _MODEL_GAP_M, _MODEL_GAP_RAD = 0.02, np.radians(3.0)
 
 
+_PLACE = "arm_correction of the hand-eye calibration"
+_REMEDY = "Calibrate hand and eye again"
+
+
 @dataclass(frozen=True, slots=True)
 class ArmCorrection:
     """Where the flange is, beside where the controller says it is, as a function of the joints.
@@ -66,15 +70,15 @@ class ArmCorrection:
                 np.array(record["gear_sin_rad"], dtype=np.float64),
                 np.array(record["observed"], dtype=np.float64),
             )
-        except (KeyError, ValueError, TypeError) as error:
-            raise DataError(f"not an arm correction: {error}") from error
+        except (KeyError, ValueError, TypeError, OverflowError) as error:
+            raise DataError(f"not an arm correction: {error!r}", where=_PLACE, remedy=_REMEDY) from error
         if (
             found.dh_deltas.shape != (6, 4)
             or found.gear_cos_rad.ndim != 2
             or found.gear_cos_rad.shape[0] != 6
             or found.gear_cos_rad.shape != found.gear_sin_rad.shape
         ):
-            raise DataError("not an arm correction: shapes do not belong together")
+            raise DataError("not an arm correction: shapes do not belong together", where=_PLACE, remedy=_REMEDY)
         return found
 
 

@@ -107,7 +107,15 @@ def read_arm_correction(record: Mapping[str, Any]) -> ArmCorrected:
     Raises:
         DataError: a field is missing or has another shape.
     """
-    T = np.array(record.get("T_flange_camera"), dtype=np.float64)
-    if T.shape != (4, 4):
-        raise DataError("an arm correction without T_flange_camera (4 × 4)")
-    return ArmCorrected(ArmCorrection.from_json(record), T)
+    missing = DataError(
+        "an arm correction without T_flange_camera (4 × 4)",
+        where="arm_correction of the hand-eye calibration",
+        remedy="Calibrate hand and eye again",
+    )
+    try:
+        T_flange_camera = np.array(record.get("T_flange_camera"), dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise missing from error
+    if T_flange_camera.shape != (4, 4):
+        raise missing
+    return ArmCorrected(ArmCorrection.from_json(record), T_flange_camera)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from service.core.errors import DataError
+from service.core.file_text import csv_rows
 from service.core.geometry import Array
 
 _HEADER = ("image", "q1", "q2", "q3", "q4", "q5", "q6")
@@ -21,17 +21,14 @@ def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
     Raises:
         DataError: the file is missing or malformed (with file:line), in degrees, or lacks an image.
     """
-    try:
-        rows = csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"the joints cannot be read: {error}", where=str(path)) from error
-    header = tuple(cell.strip() for cell in next(rows, []))
+    rows = csv_rows(path)
+    header = tuple(cell.strip() for cell in next(rows, (1, []))[1])
     if header != _HEADER:
         raise DataError(
             f"the first line is {','.join(header)!r}", where=f"{path}:1", remedy=f"it must be {','.join(_HEADER)}"
         )
     joints: dict[str, Array] = {}
-    for line, row in enumerate(rows, start=2):
+    for line, row in rows:
         if not any(cell.strip() for cell in row):
             continue
         where = f"{path}:{line}"
@@ -48,5 +45,9 @@ def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
         joints[row[0].strip()] = values
     missing = [image for image in images if image not in joints]
     if missing:
-        raise DataError(f"{len(missing)} images have no joints: {', '.join(missing[:5])}", where=str(path))
+        raise DataError(
+            f"{len(missing)} images have no joints: {', '.join(missing[:5])}",
+            where=str(path),
+            remedy="add their rows, or leave the images out",
+        )
     return {image: joints[image] for image in images}

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import importlib
 import multiprocessing
+import resource
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any, cast
 
+import psutil
+
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Transform
+
+_SPARE_BYTES = 1 << 30  # beyond what the library itself takes
+_PER_BYTE = 40  # of a model's files, once read: observations are 24 bytes in a file and some 60 in memory
 
 
 def read_model(folder: Path) -> dict[str, Transform]:
@@ -32,10 +38,12 @@ def write_model(folder: Path, camera: CameraModel, T_world_camera: dict[str, Tra
 def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> object:
     context = multiprocessing.get_context("spawn")
     try:
-        with ProcessPoolExecutor(1, mp_context=context) as pool:
+        with ProcessPoolExecutor(1, mp_context=context, initializer=_bound_memory, initargs=(str(folder),)) as pool:
             outcome = pool.submit(work, *arguments).result()
     except BrokenProcessPool:
         outcome = "pycolmap crashed on it"
+    except MemoryError:
+        outcome = "it announces more than memory can hold"
     if isinstance(outcome, str):
         raise DataError(
             f"the COLMAP model cannot be read or written: {outcome}",
@@ -43,6 +51,16 @@ def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> obj
             remedy="check that cameras, images and points3D belong together and are complete",
         )
     return outcome
+
+
+def _bound_memory(folder: str) -> None:
+    """Counts in a damaged file may ask for any amount: this process gets what a sound model of these files takes."""
+    importlib.import_module("pycolmap")
+    mapped_bytes = psutil.Process().memory_info().vms
+    files_bytes = sum(file.stat().st_size for file in Path(folder).iterdir() if file.is_file())
+    limit = mapped_bytes + _SPARE_BYTES + _PER_BYTE * files_bytes
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
 
 
 def _read(folder: str) -> dict[str, Transform] | str:

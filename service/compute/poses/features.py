@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import io
 import json
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -21,6 +23,11 @@ _NORM = 512.0  # length of a descriptor of unsigned bytes
 _ROWS = 512  # descriptors compared at a time: the products stay in the processor's cache
 _MOST_ANGLE_RAD = 0.7  # between descriptors of one scene point
 _MOST_RATIO = 0.8  # of the nearest descriptor's angle and the second nearest's (Lowe, 2004, 7.1)
+
+
+# What NumPy and the archive below it raise for bytes that are not theirs.
+_DAMAGED = (ValueError, KeyError, TypeError, IndexError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile,
+            zlib.error)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +70,7 @@ class ImageFeatures:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
                 width, height = (int(v) for v in archive["size"])
                 return cls(width, height, archive["pixels"], archive["scales_px"], archive["descriptors"])
-        except (ValueError, KeyError, OSError, EOFError) as error:
+        except _DAMAGED as error:
             raise DataError("these bytes hold no features of an image", remedy="extract them again") from error
 
 
@@ -122,7 +129,7 @@ def unpack_matches(data: bytes) -> list[PairMatches]:
                 PairMatches(first, second, each[k], int(kinds[k]), matrices[k])
                 for k, (first, second) in enumerate(pairs)
             ]
-    except (ValueError, KeyError, OSError, EOFError) as error:
+    except _DAMAGED as error:
         raise DataError("these bytes hold no matches of images", remedy="match the images again") from error
 
 

@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 from service.compute.camera_model import CameraModel
 from service.compute.poses import colmap_files
 from service.core.errors import DataError
+from service.core.file_text import csv_rows, file_text
 from service.core.geometry import Array, Transform, from_quaternion, transform
+from service.core.json_text import parse_json
 
 _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # how far a quaternion's length may be from 1: files with four decimals pass
@@ -61,7 +63,7 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
         transforms = path / "transforms.json"
         poses = read_transforms_json(transforms) if transforms.is_file() else read_colmap_model(path)
     elif not path.is_file():
-        raise DataError("the pose file does not exist", where=str(path))
+        raise DataError("the pose file does not exist", where=str(path), remedy="check the path")
     elif path.suffix.lower() == ".json":
         poses = read_transforms_json(path)
     elif path.suffix.lower() in {".csv", ".txt"}:
@@ -108,15 +110,15 @@ def read_poses_csv(path: Path) -> dict[str, Transform]:
         DataError: anything else, with file:line.
     """
     poses: dict[str, Transform] = {}
-    rows = csv.reader(_text(path).splitlines())
-    header = tuple(cell.strip() for cell in next(rows, []))
+    rows = csv_rows(path)
+    header = tuple(cell.strip() for cell in next(rows, (1, []))[1])
     if header != _HEADER:
         raise DataError(
             f"the first line is {','.join(header)!r}", where=f"{path}:1", remedy=f"it must be {','.join(_HEADER)}"
         )
-    for line, row in enumerate(rows, start=2):
+    for line, row in rows:
         where = f"{path}:{line}"
-        if not row or not any(cell.strip() for cell in row):
+        if not any(cell.strip() for cell in row):
             continue
         if len(row) != len(_HEADER):
             raise DataError(f"{len(row)} fields instead of {len(_HEADER)}", where=where, remedy="correct the line")
@@ -136,7 +138,7 @@ def read_poses_csv(path: Path) -> dict[str, Transform]:
             raise DataError(f"image {name} has two poses", where=where, remedy="remove one of them")
         poses[name] = from_quaternion(values[:3], values[3:])
     if not poses:
-        raise DataError("the file holds no pose", where=str(path))
+        raise DataError("the file holds no pose", where=str(path), remedy="give one line an image")
     return poses
 
 
@@ -184,7 +186,11 @@ def read_transforms_json(path: Path) -> dict[str, Transform]:
 def _rotation(matrix: Array, where: str) -> Array:
     """The rotation matrix nearest to one that was written with few digits."""
     if np.abs(matrix @ matrix.T - np.eye(3)).max() > 5 * _UNIT or np.linalg.det(matrix) < 0:
-        raise DataError("the matrix is not a rotation (scaled, sheared or mirrored)", where=where)
+        raise DataError(
+            "the matrix is not a rotation (scaled, sheared or mirrored)",
+            where=where,
+            remedy="export rigid poses, without a scale",
+        )
     U, _, Vt = np.linalg.svd(matrix)
     return U @ Vt
 
@@ -249,7 +255,9 @@ def write_colmap_text(folder: Path, camera: CameraModel, T_world_camera: Mapping
     """
     spaced = [name for name in T_world_camera if name.split() != [name]]
     if spaced:
-        raise DataError("COLMAP's text format cannot hold image names with spaces", where=spaced[0])
+        raise DataError(
+            "COLMAP's text format cannot hold image names with spaces", where=spaced[0], remedy="rename the image"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     colmap_files.write_model(folder, camera, dict(T_world_camera))
 
@@ -275,7 +283,9 @@ def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> C
             raise DataError(f"{key} is {value!r}, not a number", where=str(path), remedy=f"correct {key}")
         values[key] = value
     if min(values["fx"], values["fy"]) <= 0 or any(values[k] < 1 or values[k] % 1 for k in ("width", "height")):
-        raise DataError("width, height, fx and fy must be positive, the size whole", where=str(path))
+        raise DataError(
+            "width, height, fx and fy must be positive, the size whole", where=str(path), remedy="correct them"
+        )
     size = (int(values["width"]), int(values["height"]))
     if image_size is not None and size != image_size:
         raise DataError(
@@ -303,7 +313,9 @@ def read_spheres_json(path: Path) -> SphereFile:
     _check_keys(document, {"radius_mm", "registration_mm"}, {"control_mm", "details"}, path)
     radius = document["radius_mm"]
     if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0 < radius < math.inf:
-        raise DataError(f"radius_mm is {radius!r}, not a positive number", where=str(path))
+        raise DataError(
+            f"radius_mm is {radius!r}, not a positive number", where=str(path), remedy="correct radius_mm"
+        )
     centres: list[Array] = []
     for key in ("registration_mm", "control_mm"):
         rows = _numbers(document.get(key, []), f"{path}: {key}")
@@ -326,31 +338,17 @@ def _check_keys(document: Mapping[str, Any], needed: set[str], optional: set[str
         raise DataError(f"wrong keys: {'; '.join(parts)}", where=str(path), remedy=f"the keys are {allowed}")
 
 
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise DataError("the file is not UTF-8 text", where=str(path)) from None
-    except OSError as error:
-        raise DataError(f"the file cannot be read ({error.strerror})", where=str(path)) from error
-
-
 def _object(path: Path) -> dict[str, Any]:
-    try:
-        document: object = json.loads(_text(path))
-    except json.JSONDecodeError as error:
-        raise DataError(
-            f"not valid JSON ({error.msg})", where=f"{path}:{error.lineno}", remedy="correct the file"
-        ) from None
+    document = parse_json(file_text(path), name=str(path))
     if not isinstance(document, dict):
-        raise DataError("the file does not hold a JSON object", where=str(path))
+        raise DataError("the file does not hold a JSON object", where=str(path), remedy="Begin it with {")
     return cast("dict[str, Any]", document)
 
 
 def _numbers(value: object, where: str) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DataError("not an array of numbers", where=where, remedy="correct the numbers") from None
     if not np.isfinite(array).all():
         raise DataError("a number is not finite", where=where, remedy="correct the numbers")

@@ -1,0 +1,21 @@
+"""The table of all targets: every parser of the project, in groups that are imported apart."""
+
+from __future__ import annotations
+
+import importlib
+from typing import cast
+
+from bench.torture.fuzz.target import Target
+
+# Modules with a tuple TARGETS.
+GROUPS = tuple(f"bench.torture.fuzz.{name}" for name in ("written", "delivered", "records", "wires", "hostile"))
+
+
+def targets_of(group: str) -> tuple[Target, ...]:
+    """The targets of one group; its parsers are imported now."""
+    return cast("tuple[Target, ...]", importlib.import_module(group).TARGETS)
+
+
+def table() -> dict[str, tuple[str, Target]]:
+    """Every target with its group, by name."""
+    return {target.name: (group, target) for group in GROUPS for target in targets_of(group)}

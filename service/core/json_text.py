@@ -1,0 +1,73 @@
+"""JSON that others wrote, as plain data: what is no such document is told with its line, whatever is wrong."""
+
+from __future__ import annotations
+
+import json
+from typing import Any, cast
+
+from service.core.errors import DataError
+
+MOST_DEEP = 100
+_LONGEST_INTEGER = 18  # digits; beyond them a number counts as a float, as most readers of JSON have it
+
+
+def parse_json(text: str | bytes, *, name: str, remedy: str = "Correct the file") -> Any:
+    """Read one JSON document; `name` stands for the file in errors. A number beyond any float's range is infinite.
+
+    Raises:
+        DataError: not UTF-8, no JSON, a name given twice in an object, or nested more than 100 deep.
+    """
+    try:
+        read = text.decode("utf-8-sig") if isinstance(text, bytes) else text
+        document = json.loads(read, object_pairs_hook=_once, parse_int=_integer)
+    except UnicodeDecodeError:
+        raise DataError("the file is not UTF-8 text", where=name, remedy=remedy) from None
+    except json.JSONDecodeError as error:
+        raise DataError(f"not valid JSON ({error.msg})", where=f"{name}:{error.lineno}", remedy=remedy) from None
+    except _TwiceError as error:
+        raise DataError(f"{error.args[0]!r} is given twice", where=name, remedy="Give each name once") from None
+    except RecursionError:
+        raise _too_deep(name) from None
+    if _is_deep(document):
+        raise _too_deep(name)
+    return document
+
+
+class _TwiceError(Exception):
+    """A name twice in one object."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    data = dict(pairs)
+    if len(data) < len(pairs):
+        seen: set[str] = set()
+        raise _TwiceError(next(name for name, _ in pairs if name in seen or seen.add(name)))
+    return data
+
+
+def _integer(digits: str) -> int | float:
+    return int(digits) if len(digits) <= _LONGEST_INTEGER else float(digits)
+
+
+def _is_deep(document: object) -> bool:
+    """Whether it is nested deeper than allowed; level by level, since recursion is what must not be needed."""
+    level: list[object] = [document]
+    for _ in range(MOST_DEEP + 1):
+        level = [
+            item
+            for holder in level
+            if isinstance(holder, dict | list)
+            for item in (
+                cast("dict[str, object]", holder).values()
+                if isinstance(holder, dict)
+                else cast("list[object]", holder)
+            )
+            if isinstance(item, dict | list)
+        ]
+        if not level:
+            return False
+    return True
+
+
+def _too_deep(name: str) -> DataError:
+    return DataError(f"nested more than {MOST_DEEP} deep", where=name, remedy="Look for brackets that are not closed")
