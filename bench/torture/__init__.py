@@ -1,0 +1,1 @@
+"""Torture: sweeps that search for the next fault, each a `make torture-…` of its own."""
