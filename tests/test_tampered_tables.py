@@ -161,6 +161,36 @@ def test_words_that_are_there_and_cannot_be_found_are_a_fault(data: Path) -> Non
     assert fault.startswith("orthocapture.sqlite: the index by which auditors search is damaged: a search for")
 
 
+def test_commits_behind_a_damaged_frame_of_the_write_ahead_log_are_missed(data: Path) -> None:
+    wal = data / "orthocapture.sqlite-wal"
+    with Store.open(data) as store:
+        ends = [0]
+        for note in ("a", "b", "c"):
+            store.record(run_of(data), [StepNote(step="s", attempt=1, note=note)], actor="runner")
+            ends.append(wal.stat().st_size)
+        whole = wal.read_bytes()
+        database = database_path(data).read_bytes()
+
+    def altered(offset: int) -> tuple[list[str], list[str]]:
+        database_path(data).write_bytes(database)
+        wal.with_name(wal.name.replace("-wal", "-shm")).unlink(missing_ok=True)
+        flipped = bytearray(whole)
+        if offset >= 0:
+            flipped[offset] ^= 1
+        wal.write_bytes(flipped)
+        report = verify(data)
+        return [str(fault) for fault in report.faults], [note for note in report.notes if "wal" in note]
+
+    assert altered(-1) == ([], [])
+    assert altered(ends[1] + 200) == ([f"{wal.name}: 2 commits behind a damaged frame are lost"], [])
+    assert altered(ends[1] + 10) == ([f"{wal.name}: 2 commits behind a damaged frame are lost"], [])  # a salt
+    assert altered(ends[2] + 200) == (
+        [],
+        [f"{wal.name}: a commit behind a damaged frame is not read, as after a power cut"],
+    )
+    assert altered(20) == ([f"{wal.name}: its head is damaged: what was committed last is lost"], [])
+
+
 @pytest.mark.parametrize("number", ["user_version", "application_id"])
 def test_a_number_of_the_database_that_this_software_never_sets_is_a_fault(data: Path, number: str) -> None:
     with closing(sqlite3.connect(database_path(data))) as connection:

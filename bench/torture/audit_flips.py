@@ -13,6 +13,7 @@ from bench.torture.audit_record import WAL_NAME, Record, put_back
 from bench.torture.audit_tally import Tallies, Tally
 from service.store.database import database_path
 from service.store.signature_log import NAME
+from service.store.wal import wal_findings
 
 
 @contextmanager
@@ -74,13 +75,13 @@ class DatabaseFlips:
 
     def _one(self, tally: Tally, offset: int) -> None:
         now = outcome.content_of(self._record.data)
-        if now == self._before and outcome.damage_of(self._record.data) == "ok":
+        if now == self._before and not self._wal and outcome.damage_of(self._record.data) == "ok":
             tally.number += 1
             tally.meaningless += 1
             return
         name = f"byte {offset}, bit {offset % 8}"
         if self._wal:  # a frame that does not fit ends the log: few contents come of very many flips
-            key = repr(now)
+            key = repr((now, wal_findings(self._record.data)))
             if key not in self._known:
                 found = verdict(self._record, self._notes)
                 self._known[key] = found, set() if found.told else self._codes(now)
@@ -92,7 +93,7 @@ class DatabaseFlips:
     def _codes(self, now: outcome.Content | str) -> set[str]:
         codes = outcome.differences(self._before, now, self._columns)
         if self._wal and codes:
-            return {"commits after the last signature"}
+            return {"last commit of the write-ahead log"}
         if codes and all(code.startswith(outcome.WORDS) for code in codes):
             same = outcome.search_content(self._record.data, self._terms) == self._found
             return set() if same else codes

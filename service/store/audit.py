@@ -39,6 +39,7 @@ from service.store.tables import (
     sessions,
 )
 from service.store.timestamping import timestamp_findings
+from service.store.wal import wal_findings
 
 Progress = Callable[[str, int, int], None]  # what is being done, done, total (bytes)
 
@@ -116,12 +117,14 @@ def verify(
         UnknownRunError: there is no such run.
         StoreError: there is no database, or it is not readable as one.
     """
+    of_wal, notes_of_wal = wal_findings(data_dir)
     database = open_read_only(data_dir, DurableFiles())
     try:
         with database.reading() as connection:
             report = _verify_readable(data_dir, connection, run_id, progress, certificates, with_files=files)
     finally:
         database.close()
+    report = replace(report, faults=(*report.faults, *of_wal), notes=(*report.notes, *notes_of_wal))
     if signatures_copy is None:
         return report
     faults, notes = copy_faults(data_dir, signatures_copy)
@@ -217,6 +220,7 @@ def _verify(
     faults += derived.schema_faults(connection)
     faults += derived.reference_faults(connection)
     faults += derived.index_faults(connection, ordered, every_run=run_id is None)
+    faults += derived.queue_faults(connection, ordered)
     faults += word_faults(connection, ordered)
     faults += people_faults(site.people, evidence.accounts, evidence.links, evidence.sessions)
     return AuditReport(

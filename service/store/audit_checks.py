@@ -249,13 +249,9 @@ def _job_faults(run_id: str, rows: Rows, payloads: Mapping[int, Any], at_utc: Ma
     ends_of: dict[str, dict[int, Any]] = {}
     for seq, end in ended.items():
         ends_of.setdefault(end["job"], {})[seq] = end
-    before = 0
     for row in rows:
         shown = f"job {row['job_id']}"
         payload = enqueued.pop(int(row["enqueued_seq"]), None)
-        if int(row["enqueued_seq"]) < before:
-            yield Fault(run_id, int(row["enqueued_seq"]), "", f"{shown} has another place in the queue than it got")
-        before = int(row["enqueued_seq"])
         if payload is None:
             yield Fault(run_id, int(row["enqueued_seq"]), "", f"{shown} has no event job_enqueued")
         elif (

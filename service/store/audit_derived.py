@@ -1,4 +1,4 @@
-"""What the database holds beside the chains and can be made again from them: schema, references, index of events."""
+"""What the database holds beside the chains and can be made again from them: schema, references, index, queue."""
 
 from __future__ import annotations
 
@@ -26,6 +26,10 @@ SELECT run_id, seq, place, before, position - row_number() OVER (ORDER BY positi
 FROM (SELECT run_id, seq, position, position AS place,
              lag(seq) OVER (PARTITION BY run_id ORDER BY position) AS before FROM event_index)
 ORDER BY position
+"""
+_QUEUE = """
+SELECT j.run_id, j.enqueued_seq, j.job_id, j.position, row_number() OVER (ORDER BY i.position) AS place
+FROM jobs AS j JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
 """
 _STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # what ANALYZE makes, by anybody's hand
 _NUMBERS = ("user_version", "application_id")  # of the database; this software sets none of them
@@ -80,3 +84,12 @@ def index_faults(connection: Connection, run_ids: Sequence[str], *, every_run: b
         if moved and (row.run_id in wanted or every_run):
             what = f"its place in the index of events ({row.place}) is not that in which it was written"
             yield Fault(str(row.run_id), int(row.seq), "", what)
+
+
+def queue_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
+    """Jobs that do not stand in the queue where they were put: one after the other, over all runs."""
+    wanted = frozenset(run_ids)
+    for row in connection.execute(text(_QUEUE)):
+        if row.position != row.place and row.run_id in wanted:
+            what = f"job {row.job_id} has another place in the queue ({row.position}) than it got ({row.place})"
+            yield Fault(str(row.run_id), int(row.enqueued_seq), "", what)
