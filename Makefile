@@ -45,7 +45,7 @@ bench: $(TOOLS)
 
 # Every byte, row, roll-back and forgery of a small record: hours. MINUTES=60 ends it early, WORK=DIR goes on with it.
 torture-audit: $(TOOLS)
-	$(BIN)/python -m bench.torture.audit $(if $(MINUTES),--minutes $(MINUTES)) $(if $(WORK),--work $(WORK))
+	$(strip $(BIN)/python -m bench.torture.audit $(if $(MINUTES),--minutes $(MINUTES)) $(if $(WORK),--work $(WORK)))
 
 # New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \

@@ -210,6 +210,12 @@ def report(about: Mapping[str, Any], total: Mapping[str, Tally], documented: Map
     for pattern, number in sorted(numbers.items()):
         why, anchor = documented.get(pattern, ("**not documented**", ""))
         lines.append(f"| `{pattern}` | {number} | {why} | {anchor} |")
+    lines += ["", "Of the forgeries that are not told, so many are told by what was kept elsewhere:", ""]
+    lines += ["| forger | not told | told by |", "|---|---|---|"]
+    for kind, t in sorted(total.items()):
+        if t.anchors:
+            by = "; ".join(f"{anchor} {number}" for anchor, number in t.anchors.most_common())
+            lines.append(f"| {kind} | {sum(t.untold.values())} | {by} |")
     lines += ["", "Problems: " + ("none." if not about["problems"] else "")]
     lines += [f"- {problem}" for problem in about["problems"]]
     return "\n".join(lines) + "\n"

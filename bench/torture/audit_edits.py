@@ -38,6 +38,7 @@ def edits(data: Path) -> Iterator[Edit]:
             rows = connection.execute(f'SELECT rowid AS row_number, * FROM "{table}" ORDER BY rowid').fetchall()
             columns = connection.execute(f'PRAGMA table_info("{table}")').fetchall()
             yield from _of_rows(table, rows, columns)
+        yield from _of_another_run(connection)
         yield from _of_words(connection)
         yield from _of_schema(connection)
 
@@ -122,6 +123,17 @@ def _exchanged(
     for row, place in ((one, other), (other, one)):
         values = tuple(place[name] if name in of_key else row[name] for name in names)
         yield f'INSERT INTO "{table}" ({listed}) VALUES ({marks})', values
+
+
+def _of_another_run(connection: sqlite3.Connection) -> Iterator[Edit]:
+    """The rows that there is one of for a run, for the runs that have none."""
+    for table in ("leases", "control"):
+        columns = [str(row["name"]) for row in connection.execute(f"PRAGMA table_info({table})")]
+        listed = ", ".join(name for name in columns if name != "run_id")
+        without = f"SELECT run_id FROM runs WHERE run_id NOT IN (SELECT run_id FROM {table})"
+        for (run_id,) in connection.execute(without).fetchall():
+            insert = f"INSERT INTO {table} (run_id, {listed}) SELECT ?, {listed} FROM {table} LIMIT 1", (run_id,)
+            yield Edit("row inserted", f"a row of {table} for {run_id}", f"{table} +row", (insert,))
 
 
 def _of_words(connection: sqlite3.Connection) -> Iterator[Edit]:

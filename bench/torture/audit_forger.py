@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import base64
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
 from bench.torture import audit_outcome as outcome
-from bench.torture.audit_outcome import verdict
+from bench.torture.audit_outcome import Verdict, verdict
 from bench.torture.audit_record import Record, put_back
 from bench.torture.audit_tally import Tallies, Tally
 from service.store.artefacts import record_sha256
@@ -49,6 +48,7 @@ class Forgeries:
             self._last = dict(
                 connection.execute("SELECT run_id, max(seq) FROM checkpoints GROUP BY run_id").fetchall()
             )
+        self._stamped = _checkpoints(record, stamped=True)
         powers = [
             (frozenset(name for name, can in zip(CAN_WRITE, some, strict=True) if can), keys)
             for some in product((True, False), repeat=len(CAN_WRITE))
@@ -60,7 +60,11 @@ class Forgeries:
         self.size = len(self.all)
 
     def part(self, numbers: Sequence[int]) -> Tallies:
-        """Do these, one at a time; by keys, and whether the second place is compared with."""
+        """Do these, one at a time; by keys, and whether the second place is compared with.
+
+        Of what is not told it is seen whether something kept elsewhere tells it: the copy of the log as it was, the
+        time stamp as it was, the fingerprints of the keys, the hashes of the ends of the chains.
+        """
         tallies: Tallies = {}
         for number in numbers:
             run_id, seq, can, keys = self.all[number]
@@ -75,8 +79,22 @@ class Forgeries:
                 changed = found.heads != self._heads or found.key_ids != self._key_ids
                 name = f"{run_id} from event {seq}, can write {', '.join(sorted(can))}"
                 tally.count(found, name, lambda code=code, changed=changed: {code} if changed else set())
+                if changed and not found.told:
+                    tally.anchors.update(self._anchors(found))
         put_back(self._record)
         return tallies
+
+    def _anchors(self, found: Verdict) -> Iterator[str]:
+        assert found.heads is not None
+        if any(found.heads.get(run_id) != head for run_id, head in self._heads.items()):
+            yield "the ends of the chains written down"
+        if found.key_ids != self._key_ids:
+            yield "the fingerprints of the keys written down"
+        if not set(self._stamped) <= set(_checkpoints(self._record)):
+            yield "the time stamp of the first run"
+        log = self._record.states[-1].log
+        if log is not None and not (self._record.data / NAME).read_bytes().startswith(log):
+            yield "a copy of the log of signatures that he cannot write"
 
     @staticmethod
     def _code(can: frozenset[str], keys: str, *, with_copy: bool) -> str:
@@ -275,11 +293,10 @@ class _Forger:
             SignatureLog(path.parent).add(left, keys[-1])
 
 
-def stamp_tells(record: Record, data: Path) -> bool:
-    """Whether the time stamp of the record as it was, kept elsewhere, no longer fits the checkpoint in `data`."""
-    with closing(sqlite3.connect(":memory:")) as before, closing(sqlite3.connect(database_path(data))) as now:
-        before.deserialize(record.states[-1].database)
-        stamped = "SELECT run_id, seq FROM timestamps"
-        asked = f"SELECT {', '.join(_CHECKPOINT)} FROM checkpoints WHERE run_id = ? AND seq = ?"
-        places = before.execute(stamped).fetchall()
-        return any(before.execute(asked, at).fetchone() != now.execute(asked, at).fetchone() for at in places)
+def _checkpoints(record: Record, *, stamped: bool = False) -> list[tuple[Any, ...]]:
+    """All signatures as they are now, or those that have a time stamp."""
+    asked = f"SELECT {', '.join(_CHECKPOINT)} FROM checkpoints"
+    if stamped:
+        asked += " WHERE (run_id, seq) IN (SELECT run_id, seq FROM timestamps)"
+    with closing(sqlite3.connect(f"file:{database_path(record.data)}?mode=ro", uri=True)) as connection:
+        return connection.execute(asked).fetchall()

@@ -18,7 +18,7 @@ class Tally:
     """What became of the changes of one kind.
 
     `meaningless`: nothing that can be read differs. `untold`: code of what differs → how often, `noted` of them with
-    a note that is no fault; `samples` by code.
+    a note that is no fault; `samples` by code. `anchors`: what outside the folder was seen to tell it → how often.
     """
 
     number: int = 0
@@ -29,6 +29,7 @@ class Tally:
     untold: Counter[str] = field(default_factory=Counter[str])
     crashes: list[str] = field(default_factory=list[str])
     samples: dict[str, str] = field(default_factory=dict[str, str])
+    anchors: Counter[str] = field(default_factory=Counter[str])
 
     def add(self, other: Tally) -> None:
         """Count another part of the same kind too."""
@@ -40,6 +41,7 @@ class Tally:
         self.untold += other.untold
         self.crashes += other.crashes
         self.samples = other.samples | self.samples
+        self.anchors += other.anchors
 
     def count(self, found: Verdict, name: str, codes: Callable[[], set[str]]) -> None:
         """One change. `codes`: what differs that nothing told; empty for nothing."""
@@ -63,13 +65,13 @@ class Tally:
 
     def as_json(self) -> dict[str, Any]:
         """Plain data."""
-        return {**vars(self), "untold": dict(self.untold)}
+        return {**vars(self), "untold": dict(self.untold), "anchors": dict(self.anchors)}
 
     @classmethod
     def of_json(cls, data: Mapping[str, Any]) -> Self:
         """From plain data."""
         made = cls(**data)
-        made.untold = Counter(made.untold)
+        made.untold, made.anchors = Counter(made.untold), Counter(made.anchors)
         return made
 
 
