@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 
 import pytest
 
 from service.core.errors import StoreError
 from service.core.model import StepNote
-from service.people.errors import LinkError
+from service.people.errors import LinkError, NotSignedInError, PinRefusedError, SignInRefusedError
 from service.people.passwords import token_sha256
 from service.people.people import People
+from service.people.person import Person
 from service.store.audit import verify
 from service.store.database import database_path
 from service.store.records import SITE, NewArtefact, NewJob
@@ -21,7 +22,7 @@ from service.store.signature_log import NAME
 from service.store.signing import checkpoint
 from service.store.store import Store
 from service.store.timestamping import Authority, timestamp
-from tests.support.store import capture, rows, start_run, tamper
+from tests.support.store import SteppedClock, capture, rows, start_run, tamper
 from tests.support.time_stamp_authority import time_stamp_authority
 from tests.support.web import PIN, QUICK_HASHES, password_of, populate
 
@@ -247,3 +248,45 @@ def test_text_of_the_log_that_means_the_same_is_still_another_text(data: Path) -
     assert faults(data) == [f"{NAME}, line {len(lines)}: its own signature is not valid"]
     (data / NAME).write_bytes(b"".join([*lines[:-1], last.replace(b'"number":', b'"number": ')]))
     assert any("it is not as it was written" in fault for fault in faults(data))
+
+
+def test_whatever_people_do_verifies(tmp_path: Path) -> None:
+    """Every act on accounts and screens leaves rows that are what the events tell."""
+    clock = SteppedClock()
+    with Store.open(tmp_path / "data", clock) as store:
+        people = People(store, QUICK_HASHES)
+        people.first_link()  # a second one voids it
+        populate(people)
+        accounts = people.accounts
+
+        def person(account: str, password: str = "") -> Person:
+            token = people.sign_in(account, password or password_of(account))
+            found = people.person(token, idle_lock_s=1e9, deliberate=False)
+            assert found is not None
+            return found
+
+        ada, grace = person("ada"), person("grace")
+        people.lock(grace)
+        people.unlock(grace, PIN)
+        accounts.change_pin(grace, "9753")
+        accounts.change_password(grace, "another horse altogether")
+        accounts.change_role(ada, "lise", "supervisor", "she supervises now")
+        accounts.disable(ada, "emmy", "on leave")
+        accounts.enable(ada, "emmy", "back again")
+        accounts.invite(ada, "marie", "Marie Curie", "technician")
+        accounts.accept(accounts.reset(ada, "marie", "the link was lost"), "radium and polonium", PIN)
+        accounts.reset(ada, "lise", "she has forgotten it")
+        for _ in range(6):
+            with suppress(SignInRefusedError):
+                people.sign_in("marie", "wrong")
+        accounts.end_wait(ada, "marie")
+        marie = person("marie", "radium and polonium")
+        people.lock(marie)
+        for _ in range(5):
+            with suppress(PinRefusedError, NotSignedInError):
+                people.unlock(marie, "0000")
+        people.sign_out(person("emmy"))
+        clock.passed_s += 13 * 3600.0
+        person("emmy")  # the sign-ins of the morning have ended
+        checkpoint(store, SITE)
+    assert faults(tmp_path / "data") == []
