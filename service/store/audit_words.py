@@ -71,12 +71,14 @@ def _compared(connection: Connection, private: sqlite3.Connection) -> tuple[list
         private.execute(f"CREATE VIRTUAL TABLE {name}_places USING fts5vocab({name}, 'instance')")
     private.execute("CREATE VIRTUAL TABLE words USING fts5vocab(again, 'row')")
     if not _same(*(private.execute(f"SELECT term, doc, col, offset FROM {name}_places") for name in _BOTH)):
-        return [int(row[0]) for row in private.execute(_OTHER.format(*_BOTH))], ""
+        wrong = [int(row[0]) for row in private.execute(_OTHER.format(*_BOTH))]
+        return wrong, f"{_DAMAGED}: it does not hold the words of the events"
     # What is there in order need not be found: a search goes another way, by the first words of the index's pages.
-    for term, count in private.execute("SELECT term, doc FROM words"):
-        found = private.execute("SELECT count(*) FROM present WHERE present MATCH ?", (f'"{term}"',)).fetchone()
-        if found[0] != count:
-            return [], f"{_DAMAGED}: a search for {term!r} finds {found[0]} events, {count} have the word"
+    for (term,) in private.execute("SELECT term FROM words"):
+        asked = (f"SELECT count(*) FROM {name} WHERE {name} MATCH ?" for name in _BOTH)
+        found, awaited = (private.execute(ask, (f'"{term}"',)).fetchone()[0] for ask in asked)
+        if found != awaited:
+            return [], f"{_DAMAGED}: a search for {term!r} finds {found} events, {awaited} have the word"
     private.execute("INSERT INTO present (present) VALUES ('integrity-check')")
     return [], ""
 
