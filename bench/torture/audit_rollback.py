@@ -19,6 +19,7 @@ WAYS = {
     "database and log rolled back, second place compared": (("database", "log"), True),
     "database, log and second place rolled back": (("database", "log", "copy"), True),
 }
+_CODES = {"database rolled back": "commits after the last signature"}
 
 
 class RollBacks:
@@ -32,7 +33,6 @@ class RollBacks:
         self.all = [(way, number) for way in WAYS for number in range(len(record.states) - 1)]
         self.size = len(self.all)
         self._notes = outcome.audit.verify(record.data, signatures_copy=record.copy).notes
-        self._events = self._read()
 
     def part(self, numbers: Sequence[int]) -> Tallies:
         """Do these, one at a time; by way."""
@@ -46,7 +46,7 @@ class RollBacks:
             put(self._record, state)
             found = self._verdict(state, with_copy=with_copy)
             tally = tallies.setdefault(way, Tally())
-            tally.count(found, f"after commit {commit + 1}", lambda way=way: self._codes(way))
+            tally.count(found, f"after commit {commit + 1}", lambda way=way: {_CODES.get(way, way)})
         put_back(self._record)
         return tallies
 
@@ -58,14 +58,3 @@ class RollBacks:
         if with_copy and state.copy is None:  # the file that is named to the command is not there: refused
             return Verdict(True, place=True, text="there is no such copy of the log of signatures")
         return verdict(self._record, self._notes, with_copy=with_copy)
-
-    def _codes(self, way: str) -> set[str]:
-        if self._read() == self._events and "database" in way:
-            return {"present state"}
-        if way == "database rolled back":
-            return {"commits after the last signature"}
-        return {way}
-
-    def _read(self) -> object:
-        content = outcome.content_of(self._record.data)
-        return content if isinstance(content, str) else content.get("events")
