@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-versions lint format docs bench torture-fuzz lock clean
+.PHONY: demo test test-versions lint format docs bench torture-audit torture-fuzz lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -48,6 +48,10 @@ bench: $(TOOLS)
 FUZZ_S = 60
 torture-fuzz: $(TOOLS)
 	$(BIN)/python -m bench.torture.fuzz --seconds-per-target $(FUZZ_S) --record
+
+# Every byte, row, roll-back and forgery of a small record: hours. MINUTES=60 ends it early, WORK=DIR goes on with it.
+torture-audit: $(TOOLS)
+	$(strip $(BIN)/python -m bench.torture.audit $(if $(MINUTES),--minutes $(MINUTES)) $(if $(WORK),--work $(WORK)))
 
 # New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \

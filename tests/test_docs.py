@@ -166,6 +166,9 @@ RUN_HERE: dict[str, Check] = {
     "--out result.json": registers,
     "orthocapture audit show latest --data runs": succeeds,
     "orthocapture audit verify latest --data runs": succeeds,
+    "orthocapture audit verify all --data runs": succeeds,
+    "orthocapture audit verify latest --json --data runs": succeeds,
+    "orthocapture audit keys --data runs": succeeds,
 }
 # Commands that take minutes or a whole rig: the test of the suite that runs them.
 RUN_ELSEWHERE = {
@@ -189,7 +192,7 @@ RUN_ELSEWHERE = {
     "orthocapture layout --spheres spheres.json": "tests/test_layout.py::test_command",
     "make demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     **dict.fromkeys(
-        ("make test", "make lint", "make test-versions", "make clean"),
+        ("make test", "make lint", "make test-versions", "make torture-audit", "make clean"),
         "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
     ),
     "orthocapture import FOLDER --data runs": (
@@ -234,6 +237,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("demo", ".venv/bin/orthocapture demo"),
         ("lint", ".venv/bin/lint-imports"),
         ("test-versions", ".ci/versions"),
+        ("torture-audit", ".venv/bin/python -m bench.torture.audit"),
         ("clean", "rm -rf .venv build *.egg-info"),
     ):
         done = subprocess.run(

@@ -23,7 +23,7 @@ from service.store.signing import checkpoint, rotate_key
 from service.store.store import Store
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.store import CountedIds, SteppedClock, capture, start_run, tamper
-from tests.support.tampering import rewrite_to_the_end
+from tests.support.tampering import WORDS_AGAIN, rewrite_to_the_end
 
 
 @pytest.fixture
@@ -71,19 +71,25 @@ def cut(run: str, seq: int) -> list[str]:
         f"DELETE FROM event_index WHERE {of}",
         f"DELETE FROM events WHERE {of}",
         f"UPDATE heads SET seq = {seq - 1}, sha256 = {last} WHERE run_id = '{run}'",
+        *WORDS_AGAIN,
     ]
 
 
 def deleted(run: str) -> list[str]:
     tables = ("checkpoints", "artefacts", "event_index", "heads", "events", "runs")
-    return [f"DELETE FROM {table} WHERE run_id = '{run}'" for table in tables]
+    return [*(f"DELETE FROM {table} WHERE run_id = '{run}'" for table in tables), *WORDS_AGAIN]
 
 
 def forge(data: Path) -> None:
     """Rewrite the captures with all hashes, and take the run's signatures away."""
     run = run_of(data)
     rewrite_to_the_end(data, run, 2, actor="Eve")
-    tamper(data, f"UPDATE event_index SET actor = 'Eve' WHERE run_id = '{run}'", *without_signatures_from(run, 1))
+    tamper(
+        data,
+        f"UPDATE event_index SET actor = 'Eve' WHERE run_id = '{run}'",
+        *without_signatures_from(run, 1),
+        *WORDS_AGAIN,
+    )
 
 
 def forge_with_the_site(data: Path) -> None:

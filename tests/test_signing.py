@@ -26,7 +26,7 @@ from service.store.records import SITE
 from service.store.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
 from tests.support.store import CountedIds, SteppedClock, capture, rows, start_run, tamper
-from tests.support.tampering import alter_row, rewrite_to_the_end
+from tests.support.tampering import WORDS_AGAIN, alter_row, rewrite_to_the_end
 
 ROOT_DIR = Path(__file__).parents[1]
 RUN = "20261121-120000-000003"
@@ -110,7 +110,7 @@ def test_a_chain_rewritten_to_its_end_is_found(store: Store) -> None:
     assert found[0].startswith(f"run {RUN}, event 3: checkpoint: it signs an event with hash")
     assert "rewritten" in found[0]
     # The index of events was not rewritten with them, nor what the site's chain says of them.
-    others = ("checkpoint: ", "index of events", "the site's chain says")
+    others = ("checkpoint: ", "index of events", "words by which", "the site's chain says")
     assert all(any(part in fault for part in others) for fault in found)
 
 
@@ -134,6 +134,7 @@ def test_the_sites_chain_is_protected_by_the_runs(store: Store) -> None:
         "DELETE FROM event_index WHERE run_id = 'site' AND seq >= 3",
         "UPDATE heads SET seq = 2, sha256 = (SELECT sha256 FROM events WHERE run_id = 'site' AND seq = 2) "
         "WHERE run_id = 'site'",
+        *WORDS_AGAIN,
     )
     found = faults(store, RUN)
     assert found[0] == f"run {RUN}, event 3: checkpoint: event 3 of the site's chain is not the one that it names"

@@ -414,10 +414,13 @@ class AccountChanged(Record):
 
     kind: Literal["account_changed"] = "account_changed"
     account: str
-    field: str  # created, role, state, password, pin, lock_out
+    field: str  # created, role, state, password, pin, lock_out, link
     old: str
     new: str
     reason: str = ""
+    full_name: str = ""  # of an account that is made
+    # password_hash, pin_hash, token_sha256 → SHA-256 of what is stored: a secret put in past the software shows.
+    stored: dict[str, str] = Field(default_factory=dict)
 
 
 class SignInRecorded(Record):
@@ -428,6 +431,7 @@ class SignInRecorded(Record):
     outcome: Literal["signed_in", "refused", "locked_out", "signed_out", "screen_locked", "screen_unlocked", "ended"]
     screen: str = ""
     address: str = ""
+    session_sha256: str = ""  # of what is stored of the sign-in: one put in past the software shows
 
 
 class KeyChanged(Record):
@@ -447,6 +451,17 @@ class RunSigned(Record):
     run: str
     seq: int
     sha256: str  # of that event
+
+
+class TimeStampKept(Record):
+    """An authority elsewhere said when a checkpoint existed: one that is taken away is missed."""
+
+    kind: Literal["time_stamp_kept"] = "time_stamp_kept"
+    run: str
+    seq: int  # of the checkpoint
+    authority: str
+    at_utc: str  # when it was asked
+    token_sha256: str  # of the token's text
 
 
 # --- end -----------------------------------------------------------------------------------------------------
@@ -501,7 +516,8 @@ Payload = Annotated[
     | AccountChanged
     | SignInRecorded
     | KeyChanged
-    | RunSigned,
+    | RunSigned
+    | TimeStampKept,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Any
 
 from sqlalchemy import Connection, Row, func, insert, select, update
@@ -22,7 +23,6 @@ from service.people.rows import (
     require_reason,
     to_account,
 )
-from service.store.seam import utc_text
 from service.store.store import Store
 from service.store.tables import accounts, invitations
 
@@ -78,8 +78,7 @@ class Accounts:
             if find_account(connection, name) is not None:
                 raise AccountError(f"there is an account {name} already", where="account", remedy="Choose another")
             self._use(connection, token)
-            self._insert(connection, name, plain, "administrator", "active", secrets)
-            record_change(self._store, connection, name, name, "created", "", "administrator, active")
+            self._create(connection, name, name, plain, "administrator", "active", secrets)
         return name
 
     def accept(self, token: str, password: str, pin: str) -> str:
@@ -89,7 +88,8 @@ class Accounts:
         require_pin(pin)
         secrets = {"password_hash": self._passwords.hash(password), "pin_hash": self._passwords.hash(pin)}
         with self._store.database.writing() as connection:
-            if not name or self._invitation(connection, token).account != name:
+            unused = name and self._invitation(connection, token).account == name
+            if not unused or get_account(connection, name).state != "invited":
                 raise _no_link()
             self._use(connection, token)
             connection.execute(
@@ -97,7 +97,7 @@ class Accounts:
                 .where(accounts.c.account == name)
                 .values(state="active", failures=0, locked_until_utc_s=0.0, **secrets)
             )
-            record_change(self._store, connection, name, name, "state", "invited", "active")
+            record_change(self._store, connection, name, name, "state", "invited", "active", stored=secrets)
         return name
 
     def invite(self, by: Person, account: str, full_name: str, role: Role) -> str:
@@ -111,8 +111,8 @@ class Accounts:
                 raise AccountError(
                     f"there is an account {name} already", where="account", remedy="Choose another, or reset that one"
                 )
-            self._insert(connection, name, plain, role, "invited", {"password_hash": "", "pin_hash": ""})
-            record_change(self._store, connection, by.account, name, "created", "", f"{role}, invited")
+            nothing = {"password_hash": "", "pin_hash": ""}
+            self._create(connection, by.account, name, plain, role, "invited", nothing)
             return self._new_link(connection, name, INVITATION_S, actor=by.account)
 
     def reset(self, by: Person, account: str, reason: str) -> str:
@@ -122,16 +122,13 @@ class Accounts:
             row = get_account(connection, account)
             if row.state == "active":
                 self._require_another_administrator(connection, row)
-            values = {
-                "state": "invited",
-                "password_hash": "",
-                "pin_hash": "",
-                "failures": 0,
-                "locked_until_utc_s": 0.0,
-            }
+            nothing = {"password_hash": "", "pin_hash": ""}
+            values = {"state": "invited", "failures": 0, "locked_until_utc_s": 0.0, **nothing}
             connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
             end_sessions(self._store, connection, account, actor=by.account)
-            record_change(self._store, connection, by.account, account, "state", row.state, "invited", why)
+            record_change(
+                self._store, connection, by.account, account, "state", row.state, "invited", why, stored=nothing
+            )
             return self._new_link(connection, account, INVITATION_S, actor=by.account)
 
     # --- an administrator's changes ---
@@ -204,18 +201,37 @@ class Accounts:
 
     def _change_secret(self, person: Person, which: str, stored: str) -> None:
         with self._store.database.writing() as connection:
-            connection.execute(
-                update(accounts).where(accounts.c.account == person.account).values(**{f"{which}_hash": stored})
-            )
+            values = {f"{which}_hash": stored}
+            connection.execute(update(accounts).where(accounts.c.account == person.account).values(**values))
             if which == "password":
                 end_sessions(self._store, connection, person.account, actor=person.account, keep=person.screen)
-            record_change(self._store, connection, person.account, person.account, which, "set", "changed")
+            record_change(
+                self._store, connection, person.account, person.account, which, "set", "changed", stored=values
+            )
 
     # --- within a transaction ---
 
-    def _insert(
-        self, connection: Connection, name: str, full_name: str, role: Role, state: str, secrets: dict[str, str]
+    def _create(
+        self,
+        connection: Connection,
+        actor: str,
+        name: str,
+        full_name: str,
+        role: Role,
+        state: str,
+        secrets: dict[str, str],
     ) -> None:
+        made = record_change(
+            self._store,
+            connection,
+            actor,
+            name,
+            "created",
+            "",
+            f"{role}, {state}",
+            full_name=full_name,
+            stored=secrets,
+        )
         connection.execute(
             insert(accounts).values(
                 account=name,
@@ -224,7 +240,7 @@ class Accounts:
                 state=state,
                 failures=0,
                 locked_until_utc_s=0.0,
-                created_utc=utc_text(self._store.clock.utc_now()),
+                created_utc=made.at_utc,
                 **secrets,
             )
         )
@@ -232,12 +248,12 @@ class Accounts:
     def _new_link(self, connection: Connection, account: str, valid_s: float, *, actor: str) -> str:
         self._void_links(connection, account)
         token = new_token()
-        connection.execute(
-            insert(invitations).values(
-                token_sha256=token_sha256(token), account=account, expires_utc_s=self._now_s() + valid_s, used=0
-            )
+        stored = {"token_sha256": token_sha256(token)}
+        made = record_change(
+            self._store, connection, actor, account, "link", "", f"valid for {valid_s / 3600:.0f} h", stored=stored
         )
-        record_change(self._store, connection, actor, account, "link", "", f"valid for {valid_s / 3600:.0f} h")
+        expires_utc_s = datetime.fromisoformat(made.at_utc).timestamp() + valid_s
+        connection.execute(insert(invitations).values(account=account, expires_utc_s=expires_utc_s, used=0, **stored))
         return token
 
     def _void_links(self, connection: Connection, account: str) -> None:

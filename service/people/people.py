@@ -19,7 +19,16 @@ from service.people.errors import (
 )
 from service.people.passwords import Passwords, new_token, token_sha256
 from service.people.person import Person, Screen
-from service.people.rows import SERVICE, SESSION_S, find_account, get_account, plain_name, record_sign_in, to_person
+from service.people.rows import (
+    SERVICE,
+    SESSION_S,
+    find_account,
+    get_account,
+    plain_name,
+    record_change,
+    record_sign_in,
+    to_person,
+)
 from service.store.store import Store
 from service.store.tables import accounts, sessions
 
@@ -69,18 +78,14 @@ class People:
                 self._end(connection, replaces)
                 self._end_expired(connection, now)
                 screen = "".join(secrets.choice(_SCREEN_LETTERS) for _ in range(6))
-                connection.execute(
-                    insert(sessions).values(
-                        token_sha256=token_sha256(token),
-                        account=row.account,
-                        screen=screen,
-                        csrf=new_token(),
-                        created_utc_s=now,
-                        seen_utc_s=now,
-                        locked=0,
-                        pin_failures=0,
-                    )
-                )
+                session: dict[str, Any] = {
+                    "token_sha256": token_sha256(token),
+                    "account": row.account,
+                    "screen": screen,
+                    "csrf": new_token(),
+                    "created_utc_s": now,
+                }
+                connection.execute(insert(sessions).values(**session, seen_utc_s=now, locked=0, pin_failures=0))
                 self._reset_failures(connection, row, password)
                 record_sign_in(
                     self._store,
@@ -90,6 +95,7 @@ class People:
                     screen=screen,
                     address=address,
                     actor=row.account,
+                    session=session,
                 )
             return token
 
@@ -152,7 +158,10 @@ class People:
     def _reset_failures(self, connection: Connection, row: Row[Any], password: str) -> None:
         values: dict[str, object] = {"failures": 0, "locked_until_utc_s": 0.0}
         if self._passwords.is_outdated(row.password_hash):
-            values["password_hash"] = self._passwords.hash(password)
+            stored = {"password_hash": self._passwords.hash(password)}
+            values |= stored
+            name = row.account
+            record_change(self._store, connection, name, name, "password", "set", "hashed anew", stored=stored)
         connection.execute(update(accounts).where(accounts.c.account == row.account).values(**values))
 
     # --- sign-ins ---

@@ -8,10 +8,12 @@ from typing import Any, Literal, cast
 
 from sqlalchemy import Connection, Row, delete, select
 
-from service.core.model import AccountChanged, SignInRecorded
+from service.core.model import AccountChanged, Event, SignInRecorded
 from service.people.errors import AccountError
 from service.people.person import Account, Person
 from service.people.roles import Role
+from service.store.audit_people import session_sha256
+from service.store.events import sha256_text
 from service.store.store import Store
 from service.store.tables import accounts, sessions
 
@@ -112,11 +114,28 @@ def to_person(row: Row[Any]) -> Person:
 
 
 def record_change(
-    store: Store, connection: Connection, actor: str, account: str, field: str, old: str, new: str, reason: str = ""
-) -> None:
-    """Append that an account changed, in the transaction that changes it."""
-    change = AccountChanged(account=account, field=field, old=old, new=new, reason=reason)
-    store.append_site(connection, [change], actor=actor)
+    store: Store,
+    connection: Connection,
+    actor: str,
+    account: str,
+    field: str,
+    old: str,
+    new: str,
+    reason: str = "",
+    *,
+    full_name: str = "",
+    stored: Mapping[str, str] | None = None,
+) -> Event:
+    """Append that an account changed, in the transaction that changes it.
+
+    `stored`: what is kept of secrets that it sets, by column; only the hash of it goes into the chain.
+    """
+    hashes = {column: sha256_text(value) for column, value in (stored or {}).items()}
+    change = AccountChanged(
+        account=account, field=field, old=old, new=new, reason=reason, full_name=full_name, stored=hashes
+    )
+    (event,) = store.append_site(connection, [change], actor=actor)
+    return event
 
 
 def record_sign_in(
@@ -128,9 +147,11 @@ def record_sign_in(
     screen: str = "",
     address: str = "",
     actor: str = SERVICE,
+    session: Mapping[str, Any] | None = None,
 ) -> None:
-    """Append what happened to a sign-in, in the transaction in which it happens."""
-    event = SignInRecorded(account=account, outcome=outcome, screen=screen, address=address)
+    """Append what happened to a sign-in, in the transaction in which it happens. `session`: the row of a new one."""
+    known = "" if session is None else session_sha256(session)
+    event = SignInRecorded(account=account, outcome=outcome, screen=screen, address=address, session_sha256=known)
     store.append_site(connection, [event], actor=actor)
 
 

@@ -15,8 +15,10 @@ from service.store import audit_derived as derived
 from service.store import audit_signatures as signatures
 from service.store.artefacts import TEMPORARY, hash_file, read_artefacts, relative_path
 from service.store.audit_checks import ChainFacts, Fault, FileState
+from service.store.audit_people import people_faults
+from service.store.audit_words import word_faults
 from service.store.checkpoints import read_checkpoints, read_timestamps
-from service.store.database import database_path, open_read_only
+from service.store.database import DATABASE_NAME, RESTORE, database_path, open_read_only
 from service.store.errors import UnknownRunError
 from service.store.events import read_events
 from service.store.records import SITE, Artefact, Checkpoint, RunRow, Timestamp
@@ -25,8 +27,19 @@ from service.store.signature_copy import copy_faults
 from service.store.signature_log import NAME as LOG_NAME
 from service.store.signature_log import log_findings, read_log
 from service.store.store import read_runs
-from service.store.tables import accounts, artefacts, checkpoints, events, heads, jobs, runs
+from service.store.tables import (
+    accounts,
+    artefacts,
+    checkpoints,
+    events,
+    heads,
+    invitations,
+    jobs,
+    runs,
+    sessions,
+)
 from service.store.timestamping import timestamp_findings
+from service.store.wal import wal_findings
 
 Progress = Callable[[str, int, int], None]  # what is being done, done, total (bytes)
 
@@ -104,16 +117,42 @@ def verify(
         UnknownRunError: there is no such run.
         StoreError: there is no database, or it is not readable as one.
     """
+    of_wal, notes_of_wal = wal_findings(data_dir)
     database = open_read_only(data_dir, DurableFiles())
     try:
         with database.reading() as connection:
-            report = _verify(data_dir, connection, run_id, progress, certificates, with_files=files)
+            report = _verify_readable(data_dir, connection, run_id, progress, certificates, with_files=files)
     finally:
         database.close()
+    report = replace(report, faults=(*report.faults, *of_wal), notes=(*report.notes, *notes_of_wal))
     if signatures_copy is None:
         return report
     faults, notes = copy_faults(data_dir, signatures_copy)
     return replace(report, faults=(*report.faults, *faults), notes=(*report.notes, *notes))
+
+
+def _verify_readable(
+    data_dir: Path,
+    connection: Connection,
+    run_id: str | None,
+    progress: Progress | None,
+    certificates: Path | None,
+    *,
+    with_files: bool,
+) -> AuditReport:
+    """Raises StoreError where a damaged database holds rows that its own tables forbid."""
+    try:
+        return _verify(data_dir, connection, run_id, progress, certificates, with_files=with_files)
+    except (TypeError, ValueError, LookupError, ArithmeticError) as error:
+        damage = _damage(connection)
+        if not damage:
+            raise
+        raise StoreError(damage[0], where=str(database_path(data_dir)), remedy=RESTORE) from error
+
+
+def _damage(connection: Connection) -> tuple[str, ...]:
+    found = connection.execute(text("PRAGMA integrity_check(5)")).scalars()
+    return tuple(f"SQLite finds the database damaged: {line}" for line in found if line != "ok")
 
 
 def _verify(
@@ -149,6 +188,7 @@ def _verify(
     notes = list(keys.notes)
     unsigned: dict[str, int] = {}
     stamps = 0
+    kept = list(signatures.stamp_faults(site, evidence.checkpoints, evidence.timestamps))
     for run, facts in chains.items():
         signed = evidence.checkpoints[run]
         rows = evidence.artefacts.get(run, [])
@@ -157,6 +197,7 @@ def _verify(
         found[run] += signatures.unsigned_end_faults(run, signed, facts)
         faults, said = timestamp_findings(signed, evidence.timestamps[run], certificates)
         found[run] += faults
+        found[run] += [fault for fault in kept if fault.run_id == run and not faults]
         count, note = signatures.unsigned(run, signed, len(facts.sha256_at))
         notes += [*said, *([note] if note else [])]
         if run in evidence.run_ids:
@@ -171,14 +212,17 @@ def _verify(
     )
     notes += said_of_log
     ordered = [*evidence.run_ids, *([] if SITE in evidence.run_ids else [SITE])]
-    faults = [Fault(None, None, "", problem) for problem in evidence.damage]
+    faults = [Fault(None, None, DATABASE_NAME, problem) for problem in evidence.damage]
     faults += [fault for run in ordered for fault in found[run]]
     faults += signatures.signed_run_faults(site, chains, every_run=run_id is None)
     faults += of_log
     faults += foreign
     faults += derived.schema_faults(connection)
-    faults += derived.index_faults(connection, ordered)
-    faults += derived.account_faults(evidence.accounts, site.account_changes)
+    faults += derived.reference_faults(connection)
+    faults += derived.index_faults(connection, ordered, every_run=run_id is None)
+    faults += derived.queue_faults(connection, ordered)
+    faults += word_faults(connection, ordered)
+    faults += people_faults(site.people, evidence.accounts, evidence.links, evidence.sessions)
     return AuditReport(
         data_dir=str(data_dir),
         runs=evidence.run_ids,
@@ -250,11 +294,13 @@ class _Evidence:
     timestamps: Mapping[str, list[Timestamp]]
     every_sha256: frozenset[str]
     accounts: Sequence[Mapping[str, Any]]
+    links: Sequence[Mapping[str, Any]]
+    sessions: Sequence[Mapping[str, Any]]
     damage: tuple[str, ...]
 
 
 def _read(connection: Connection, run_id: str | None) -> _Evidence:
-    damage = [str(row[0]) for row in connection.execute(text("PRAGMA integrity_check(5)"))]
+    damage = _damage(connection)
     known = set(connection.execute(select(runs.c.run_id)).scalars())
     # A run whose row was deleted is still there in its events, or in what signs them.
     known |= set(connection.execute(select(events.c.run_id).distinct()).scalars())
@@ -271,6 +317,9 @@ def _read(connection: Connection, run_id: str | None) -> _Evidence:
             grouped.setdefault(str(row["run_id"]), []).append(dict(row))
         return grouped
 
+    def all_of(table: Table) -> list[dict[str, Any]]:
+        return [dict(row) for row in connection.execute(select(table)).mappings()]
+
     return _Evidence(
         run_ids=chosen,
         has_site=SITE in known,
@@ -281,8 +330,10 @@ def _read(connection: Connection, run_id: str | None) -> _Evidence:
         checkpoints={run: read_checkpoints(connection, run) for run in read},
         timestamps={run: read_timestamps(connection, run) for run in read},
         every_sha256=frozenset(connection.execute(select(artefacts.c.sha256)).scalars()),
-        accounts=[dict(row) for row in connection.execute(select(accounts)).mappings()],
-        damage=tuple(f"SQLite finds the database damaged: {line}" for line in damage if line != "ok"),
+        accounts=all_of(accounts),
+        links=all_of(invitations),
+        sessions=all_of(sessions),
+        damage=damage,
     )
 
 

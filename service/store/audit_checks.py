@@ -62,7 +62,8 @@ class ChainFacts:
     jobs: dict[int, Any] = field(default_factory=dict[int, Any])  # payloads that concern jobs
     jobs_utc: dict[int, str] = field(default_factory=dict[int, str])  # when
     key_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
-    account_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
+    people: list[tuple[Any, str]] = field(default_factory=list[tuple[Any, str]])  # changes and sign-ins, when
+    stamps: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of authorities, as the site tells
     heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of ServiceStarted
     runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of the site's chain
     to_sign: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # what is signed when it happens
@@ -79,8 +80,10 @@ class ChainFacts:
         self.last_own = seq
         if kind == "key_changed":
             self.key_changes.append((seq, payload))
-        elif kind == "account_changed":
-            self.account_changes.append((seq, payload))
+        elif kind == "account_changed" or (kind == "sign_in_recorded" and payload["screen"]):
+            self.people.append((payload, at_utc))
+        elif kind == "time_stamp_kept":
+            self.stamps.append((seq, payload))
         elif kind == "run_signed":
             self.runs_signed.append((seq, payload))
         elif kind in ("step_passed", "run_completed", "run_aborted"):
@@ -267,6 +270,8 @@ def _job_faults(run_id: str, rows: Rows, payloads: Mapping[int, Any], at_utc: Ma
             yield Fault(run_id, row["ended_seq"], "", what)
         elif expected is not None:
             yield from _end_of_job_faults(run_id, row, ends[row["ended_seq"]], at_utc)
+        elif row["ended_seq"] is not None or row["ended_utc"] is not None:
+            yield Fault(run_id, int(row["enqueued_seq"]), "", f"{shown} is {row['state']} and has an end")
     for seq, payload in enqueued.items():
         yield Fault(run_id, seq, "", f"job {payload['job']} was enqueued and has no row")
     for seq, payload in ((seq, end) for ends in ends_of.values() for seq, end in ends.items()):
@@ -277,7 +282,9 @@ def _end_of_job_faults(
     run_id: str, row: Mapping[str, Any], end: Mapping[str, Any], at_utc: Mapping[int, str]
 ) -> Iterator[Fault]:
     error = f"{end['error']}: {end['message']}" if end["kind"] == "job_failed" else None
-    if (row["error"], row["ended_utc"]) != (error, at_utc.get(row["ended_seq"])):
+    lease = row["token"], row["until_utc_s"]
+    told = error, at_utc.get(row["ended_seq"]), end["worker"], (None, None)
+    if (row["error"], row["ended_utc"], row["worker"] or "", lease) != told:
         yield Fault(run_id, row["ended_seq"], "", f"job {row['job_id']} differs from its event {end['kind']}")
 
 

@@ -1,15 +1,13 @@
-"""What the database holds beside the chains and can be made again from them: schema, index of events, accounts."""
+"""What the database holds beside the chains and can be made again from them: schema, references, index, queue."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 from sqlalchemy import Connection, text
 
 from service.store.audit_checks import Fault
-from service.store.database import DATABASE_NAME, fresh_schema
-from service.store.records import SITE
+from service.store.database import DATABASE_NAME, fresh_schema, read_schema
 
 # Of an index that says something else than the events, or of events that it does not have.
 _INDEX = """
@@ -22,28 +20,57 @@ WHERE e.seq IS NULL OR i.seq IS NULL OR i.kind IS NOT e.kind OR i.actor IS NOT e
 """
 
 
+# Places are given in the order of writing over all runs, one after the other.
+_PLACES = """
+SELECT run_id, seq, place, before, position - row_number() OVER (ORDER BY position) AS gap
+FROM (SELECT run_id, seq, position, position AS place,
+             lag(seq) OVER (PARTITION BY run_id ORDER BY position) AS before FROM event_index)
+ORDER BY position
+"""
+_QUEUE = """
+SELECT j.run_id, j.enqueued_seq, j.job_id, j.position, row_number() OVER (ORDER BY i.position) AS place
+FROM jobs AS j JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
+"""
+_STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # what ANALYZE makes, by anybody's hand
+_NUMBERS = ("user_version", "application_id")  # of the database; this software sets none of them
+
+
 def schema_faults(connection: Connection) -> Iterator[Fault]:
     """Tables, indexes and triggers that are not as this software makes them: a trigger may do nothing any more."""
-    statement = text("SELECT type, name, sql FROM sqlite_master WHERE name NOT LIKE 'sqlite_stat%'")
-    present = {(str(row.type), str(row.name)): row.sql for row in connection.execute(statement)}
+    for name in _NUMBERS:
+        number = connection.execute(text(f"PRAGMA {name}")).scalar_one()
+        if number != 0:
+            yield Fault(None, None, DATABASE_NAME, f"its {name} is {number}: this software leaves it 0")
+    present = {key: made for key, made in read_schema(connection).items() if key not in _STATISTICS}
     expected = fresh_schema()
-    for (kind, name), sql in expected.items():
+    for (kind, name), made in expected.items():
         if (kind, name) not in present:
             consequence = ": the evidence could be changed" if kind == "trigger" else ""
             yield Fault(None, None, DATABASE_NAME, f"the {kind} {name} is missing{consequence}")
-        elif present[kind, name] != sql:
+        elif present[kind, name] != made:
             yield Fault(None, None, DATABASE_NAME, f"the {kind} {name} is not the one that this software makes")
     for kind, name in present.keys() - expected.keys():
         yield Fault(None, None, DATABASE_NAME, f"the {kind} {name} is not of this software")
 
 
-def index_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
-    """Rows of the index that auditors filter by: missing, foreign, or saying something else than their event."""
+def reference_faults(connection: Connection) -> Iterator[Fault]:
+    """Rows that belong to a row which is not there, such as a lease on a run that never was."""
+    for row in connection.execute(text("PRAGMA foreign_key_check")):
+        what = f"row {row.rowid} of the table {row.table} belongs to a row of {row.parent} that is not there"
+        yield Fault(None, None, DATABASE_NAME, what)
+
+
+def index_faults(connection: Connection, run_ids: Sequence[str], *, every_run: bool) -> Iterator[Fault]:
+    """Rows of the index that auditors filter by: missing, foreign, out of order, or saying something else.
+
+    `every_run`: rows of runs that are not there at all are told too.
+    """
     wanted = frozenset(run_ids)
     for left, right in (("events AS e", "event_index AS i"), ("event_index AS i", "events AS e")):
         seen_before = left.startswith("event_index")
         for row in connection.execute(text(_INDEX.format(left=left, right=right))):
-            if row.run_id not in wanted or (seen_before and not row.foreign_row):
+            here = row.run_id in wanted or every_run
+            if not here or (seen_before and not row.foreign_row):
                 continue
             what = "the index of events does not say what the event says"
             if row.missing_row:
@@ -51,40 +78,18 @@ def index_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fau
             elif row.foreign_row:
                 what = "the index of events has a row of an event that is not there"
             yield Fault(str(row.run_id), int(row.seq), "", what)
+    gap = 0
+    for row in connection.execute(text(_PLACES)):
+        moved, gap = row.gap != gap or row.seq != (row.before or 0) + 1, row.gap
+        if moved and (row.run_id in wanted or every_run):
+            what = f"its place in the index of events ({row.place}) is not that in which it was written"
+            yield Fault(str(row.run_id), int(row.seq), "", what)
 
 
-def account_faults(
-    rows: Sequence[Mapping[str, Any]], changes: Sequence[tuple[int, Mapping[str, Any]]]
-) -> Iterator[Fault]:
-    """Accounts whose role or state did not come about as the site's chain tells it.
-
-    Args:
-        rows: of the table of accounts.
-        changes: payloads of account_changed with the numbers of their events, oldest first.
-    """
-    told: dict[str, tuple[str, str]] = {}
-    for _, change in changes:
-        account, new = str(change["account"]), str(change["new"])
-        role, state = told.get(account, ("", ""))
-        match change["field"]:
-            case "created":
-                role, _, state = new.partition(", ")
-            case "role":
-                role = new
-            case "state":
-                state = new
-            case _:
-                continue
-        told[account] = (role, state)
-    for row in rows:
-        account = str(row["account"])
-        recorded = told.pop(account, None)
-        if recorded is None:
-            yield Fault(
-                SITE, None, "", f"the account {account} ({row['role']}) was made by nobody: no event tells of it"
-            )
-        elif recorded != (row["role"], row["state"]):
-            what = f"the account {account} is {row['role']}, {row['state']}; the events say {', '.join(recorded)}"
-            yield Fault(SITE, None, "", what)
-    for account in told:
-        yield Fault(SITE, None, "", f"the account {account} was made, and its row is gone")
+def queue_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
+    """Jobs that do not stand in the queue where they were put: one after the other, over all runs."""
+    wanted = frozenset(run_ids)
+    for row in connection.execute(text(_QUEUE)):
+        if row.position != row.place and row.run_id in wanted:
+            what = f"job {row.job_id} has another place in the queue ({row.position}) than it got ({row.place})"
+            yield Fault(str(row.run_id), int(row.enqueued_seq), "", what)

@@ -10,7 +10,8 @@ from typing import Any
 
 from service.store.audit_checks import ChainFacts, Fault
 from service.store.checkpoints import RowsDigest, key_fingerprint, signed_by
-from service.store.records import SITE, Checkpoint
+from service.store.events import sha256_text
+from service.store.records import SITE, Checkpoint, Timestamp
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +120,31 @@ def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[F
                     "the chain was cut or rewritten since"
                 )
                 yield Fault(run_id, int(seq), "", what)
+
+
+def stamp_faults(
+    site: ChainFacts, signed: Mapping[str, Sequence[Checkpoint]], stamps: Mapping[str, Sequence[Timestamp]]
+) -> Iterator[Fault]:
+    """Time stamps that are not those of which the site's chain tells. Both by run; stamps of other runs are left out.
+
+    Stamps from before the site's chain told of them are let be.
+    """
+    told: dict[tuple[str, int, str], tuple[str, str]] = {}
+    for _, payload in site.stamps:
+        place = str(payload["run"]), int(payload["seq"]), str(payload["authority"])
+        told[place] = str(payload["at_utc"]), str(payload["token_sha256"])
+    present = {(stamp.run_id, stamp.seq, stamp.authority): stamp for items in stamps.values() for stamp in items}
+    site_seq = {(item.run_id, item.seq): item.site_seq for items in signed.values() for item in items}
+    first = min((site_seq[place[:2]] for place in told if place[:2] in site_seq), default=None)
+    for place, stamp in present.items():
+        if place in told:
+            if told[place] != (stamp.at_utc, sha256_text(stamp.token)):
+                yield Fault(*place[:2], "", f"time stamp of {place[2]}: it is not the one that was given")
+        elif first is not None and site_seq.get(place[:2], first) >= first:
+            yield Fault(*place[:2], "", f"time stamp of {place[2]}: no event tells that it was given")
+    for place in told:
+        if place[0] in stamps and place not in present:
+            yield Fault(*place[:2], "", f"the time stamp of {place[2]} was taken away")
 
 
 def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, every_run: bool) -> Iterator[Fault]:

@@ -21,7 +21,7 @@ from service.store.seam import Files
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0
 REVISIONS = ("0001", "0002", "0003", "0004")  # of migrations/versions, in order
-_RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
+RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
 _MIGRATIONS = Path(__file__).with_name("migrations")
 
 
@@ -30,15 +30,20 @@ def database_path(data_dir: Path) -> Path:
     return data_dir / DATABASE_NAME
 
 
+def read_schema(connection: Connection) -> dict[tuple[str, str], tuple[str, str | None]]:
+    """What this database is made of, as `fresh_schema` gives it."""
+    made = connection.execute(text("SELECT type, name, tbl_name, sql FROM sqlite_master"))
+    return {(str(row.type), str(row.name)): (str(row.tbl_name), row.sql) for row in made}
+
+
 @cache
-def fresh_schema() -> Mapping[tuple[str, str], str | None]:
-    """What a database is made of, as this software makes it: SQL by kind (table, index, trigger) and name."""
+def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
+    """What a database is made of, as this software makes it: table and SQL by kind (table, index …) and name."""
     engine = create_engine("sqlite://")
     try:
         with engine.begin() as connection:
             _upgrade(connection, Path(":memory:"))
-            made = connection.execute(text("SELECT type, name, sql FROM sqlite_master"))
-            return {(str(row.type), str(row.name)): row.sql for row in made}
+            return read_schema(connection)
     finally:
         engine.dispose()
 
@@ -225,7 +230,7 @@ def _store_errors(path: Path) -> Generator[None]:
         raise StoreError(_explain(error), where=str(path), remedy=_advise(error)) from error
     except UnicodeDecodeError as error:  # of the driver, where damaged bytes are to be text
         raise StoreError(
-            "the database is damaged: it holds text that is no UTF-8", where=str(path), remedy=_RESTORE
+            "the database is damaged: it holds text that is no UTF-8", where=str(path), remedy=RESTORE
         ) from error
     except SQLAlchemyError as error:
         raise StoreError(f"the database refused: {error}", where=str(path)) from error
@@ -244,8 +249,8 @@ def _advise(error: DBAPIError) -> str:
     return {
         "SQLITE_BUSY": "Another process holds the database for too long; look for one that hangs",
         "SQLITE_FULL": "Free space on this disk; what was recorded before is safe",
-        "SQLITE_CORRUPT": _RESTORE,
-        "SQLITE_NOTADB": _RESTORE,
+        "SQLITE_CORRUPT": RESTORE,
+        "SQLITE_NOTADB": RESTORE,
         "SQLITE_READONLY": "Check the permissions of the data folder",
         "SQLITE_CANTOPEN": "Check that the data folder exists and its permissions",
     }.get(str(code), "Nothing of this action was recorded")

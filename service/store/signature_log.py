@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from service.core.errors import StoreError
 from service.store.audit_checks import Fault
 from service.store.checkpoints import key_fingerprint
-from service.store.events import canonical
+from service.store.events import canonical_parsed
 from service.store.keys import public_bytes
 from service.store.records import Checkpoint
 from service.store.seam import DurableFiles
@@ -60,6 +60,8 @@ class Line:
         """Whether the line's signature is this key's."""
         try:
             signature = base64.b64decode(self.signature, validate=True)
+            if base64.b64encode(signature).decode() != self.signature:  # its last letter has bits that say nothing
+                return False
             Ed25519PublicKey.from_public_bytes(public_key).verify(signature, self.message)
         except (InvalidSignature, binascii.Error, ValueError):
             return False
@@ -134,14 +136,17 @@ def _line(number: int, raw: bytes, previous: str) -> Line:
         key_id, signature = str(data["key_id"]), str(data["signature"])
         said_before, said_number = data["previous_sha256"], data["number"]
         message = _message(number, previous, checkpoint, key_id)
+        written = canonical_parsed(data).encode() + b"\n"
     except (ValueError, TypeError, KeyError, RecursionError, StoreError):
         return Line(number, None, "it cannot be read")
     problem = "" if (said_before, said_number) == (previous, number) else "it does not follow the line before it"
+    if not problem and raw != written:
+        problem = "it is not as it was written: its text was altered"
     return Line(number, checkpoint, problem, message, key_id, signature)
 
 
 def _message(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> bytes:
-    return canonical(_fields(number, previous, checkpoint, key_id) | {"purpose": PURPOSE}).encode()
+    return canonical_parsed(_fields(number, previous, checkpoint, key_id) | {"purpose": PURPOSE}).encode()
 
 
 def _fields(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> dict[str, Any]:
@@ -167,7 +172,7 @@ def _add(path: Path, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) 
             number += 1
             signature = base64.b64encode(key.sign(_message(number, previous, checkpoint, key_id))).decode()
             data = _fields(number, previous, checkpoint, key_id) | {"signature": signature}
-            raw = canonical(data).encode() + b"\n"
+            raw = canonical_parsed(data).encode() + b"\n"
             stream.write(raw)
             previous = hashlib.sha256(raw).hexdigest()
         stream.flush()

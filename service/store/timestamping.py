@@ -25,11 +25,12 @@ from rfc3161_client import (
 )
 from sqlalchemy import insert, select
 
-from service.core.model import DeviceTrouble
+from service.core.model import DeviceTrouble, TimeStampKept
 from service.store.audit_checks import Fault
 from service.store.checkpoints import statement
 from service.store.errors import TimestampError
-from service.store.records import Checkpoint, Timestamp
+from service.store.events import sha256_text
+from service.store.records import SITE, Checkpoint, Timestamp
 from service.store.seam import utc_text
 from service.store.signing import checkpoint
 from service.store.store import Store
@@ -56,17 +57,18 @@ def stamped_bytes(checkpoint: Checkpoint) -> bytes:
     return statement(checkpoint) + b"\n" + checkpoint.signature.encode()
 
 
-def timestamp(store: Store, checkpoint: Checkpoint, authority: Authority) -> Timestamp:
+def timestamp(store: Store, signed: Checkpoint, authority: Authority) -> Timestamp:
     """Have a checkpoint stamped, verify the answer and keep it; one that is there already is returned.
 
     Raises:
         TimestampError: no answer, or one that does not verify. Nothing was recorded and nothing is lost.
+        StoreError: that the stamp was given could not be signed.
     """
-    for present in store.timestamps(checkpoint.run_id):
-        if (present.seq, present.authority) == (checkpoint.seq, authority.url):
+    for present in store.timestamps(signed.run_id):
+        if (present.seq, present.authority) == (signed.seq, authority.url):
             return present
     asked_utc = utc_text(store.clock.utc_now())
-    message = stamped_bytes(checkpoint)
+    message = stamped_bytes(signed)
     request = TimestampRequestBuilder().data(message).hash_algorithm(HashAlgorithm.SHA256).build()
     try:
         reply = _post_within(authority, request.as_bytes())
@@ -80,7 +82,7 @@ def timestamp(store: Store, checkpoint: Checkpoint, authority: Authority) -> Tim
             where=authority.url,
             remedy="Check the network, address and certificates in the rig file; the checkpoint stands by itself",
         ) from error
-    found = Timestamp(checkpoint.run_id, checkpoint.seq, authority.url, asked_utc, base64.b64encode(reply).decode())
+    found = Timestamp(signed.run_id, signed.seq, authority.url, asked_utc, base64.b64encode(reply).decode())
     with store.database.writing() as connection:
         taken = select(timestamps.c.seq).where(
             timestamps.c.run_id == found.run_id,
@@ -97,6 +99,15 @@ def timestamp(store: Store, checkpoint: Checkpoint, authority: Authority) -> Tim
                     token=found.token,
                 )
             )
+            kept = TimeStampKept(
+                run=found.run_id,
+                seq=found.seq,
+                authority=found.authority,
+                at_utc=found.at_utc,
+                token_sha256=sha256_text(found.token),
+            )
+            store.append_site(connection, [kept], actor="service")
+    checkpoint(store, SITE)
     return found
 
 

@@ -9,6 +9,13 @@ from service.store.artefacts import record_sha256
 from service.store.events import event_sha256, parse_canonical
 from tests.support.store import rows, tamper
 
+# The index of words made again from the events as they are now; before the first, tamper() has dropped the triggers.
+WORDS_AGAIN = (
+    "INSERT INTO event_words (event_words) VALUES ('delete-all')",
+    "INSERT INTO event_words (rowid, words) SELECT i.position, e.actor || ' ' || "
+    "coalesce((SELECT group_concat(atom, ' ') FROM json_tree(e.payload) WHERE type = 'text'), '') "
+    "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq ORDER BY i.position",
+)
 _EVENT: tuple[str, ...] = ("seq", "run_id", "at_utc", "monotonic_s", "actor", "previous_sha256", "payload", "sha256")
 
 

@@ -1,0 +1,225 @@
+"""Evidence, altered in every way there is: does `audit verify` tell it, and where? `make torture-audit`.
+
+A small record made by the software itself; every byte of it with one bit flipped, every row and column altered,
+every roll-back, and a forger with every subset of what he can write and sign with. What is not told must stand in the
+table of docs/evidence.md, and what stands there must have been found not to be told. The changes of each sweep are
+done in a random order of a fixed seed: what a sweep that was ended early (--minutes) has done is a sample of all of
+them, and with the same --work it is continued.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import pickle
+import random
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from bench.machine import REPOSITORY, commit, machine
+from bench.torture.audit_edits import Edits
+from bench.torture.audit_flips import ArtefactFlips, DatabaseFlips, LogFlips
+from bench.torture.audit_forger import Forgeries
+from bench.torture.audit_outcome import quickened, verdict
+from bench.torture.audit_record import Record, make_record, put_back
+from bench.torture.audit_rollback import RollBacks
+from bench.torture.audit_tally import Sweep, Tallies, Tally, add_all, in_a_process
+
+RESULTS = REPOSITORY / "bench" / "results"
+DOCUMENT = REPOSITORY / "docs" / "evidence.md"
+CHUNK = 250  # changes of one process
+SWEEPS: Mapping[str, Callable[[Record], Sweep]] = {
+    "edits": Edits,
+    "rollbacks": RollBacks,
+    "forgeries": Forgeries,
+    "log": LogFlips,
+    "artefacts": ArtefactFlips,
+    "wal": lambda record: DatabaseFlips(record, wal=True),
+    "database": lambda record: DatabaseFlips(record, wal=False),
+}
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Do the sweeps, print the table and write it. 1 when the documentation and what was found do not agree."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sample", type=int, help="so many changes of each sweep instead of all of them")
+    parser.add_argument("--seed", type=int, default=11, help="of the order of the changes")
+    parser.add_argument("--minutes", type=float, help="begin nothing new after so long")
+    parser.add_argument("--only", nargs="+", choices=SWEEPS, default=list(SWEEPS))
+    parser.add_argument(
+        "--work", type=Path, help="folder for the record and what is done, used again; best in memory"
+    )
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    options = parser.parse_args(words)
+    ends = time.monotonic() + options.minutes * 60 if options.minutes is not None else None
+    with ExitStack() as stack:
+        work = options.work or Path(stack.enter_context(tempfile.TemporaryDirectory(dir=_memory())))
+        record = _record(work)
+        done = {
+            name: sweep(work, record, name, sample=options.sample, seed=options.seed, ends=ends)
+            for name in options.only
+        }
+    about: dict[str, Any] = {
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "commit": commit(),
+        "machine": machine(),
+        "load": [round(load, 1) for load in os.getloadavg()],
+        "seed": options.seed,
+        "sweeps": {name: {"done": number, "of": size} for name, (number, size, _) in done.items()},
+        "kinds": {},
+    }
+    total: Tallies = {}
+    for _number, _size, tallies in done.values():
+        add_all(total, tallies)
+    documented = documented_codes(DOCUMENT.read_text())
+    whole = all(number == size for number, size, _ in done.values()) and set(done) == set(SWEEPS)
+    about["problems"] = problems(total, documented, whole=whole)
+    about["kinds"] = {kind: tally.as_json() for kind, tally in total.items()}
+    text = report(about, total, documented)
+    sys.stdout.write(text)
+    options.results.mkdir(parents=True, exist_ok=True)
+    stem = options.results / f"torture_audit-{about['date']}"
+    stem.with_suffix(".md").write_text(text)
+    stem.with_suffix(".json").write_text(json.dumps(about, indent=1) + "\n")
+    return int(bool(about["problems"]))
+
+
+def _memory() -> str | None:
+    """The record is written some hundred thousand times: not to a disk where there is room in memory."""
+    memory = Path("/dev/shm")
+    return str(memory) if memory.is_dir() and os.access(memory, os.W_OK) else None
+
+
+def _record(work: Path) -> Record:
+    kept = work / "record.pickle"
+    if kept.exists():
+        record: Record = pickle.loads(kept.read_bytes())
+        put_back(record)
+        return record
+    record = make_record(work / "record")
+    kept.write_bytes(pickle.dumps(record))
+    return record
+
+
+def sweep(
+    work: Path, record: Record, name: str, *, sample: int | None, seed: int, ends: float | None
+) -> tuple[int, int, Tallies]:
+    """Do one sweep, or go on with it: how many changes are done, of how many, and what became of them."""
+    log = work / f"{name}-{seed}.jsonl"
+    total: Tallies = {}
+    done = 0
+    for line in log.read_text().splitlines() if log.exists() else ():
+        part = json.loads(line)
+        done += part["done"]
+        add_all(total, {kind: Tally.of_json(tally) for kind, tally in part["tallies"].items()})
+    with quickened(files_stay=name != "artefacts", database_stays=name in ("log", "artefacts")):
+        put_back(record)
+        verdict(record, ())  # so that every process knows what the record as it was needs
+        made = SWEEPS[name](record)
+        numbers = list(range(made.size))
+        random.Random(seed).shuffle(numbers)
+        wanted = numbers if sample is None else numbers[:sample]
+        while done < len(wanted) and (ends is None or time.monotonic() < ends):
+            chunk = wanted[done : done + CHUNK]
+            found = in_a_process(made, chunk)
+            add_all(total, found)
+            done += len(chunk)
+            with log.open("a") as stream:
+                tallies = {kind: tally.as_json() for kind, tally in found.items()}
+                stream.write(json.dumps({"done": len(chunk), "tallies": tallies}) + "\n")
+            sys.stderr.write(f"{name}: {done} of {len(wanted)}\n")
+    put_back(record)
+    return done, made.size, total
+
+
+def documented_codes(text: str) -> dict[str, tuple[str, str]]:
+    """What the documentation says is not told: pattern → why not, and what tells it from outside."""
+    found: dict[str, tuple[str, str]] = {}
+    for line in text.splitlines():
+        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
+        if line.startswith("| `") and len(cells) == 3:
+            for pattern in cells[0].split("`")[1::2]:
+                found[pattern] = cells[1], cells[2]
+    return found
+
+
+def _codes(total: Mapping[str, Tally]) -> Iterator[tuple[str, str, int]]:
+    for kind, tally in total.items():
+        for codes, number in tally.untold.items():
+            for code in codes.split("; "):
+                yield kind, code, number
+
+
+def problems(total: Mapping[str, Tally], documented: Mapping[str, object], *, whole: bool) -> list[str]:
+    """Crashes, what is told without its place, and where the documentation and what was found do not agree."""
+    found = [f"{kind}: {crash}" for kind, tally in total.items() for crash in tally.crashes]
+    for kind, tally in total.items():
+        if tally.placed < tally.told:
+            example = tally.samples["told without a place"]
+            found.append(f"{kind}: {tally.told - tally.placed} are told without a place, such as {example}")
+    seen = {code for _, code, _ in _codes(total)}
+    for code in sorted(seen):
+        if not any(fnmatchcase(code, pattern) for pattern in documented):
+            sample = next(t.samples[c] for t in total.values() for c in t.untold if code in c.split("; "))
+            found.append(f"{code} is not told, and {DOCUMENT.name} does not say so ({sample})")
+    if whole:
+        found += [
+            f"{DOCUMENT.name} says that {pattern} is not told, and it always was"
+            for pattern in documented
+            if not any(fnmatchcase(code, pattern) for code in seen)
+        ]
+    return found
+
+
+def report(about: Mapping[str, Any], total: Mapping[str, Tally], documented: Mapping[str, tuple[str, str]]) -> str:
+    """For people."""
+    cpu = about["machine"]
+    lines = [
+        f"# Evidence, altered in every way: what `audit verify` tells ({about['date']})",
+        "",
+        "`make torture-audit`. Told: a fault is named, or the record refused in words. Meaningless: all that SQLite",
+        "reads from the database was read and is what it was. Of a byte one bit is flipped, number offset modulo 8.",
+        "",
+        f"Commit {about['commit']}; {cpu['processor']}, {cpu['cores']} cores, Python {cpu['python']}; "
+        f"load {about['load']}.",
+        "",
+        "Done: "
+        + "; ".join(f"{name} {one['done']} of {one['of']}" for name, one in about["sweeps"].items())
+        + f" (in a random order, seed {about['seed']}).",
+        "",
+        "| change | number | told | with its place | meaningless | not told | of these with a note | crashes |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for kind, t in sorted(total.items()):
+        cells = (kind, t.number, t.told, t.placed, t.meaningless, sum(t.untold.values()), t.noted, len(t.crashes))
+        lines.append(f"| {' | '.join(str(cell) for cell in cells)} |")
+    lines += ["", "Not told, why, and what tells it from outside (docs/evidence.md):", ""]
+    lines += ["| what | number | why | what tells it |", "|---|---|---|---|"]
+    numbers: dict[str, int] = {}
+    for _kind, code, number in _codes(total):
+        pattern = next((p for p in documented if fnmatchcase(code, p)), code)
+        numbers[pattern] = numbers.get(pattern, 0) + number
+    for pattern, number in sorted(numbers.items()):
+        why, anchor = documented.get(pattern, ("**not documented**", ""))
+        lines.append(f"| `{pattern}` | {number} | {why} | {anchor} |")
+    lines += ["", "Of the forgeries that are not told, so many are told by what was kept elsewhere:", ""]
+    lines += ["| forger | not told | told by |", "|---|---|---|"]
+    for kind, t in sorted(total.items()):
+        if t.anchors:
+            by = "; ".join(f"{anchor} {number}" for anchor, number in t.anchors.most_common())
+            lines.append(f"| {kind} | {sum(t.untold.values())} | {by} |")
+    lines += ["", "Problems: " + ("none." if not about["problems"] else "")]
+    lines += [f"- {problem}" for problem in about["problems"]]
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,221 @@
+"""What verification says of an altered record, and what a database holds beyond what verification looks at."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import hashlib
+import sqlite3
+import traceback
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from sqlalchemy import Connection
+
+from bench.torture.audit_record import Record
+from service.core.errors import OrthocaptureError
+from service.store import audit, audit_checks, audit_signatures, audit_words, database, signature_log
+from service.store.audit_checks import Fault
+from service.store.database import database_path
+from service.store.signature_log import Line
+
+_WORDS_COME_FROM = (
+    "SELECT * FROM event_words_data",
+    "SELECT * FROM event_words_idx",
+    "SELECT * FROM event_words_config",
+    "SELECT position, run_id, seq FROM event_index ORDER BY position",
+    "SELECT run_id, seq, actor, payload FROM events",
+)
+_NUMBERS = ("user_version", "application_id", "encoding")
+WORDS = "event_words"  # the search index; its tables hold its own structure
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What `audit verify` says of a record.
+
+    Attributes:
+        told: a fault was named, or the record was refused loudly.
+        place: the fault says where: a run, an event, a row, a file.
+        noted: what was said beside faults that is not said of the record as it was.
+        text: the first fault or the refusal; of a crash the traceback.
+        crashed: it ended in an error that is none of ours.
+    """
+
+    told: bool
+    place: bool = False
+    noted: tuple[str, ...] = ()
+    text: str = ""
+    crashed: bool = False
+    heads: Mapping[str, str] | None = None
+    key_ids: tuple[str, ...] = ()
+
+
+def verdict(record: Record, notes: tuple[str, ...], *, with_copy: bool = False, run_id: str | None = None) -> Verdict:
+    """Verify the record as it lies there now; `notes` are those of the record as it was."""
+    try:
+        report = audit.verify(record.data, run_id, signatures_copy=record.copy if with_copy else None)
+    except OrthocaptureError as error:
+        return Verdict(True, bool(error.where), text=f"{type(error).__name__}: {error}")
+    except Exception:  # noqa: BLE001 - what this sweep is to find
+        return Verdict(False, text=traceback.format_exc(limit=-4), crashed=True)
+    placed = [fault for fault in report.faults if fault.run_id or fault.seq is not None or fault.file]
+    noted = tuple(note for note in report.notes if note not in notes)
+    text = str((placed or report.faults)[0]) if report.faults else ""
+    return Verdict(bool(report.faults), bool(placed), noted, text, False, report.heads, report.key_ids)
+
+
+@contextmanager
+def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[None]:
+    """Remember what pure functions answered: the same text has the same hash, the same signature the same answer.
+
+    Nothing else of verification is changed: database and log of signatures are read again each time, and so are the
+    files of the artefacts unless they stay as they are (`files_stay`). The search index is compared anew whenever
+    what goes into the comparison is not what it was before (and never where `database_stays`).
+    """
+    payload_of: Any = vars(audit_checks)["_payload_of"]
+    kept: dict[tuple[Any, ...], Any] = {}
+
+    def remembered(row: Mapping[str, Any]) -> Any:
+        key = tuple((name, type(value), value) for name, value in row.items())
+        if key not in kept:
+            kept[key] = payload_of(row)
+        return kept[key]
+
+    def file_hash(path: Path) -> tuple[str, int]:
+        content = path.read_bytes()
+        return _digest(content), len(content)
+
+    file_state, unlisted = vars(audit)["_file_state"], vars(audit)["_unlisted"]
+    with ExitStack() as stack:
+        if files_stay:
+            stack.enter_context(patch.object(audit, "_file_state", functools.cache(file_state)))
+            stack.enter_context(patch.object(audit, "_unlisted", functools.cache(unlisted)))
+        stack.enter_context(patch.object(audit, "word_faults", _remembered_words(database_stays=database_stays)))
+        gc.disable()
+        stack.callback(gc.enable)
+        for target, name, new in (
+            (audit_checks, "_payload_of", remembered),
+            (audit_signatures, "signed_by", functools.cache(audit_signatures.signed_by)),
+            (Line, "signed_by", functools.cache(Line.signed_by)),
+            (signature_log, "_line", functools.cache(vars(signature_log)["_line"])),
+            (database, "_engine", functools.cache(vars(database)["_engine"])),
+            (audit, "hash_file", file_hash),
+        ):
+            stack.enter_context(patch.object(target, name, new))
+        yield
+
+
+def _remembered_words(*, database_stays: bool) -> Callable[[Connection, Sequence[str]], list[Fault]]:
+    kept: dict[object, list[Fault]] = {}
+
+    def faults(connection: Connection, run_ids: Sequence[str]) -> list[Fault]:
+        key: object = tuple(run_ids)
+        if not database_stays:
+            read = [tuple(map(tuple, connection.exec_driver_sql(asked))) for asked in _WORDS_COME_FROM]
+            key = key, tuple(read)
+        if key not in kept:
+            kept[key] = list(audit_words.word_faults(connection, run_ids))
+        return kept[key]
+
+    return faults
+
+
+@functools.lru_cache(maxsize=256)
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+Content = Mapping[str, Any]
+
+
+def content_of(data: Path) -> Content | str:
+    """All that SQLite reads from a database: every row of every table, what was made, what it finds damaged.
+
+    Indexes are not read here: `damage_of` holds each of their entries against its row. A text instead of the content
+    where it cannot be read.
+    """
+    found: dict[str, Any] = {}
+    try:
+        with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
+            connection.text_factory = bytes
+            for name in _NUMBERS:
+                found[name] = connection.execute(f"PRAGMA {name}").fetchall()
+            schema = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_master").fetchall()
+            found["schema"] = schema
+            for kind, name, _table, sql in schema:
+                if kind == b"table" and not sql.upper().startswith(b"CREATE VIRTUAL"):
+                    table = name.decode("ascii")
+                    found[table] = connection.execute(f'SELECT * FROM "{table}"').fetchall()
+    except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
+        return f"{type(error).__name__}: {error}"
+    return found
+
+
+def same_rows(one: Content, other: Content | str) -> bool:
+    """Whether the same rows are there. Where they lie within a table means nothing: what is ordered has a column."""
+    if isinstance(other, str) or one.keys() != other.keys():
+        return False
+    return all(sorted(map(repr, one[name])) == sorted(map(repr, other[name])) for name in one)
+
+
+def damage_of(data: Path) -> str:
+    """What SQLite's integrity_check says: "ok", or what it finds damaged."""
+    try:
+        with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
+            return "\n".join(str(row[0]) for row in connection.execute("PRAGMA integrity_check"))
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def columns_of(data: Path) -> dict[str, tuple[str, ...]]:
+    """Names of the columns of every table, as `content_of` gives them."""
+    with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
+        made = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+        names: dict[str, tuple[str, ...]] = {}
+        for (table,) in made:
+            names[table] = tuple(str(row[1]) for row in connection.execute(f'PRAGMA table_info("{table}")'))
+        return names
+
+
+def differences(before: Content, now: Content | str, columns: Mapping[str, tuple[str, ...]]) -> set[str]:
+    """Where the content differs: `table.column`, `table +row`, `table -row`, or a number of the database."""
+    if isinstance(now, str):
+        return {"unreadable"}
+    places: set[str] = set()
+    for name in before.keys() | now.keys():
+        old, new = before.get(name), now.get(name)
+        if old == new:
+            continue
+        if name not in columns or old is None or new is None:
+            places.add(name)
+            continue
+        if len(old) != len(new):
+            places.add(f"{name} {'+' if len(new) > len(old) else '-'}row")
+            continue
+        for one, other in zip(old, new, strict=True):
+            places |= {f"{name}.{column}" for column, a, b in zip(columns[name], one, other, strict=True) if a != b}
+    return places
+
+
+def search_content(data: Path, terms: tuple[str, ...]) -> object:
+    """What searches give: the events of every word, and where each word stands; a text where it cannot be read."""
+    try:
+        with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
+            connection.execute(f"CREATE VIRTUAL TABLE temp.words USING fts5vocab('main', '{WORDS}', 'instance')")
+            places = connection.execute("SELECT term, doc, col, offset FROM temp.words").fetchall()
+            ask = f"SELECT rowid FROM {WORDS} WHERE {WORDS} MATCH ? ORDER BY rowid"
+            return places, [connection.execute(ask, (f'"{term}"',)).fetchall() for term in terms]
+    except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def search_terms(data: Path) -> tuple[str, ...]:
+    """Every word of the search index."""
+    with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
+        connection.execute(f"CREATE VIRTUAL TABLE temp.words USING fts5vocab('main', '{WORDS}', 'row')")
+        return tuple(row[0] for row in connection.execute("SELECT term FROM temp.words"))

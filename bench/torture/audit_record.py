@@ -1,0 +1,229 @@
+"""The record that is attacked: a small, complete one, made by the software itself, and its state at every commit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from service.audit.correcting import correct
+from service.audit.start_up import record_start
+from service.core.errors import DataError
+from service.core.model import EvidenceExported, OperatorAction, RunAborted, RunReleased
+from service.people.control import Control
+from service.people.errors import SignInRefusedError
+from service.people.people import People
+from service.people.person import Person
+from service.rig import load_rig
+from service.store.database import database_path
+from service.store.records import SITE, NewArtefact, NewJob
+from service.store.seam import DurableFiles
+from service.store.signature_copy import bring_up_to_date
+from service.store.signature_log import NAME
+from service.store.signing import checkpoint, rotate_key
+from service.store.store import Store
+from service.store.timestamping import Authority
+from tests.support.bench_run import PROTOCOL, begin_run
+from tests.support.time_stamp_authority import time_stamp_authority
+from tests.support.web import PIN, QUICK_HASHES, password_of, populate
+
+COPY = "second_place.jsonl"
+WAL_NAME = "orthocapture.sqlite-wal"
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What lay on the disk right after a commit."""
+
+    database: bytes
+    log: bytes | None
+    copy: bytes | None
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """A finished record.
+
+    Attributes:
+        folder: holds data/ and the second place of the signatures; nothing has it open.
+        run_id: of the run that is complete, corrected and released.
+        states: after every commit, oldest first; the last is the present one.
+        with_wal: the database and its write-ahead log as a crash leaves them, some commits before the end.
+        keys: PEM of every key that signed, oldest first; of all but the last the file is gone.
+    """
+
+    folder: Path
+    run_id: str
+    states: tuple[State, ...]
+    with_wal: tuple[bytes, bytes, bytes]
+    keys: tuple[bytes, ...]
+
+    @property
+    def data(self) -> Path:
+        """The data folder."""
+        return self.folder / "data"
+
+    @property
+    def copy(self) -> Path:
+        """The second place of the log of signatures."""
+        return self.folder / COPY
+
+
+@dataclass
+class _Keeping(DurableFiles):
+    """The seam to the disk; keeps what lies there after every commit."""
+
+    folder: Path
+    states: list[State] = field(default_factory=list[State])
+
+    def commit(self, commit: Callable[[], None]) -> None:
+        """See Files."""
+        commit()
+        self.states.append(state_of(self.folder))
+
+
+def state_of(folder: Path) -> State:
+    """The three files as they are now."""
+    with closing(sqlite3.connect(database_path(folder / "data"))) as connection:
+        database = connection.serialize()
+    return State(database, _content(folder / "data" / NAME), _content(folder / COPY))
+
+
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.exists() else None
+
+
+def make_record(folder: Path) -> Record:
+    """Two ended runs and an open one, jobs of every end, people, a correction, a release, a time stamp, two keys."""
+    folder.mkdir(parents=True)
+    files = _Keeping(folder)
+    with time_stamp_authority(folder / "tsa") as authority, Store.open(folder / "data", files=files) as store:
+        people = People(store, QUICK_HASHES)
+        _start(store, folder, people)
+        run_id = _complete_run(store, folder, Authority(authority.url, authority.certificates))
+        _people_act(store, people, run_id)
+        (first_key,) = (folder / "data" / "keys").glob("*.pem")
+        first = first_key.read_bytes()
+        rotate_key(store, reason="yearly", actor="ada")
+        bring_up_to_date(folder / "data", folder / COPY)
+        _aborted_run(store, folder)
+        _open_run(store, folder, people)
+        with_wal = _with_wal(folder)
+    (key,) = (folder / "data" / "keys").glob("*.pem")
+    record = Record(folder, run_id, (*files.states, state_of(folder)), with_wal, (first, key.read_bytes()))
+    shutil.rmtree(folder / "tsa")
+    put_back(record)
+    return record
+
+
+def put_back(record: Record) -> None:
+    """The files of the record as they were at its end."""
+    put(record, record.states[-1])
+
+
+def put(record: Record, state: State) -> None:
+    """The files of the record as they were once. None: the file is not there."""
+    for left in record.data.glob("orthocapture.sqlite-*"):
+        left.unlink()
+    database_path(record.data).write_bytes(state.database)
+    for path, content in ((record.data / NAME, state.log), (record.copy, state.copy)):
+        if content is None:
+            path.unlink(missing_ok=True)
+        elif not path.exists() or path.read_bytes() != content:
+            path.write_bytes(content)
+
+
+def _start(store: Store, folder: Path, people: People) -> None:
+    rig = folder / "rig.yaml"
+    rig.write_text("name: bench\nsimulated: true\ndevices: {}\n")
+    protocol = folder / "bench.yaml"
+    protocol.write_text(PROTOCOL)
+    record_start(store, load_rig(rig), [protocol], "http://127.0.0.1:8000")
+    populate(people)
+
+
+def _complete_run(store: Store, folder: Path, authority: Authority) -> str:
+    bench = begin_run(store, PROTOCOL.replace("count: 4", "count: 3"), folder)
+    bench.signature_copy, bench.authority = folder / COPY, authority
+    _jobs(store, bench.run_id)
+    if bench.run().status != "completed":
+        raise DataError("the run that is to be attacked did not complete", where=bench.run_id)
+    *_, end = (e for e in store.events(bench.run_id) if e.payload.kind == "run_completed")
+    correct(store, bench.run_id, of_seq=1, field="operator", new="Ada L.", reason="her name", actor="emmy")
+    released = RunReleased(meaning="reviewed and released", signed_sha256=end.sha256)
+    store.record(bench.run_id, [released], actor="lise")
+    exported = EvidenceExported(
+        what="bundle", file_name="b.zip", sha256="0" * 64, size_bytes=1, head_sha256=end.sha256
+    )
+    store.record(bench.run_id, [exported], actor="lise")
+    checkpoint(store, bench.run_id)
+    bring_up_to_date(folder / "data", folder / COPY)
+    return bench.run_id
+
+
+def _jobs(store: Store, run_id: str) -> None:
+    """One that is finished with a file, one that failed after it was tried again, one that waits."""
+    for key in ("one", "two", "three"):
+        store.enqueue_job(run_id, NewJob("registration", "capture", 1, key, {"sigma_px": 0.5}), actor="runner")
+    job = store.claim_job("worker 1", 10.0)
+    assert job is not None
+    answer = store.put_bytes(
+        json.dumps({"rms_px": 0.4}).encode(), kind="result", media_type="application/json", original_name="r.json"
+    )
+    store.finish_job(job, measures={"rms_px": 0.4}, duration_s=1.0, artefacts=[NewArtefact(answer, "worker 1")])
+    for retry in (True, False):
+        job = store.claim_job("worker 1", 10.0)
+        assert job is not None
+        store.fail_job(job, DataError("too few outlines"), retry=retry)
+
+
+def _person(people: People, account: str) -> Person:
+    person = people.person(people.sign_in(account, password_of(account)), idle_lock_s=1e9, deliberate=False)
+    assert person is not None
+    return person
+
+
+def _people_act(store: Store, people: People, run_id: str) -> None:
+    """A password refused, a PIN changed, a role changed, an invitation left open, a locked and an open screen."""
+    administrator = _person(people, "ada")
+    people.accounts.invite(administrator, "marie", "Marie Curie", "technician")
+    people.accounts.change_role(administrator, "lise", "supervisor", "she supervises now")
+    with suppress(SignInRefusedError):
+        people.sign_in("grace", "wrong password")
+    grace = _person(people, "grace")
+    people.accounts.change_pin(grace, PIN[::-1])
+    people.lock(grace)
+    people.sign_out(administrator)
+    checkpoint(store, SITE)
+    checkpoint(store, run_id)
+
+
+def _aborted_run(store: Store, folder: Path) -> None:
+    bench = begin_run(store, PROTOCOL, folder)
+    store.record(bench.run_id, [RunAborted(reason="the specimen was dropped")], actor="Ada")
+    checkpoint(store, bench.run_id)
+    bring_up_to_date(folder / "data", folder / COPY)
+
+
+def _open_run(store: Store, folder: Path, people: People) -> None:
+    """One that was signed once and has gone on; its lease and its control are what a killed runner left."""
+    bench = begin_run(store, PROTOCOL, folder)
+    Control(store).take(bench.run_id, _person(people, "emmy"))
+    store.lease(bench.run_id, "runner", 1.0)
+    store.enqueue_job(bench.run_id, NewJob("registration", "capture", 1, "four"), actor="runner")
+    store.claim_job("worker 2", 1.0, run_id=bench.run_id)
+    # From here on commits stay in the write-ahead log: a signature, and an event after it.
+    with closing(sqlite3.connect(database_path(folder / "data"))) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    checkpoint(store, bench.run_id)
+    bring_up_to_date(folder / "data", folder / COPY)
+    store.record(bench.run_id, [OperatorAction(action="pause", reason="lunch")], actor="emmy")
+
+
+def _with_wal(folder: Path) -> tuple[bytes, bytes, bytes]:
+    data = folder / "data"
+    return database_path(data).read_bytes(), (data / WAL_NAME).read_bytes(), (data / NAME).read_bytes()
