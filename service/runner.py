@@ -340,7 +340,8 @@ class Runner:
             stamp_end(self.store, self.run_id, self.authority if self._log.state.terminal else None)
         except StoreError as error:
             self.operator.tell(f"the record could not be signed: {error}")
-        keep_elsewhere(self.store.database_path.parent, self.signature_copy, self.operator.tell)
+        folder, files = self.store.database_path.parent, self.store.files
+        keep_elsewhere(folder, self.signature_copy, self.operator.tell, files)
 
 
 def software_versions() -> dict[str, str]:
