@@ -9,9 +9,7 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
-
-from service.core.model import LeftoversRemoved
+from service.core.model import ArtefactRef, LeftoversRemoved
 from service.store.audit import verify
 from service.store.leftovers import leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob
@@ -90,32 +88,43 @@ def test_what_is_young_stays_also_where_old_bytes_were_stored_again(tmp_path: Pa
         assert path.exists()
 
 
-@pytest.mark.parametrize("work", ["run", "job"])
-def test_what_a_process_at_work_may_still_record_stays(tmp_path: Path, work: str) -> None:
-    """Whatever the age: the lease of a runner, or the job of a worker, is older than the file."""
+def test_what_a_runner_at_work_may_still_record_stays(tmp_path: Path) -> None:
+    """Whatever the age: its lease is older than the file."""
     with Store.open(tmp_path) as store:
         run = start_run(store)
-        if work == "run":
-            holder = subprocess.Popen(
-                [sys.executable, "-c", HOLDER, str(tmp_path)], cwd=REPOSITORY, stdout=subprocess.PIPE
-            )
+        with subprocess.Popen(
+            [sys.executable, "-c", HOLDER, str(tmp_path)], cwd=REPOSITORY, stdout=subprocess.PIPE
+        ) as holder:
             assert holder.stdout is not None
             assert holder.stdout.readline() == b"holds\n"
-        else:
-            store.enqueue_job(run, NewJob("register", "capture", 1, "key"), actor="runner")
-            assert store.claim_job("a worker", 30.0) is not None
-        ref = put_image(store, "v1")
-        (one,) = leftovers(store, min_age_s=0)
-        assert "may still record it" in one.stays
-        assert remove_leftovers(store, actor="Ada", min_age_s=0) == []
-        if work == "run":
+            ref = put_image(store, "v1")
+            must_stay(store)
             holder.kill()
-            holder.wait()
-            holder.stdout.close()
-            assert [one.stays for one in leftovers(store, min_age_s=0)] == [""]
-        store.record(run, [captured(ref, "v1")], actor="camera", artefacts=[NewArtefact(ref, "camera")])
-        assert leftovers(store, min_age_s=0) == []
-    assert verify(tmp_path).ok
+        assert [one.stays for one in leftovers(store, min_age_s=0)] == [""]
+        must_record(store, run, ref)
+
+
+def test_what_a_worker_at_work_may_still_record_stays(tmp_path: Path) -> None:
+    with Store.open(tmp_path) as store:
+        run = start_run(store)
+        store.enqueue_job(run, NewJob("register", "capture", 1, "key"), actor="runner")
+        assert store.claim_job("a worker", 30.0) is not None
+        ref = put_image(store, "v1")
+        must_stay(store)
+        must_record(store, run, ref)
+
+
+def must_stay(store: Store) -> None:
+    (one,) = leftovers(store, min_age_s=0)
+    assert "may still record it" in one.stays
+    assert remove_leftovers(store, actor="Ada", min_age_s=0) == []
+
+
+def must_record(store: Store, run: str, ref: ArtefactRef) -> None:
+    """The file is there for its record."""
+    store.record(run, [captured(ref, "v1")], actor="camera", artefacts=[NewArtefact(ref, "camera")])
+    assert leftovers(store, min_age_s=0) == []
+    assert verify(store.database_path.parent).ok
 
 
 def test_the_command_lists_first_and_removes_when_asked(tmp_path: Path) -> None:

@@ -1,0 +1,1 @@
+"""Sweeps for faults that no single test looks for: crashes, power loss, bad input, forged evidence."""
