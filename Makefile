@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-versions lint format docs bench lock clean
+.PHONY: demo test test-versions lint format docs bench torture-crash lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -42,6 +42,10 @@ bench: $(TOOLS)
 	$(BIN)/python -m bench.accuracy
 	$(BIN)/python -m bench.marker_speed
 	$(BIN)/python -m bench.register_scale
+
+# Searches for faults that no single test looks for (docs/torture.md); takes most of an hour.
+torture-crash: $(TOOLS)
+	$(BIN)/python -m bench.torture.crash
 
 # New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \

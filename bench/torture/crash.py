@@ -33,13 +33,16 @@ _WAYS: tuple[How, ...] = ("kill", "power")
 _TWICE = 10  # one case of so many dies once more after the resumption
 
 
-def chosen(sweep: Sweep, rng: Random, sample: int | None) -> list[Case]:
-    """Every case, or a sample, in an order of chance: a sweep that is cut short has tried a bit of everything."""
-    cases = list(sweep.cases(_WAYS))
+def chosen(sweep: Sweep, rng: Random, options: argparse.Namespace) -> list[Case]:
+    """Every case, or some, in an order of chance: a sweep that is cut short has tried a bit of everything."""
+    cases = list(sweep.cases(options.ways))
     rng.shuffle(cases)
+    if options.kinds:
+        return list({(case.role, case.point.effect): case for case in cases}.values())
     later = sweep.points["runner", "kill"]
     twice = [Case(c.role, c.point, c.how, rng.choice(later)) for c in cases[::_TWICE] if c.role == "runner"]
-    return [*cases, *twice][:sample] if sample is not None else [*cases, *twice]
+    both = [*cases, *twice]
+    return both if options.sample is None else both[: options.sample]
 
 
 def sweep_points(folder: Path, options: argparse.Namespace, rng: Random) -> dict[str, Any]:
@@ -49,7 +52,7 @@ def sweep_points(folder: Path, options: argparse.Namespace, rng: Random) -> dict
     # What all children share is not copied when they count references.
     gc.collect()
     gc.freeze()
-    cases = chosen(sweep, rng, options.sample)
+    cases = chosen(sweep, rng, options)
     verdicts: list[Verdict] = []
     for number, case in enumerate(cases, start=1):
         if options.minutes and time.monotonic() - began_s > 60 * options.minutes:
@@ -147,12 +150,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--sample", type=int, help="so many cases of the systematic sweep; all of them without it")
+    parser.add_argument("--kinds", action="store_true", help="one case for each process and effect, of either death")
+    parser.add_argument("--ways", nargs="+", choices=_WAYS, default=_WAYS, help="how the processes die")
     parser.add_argument("--minutes", type=float, default=0, help="end the systematic sweep after this; 0: never")
     parser.add_argument("--random-runs", type=int, default=6, help="runs over the real wires; 0: none")
     parser.add_argument("--kills", type=int, default=4, help="in each of these")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
-    cv2.setNumThreads(1)  # a fork has no threads
+    cv2.setNumThreads(1)
     rng = Random(options.seed)
     folder = Path(tempfile.mkdtemp(prefix="orthocapture-torture-"))
     result: dict[str, Any] = {
@@ -189,5 +194,7 @@ def _kill_record(kill: Kill) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if "OPENBLAS_NUM_THREADS" not in os.environ:  # it is read when the library is loaded; a fork has no threads
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
+        os.execv(sys.executable, [sys.executable, "-m", "bench.torture.crash", *sys.argv[1:]])
     main()
