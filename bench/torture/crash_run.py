@@ -28,7 +28,6 @@ from service.steps import params_models
 from service.store.signature_copy import keep_elsewhere
 from service.store.signing import checkpoint
 from service.store.store import Store
-from service.store.timestamping import stamp_end
 from service.worker import loop
 from tests.support.bench_rig import ScriptedOperator
 
@@ -210,8 +209,6 @@ def _run(store: Store, place: Place, parent: int, person: str) -> None:
 
     operator = ScriptedOperator(name=person)
     runner.Runner(store, run_id, protocol, rig, operator, signature_copy=place.signature_copy, wait=wait).run()
-    stamp_end(store, run_id, None)
-    keep_elsewhere(place.data, place.signature_copy, print, store.files)
 
 
 def _work(store: Store, place: Place, parent: int, _person: str) -> None:
