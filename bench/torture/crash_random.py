@@ -36,7 +36,7 @@ from service.store.leftovers import leftovers, remove_leftovers
 from service.store.store import Store
 from tests.support.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
 
-_HOST = "127.0.0.61"
+_HOST = "127.0.0.71"
 _VIEWS = 6
 _LONGEST_S = 420.0  # of a run with its kills, on a busy machine
 _ROBOT_PORTS = {29999, 30001, 30002, 30003, 30004}  # fixed by the maker
