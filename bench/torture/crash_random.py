@@ -79,7 +79,7 @@ def random_kills(folder: Path, runs: int, kills: int, rng: Random) -> tuple[list
 
 _TARGETS = (
     "runner", "runner", "worker", "worker's child", "web",
-    "driver of the robot", "driver of the camera", "driver of the light box",
+    "driver of the robot", "driver of the camera",
     "simulated robot", "simulated camera", "simulated light box",
 )  # fmt: skip
 
@@ -260,11 +260,11 @@ def _is(what: str, process: psutil.Process, rig: str) -> bool:
 
 
 def _driver(process: psutil.Process) -> str:
-    """Which device a driver's process is of, by the wire that it holds."""
+    """Which device a driver's process is of, by the wire that it holds; that of the light box has no process."""
     ports = {link.raddr.port for link in process.net_connections("tcp") if link.raddr}
     if ports & _ROBOT_PORTS:
         return "driver of the robot"
-    return "driver of the camera" if ports else "driver of the light box"
+    return "driver of the camera" if ports else ""
 
 
 def _session(events: Sequence[Event]) -> int:
