@@ -40,6 +40,7 @@ def test_a_death_at_every_kind_of_point_leaves_nothing_behind(tmp_path: Path) ->
     assert shown["faults"] == []
     assert status == 0
     assert {(row["process"], row["effect"]) for row in shown["rows"]} >= {
+        *(("begin", effect) for effect in ("make_directory", "write", "sync_file", "rename", "commit")),
         *(("runner", effect) for effect in ("write", "append", "sync_file", "rename", "sync_directory", "commit")),
         *(("worker", effect) for effect in ("write", "sync_file", "rename", "sync_directory", "commit")),
         *(("web", effect) for effect in ("append", "sync_file", "commit")),

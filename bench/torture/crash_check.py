@@ -19,11 +19,12 @@ from service.evidence import RunLog
 from service.runs import recorded_run
 from service.store.audit import verify
 from service.store.database import database_path
+from service.store.errors import StoreVersionError
 from service.store.leftovers import leftovers, remove_leftovers
 from service.store.signature_log import NAME as LOG_NAME
 from service.store.store import Store
 
-ROLES: tuple[Role, ...] = ("runner", "worker", "web")
+ROLES: tuple[Role, ...] = ("begin", "runner", "worker", "web")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,16 +56,39 @@ def outcome(events: Sequence[Event]) -> Outcome:
 
 def after_the_crash(place: Place) -> list[str]:
     """Faults of a folder before anybody has resumed: nothing that was said to be recorded may be gone."""
-    found = [f"after the crash: {fault}" for fault in verify(place.data).faults]
-    said = max(
-        (line["events"] for role in ROLES for line in read_journal(place.journal(role)) if "events" in line),
-        default=0,
-    )
+    if not database_path(place.data).exists() and not _events_said(place):
+        return []  # nobody was told that there was anything
+    try:
+        found = [f"after the crash: {fault}" for fault in verify(place.data).faults]
+    except StoreVersionError:  # its tables are not there yet
+        return ["after the crash: the tables are gone"] if _events_said(place) else []
+    said = _events_said(place)
     with closing(sqlite3.connect(f"file:{database_path(place.data)}?mode=ro", uri=True)) as connection:
-        there = int(connection.execute("SELECT sum(seq) FROM heads").fetchone()[0])
+        there = int(connection.execute("SELECT coalesce(sum(seq), 0) FROM heads").fetchone()[0])
     if there < said:
         found.append(f"after the crash: {there} events of {said} that were recorded")
     return found
+
+
+def of_a_beginning(place: Place) -> tuple[list[str], int]:
+    """Faults of a folder in which a run was begun, perhaps twice; and how many leftovers were collected."""
+    with Store.open(place.data) as store:
+        begun = len(store.runs())
+        gone = remove_leftovers(store, actor="Sue", min_age_s=0)
+    report = verify(place.data)
+    found = [str(fault) for fault in report.faults]
+    found += [f"after store gc: {note}" for note in report.notes if note.startswith("artefacts/")]
+    if begun not in (1, 2):
+        found.append(f"{begun} runs were begun")
+    return found, len(gone)
+
+
+def _events_said(place: Place) -> int:
+    """How many events had been recorded by commits that returned."""
+    return max(
+        (line["events"] for role in ROLES for line in read_journal(place.journal(role)) if "events" in line),
+        default=0,
+    )
 
 
 def at_the_end(place: Place, expected: Outcome | None) -> tuple[list[str], int]:

@@ -19,7 +19,7 @@ from bench.torture.remembered import remembering
 from service import runner
 from service.core.fold import fold
 from service.core.gates import evaluate_gates
-from service.core.model import RunReleased, StepMeasured, StepPassed, StepStarted
+from service.core.model import RunReleased, StepMeasured, StepStarted
 from service.core.protocol import parse_protocol
 from service.core.release import refuse_release
 from service.rig import load_rig
@@ -32,7 +32,7 @@ from service.worker import loop
 from tests.support.bench_rig import ScriptedOperator
 
 _SOFTWARE = runner.software_versions()
-Role = Literal["runner", "worker", "web"]
+Role = Literal["begin", "runner", "worker", "web"]
 _ARC = VIEWPOINTS.arcs[0]
 PROTOCOL = f"""\
 id: torture
@@ -121,6 +121,11 @@ class Place:
         return self.folder / "data"
 
     @property
+    def rig(self) -> Path:
+        """The rig file."""
+        return self.files / "rig.yaml"
+
+    @property
     def signature_copy(self) -> Path:
         """The second place of the log of signatures."""
         return self.folder / "elsewhere.jsonl"
@@ -141,28 +146,26 @@ class Place:
 
 
 def prepare(folder: Path) -> Place:
-    """A run that is calibrated and otherwise about to begin; copies of it are killed."""
+    """A run that has calibrated, and nothing else, not even signed that; copies of it are killed."""
     place = Place(folder / "seed", folder / "files")
     for made in (place.folder, place.files):
         made.mkdir(parents=True)
     prepare_files(place.files)
-    rig = folder / "rig.yaml"
-    rig.write_text("name: torture\nsimulated: true\ndevices: {}\n")
-    loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="torture.yaml")
+    place.rig.write_text("name: torture\nsimulated: true\ndevices: {}\n")
     with Store.open(place.data) as store:
-        run_id = start_run(store, loaded, load_rig(rig), operator="Ada", auto_confirm=False)
+        _begin(store, place, 0, "Ada")
+        run_id = store.find_run("latest")
+        protocol, _ = recorded_run(store, run_id)
         result = {
             "camera": CAMERA.record(),
             "T_flange_camera": CrashRig().nominal_T_flange_camera().tolist(),
             "robots": ["robot"],
             "details": {},
         }
-        step = loaded.protocol.step("calibration")
+        step = protocol.step("calibration")
         store.record(run_id, [StepStarted(step=step.id, attempt=1)], actor="runner")
         measured = StepMeasured(step=step.id, attempt=1, measures={}, artefacts=(), result=result)
-        judged = evaluate_gates(step, 1, {})
-        store.record(run_id, [measured, judged, StepPassed(step=step.id, attempt=1)], actor="runner")
-        checkpoint(store, run_id)
+        store.record(run_id, [measured, evaluate_gates(step, 1, {})], actor="runner")
     return place
 
 
@@ -194,6 +197,12 @@ def start(role: Role, place: Place, *, die_at: Point | None = None, person: str 
         traceback.print_exc()
     finally:
         os._exit(status)
+
+
+def _begin(store: Store, place: Place, _parent: int, person: str) -> None:
+    """As `orthocapture run` does first."""
+    loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="torture.yaml")
+    start_run(store, loaded, load_rig(place.rig), operator=person, auto_confirm=False)
 
 
 def _run(store: Store, place: Place, parent: int, person: str) -> None:
@@ -240,4 +249,9 @@ def _release(store: Store, place: Place, _parent: int, person: str) -> None:
     keep_elsewhere(place.data, place.signature_copy, print, store.files)
 
 
-_ROLES: dict[Role, Callable[[Store, Place, int, str], None]] = {"runner": _run, "worker": _work, "web": _release}
+_ROLES: dict[Role, Callable[[Store, Place, int, str], None]] = {
+    "begin": _begin,
+    "runner": _run,
+    "worker": _work,
+    "web": _release,
+}

@@ -13,13 +13,14 @@ from pathlib import Path
 from random import Random
 from typing import Literal
 
-from bench.torture.crash_check import ROLES, Outcome, after_the_crash, at_the_end, outcome
+from bench.torture.crash_check import ROLES, Outcome, after_the_crash, at_the_end, of_a_beginning, outcome
 from bench.torture.crash_run import Place, Role, prepare, start
 from bench.torture.mortal import Point, points, read_journal
 from bench.torture.power import lose_power
 from service.store.store import Store
 
 How = Literal["kill", "power"]
+_ALONE: dict[Role, str] = {"begin": "Ada", "web": "Sue"}  # processes beside which no other works, and who acts
 _LONGEST_S = 300.0  # of a process of the run, on a busy machine; the undisturbed run takes a few seconds
 _POLL_S = 0.004
 
@@ -95,9 +96,12 @@ class Sweep:
                 outcomes.append(outcome(store.events(store.find_run("latest"))))
         if outcomes[0] != outcomes[1]:
             raise SweepError("two undisturbed runs do not come to the same results")
+        begun = Place(folder / "begun", seed.files)
+        begun.folder.mkdir()
+        _ended(start("begin", begun), begun)
         found: dict[tuple[Role, How], list[Point]] = {}
         for role in ROLES:
-            journal = folder / "undisturbed-1" / f"{role}.jsonl"
+            journal = (begun if role == "begin" else replace(seed, folder=folder / "undisturbed-1")).journal(role)
             found[role, "kill"] = points(journal, power=False)
             found[role, "power"] = points(journal, power=True)
         return cls(folder, seed, outcomes[0], completed, found)
@@ -113,8 +117,7 @@ class Sweep:
         """Run up to the point, die there, resume, confirm, go to the end, and look what does not hold."""
         began_s = time.monotonic()
         self.numbered += 1
-        source = self.completed if case.role == "web" else self.seed
-        place = _copy(source, self.folder / f"case-{self.numbered}")
+        place = self._place(case)
         faults: list[str] = []
         taken: list[str] = []
         collected = 0
@@ -126,7 +129,7 @@ class Sweep:
             if reached:
                 faults += after_the_crash(place)
             self._resume(case, place)
-            late, collected = at_the_end(place, self.expected)
+            late, collected = of_a_beginning(place) if case.role == "begin" else at_the_end(place, self.expected)
             faults += late
         except SweepError as error:
             faults.append(str(error))
@@ -135,10 +138,18 @@ class Sweep:
         seconds = time.monotonic() - began_s
         return Verdict(case, reached, tuple(faults), tuple(taken), collected, seconds)
 
+    def _place(self, case: Case) -> Place:
+        """A copy of what the process finds that is to die; a run is begun where there is nothing."""
+        folder = self.folder / f"case-{self.numbered}"
+        if case.role == "begin":
+            folder.mkdir()
+            return replace(self.seed, folder=folder)
+        return _copy(self.completed if case.role == "web" else self.seed, folder)
+
     def _die(self, case: Case, place: Place) -> bool:
         """Whether the process came to its point; nobody lives afterwards."""
-        if case.role == "web":
-            status = _wait(start("web", place, die_at=case.point, person="Sue"))
+        if case.role in _ALONE:
+            status = _wait(start(case.role, place, die_at=case.point, person=_ALONE[case.role]))
             return os.WIFSIGNALED(status)
         alive: dict[Role, int] = {
             "worker": start("worker", place, die_at=case.point if case.role == "worker" else None),
@@ -173,6 +184,9 @@ class Sweep:
 
     def _resume(self, case: Case, place: Place) -> None:
         """Another runner and worker, and another person who confirms; then the release."""
+        if case.role == "begin":
+            _ended(start("begin", place), place)
+            return
         if case.again is not None:
             alive: dict[Role, int] = {
                 "worker": start("worker", place),
