@@ -64,6 +64,7 @@ def sweep_points(folder: Path, options: argparse.Namespace, rng: Random) -> dict
         if number % 50 == 0:
             print(f"{number} of {len(cases)}, {time.monotonic() - began_s:.0f} s", flush=True)
     return {
+        "points": sum(map(len, sweep.points.values())),
         "planned": len(cases),
         "rows": rows(sweep, verdicts),
         "deaths": sum(v.reached for v in verdicts),
@@ -102,17 +103,19 @@ def rows(sweep: Sweep, verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
 
 def report(result: dict[str, Any]) -> str:
     """As Markdown."""
+    command = " ".join(["python -m bench.torture.crash", *result["options"]])
     lines = [
         "# Crash sweep",
         "",
-        f"`make torture-crash`, {result['date']}, {result['commit']}; {result['machine']['processor']}, "
+        f"`{command}`, {result['date']}, {result['commit']}; {result['machine']['processor']}, "
         f"{result['machine']['cores']} cores shared with other work. Seed {result['seed']}.",
         "",
     ]
     points = result.get("points")
     if points:
         lines += [
-            f"At points of the seam: {points['deaths']} deaths (of {points['planned']} planned), "
+            f"At points of the seam, of which a run has {points['points']} by both deaths together: "
+            f"{points['deaths']} deaths (of {points['planned']} planned), "
             f"{points['twice']} of which died once more after the resumption; a loss of power took something from "
             f"{points['taken_by_power']} of them; {points['leftovers']} leftovers were collected by "
             f"`orthocapture store gc`; **{len(points['faults'])} with a fault**; {points['seconds']} s.",
@@ -165,6 +168,7 @@ def main() -> None:
         "commit": commit(),
         "machine": machine(),
         "seed": options.seed,
+        "options": sys.argv[1:],
     }
     if options.sample != 0:
         result["points"] = sweep_points(folder / "points", options, rng)
