@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-versions lint format docs bench torture-audit torture-fuzz lock clean
+.PHONY: demo test test-versions lint format docs bench torture-audit torture-crash torture-fuzz lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -52,6 +52,10 @@ torture-fuzz: $(TOOLS)
 # Every byte, row, roll-back and forgery of a small record: hours. MINUTES=60 ends it early, WORK=DIR goes on with it.
 torture-audit: $(TOOLS)
 	$(strip $(BIN)/python -m bench.torture.audit $(if $(MINUTES),--minutes $(MINUTES)) $(if $(WORK),--work $(WORK)))
+
+# Searches for faults that no single test looks for (docs/torture.md); takes most of an hour.
+torture-crash: $(TOOLS)
+	$(BIN)/python -m bench.torture.crash
 
 # New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \

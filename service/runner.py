@@ -136,8 +136,8 @@ class Runner:
             self._lease = lease
             self._log = RunLog(self.store, self.run_id, self.protocol)
             if self._log.state.terminal:
-                if self.authority is not None and not self.store.timestamps(self.run_id):
-                    self._seal()  # the authority did not answer, or this process died before it was asked
+                if self.authority is None or not self.store.timestamps(self.run_id):
+                    self._seal()  # the process died before it could, or the authority did not answer
                 return self._log.state
             resumed = self._log.state.sessions > 0
             if resumed:
@@ -340,7 +340,8 @@ class Runner:
             stamp_end(self.store, self.run_id, self.authority if self._log.state.terminal else None)
         except StoreError as error:
             self.operator.tell(f"the record could not be signed: {error}")
-        keep_elsewhere(self.store.database_path.parent, self.signature_copy, self.operator.tell)
+        folder, files = self.store.database_path.parent, self.store.files
+        keep_elsewhere(folder, self.signature_copy, self.operator.tell, files)
 
 
 def software_versions() -> dict[str, str]:

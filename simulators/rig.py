@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--without-cable", action="store_true", help="with --hand: the camera sends its photographs into a folder"
     )
+    parser.add_argument(
+        "--revive-after-s", type=float, metavar="S", help="a device that dies is switched on again; else the rig ends"
+    )
 
 
 def serve(args: argparse.Namespace) -> None:
@@ -67,6 +71,8 @@ class _Rig:
         scene = Scene.generate(args.scene)
         self.arms = () if args.hand else ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
         self.children: dict[str, subprocess.Popen[str]] = {}
+        self._words: dict[str, tuple[str, ...]] = {}  # with which each of them was started
+        self._ready: dict[str, dict[str, Any]] = {}  # what each has said then
         self.world = World(scene, args.image_width, self.arms, _start_joints(scene), camera_held=bool(args.hand))
         self.hand = args.hand and Hand(
             args.hand, args.scene, self.world.hold, self.world.press_shutter, SCENE_CENTRE_M.copy()
@@ -136,7 +142,25 @@ class _Rig:
             for name, process in self.children.items():
                 if process.poll() is not None and not self.termination.is_set():
                     sys.stderr.write(f"{name} ended with status {process.returncode}: see {self.folder}/logs\n")
-                    self.termination.set()
+                    if self.args.revive_after_s is None or self.termination.wait(self.args.revive_after_s):
+                        self.termination.set()
+                        return
+                    self._revive(name)
+                    break
+
+    def _revive(self, name: str) -> None:
+        """The device at the same address: an arm stands where it stood, a camera counts its files on."""
+        words = list(self._words[name])
+        if name in self.arms:
+            joints = ",".join(f"{q:.6f}" for q in self.world.joints_rad(name))
+            words = [f"--initial-joints={joints}" if w.startswith("--initial-joints") else w for w in words]
+        if name == "camera":
+            log = self.folder / "truth_exposures.jsonl"
+            taken = len(log.read_text().splitlines()) if log.exists() else 0
+            port = self._ready[name]["gphoto_port"].rpartition(":")[2]
+            words += ["--port", port, "--first-counter", str(taken + 1)]  # these count instead of the first ones
+        with suppress(SimulatorError):  # it is tried again
+            self._child(name, *words)
 
     def _child(self, name: str, *words: str) -> dict[str, Any]:
         """Start a simulator and wait for its ready line."""
@@ -146,7 +170,9 @@ class _Rig:
                 command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True
             )
         self.children[name] = process
-        return _ready_line(process, name, self.folder)
+        self._words[name] = words
+        self._ready[name] = ready = _ready_line(process, name, self.folder)
+        return ready
 
     # --- what the service reads ---
 

@@ -70,6 +70,11 @@ class World:
         with self._lock:
             self._joints[arm] = q
 
+    def joints_rad(self, arm: str) -> Array:
+        """Where a controller has said that its joints are (6,); where they are at first."""
+        with self._lock:
+            return self._joints.get(arm, self.start_joints_rad)
+
     @property
     def camera_arm(self) -> str:
         """The arm that carries the camera: with two, the one at the present station."""

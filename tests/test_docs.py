@@ -169,6 +169,7 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture audit verify all --data runs": succeeds,
     "orthocapture audit verify latest --json --data runs": succeeds,
     "orthocapture audit keys --data runs": succeeds,
+    "orthocapture store gc --data runs": succeeds,
 }
 # Commands that take minutes or a whole rig: the test of the suite that runs them.
 RUN_ELSEWHERE = {
@@ -191,6 +192,10 @@ RUN_ELSEWHERE = {
     ),
     "orthocapture layout --spheres spheres.json": "tests/test_layout.py::test_command",
     "make demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
+    "make torture-crash": "tests/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind",
+    "python -m bench.torture.crash --sample 100 --random-runs 1": (
+        "tests/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
+    ),
     **dict.fromkeys(
         ("make test", "make lint", "make test-versions", "make torture-audit", "make clean"),
         "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
@@ -238,6 +243,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("lint", ".venv/bin/lint-imports"),
         ("test-versions", ".ci/versions"),
         ("torture-audit", ".venv/bin/python -m bench.torture.audit"),
+        ("torture-crash", ".venv/bin/python -m bench.torture.crash"),
         ("clean", "rm -rf .venv build *.egg-info"),
     ):
         done = subprocess.run(

@@ -254,3 +254,22 @@ def test_two_controllers_are_found_and_used(tmp_path: Path) -> None:
             error_m = float(np.linalg.norm(recorded[:3, 3] - true[:3, 3]))
             # The arm's own error is below 5 mm; from the other base the camera would be somewhere else.
             assert (error_m < 0.005) == (station == event.station), (event.viewpoint, station, error_m)
+
+
+def test_a_device_that_dies_is_switched_on_again_at_its_address(tmp_path: Path) -> None:
+    with simulated_rig(tmp_path, *SMALL, "--revive-after-s", "0.2", host=OWN_HOST) as ready:
+        before = load_rig(Path(ready["rig"])).source
+        port = int(load_rig(Path(ready["rig"])).section.devices["camera"]["port"].rpartition(":")[2])
+        camera = next(
+            process
+            for process in psutil.Process().children(recursive=True)
+            if process.cmdline()[2:4] == ["simulators", "camera"]
+        )
+        camera.kill()
+
+        def answers() -> bool:
+            with socket.socket() as probe:
+                return not camera.is_running() and probe.connect_ex(("127.0.0.1", port)) == 0
+
+        until(answers, "the camera does not answer again")
+        assert Path(ready["rig"]).read_bytes() == before

@@ -11,7 +11,7 @@ import pytest
 from drivers.errors import DeviceBusyError, DeviceTimeoutError, DeviceUnavailableError
 from drivers.interfaces import SafetyState
 from service.core.decide import AskOperator
-from service.core.errors import ComputeError, ConfigurationError
+from service.core.errors import ComputeError, ConfigurationError, StoreError
 from service.core.model import (
     ActionRefused,
     DeviceOpened,
@@ -28,7 +28,10 @@ from service.core.model import (
 )
 from service.core.run_state import RunState
 from service.runs import recorded_rig, recorded_run
+from service.store import timestamping
+from service.store.audit import verify
 from service.store.errors import LeaseHeldError
+from service.store.records import Checkpoint
 from service.store.store import Store
 from tests.support.bench_rig import Answer, answer, other_settings
 from tests.support.bench_run import PROTOCOL, Bench, begin_run
@@ -110,6 +113,25 @@ def test_a_completed_run_is_not_touched_again(bench: Bench) -> None:
     before = bench.store.events(bench.run_id)
     assert bench.run().status == "completed"
     assert bench.store.events(bench.run_id) == before
+
+
+def test_the_end_of_a_run_that_could_not_be_signed_is_signed_when_it_is_resumed(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk was full in that moment, or the process was killed; nobody may be there to compute anything more."""
+    sign = timestamping.checkpoint
+
+    def full(store: Store, run_id: str) -> Checkpoint:
+        if bench.state().terminal:
+            raise StoreError("no space left")
+        return sign(store, run_id)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(timestamping, "checkpoint", full)
+        assert bench.run().status == "completed"
+    assert verify(bench.data).unsigned_events[bench.run_id] > 0
+    assert bench.run().status == "completed"
+    assert verify(bench.data).unsigned_events[bench.run_id] == 0
 
 
 def test_one_run_has_one_runner(bench: Bench) -> None:

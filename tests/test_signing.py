@@ -200,7 +200,7 @@ def test_an_old_key_signs_nothing_new(store: Store, monkeypatch: pytest.MonkeyPa
     """A copy of the old private key, kept by somebody, used after its replacement."""
     checkpoint(store, RUN)
     (first,) = public_keys(store)
-    stolen = KeyFolder(folder(store)).load(first.key_id)
+    stolen = KeyFolder(folder(store), store.files).load(first.key_id)
     rotate_key(store, reason="suspicion", actor="ada")
     capture(store, RUN, "v3")
     monkeypatch.setattr(signing, "_present_key", lambda *_: stolen)

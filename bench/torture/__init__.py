@@ -1,1 +1,1 @@
-"""Torture: sweeps that search for the next fault, each a `make torture-…` of its own."""
+"""Sweeps that search for faults no single test looks for, each a `make torture-…` of its own (docs/torture.md)."""

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import getpass
-import os
 import signal
-import subprocess
 import sys
-from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, cast
 
-import psutil
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 from drivers.interfaces import Camera, Lightbox, RobotArm
+from service.cli.beside import worker_beside
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -74,7 +71,6 @@ PasswordOption = Annotated[
 ]
 WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
 
-_WORKER_GRACE_S = 10.0
 _OF_A_CAPTURE = ("release", "finish")
 
 
@@ -347,7 +343,7 @@ def drive(
     # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with _worker(data, wanted=worker):
+        with worker_beside(data, error_console.print) if worker else nullcontext():
             authority, copy = time_stamp_authority(rig), signature_copy(rig)
             try:
                 state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
@@ -383,29 +379,6 @@ def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
     except ConfigurationError as error:
         return str(error)
     return "; ".join([plan.text for plan in plans] + ([board.text] if board is not None else []))
-
-
-@contextmanager
-def _worker(data: Path, *, wanted: bool) -> Generator[None]:
-    """A worker process that ends with this block, or with this process."""
-    if not wanted:
-        yield
-        return
-    command = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(data), "--json"]
-    # Its number is told, for a worker that looks who its parent is may look too late.
-    command += ["--parent", str(os.getpid())]
-    # A session of its own: Ctrl-C is for the runner, which ends its worker in order.
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)
-    try:
-        yield
-    finally:
-        process.terminate()
-        try:
-            process.wait(timeout=_WORKER_GRACE_S)
-        except subprocess.TimeoutExpired:  # in the middle of a long job, which the next worker begins anew
-            for child in (*psutil.Process(process.pid).children(recursive=True), process):
-                child.kill()
-            process.wait()
 
 
 def _report_end(run_id: str, state: RunState, *, json: bool) -> None:

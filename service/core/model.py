@@ -444,6 +444,13 @@ class KeyChanged(Record):
     reason: str
 
 
+class LeftoversRemoved(Record):
+    """Files to which no record refers, left over from crashes, were removed."""
+
+    kind: Literal["leftovers_removed"] = "leftovers_removed"
+    files: dict[str, int]  # path within the data folder → bytes
+
+
 class RunSigned(Record):
     """A run's chain was signed up to an event: written down here as well, at once."""
 
@@ -518,6 +525,7 @@ Payload = Annotated[
     | KeyChanged
     | RunSigned
     | TimeStampKept,
+    | LeftoversRemoved,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import os
 import re
 from collections.abc import Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +105,7 @@ class ArtefactFiles:
                 _check_arrival(meter.sha256, expected_sha256)
                 target = self._folder / relative_path(meter.sha256)
                 self._make_shard(target.parent)
-                if target.exists():
+                if self._made_young(target):
                     self._check_same(target, meter.sha256)
                     self._files.remove(temporary)
                 else:
@@ -122,6 +124,15 @@ class ArtefactFiles:
             self._files.make_directory(shard)
             self._files.sync_directory(shard.parent)
             self._durable_shards.add(shard)
+
+    def _made_young(self, target: Path) -> bool:
+        """Whether the file is there already; it counts as new then, lest it be removed as a leftover of old."""
+        with _locked(self._folder, fcntl.LOCK_SH):
+            try:
+                os.utime(target)
+            except (FileNotFoundError, PermissionError):  # of another user: the same bytes take its place
+                return False
+        return True
 
     def _check_same(self, target: Path, sha256: str) -> None:
         present, _size = hash_file(target)
@@ -146,6 +157,21 @@ class ArtefactFiles:
         path = self.path(sha256)
         self._check_same(path, sha256)
         return path
+
+
+def alone_with(folder: Path) -> AbstractContextManager[None]:
+    """Nobody takes a file of this artefact folder for stored meanwhile. Raises OSError."""
+    return _locked(folder, fcntl.LOCK_EX)
+
+
+@contextmanager
+def _locked(folder: Path, how: int) -> Generator[None]:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, how)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _check_arrival(sha256: str, expected_sha256: str | None) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from cryptography.exceptions import UnsupportedAlgorithm
@@ -17,7 +16,7 @@ from cryptography.hazmat.primitives.serialization import (
 
 from service.store.checkpoints import key_fingerprint
 from service.store.errors import SigningKeyError
-from service.store.seam import DurableFiles
+from service.store.seam import Files
 
 FOLDER = "keys"
 _SUFFIX, _PART = ".pem", ".part"
@@ -32,8 +31,9 @@ def public_bytes(key: Ed25519PrivateKey) -> bytes:
 class KeyFolder:
     """The private keys of one data folder. Callers hold the database's write lock, so one process works at a time."""
 
-    def __init__(self, data_dir: Path) -> None:
+    def __init__(self, data_dir: Path, files: Files) -> None:
         self._folder = data_dir / FOLDER
+        self._files = files
 
     def make(self) -> Ed25519PrivateKey:
         """A new key, durable on return. Raises SigningKeyError.
@@ -46,13 +46,10 @@ class KeyFolder:
         try:
             self._prepare()
             part = target.with_suffix(_PART)
-            descriptor = os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-            with open(descriptor, "wb") as handle:
-                handle.write(pem)
-                handle.flush()
-                os.fsync(descriptor)
-            part.replace(target)
-            DurableFiles().sync_directory(self._folder)
+            self._files.write(part, [pem], private=True)
+            self._files.sync_file(part)
+            self._files.rename(part, target)
+            self._files.sync_directory(self._folder)
         except OSError as error:
             raise SigningKeyError(
                 f"the signing key cannot be stored: {error.strerror or error}",
@@ -92,9 +89,9 @@ class KeyFolder:
         try:
             others = [p for p in self._folder.iterdir() if p.suffix in (_SUFFIX, _PART) and p != self._path(key_id)]
             for path in others:
-                path.unlink(missing_ok=True)
+                self._files.remove(path)
             if others:
-                DurableFiles().sync_directory(self._folder)
+                self._files.sync_directory(self._folder)
         except OSError as error:
             raise SigningKeyError(
                 f"an old signing key cannot be destroyed: {error.strerror or error}",
@@ -107,5 +104,5 @@ class KeyFolder:
 
     def _prepare(self) -> None:
         if not self._folder.exists():
-            self._folder.mkdir(mode=0o700)
-            DurableFiles().sync_directory(self._folder.parent)
+            self._files.make_directory(self._folder, private=True)
+            self._files.sync_directory(self._folder.parent)

@@ -135,17 +135,18 @@ class RunLease:
 def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
     """Whether somebody has the lease of a run who may still live."""
     row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
-    return row is not None and _is_live(row, clock.utc_now().timestamp())
+    return row is not None and is_live(row, clock.utc_now().timestamp())
 
 
 def held_runs(connection: Connection, clock: Clock) -> list[str]:
     """Runs whose lease somebody has who may still live, by name."""
     now_utc_s = clock.utc_now().timestamp()
     rows = connection.execute(select(leases).order_by(leases.c.run_id)).all()
-    return [row.run_id for row in rows if _is_live(row, now_utc_s)]
+    return [row.run_id for row in rows if is_live(row, now_utc_s)]
 
 
-def _is_live(row: Row[Any], now_utc_s: float) -> bool:
+def is_live(row: Row[Any], now_utc_s: float) -> bool:
+    """Whether the holder of a row of `leases` or `jobs` may still live; of another host: as long as its time runs."""
     life = identity_of(row).life()
     return life == "lives" or (life == "unknown" and now_utc_s < row.until_utc_s)
 
@@ -157,7 +158,7 @@ def acquire(database: Database, clock: Clock, ids: Ids, *, run_id: str, holder: 
         now = clock.utc_now().timestamp()
         row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
         if row is not None:
-            if _is_live(row, now):
+            if is_live(row, now):
                 here = row.host == socket.gethostname()
                 left_s = max(0.0, row.until_utc_s - now)
                 raise LeaseHeldError(

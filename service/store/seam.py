@@ -17,12 +17,19 @@ class Files(Protocol):
     A crash may fall before, within or after any call; the store's order of calls makes each of them harmless.
     """
 
-    def make_directory(self, path: Path) -> None:
+    def make_directory(self, path: Path, *, private: bool = False) -> None:
         """Create one directory; an existing one is fine. Not durable before `sync_directory(path.parent)`."""
         ...
 
-    def write(self, path: Path, chunks: Iterable[bytes]) -> None:
-        """Create `path`, which must not exist, and write the chunks. Not durable before `sync_file`."""
+    def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
+        """Create `path`, which must not exist, and write the chunks. Not durable before `sync_file`.
+
+        What is `private` nobody else can read, not even for a moment.
+        """
+        ...
+
+    def append(self, path: Path, offset: int, data: bytes) -> None:
+        """Cut a file, or begin a new one, to `offset` bytes and add the data. Not durable before `sync_file`."""
         ...
 
     def make_read_only(self, path: Path) -> None:
@@ -42,7 +49,7 @@ class Files(Protocol):
         ...
 
     def remove(self, path: Path) -> None:
-        """Delete a temporary file; a missing one is fine."""
+        """Delete a file to which nothing refers; a missing one is fine."""
         ...
 
     def commit(self, commit: Callable[[], None]) -> None:
@@ -53,15 +60,23 @@ class Files(Protocol):
 class DurableFiles:
     """The seam on a POSIX file system."""
 
-    def make_directory(self, path: Path) -> None:
+    def make_directory(self, path: Path, *, private: bool = False) -> None:
         """See Files."""
-        path.mkdir(exist_ok=True)
+        path.mkdir(mode=0o700 if private else 0o777, exist_ok=True)
 
-    def write(self, path: Path, chunks: Iterable[bytes]) -> None:
+    def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
         """See Files."""
-        with path.open("xb") as handle:
+        flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW
+        with open(os.open(path, flags, 0o600 if private else 0o666), "wb") as handle:
             for chunk in chunks:
                 handle.write(chunk)
+
+    def append(self, path: Path, offset: int, data: bytes) -> None:
+        """See Files."""
+        with open(os.open(path, os.O_CREAT | os.O_WRONLY | os.O_CLOEXEC, 0o666), "wb") as handle:
+            handle.truncate(offset)
+            handle.seek(offset)
+            handle.write(data)
 
     def make_read_only(self, path: Path) -> None:
         """See Files."""

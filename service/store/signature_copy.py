@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
 from service.core.errors import IntegrityError, StoreError
 from service.store.audit_checks import Fault
+from service.store.seam import DurableFiles, Files
 from service.store.signature_log import NAME
 
+_FILES = DurableFiles()
 
-def keep_elsewhere(data_dir: Path, copy: Path | None, tell: Callable[[str], object]) -> None:
+
+def keep_elsewhere(data_dir: Path, copy: Path | None, tell: Callable[[str], object], files: Files = _FILES) -> None:
     """Bring the copy up to date, where there is one. What is wrong with it is told, and stops nothing."""
     if copy is None:
         return
     try:
-        bring_up_to_date(data_dir, copy)
+        bring_up_to_date(data_dir, copy, files)
     except StoreError as error:
         tell(f"the copy of the signatures: {error}")
 
 
-def bring_up_to_date(data_dir: Path, copy: Path) -> None:
+def bring_up_to_date(data_dir: Path, copy: Path, files: Files = _FILES) -> None:
     """Append to `copy` what the log has and it has not. One that says something else is left as it is.
 
     Raises:
@@ -37,12 +39,11 @@ def bring_up_to_date(data_dir: Path, copy: Path) -> None:
             remedy="Keep both; see `orthocapture audit verify --signatures`. Each data folder needs its own copy",
         )
     try:
-        with copy.open("r+b" if copy.exists() else "wb") as stream:
-            stream.seek(len(held))
-            stream.truncate()  # half a line, of a write that was cut off
-            stream.write(log[len(held) :])
-            stream.flush()
-            os.fsync(stream.fileno())
+        if not copy.exists():
+            files.write(copy, ())
+            files.sync_directory(copy.parent)
+        files.append(copy, len(held), log[len(held) :])  # over half a line, of a write that was cut off
+        files.sync_file(copy)
     except OSError as error:
         raise StoreError(
             f"the copy of the log of signatures cannot be written: {error.strerror or error}",

@@ -12,7 +12,6 @@ import binascii
 import fcntl
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -27,7 +26,7 @@ from service.store.checkpoints import key_fingerprint
 from service.store.events import canonical_parsed
 from service.store.keys import public_bytes
 from service.store.records import Checkpoint
-from service.store.seam import DurableFiles
+from service.store.seam import Files
 
 NAME = "signatures.jsonl"
 PURPOSE = "orthocapture signature log v1"  # so that no signature of this key can be taken for one of another kind
@@ -71,8 +70,9 @@ class Line:
 class SignatureLog:
     """The log of one data folder."""
 
-    def __init__(self, data_dir: Path) -> None:
+    def __init__(self, data_dir: Path, files: Files) -> None:
         self.path = data_dir / NAME
+        self._files = files
 
     def lines(self) -> list[Line] | None:
         """Every line, oldest first; None where there is no log. Raises StoreError."""
@@ -81,15 +81,16 @@ class SignatureLog:
     def begin(self) -> None:
         """Make the log before the first signature: from then on it is missed. Raises StoreError."""
         try:
-            self.path.touch(exist_ok=True)
-            DurableFiles().sync_directory(self.path.parent)
+            if not self.path.exists():
+                self._files.write(self.path, ())
+            self._files.sync_directory(self.path.parent)
         except OSError as error:
             raise _unwritten(self.path, error) from error
 
     def add(self, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
         """Append those that the log does not hold yet, durably. Raises StoreError."""
         try:
-            _add(self.path, checkpoints, key)
+            _add(self._files, self.path, checkpoints, key)
         except OSError as error:
             raise _unwritten(self.path, error) from error
 
@@ -153,30 +154,29 @@ def _fields(number: int, previous: str, checkpoint: Checkpoint, key_id: str) -> 
     return {"number": number, "previous_sha256": previous, "checkpoint": asdict(checkpoint), "key_id": key_id}
 
 
-def _add(path: Path, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
-    with path.open("a+b") as stream:
+def _add(files: Files, path: Path, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
+    with path.open("rb") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)  # one process appends at a time
-        stream.seek(0)
         content = stream.read()
-        end = content.rfind(b"\n") + 1
-        if end < len(content):
-            stream.truncate(end)  # half a line, of a write that a power cut ended
+        end = content.rfind(b"\n") + 1  # behind it: half a line, of a write that a power cut ended
         lines = list(_parsed(content[:end]))
         held = {(line.checkpoint.run_id, line.checkpoint.seq) for line in lines if line.checkpoint is not None}
         last = content[:end].splitlines(keepends=True)[-1:]
         number, previous = len(lines), hashlib.sha256(last[0]).hexdigest() if last else _FIRST
         key_id = key_fingerprint(public_bytes(key))
+        new = b""
         for checkpoint in checkpoints:
             if (checkpoint.run_id, checkpoint.seq) in held:
                 continue
             number += 1
             signature = base64.b64encode(key.sign(_message(number, previous, checkpoint, key_id))).decode()
             data = _fields(number, previous, checkpoint, key_id) | {"signature": signature}
-            raw = canonical_parsed(data).encode() + b"\n"
-            stream.write(raw)
+            raw = canonical_parsed(data).encode() + b"
+"
+            new += raw
             previous = hashlib.sha256(raw).hexdigest()
-        stream.flush()
-        os.fsync(stream.fileno())
+        files.append(path, end, new)
+        files.sync_file(path)
 
 
 def log_findings(

@@ -96,10 +96,13 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
     Raises:
         SigningKeyError: the old key cannot be used and `lost` is not given; or it can, and `lost` is.
     """
-    folder = KeyFolder(store.database_path.parent)
+    folder = KeyFolder(store.database_path.parent, store.files)
     log = _log_of(store)
     with store.database.writing() as connection:
-        require_sound(store, connection, SITE, log.lines())
+        lines = log.lines()
+        require_sound(store, connection, SITE, lines)
+        if lines is None:
+            log.begin()
         if lost:
             _require_lost(connection, folder)
         old = None if lost else _present_key(store, connection)
@@ -142,7 +145,7 @@ def public_keys(store: Store) -> list[PublicKey]:
 
 
 def _log_of(store: Store) -> SignatureLog:
-    return SignatureLog(store.database_path.parent)
+    return SignatureLog(store.database_path.parent, store.files)
 
 
 def _require_run(connection: Connection, run_id: str, store: Store) -> None:
@@ -165,7 +168,7 @@ def _require_lost(connection: Connection, folder: KeyFolder) -> None:
 
 def _present_key(store: Store, connection: Connection) -> Ed25519PrivateKey:
     """The key in use; made, recorded and signed by itself when there is none yet."""
-    folder = KeyFolder(store.database_path.parent)
+    folder = KeyFolder(store.database_path.parent, store.files)
     changes = read_key_changes(connection)
     if changes:
         key_id = changes[-1][1]["key_id"]

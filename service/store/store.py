@@ -34,9 +34,12 @@ class Store:
     Methods raise StoreError (or a leaf of it) and nothing else; after a raise, nothing of the call was recorded.
     """
 
-    def __init__(self, database: Database, folder: ArtefactFiles, clock: Clock, ids: Ids, path: Path) -> None:
+    def __init__(
+        self, database: Database, folder: ArtefactFiles, files: Files, clock: Clock, ids: Ids, path: Path
+    ) -> None:
         self._database = database
         self._folder = folder
+        self._files = files
         self._clock = clock
         self._ids = ids
         self.database_path = path
@@ -74,12 +77,23 @@ class Store:
                 where=str(error.filename or data_dir),
                 remedy="Check the path and its permissions, or choose another folder with --data DIR",
             ) from error
-        return cls(open_database(data_dir, files), folder, clock or SystemClock(), ids, database_path(data_dir))
+        database = open_database(data_dir, files)
+        return cls(database, folder, files, clock or SystemClock(), ids, database_path(data_dir))
 
     @property
     def database(self) -> Database:
         """For what has tables of its own beside the evidence: people, screens."""
         return self._database
+
+    @property
+    def artefact_folder(self) -> Path:
+        """Where the content-addressed files lie."""
+        return self._folder.folder
+
+    @property
+    def files(self) -> Files:
+        """Through which everything is written that must survive a crash."""
+        return self._files
 
     @property
     def clock(self) -> Clock:

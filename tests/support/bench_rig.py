@@ -147,8 +147,9 @@ class BenchArm:
 
     def _joints(self, at_s: float) -> Array:
         begun, origin, end, target = next((leg for leg in reversed(self._legs) if leg[0] <= at_s), self._legs[0])
-        share = 1.0 if at_s >= end else (at_s - begun) / (end - begun)
-        return origin + share * (target - origin)
+        if at_s >= end:  # exactly there, wherever it came from
+            return target
+        return origin + (at_s - begun) / (end - begun) * (target - origin)
 
     def _sample(self, at_s: float) -> RobotSample:
         joints, zeros = self._joints(at_s), np.zeros(6)

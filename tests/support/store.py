@@ -88,19 +88,19 @@ class CrashingFiles:
         act()
         self._point(f"after {name}")
 
-    def make_directory(self, path: Path) -> None:
+    def make_directory(self, path: Path, *, private: bool = False) -> None:
         def act() -> None:
             if not path.exists():
-                self._real.make_directory(path)
+                self._real.make_directory(path, private=private)
                 self._unsynced_names[path] = None
 
         self._call("make_directory", act)
 
-    def write(self, path: Path, chunks: Iterable[bytes]) -> None:
+    def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
         def act() -> None:
             self._unsynced_names[path] = None
             self._unsynced_data.add(path)
-            self._real.write(path, chunks)
+            self._real.write(path, chunks, private=private)
 
         def half() -> None:
             data = b"".join(chunks)
@@ -109,6 +109,9 @@ class CrashingFiles:
             self._real.write(path, [data[: len(data) // 2]])
 
         self._call("write", act, half)
+
+    def append(self, path: Path, offset: int, data: bytes) -> None:
+        raise NotImplementedError("no record of one viewpoint is signed")
 
     def make_read_only(self, path: Path) -> None:
         self._call("make_read_only", lambda: self._real.make_read_only(path))

@@ -1,0 +1,156 @@
+"""What must hold of a folder right after a crash, and of the run that was resumed and brought to its end."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bench.torture.crash_run import Place, Role
+from bench.torture.crash_scene import import_list, planned
+from bench.torture.mortal import read_journal
+from service.core.model import Event, JobFinished, OperatorAction, SessionStarted, StepMeasured, View
+from service.evidence import RunLog
+from service.runs import recorded_run
+from service.store.audit import verify
+from service.store.database import database_path
+from service.store.errors import StoreVersionError
+from service.store.leftovers import leftovers, remove_leftovers
+from service.store.signature_log import NAME as LOG_NAME
+from service.store.store import Store
+
+ROLES: tuple[Role, ...] = ("begin", "runner", "worker", "web")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a run came to, as far as it must be the same whatever killed it on the way.
+
+    Attributes:
+        results: of the steps that computed, as canonical text: positions, covariance, residuals, errors.
+        jobs: how often each kind of job was finished.
+    """
+
+    results: str
+    jobs: dict[str, int]
+
+
+def outcome(events: Sequence[Event]) -> Outcome:
+    """Of a run's events."""
+    results: dict[str, Any] = {}
+    jobs: Counter[str] = Counter()
+    for event in events:
+        payload = event.payload
+        if isinstance(payload, StepMeasured) and payload.step in ("scan", "registration", "evaluation"):
+            timeless = {k: v for k, v in payload.measures.items() if k != "since_application_min"}
+            results[payload.step] = {"result": payload.result, "measures": timeless}
+        if isinstance(payload, JobFinished):
+            jobs[payload.job_kind] += 1
+    return Outcome(json.dumps(results, sort_keys=True), dict(jobs))
+
+
+def after_the_crash(place: Place) -> list[str]:
+    """Faults of a folder before anybody has resumed: nothing that was said to be recorded may be gone."""
+    if not database_path(place.data).exists() and not _events_said(place):
+        return []  # nobody was told that there was anything
+    try:
+        found = [f"after the crash: {fault}" for fault in verify(place.data).faults]
+    except StoreVersionError:  # its tables are not there yet
+        return ["after the crash: the tables are gone"] if _events_said(place) else []
+    said = _events_said(place)
+    with closing(sqlite3.connect(f"file:{database_path(place.data)}?mode=ro", uri=True)) as connection:
+        there = int(connection.execute("SELECT coalesce(sum(seq), 0) FROM heads").fetchone()[0])
+    if there < said:
+        found.append(f"after the crash: {there} events of {said} that were recorded")
+    return found
+
+
+def of_a_beginning(place: Place) -> tuple[list[str], int]:
+    """Faults of a folder in which a run was begun, perhaps twice; and how many leftovers were collected."""
+    with Store.open(place.data) as store:
+        begun = len(store.runs())
+        gone = remove_leftovers(store, actor="Sue", min_age_s=0)
+    report = verify(place.data)
+    found = [str(fault) for fault in report.faults]
+    found += [f"after store gc: {note}" for note in report.notes if note.startswith("artefacts/")]
+    if begun not in (1, 2):
+        found.append(f"{begun} runs were begun")
+    return found, len(gone)
+
+
+def _events_said(place: Place) -> int:
+    """How many events had been recorded by commits that returned."""
+    return max(
+        (line["events"] for role in ROLES for line in read_journal(place.journal(role)) if "events" in line),
+        default=0,
+    )
+
+
+def at_the_end(place: Place, expected: Outcome | None) -> tuple[list[str], int]:
+    """Faults of a run at its end, and how many leftovers were collected. `expected`: of the undisturbed run."""
+    found: list[str] = []
+    with Store.open(place.data) as store:
+        run_id = store.find_run("latest")
+        protocol, _ = recorded_run(store, run_id)
+        log = RunLog(store, run_id, protocol)
+        if (log.state.status, log.state.released_by) != ("completed", "Sue"):
+            found.append(f"the run is {log.state.status}, released by {log.state.released_by or 'nobody'}")
+        found += _once(log.events, [v.name for v in planned()] + [v.name for v in import_list(place.files).views])
+        if expected is not None:
+            mine = outcome(log.events)
+            if mine.results != expected.results:
+                found.append("the results are not those of the undisturbed run")
+            if mine.jobs != expected.jobs:
+                found.append(f"jobs were finished {mine.jobs} times, undisturbed {expected.jobs}")
+        found += _surprises(place.motions, log.events, {s.id for s in protocol.steps if s.moves_robot})
+        report = verify(place.data, signatures_copy=place.signature_copy)
+        found += [str(fault) for fault in report.faults]
+        found += [f"{count} events of {run} are not signed" for run, count in report.unsigned_events.items() if count]
+        noted = sorted(note.split(":")[0] for note in report.notes if note.startswith("artefacts/"))
+        left = leftovers(store, min_age_s=0)
+        if [one.path for one in left] != noted:
+            found.append(f"store gc finds {[one.path for one in left]}, audit verify {noted}")
+        gone = remove_leftovers(store, actor="Sue", min_age_s=0)
+        if len(gone) != len(left):
+            found.append(f"store gc left {leftovers(store, min_age_s=0)}")
+    if gone:
+        after = verify(place.data)
+        found += [f"after store gc: {fault}" for fault in after.faults]
+        found += [f"after store gc: {note}" for note in after.notes if note.startswith("artefacts/")]
+    if place.signature_copy.read_bytes() != (place.data / LOG_NAME).read_bytes():
+        found.append("the copy of the log of signatures is not the log")
+    if list((place.data / "keys").glob("*.part")):
+        found.append("half a key is left")
+    return found, len(gone)
+
+
+def _once(events: Sequence[Event], names: Sequence[str]) -> list[str]:
+    """Every viewpoint and every photograph once."""
+    taken = Counter(event.payload.viewpoint for event in events if isinstance(event.payload, View))
+    wrong = {name: taken[name] for name in {*names, *taken} if taken[name] != (name in names)}
+    return [f"{name} is in the record {count} times" for name, count in sorted(wrong.items())]
+
+
+def _surprises(motions: Path, events: Sequence[Event], moving: set[str]) -> list[str]:
+    """Motions without a person's confirmation since the program began that made them."""
+    if not motions.exists():
+        return ["the arm never moved"]
+    found: list[str] = []
+    for line in motions.read_text().splitlines():
+        moment = float(line)
+        leave = False
+        for event in events:
+            if event.monotonic_s > moment:
+                break
+            if isinstance(event.payload, SessionStarted):
+                leave = False
+            elif isinstance(event.payload, OperatorAction) and event.payload.action == "confirm":
+                leave = leave or (event.payload.step in moving and not event.payload.automatic)
+        if not leave:
+            found.append(f"the arm moved at {moment:.3f} s without a confirmation")
+    return found

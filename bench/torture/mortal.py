@@ -1,0 +1,176 @@
+"""A seam of durable effects that dies by SIGKILL at a chosen point, and keeps a journal of what is synced."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from service.store.database import database_path
+from service.store.seam import DurableFiles
+
+Where = Literal["before", "within", "after"]
+HALVED = ("write", "append")  # effects that a crash may cut in half
+TORN = "commit"  # and the one that a loss of power may
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A place at which a process may die: a call of the seam, counted from 0, and where in it."""
+
+    call: int
+    effect: str
+    where: Where
+
+
+def points(journal: Path, *, power: bool) -> list[Point]:
+    """Every point of a run that nobody disturbed; with `power`, those within a commit too."""
+    found: list[Point] = []
+    for line in read_journal(journal):
+        if line["where"] == "before":
+            effect = str(line["effect"])
+            found.append(Point(line["call"], effect, "before"))
+            if effect in HALVED or (power and effect == TORN):
+                found.append(Point(line["call"], effect, "within"))
+            found.append(Point(line["call"], effect, "after"))
+    return found
+
+
+def read_journal(journal: Path) -> list[dict[str, Any]]:
+    """The lines of a journal; the last may have been cut by a SIGKILL from outside."""
+    if not journal.exists():
+        return []
+    content = journal.read_bytes()
+    return [json.loads(line) for line in content[: content.rfind(b"\n") + 1].splitlines()]
+
+
+class MortalFiles:
+    """service.store.seam.Files that keeps a journal of every effect, and dies at one point of one of them."""
+
+    def __init__(self, data: Path, journal: Path, die_at: Point | None) -> None:
+        self._data = data
+        self._journal = journal
+        self._die_at = die_at
+        self._attic = journal.with_suffix(".attic")
+        self._real = DurableFiles()
+        self._calls = 0
+        self._lock = threading.Lock()
+        self._out = os.open(journal, os.O_CREAT | os.O_APPEND | os.O_WRONLY | os.O_CLOEXEC)
+
+    def make_directory(self, path: Path, *, private: bool = False) -> None:
+        """See Files."""
+        self._effect(
+            "make_directory",
+            lambda: self._real.make_directory(path, private=private),
+            path=str(path),
+            new=not path.exists(),
+        )
+
+    def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
+        """See Files."""
+
+        def half() -> None:
+            data = b"".join(chunks)
+            self._real.write(path, [data[: len(data) // 2]], private=private)
+
+        self._effect("write", lambda: self._real.write(path, chunks, private=private), half, path=str(path))
+
+    def append(self, path: Path, offset: int, data: bytes) -> None:
+        """See Files."""
+        self._effect(
+            "append",
+            lambda: self._real.append(path, offset, data),
+            lambda: self._real.append(path, offset, data[: len(data) // 2]),
+            path=str(path),
+            offset=offset,
+        )
+
+    def make_read_only(self, path: Path) -> None:
+        """See Files."""
+        self._effect("make_read_only", lambda: self._real.make_read_only(path), path=str(path))
+
+    def sync_file(self, path: Path) -> None:
+        """See Files."""
+        self._effect("sync_file", lambda: self._real.sync_file(path), path=str(path))
+
+    def rename(self, source: Path, target: Path) -> None:
+        """See Files."""
+        self._effect("rename", lambda: self._real.rename(source, target), path=str(target), source=str(source))
+
+    def sync_directory(self, path: Path) -> None:
+        """See Files."""
+        self._effect("sync_directory", lambda: self._real.sync_directory(path), path=str(path))
+
+    def remove(self, path: Path) -> None:
+        """See Files. The file is kept aside: until the folder is synced, a loss of power may bring it back."""
+        aside = self._attic / str(self._calls)
+        if path.exists():
+            self._attic.mkdir(exist_ok=True)
+            os.link(path, aside)
+        self._effect("remove", lambda: self._real.remove(path), path=str(path), aside=str(aside))
+
+    def commit(self, commit: Callable[[], None]) -> None:
+        """See Files. Notes how far the chains had come when the commit returned."""
+
+        def torn() -> None:
+            before, unchanged = self._log_bytes(), self._checkpointed()
+            commit()
+            if self._checkpointed() == unchanged:  # else SQLite has synced its log in the middle
+                self._note({"torn": [before, self._log_bytes()]})
+
+        self._effect("commit", commit, torn)
+
+    def _effect(
+        self, effect: str, act: Callable[[], None], within: Callable[[], None] | None = None, **details: Any
+    ) -> None:
+        with self._lock:
+            call, self._calls = self._calls, self._calls + 1
+        line = {"call": call, "effect": effect, **details}
+        self._note({**line, "where": "before"})
+        self._die_here(call, effect, "before")
+        if within is not None and self._is_here(call, "within"):
+            within()
+            self._die_here(call, effect, "within")
+        act()
+        if effect == TORN:
+            line["events"] = events_recorded(self._data)
+        self._note({**line, "where": "after"})
+        self._die_here(call, effect, "after")
+
+    def _is_here(self, call: int, where: Where) -> bool:
+        return self._die_at is not None and (self._die_at.call, self._die_at.where) == (call, where)
+
+    def _die_here(self, call: int, effect: str, where: Where) -> None:
+        if self._is_here(call, where):
+            self._note({"died": True, "call": call, "effect": effect, "where": "died", "at": where})
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def _note(self, line: dict[str, Any]) -> None:
+        line = {"at_ns": time.monotonic_ns(), "where": "", **line}
+        os.write(self._out, json.dumps(line).encode() + b"\n")
+
+    def _log_bytes(self) -> int:
+        log = Path(f"{database_path(self._data)}-wal")
+        return log.stat().st_size if log.exists() else 0
+
+    def _checkpointed(self) -> int:
+        return database_path(self._data).stat().st_mtime_ns
+
+
+def events_recorded(data: Path) -> int:
+    """How many events all chains of a data folder hold together; 0 before the tables are there."""
+    with closing(sqlite3.connect(database_path(data), timeout=30)) as connection:
+        try:
+            return int(connection.execute("SELECT coalesce(sum(seq), 0) FROM heads").fetchone()[0])
+        except sqlite3.OperationalError as error:
+            if "no such table" in str(error):
+                return 0
+            raise
