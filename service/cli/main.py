@@ -28,6 +28,7 @@ _COMMANDS = {
     "layout": "service.cli.layout:layout_command",
     "simulate": "service.cli.simulate:simulate_command",
     "audit": "service.cli.audit:audit_app",
+    "store": "service.cli.store_backup:store_app",
     "replay": "service.cli.replay:replay_command",
     "protocol": "service.cli.protocol:protocol_app",
     "plan": "service.cli.plan:plan_app",

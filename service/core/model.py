@@ -449,6 +449,16 @@ class RunSigned(Record):
     sha256: str  # of that event
 
 
+class DataRestored(Record):
+    """This data folder was made from a backup: what was recorded after it, in the folder of then, is not here."""
+
+    kind: Literal["data_restored"] = "data_restored"
+    state: str  # name of the backup's state
+    at_utc: str  # when the backup was made
+    folder: str  # of which it was made
+    host: str
+
+
 # --- end -----------------------------------------------------------------------------------------------------
 
 
@@ -501,7 +511,8 @@ Payload = Annotated[
     | AccountChanged
     | SignInRecorded
     | KeyChanged
-    | RunSigned,
+    | RunSigned
+    | DataRestored,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)
