@@ -50,6 +50,7 @@ from service.core.protocol import Protocol
 from service.core.recovery import recovery_policy
 from service.core.run_state import RunState
 from service.evidence import RunLog, StepEvidence
+from service.logs.where import at
 from service.monitor.snapshot import Doing
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
@@ -266,6 +267,7 @@ class Runner:
 
     def _execute(self, step_id: str, attempt: int) -> None:
         step = self.protocol.step(step_id)
+        at(step=step_id, viewpoint="")
         kind = step_kinds()[step.kind]
         checkpoint = partial(self._checkpoint, step_id, attempt)
         evidence = StepEvidence(self._log, self._lease, step_id, attempt, checkpoint, self.operator.show, self.wait)

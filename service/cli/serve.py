@@ -26,6 +26,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.core.errors import ConfigurationError
+from service.logs.file_log import file_log
 from service.people.people import People
 from service.rig import load_rig
 from service.runs import signature_copy
@@ -61,7 +62,7 @@ def serve_command(
     json: JsonOption = False,
 ) -> None:
     """Serve the guided screen and the audit. Runs go on when this ends; stop them on the screen."""
-    with reporting_errors(json):
+    with reporting_errors(json), file_log(data, "web"):
         tls = _tls(tls_certificate, tls_key)
         lan = _leaves_this_machine(host)
         if lan and tls is None and not insecure_lan:

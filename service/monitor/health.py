@@ -11,11 +11,11 @@ from pathlib import Path
 from sqlalchemy import text
 
 from service.core.errors import OrthocaptureError
+from service.core.space import LEAST_FREE_BYTES
 from service.monitor.snapshot import read_snapshot
 from service.monitor.worker_sign import living_workers
 from service.store.store import Store
 
-LEAST_FREE_BYTES = 1 << 30  # below this the disk counts as full: what is left is for the evidence
 _SILENT_S = 60.0  # for which a runner says nothing; fetching one photograph takes less
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import time
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 _SECONDS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+_log = logging.getLogger("orthocapture.web")
 _METHODS = ("GET", "HEAD", "POST")
 
 
@@ -40,7 +42,11 @@ class RequestCounts:
             route = str(getattr(scope.get("route"), "path", "other"))
             method = scope["method"] if scope["method"] in _METHODS else "other"
             self._answers.labels(method, route, status).inc()
-            self._seconds.labels(route).observe(time.monotonic() - begun_s)
+            seconds = time.monotonic() - begun_s
+            self._seconds.labels(route).observe(seconds)
+            if method != "GET" or status >= "400":
+                said = {"method": method, "route": route, "status": int(status), "seconds": round(seconds, 3)}
+                _log.info("answered", extra=said)
 
         async def counted(message: Message) -> None:
             if message["type"] == "http.response.start":

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
 from service.core.priorities import Lane
+from service.logs.where import at
 from service.store.errors import LeaseLostError
 from service.store.records import Job
 from service.store.store import Store
@@ -109,6 +110,7 @@ def _following(store: Store) -> Following:
 
 def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], following: Following) -> None:
     started_s = time.monotonic()
+    at(run=job.run_id, step=job.step, job=job.job_id)
     answer = JobAnswer({})
     attempt = _Attempt(store, job)
     progress(job.kind.replace("_", " "), 0, 0)

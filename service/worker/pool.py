@@ -23,6 +23,7 @@ from pathlib import Path
 
 from service.compute.memory import keep_freed_memory
 from service.core.priorities import Lane
+from service.logs.file_log import file_log
 from service.monitor.worker_sign import SignOfLife
 from service.store.store import Store
 from service.worker.loop import work
@@ -166,7 +167,7 @@ def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int)
         with contextlib.suppress(OSError):  # the worker has gone, and this process goes too
             pipe.send((what, done, total))
 
-    with Store.open(data) as store:
+    with file_log(data, "worker"), Store.open(data) as store:
         work(store, until_idle=False, stop=lambda: False, progress=tell, lane=lane, finished=lambda: tell("", 0, -1))
 
 
