@@ -94,6 +94,7 @@ class StepEvidence:
     checkpoint: Callable[[], None]
     progress: Callable[[str, int, int], None]
     wait: Callable[[float], None]
+    space: Callable[[], None]
 
     def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "runner") -> None:
         """Append events and artefact rows in one transaction."""
@@ -167,6 +168,10 @@ class StepEvidence:
     def state(self) -> RunState:
         """See service.steps.context.Evidence."""
         return self.log.refresh()
+
+    def require_space(self) -> None:
+        """See service.steps.context.Evidence."""
+        self.space()
 
     def _key(self, request: JobRequest) -> str:
         """The same for the same work: after a restart or a retry its result is used, not computed again."""

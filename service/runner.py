@@ -42,6 +42,7 @@ from service.core.model import (
     SessionStarted,
     StepFailed,
     StepMeasured,
+    StepNote,
     StepPassed,
     StepRetried,
     StepStarted,
@@ -49,6 +50,7 @@ from service.core.model import (
 from service.core.protocol import Protocol
 from service.core.recovery import recovery_policy
 from service.core.run_state import RunState
+from service.core.space import Forecast, Verdict
 from service.evidence import RunLog, StepEvidence
 from service.logs.where import at
 from service.monitor.snapshot import Doing
@@ -56,12 +58,15 @@ from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
 from service.store.leases import RunLease
 from service.store.signature_copy import keep_elsewhere
+from service.store.space import forecast_of, require_space
 from service.store.store import Store
 from service.store.timestamping import Authority, stamp_end
 
 _LEASE_S = 30.0
 _POLL_S = 0.1
 _PEDAL_RETRY_S = 30.0
+_WRITE_NOTHING = ("checklist", "timed_application")  # step kinds that go on when the disk is full
+_SPACE_EVERY_S = 2.0  # in which a camera fills no more than the room that is kept
 # Where the robot will move, one press arms the pedal and a second one within this time confirms: what holding the
 # button is on a screen.
 _PEDAL_SECOND_PRESS_S = (0.5, 6.0)
@@ -126,6 +131,8 @@ class Runner:
     _asked: AskOperator | None = field(init=False, default=None)
     _pedal: int | None = field(init=False, default=None)  # presses when the open question was first asked
     _pedal_again_s: float = field(init=False, default=0.0)
+    _space_due_s: float = field(init=False, default=0.0)
+    _space_told: Verdict = field(init=False, default="enough")
     _armed_s: float | None = field(init=False, default=None)  # time of the press that armed the pedal
 
     def run(self) -> RunState:
@@ -147,6 +154,7 @@ class Runner:
                 SessionStarted(resumed=resumed, software=software_versions(), host=socket.gethostname(), pid=getpid())
             )
             self.devices.watch(self._opened)
+            self._follow_space()
             try:
                 while True:
                     state = self._log.refresh()
@@ -270,7 +278,10 @@ class Runner:
         at(step=step_id, viewpoint="")
         kind = step_kinds()[step.kind]
         checkpoint = partial(self._checkpoint, step_id, attempt)
-        evidence = StepEvidence(self._log, self._lease, step_id, attempt, checkpoint, self.operator.show, self.wait)
+        space = self._require_space
+        evidence = StepEvidence(
+            self._log, self._lease, step_id, attempt, checkpoint, self.operator.show, self.wait, space
+        )
         context = StepContext(
             protocol=self.protocol,
             step=step,
@@ -289,6 +300,8 @@ class Runner:
             self.devices.let_move(LeaveToMove(leave.seq, leave.by, self._log.leave_not_before_s))
         try:
             checkpoint()
+            if step.kind not in _WRITE_NOTHING:
+                space()
             outcome = kind.execute(context, step.params)
         except StepInterruptedError as interruption:
             self.operator.tell(str(interruption))
@@ -329,6 +342,26 @@ class Runner:
             raise StepInterruptedError("paused")
         if state.terminal or (state.current, state.step.attempt, state.phase) != (step, attempt, "running"):
             raise StepInterruptedError(f"the operator has ended this attempt; the run is {state.status}")
+
+    def _require_space(self) -> None:
+        """Follows the disk; raises SpaceShortError when it is time to stop."""
+        now_s = self.monotonic_s()
+        if now_s >= self._space_due_s:
+            require_space(self.store, self._follow_space())
+            self._space_due_s = now_s + _SPACE_EVERY_S
+
+    def _follow_space(self) -> Forecast:
+        """The forecast; told and recorded whenever it turns worse."""
+        state = self._log.refresh()
+        found = forecast_of(self.store, self.protocol, state)
+        worse = found.verdict not in ("enough", self._space_told)
+        self._space_told = found.verdict
+        if worse:
+            data = dataclasses.asdict(found) | {"verdict": found.verdict}
+            self._append(StepNote(step=state.current, attempt=state.step.attempt, note="disk_space", data=data))
+            if found.verdict == "short":
+                self.operator.tell(f"{found.words}. The run stops and asks before the disk is full")
+        return found
 
     def _append(self, *payloads: Payload, actor: str = "runner") -> None:
         self.store.record(self.run_id, payloads, actor=actor, lease=self._lease)

@@ -210,6 +210,9 @@ RUN_ELSEWHERE = {
     'orthocapture audit rotate-key --lost --reason "disk died" --data restored': (
         "tests/test_backup.py::test_the_signing_key_leaves_only_when_asked_and_a_restored_run_can_be_signed"
     ),
+    "orthocapture doctor --rig rig.yaml --protocol protocols/exvivo_spine.yaml --data runs": (
+        "tests/test_space.py::test_doctor_and_pages_say_it_before_a_run"
+    ),
     "orthocapture audit verify --signatures FILE": (
         "tests/test_signature_log.py::test_a_run_keeps_the_copy_that_its_rig_file_names"
     ),

@@ -133,6 +133,7 @@ class _CaptureLoop:
             self.context.checkpoint()
             if self.until():
                 return
+            self.context.evidence.require_space()
             self.context.progress("viewpoints", len(self.viewpoints) - len(todo), len(self.viewpoints))
             viewpoint = todo[0]
             if viewpoint.name in refused:

@@ -10,8 +10,10 @@ from fastapi.responses import JSONResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
 
 from service.core.errors import StoreError
+from service.core.space import Forecast
 from service.monitor.figures import read_figures
 from service.monitor.health import read_health
+from service.store.space import forecast_of
 from service.web.metrics import DataFolderMetrics
 from service.web.request_counts import RequestCounts
 from service.web.security import Guard
@@ -49,12 +51,18 @@ def install_metrics(app: FastAPI) -> None:
     registry.register(
         DataFolderMetrics(
             lambda: read_figures(site.store, site.data, site.launcher.driven_runs()),
+            lambda: _forecasts(site),
             lambda: read_health(site.store, site.data, _driven(site)),
         )
     )
     ProcessCollector(namespace="orthocapture_web", registry=registry)
     app.state.metrics = registry
     app.add_middleware(RequestCounts, registry=registry)
+
+
+def _forecasts(site: Site) -> dict[str, Forecast]:
+    logs = {run_id: site.run(run_id) for run_id in site.launcher.driven_runs()}
+    return {run_id: forecast_of(site.store, log.protocol, log.state) for run_id, log in logs.items()}
 
 
 def _driven(site: Site) -> list[str]:

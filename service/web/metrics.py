@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Mapping
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric, SummaryMetricFamily
 from prometheus_client.registry import Collector
 
-from service.core.errors import StoreError
+from service.core.errors import OrthocaptureError
+from service.core.space import Forecast
 from service.monitor.figures import Figures
 from service.monitor.health import Health
 
@@ -18,8 +19,14 @@ _PREFIX = "orthocapture_"
 class DataFolderMetrics(Collector):
     """A collector over one data folder; where the record cannot be read, health alone is told."""
 
-    def __init__(self, figures: Callable[[], Figures], health: Callable[[], Health]) -> None:
+    def __init__(
+        self,
+        figures: Callable[[], Figures],
+        forecasts: Callable[[], Mapping[str, Forecast]],
+        health: Callable[[], Health],
+    ) -> None:
         self._figures = figures
+        self._forecasts = forecasts
         self._health = health
 
     def describe(self) -> Iterable[Metric]:
@@ -39,12 +46,24 @@ class DataFolderMetrics(Collector):
             "healthy", "1 where nothing is wrong with a part.", ("part",), {(p,): not w for p, w in parts.items()}
         )
         try:
-            figures = self._figures()
-        except (StoreError, OSError):
+            figures, forecasts = self._figures(), self._forecasts()
+        except (OrthocaptureError, OSError):
             return
         yield from _record(figures)
         yield from _processes(figures)
         yield from _devices(figures)
+        yield _gauge(
+            "forecast_bytes",
+            "What a run that is driven will still write.",
+            ("run",),
+            {(run_id,): space.needed_bytes for run_id, space in forecasts.items()},
+        )
+        yield _gauge(
+            "forecast_views",
+            "Photographs that it will still take.",
+            ("run",),
+            {(run_id,): space.views_left for run_id, space in forecasts.items()},
+        )
 
 
 def _record(figures: Figures) -> Iterable[Metric]:
