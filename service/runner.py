@@ -17,6 +17,7 @@ from typing import Protocol as Interface
 from drivers.errors import DeviceError
 from drivers.interfaces import DeviceReport
 from service.core.actions import refuse
+from service.core.clocks import clock_readings
 from service.core.decide import (
     AbortRun,
     Accept,
@@ -53,6 +54,7 @@ from service.core.run_state import RunState
 from service.core.space import Forecast, Verdict
 from service.evidence import RunLog, StepEvidence
 from service.logs.where import at
+from service.monitor.host_clock import host_clock
 from service.monitor.snapshot import Doing
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
@@ -131,6 +133,7 @@ class Runner:
     _asked: AskOperator | None = field(init=False, default=None)
     _pedal: int | None = field(init=False, default=None)  # presses when the open question was first asked
     _pedal_again_s: float = field(init=False, default=0.0)
+    _clocks_told: set[str] = field(init=False, default_factory=set[str])
     _space_due_s: float = field(init=False, default=0.0)
     _space_told: Verdict = field(init=False, default="enough")
     _armed_s: float | None = field(init=False, default=None)  # time of the press that armed the pedal
@@ -151,7 +154,13 @@ class Runner:
             if resumed:
                 self._seal()  # what the runner before could not sign any more
             self._append(
-                SessionStarted(resumed=resumed, software=software_versions(), host=socket.gethostname(), pid=getpid())
+                SessionStarted(
+                    resumed=resumed,
+                    software=software_versions(),
+                    host=socket.gethostname(),
+                    pid=getpid(),
+                    host_clock=host_clock(),
+                )
             )
             self.devices.watch(self._opened)
             self._follow_space()
@@ -270,6 +279,15 @@ class Runner:
 
     def _opened(self, device: str, report: DeviceReport) -> None:
         self._append(DeviceOpened(device=device, report=dataclasses.asdict(report)))
+        self._log.refresh()
+        self._look_at_clocks()
+
+    def _look_at_clocks(self) -> None:
+        """A clock beyond its limit is told once a session."""
+        for reading in clock_readings(self._log.events):
+            if reading.within is False and reading.device not in self._clocks_told:
+                self._clocks_told.add(reading.device)
+                self.operator.tell(reading.words)
 
     # --- steps ---
 
@@ -311,6 +329,7 @@ class Runner:
             self._measured(step_id, attempt, outcome)
 
     def _measured(self, step: str, attempt: int, outcome: StepOutcome) -> None:
+        self._look_at_clocks()
         self._append(
             StepMeasured(
                 step=step,

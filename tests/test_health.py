@@ -113,7 +113,8 @@ def test_the_figures_are_those_of_the_record(site: WebSite) -> None:
     assert found["orthocapture_database_bytes"][()] > 100_000
     assert found["orthocapture_free_bytes"][()] > 0
     of_camera = ("camera", "camera", bench.run_id)
-    assert found["orthocapture_device_clock_offset_seconds"] == {of_camera: -2.5}
+    assert found["orthocapture_clock_offset_seconds"][("host UTC", "camera", bench.run_id)] == -2.5
+    assert found["orthocapture_clock_within_limit"][("camera", bench.run_id)] == 1
     assert found["orthocapture_device_problems"] == {of_camera: 1}
     assert found["orthocapture_device_up"] == {of_camera: 1}
     trouble = DeviceTrouble(device="camera", error="DeviceUnavailableError", message="it is gone")

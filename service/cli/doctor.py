@@ -24,9 +24,12 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run import RigOption
+from service.core.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S
 from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.model import HostClock
 from service.core.protocol import Protocol, load_protocol
 from service.core.space import Forecast, Usage, forecast
+from service.monitor.host_clock import host_clock
 from service.rig import load_rig
 from service.station import Station
 from service.steps import params_models
@@ -72,13 +75,15 @@ def doctor_command(
         space = None if loaded is None else _foresee(data, loaded, free_bytes, simulated=rig_file.section.simulated)
     healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
     healthy = healthy and (space is None or space.verdict == "enough")
+    clock = host_clock()
     missing = [what for module, what in _PARTS.items() if importlib.util.find_spec(module) is None]
     if json:
         devices = {name: _record(report) for name, report in found.items()}
         folder: dict[str, Any] = {"folder": str(data), "free_bytes": free_bytes}
         if space is not None:
             folder["forecast"] = dataclasses.asdict(space) | {"verdict": space.verdict, "words": space.words}
-        print_json({"ok": healthy, "devices": devices, "data": folder, "missing": missing})
+        found_clock = clock.model_dump()
+        print_json({"ok": healthy, "devices": devices, "data": folder, "host_clock": found_clock, "missing": missing})
     else:
         for what in missing:
             console.print(f"[bold yellow]![/] not installed: {escape(what)} (see docs/installation.md)")
@@ -86,11 +91,22 @@ def doctor_command(
             _print(name, report)
         note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"
         console.print(f"[bold]data folder[/] {escape(str(data))}: {free_bytes / 1e9:.1f} GB free{note}")
+        console.print(f"[bold]this machine's clock[/] {escape(_clock_words(clock))}")
         if space is not None:
             colour = {"enough": "green", "short": "yellow", "stop": "red"}[space.verdict]
             console.print(f"    [{colour}]{escape(space.words)}[/]")
     if not healthy:
         raise typer.Exit(1)
+
+
+def _clock_words(clock: HostClock) -> str:
+    if clock.offset_s is not None:
+        beyond = f", more than {HOST_LIMIT_S:g} s" if abs(clock.offset_s) > HOST_LIMIT_S else ""
+        return f"{clock.offset_s:+.6f} s against the network's time (chrony){beyond}"
+    if clock.synchronised:
+        error = "" if clock.error_s is None else f", within {clock.error_s:.3f} s by its own word"
+        return f"is set by the network's time{error}"
+    return "is not known to be set" if clock.synchronised is None else "is not set by the network's time"
 
 
 def _foresee(data: Path, protocol: Protocol, free_bytes: int, *, simulated: bool) -> Forecast:
@@ -117,7 +133,10 @@ def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
     )
     console.print(f"    {escape(who.driver)} {escape(who.driver_version)} at {escape(who.address)}")
     if report.clock_offset_s is not None:
-        console.print(f"    clock offset {report.clock_offset_s:+.3f} s")
+        since = " (counted from power-on: only its change means anything)" if report.clock == "uptime" else ""
+        late = report.clock == "utc" and abs(report.clock_offset_s) > DEVICE_LIMIT_S
+        beyond = f"  [yellow]more than {DEVICE_LIMIT_S:g} s: set it[/]" if late else ""
+        console.print(f"    clock offset {report.clock_offset_s:+.3f} s{since}{beyond}")
     if report.free_bytes is not None:
         console.print(f"    {report.free_bytes / 1e9:.1f} GB free")
     if report.battery_fraction is not None:

@@ -80,6 +80,15 @@ class RunStarted(Record):
     origin: Literal["captured", "imported"] = "captured"
 
 
+class HostClock(Record):
+    """How well the host's clock is set; None: not known."""
+
+    source: Literal["chrony", "kernel", ""]
+    synchronised: bool | None  # with the network's time
+    offset_s: float | None  # host minus network
+    error_s: float | None = None  # at most, as the kernel states it
+
+
 class SessionStarted(Record):
     """The runner's process started (first start or resume): versions again, and the clocks."""
 
@@ -88,6 +97,7 @@ class SessionStarted(Record):
     software: dict[str, str]
     host: str
     pid: int
+    host_clock: HostClock | None = None
 
 
 class DeviceOpened(Record):

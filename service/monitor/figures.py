@@ -33,7 +33,6 @@ class DeviceFigures:
     kind: str  # robot, camera, …
     answers: bool  # it was opened, and no trouble was recorded since
     problems: int  # that its report named
-    clock_offset_s: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +52,7 @@ class Figures:
 
     runs: Mapping[str, int]  # completed, aborted, open
     driven: Sequence[DrivenRun]
+    shown: Sequence[str]  # the runs whose devices are meant: those that are driven, else the newest
     captures: int  # photographs recorded, of all runs
     jobs: Mapping[tuple[str, str], int]  # kind and state
     job_seconds: Mapping[str, tuple[int, float]]  # kind → how many were computed, and how long in all
@@ -67,10 +67,11 @@ def read_figures(store: Store, data: Path, driven: Sequence[str]) -> Figures:
     """Read them. `driven`: the runs that a process drives. Raises StoreError; OSError of the data folder's disk."""
     with store.database.reading() as connection:
         latest = select(runs.c.run_id).where(runs.c.run_id != SITE).order_by(runs.c.created_utc.desc()).limit(1)
-        shown = driven or list(connection.execute(latest).scalars())
+        shown = list(driven) or list(connection.execute(latest).scalars())
         return Figures(
             runs=_runs(connection),
             driven=[_driven(connection, data, run_id) for run_id in driven],
+            shown=shown,
             captures=connection.execute(
                 select(func.count()).select_from(event_index).where(event_index.c.kind.in_(CAPTURED))
             ).scalar_one(),
@@ -150,9 +151,9 @@ def _devices(connection: Connection, run_id: str) -> list[DeviceFigures]:
             report: dict[str, Any] = payload["report"]
             kind = str(dict(report.get("identity") or {}).get("kind", ""))
             problems = len(report.get("problems") or ())
-            devices[name] = DeviceFigures(run_id, name, kind, True, problems, report.get("clock_offset_s"))
+            devices[name] = DeviceFigures(run_id, name, kind, True, problems)
         elif known is not None:  # the trouble of what is no device of the rig file names a step
-            devices[name] = DeviceFigures(run_id, name, known.kind, False, known.problems, known.clock_offset_s)
+            devices[name] = DeviceFigures(run_id, name, known.kind, False, known.problems)
     return list(devices.values())
 
 

@@ -9,6 +9,7 @@ from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
 
+from service.core.clocks import clock_readings
 from service.core.errors import StoreError
 from service.core.space import Forecast
 from service.monitor.figures import read_figures
@@ -52,6 +53,7 @@ def install_metrics(app: FastAPI) -> None:
         DataFolderMetrics(
             lambda: read_figures(site.store, site.data, site.launcher.driven_runs()),
             lambda: _forecasts(site),
+            lambda run_ids: {run_id: clock_readings(site.run(run_id).events) for run_id in run_ids},
             lambda: read_health(site.store, site.data, _driven(site)),
         )
     )

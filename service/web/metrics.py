@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric, SummaryMetricFamily
 from prometheus_client.registry import Collector
 
+from service.core.clocks import ClockReading
 from service.core.errors import OrthocaptureError
 from service.core.space import Forecast
 from service.monitor.figures import Figures
@@ -23,10 +24,12 @@ class DataFolderMetrics(Collector):
         self,
         figures: Callable[[], Figures],
         forecasts: Callable[[], Mapping[str, Forecast]],
+        clocks: Callable[[Sequence[str]], Mapping[str, Sequence[ClockReading]]],
         health: Callable[[], Health],
     ) -> None:
         self._figures = figures
         self._forecasts = forecasts
+        self._clocks = clocks
         self._health = health
 
     def describe(self) -> Iterable[Metric]:
@@ -47,11 +50,13 @@ class DataFolderMetrics(Collector):
         )
         try:
             figures, forecasts = self._figures(), self._forecasts()
+            clocks = self._clocks(figures.shown)
         except (OrthocaptureError, OSError):
             return
         yield from _record(figures)
         yield from _processes(figures)
         yield from _devices(figures)
+        yield from _clocks(clocks)
         yield _gauge(
             "forecast_bytes",
             "What a run that is driven will still write.",
@@ -121,11 +126,21 @@ def _devices(figures: Figures) -> Iterable[Metric]:
         labels,
         {(d.run_id, d.device, d.kind): d.problems for d in figures.devices},
     )
+
+
+def _clocks(clocks: Mapping[str, Sequence[ClockReading]]) -> Iterable[Metric]:
+    known = {(run_id, clock.device): clock for run_id, found in clocks.items() for clock in found}
     yield _gauge(
-        "device_clock_offset_seconds",
-        "Device clock minus the host's: UTC, or monotonic for a clock that counts from power-on.",
-        labels,
-        {(d.run_id, d.device, d.kind): d.clock_offset_s for d in figures.devices if d.clock_offset_s is not None},
+        "clock_offset_seconds",
+        "A clock minus the one it is compared with: a device's minus the host's, the host's minus the network's.",
+        ("run", "device", "against"),
+        {(*of, clock.against): clock.offset_s for of, clock in known.items() if clock.offset_s is not None},
+    )
+    yield _gauge(
+        "clock_within_limit",
+        "0 for a clock beyond its limit.",
+        ("run", "device"),
+        {of: clock.within for of, clock in known.items() if clock.within is not None},
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
 
+from service.core.clocks import ClockReading
 from service.core.gates import figure
 from service.core.model import Event, GateVerdict, SessionStarted, View
 from service.core.protocol import Gate, Protocol, Step
@@ -134,12 +135,15 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def readings(snapshot: Snapshot, space: Forecast | None = None) -> tuple[Reading, ...]:
+def readings(
+    snapshot: Snapshot, space: Forecast | None = None, clocks: Sequence[ClockReading] = ()
+) -> tuple[Reading, ...]:
     """What the runner last told of the machine and the devices; what it did not tell is said to be unknown.
 
     Args:
         snapshot: of the runner.
         space: what the run will still write, where it is known.
+        clocks: as last compared; those beyond their limits are shown.
     """
     battery = snapshot.camera_battery_fraction
     return (
@@ -154,6 +158,11 @@ def readings(snapshot: Snapshot, space: Forecast | None = None) -> tuple[Reading
         ),
         Reading("Light", "unknown" if snapshot.light_lux is None else f"{snapshot.light_lux:.0f} lx"),
         Reading("Temperature", "unknown" if snapshot.temperature_c is None else f"{snapshot.temperature_c:.1f} °C"),
+        *(
+            Reading(f"Clock of {clock.device}", f"{clock.offset_s:+.2f} s", "attention", "set it")
+            for clock in clocks
+            if clock.within is False
+        ),
     )
 
 

@@ -9,6 +9,7 @@ from typing import Protocol as Interface
 
 from service.core.acceptance import acceptors, demanded_role, failed_gates
 from service.core.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
+from service.core.clocks import clock_readings
 from service.core.decide import AskOperator, decide
 from service.core.dependence import AcceptedGate, dependent_steps, depends_on
 from service.core.model import Event, OperatorVerb
@@ -273,7 +274,7 @@ def run_view(
         redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
         skip_overrides=bool(state.step.verdicts) and not state.step.gates_passed,
         progress=capture_progress(protocol, state, log.events),
-        readings=readings(snapshot, space),
+        readings=readings(snapshot, space, clock_readings(log.events)),
         working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
         deviations=tuple(reversed(state.deviations)),
         news=tuple((m.at_utc, m.text) for m in reversed(snapshot.messages)),
