@@ -77,7 +77,8 @@ class BoundedFile(logging.Handler):
                 self._stream = None
             if self._stream is None:
                 self._stream = path.open("ab", buffering=0)
-            if self._stream.tell() and self._stream.tell() + len(line) > self._file_bytes:
+            size = os.fstat(self._stream.fileno()).st_size  # not this process' own place in it
+            if size and size + len(line) > self._file_bytes:
                 self._stream.close()
                 self._rotate(path)
                 self._stream = path.open("ab", buffering=0)
