@@ -147,14 +147,14 @@ def test_a_run_records_tells_and_shows_its_clocks(
         assert bench.run().status == "completed"
         told = [words for words in bench.operator.told if words.startswith("The clock of")]
         assert len(told) == 2
-        assert "The clock of host is 1.25 s behind the network's: more than 1 s" in told[0]
+        assert "The clock of this machine is 1.25 s behind the network's: more than 1 s" in told[0]
         assert "The clock of camera is 90.00 s behind this machine's: more than 5 s" in told[1]
         (begun,) = bench.payloads(SessionStarted)
         assert begun.host_clock == HostClock(source="chrony", synchronised=True, offset_s=-1.25)
         auditor = site.browser("auditor")
         page = auditor.get(f"/audit/runs/{bench.run_id}/devices").text
-        assert "-90.000 s" in page
-        assert "-1.250 s" in page
+        assert "90.000 s behind" in page
+        assert "1.250 s behind" in page
         assert page.count("Beyond") == 2
         scraped = auditor.get("/metrics").text
         labels = f'{{against="host UTC",device="camera",run="{bench.run_id}"}}'
@@ -164,4 +164,4 @@ def test_a_run_records_tells_and_shows_its_clocks(
         site.store.record(begun_run.run_id, [opened("camera", "camera", -90.0)], actor="runner")
         page = auditor.get(f"/runs/{begun_run.run_id}").text
         assert "Clock of camera" in page
-        assert "-90.00 s" in page
+        assert "90.000 s behind" in page

@@ -72,6 +72,7 @@ def test_a_run_says_of_what_it_speaks_and_the_terminal_shows_what_it_showed(
         if e.payload.kind == "viewpoint_captured"
     ]
     assert "step_passed" in {line["event"] for line in said}
+    assert {line["logger"].split(".")[0] for line in said} == {"service"}  # not every library's every move
     assert terminal.getvalue() == "the lens is cold\n"
 
 
@@ -122,7 +123,7 @@ from service.logs.file_log import file_log
 data = Path(sys.argv[1])
 with file_log(data, sys.argv[2], handler=BoundedFile(data, file_bytes=20_000, files=4)):
     for number in range(300):
-        logging.getLogger("w").info("line %d %s", number, "x" * 150)
+        logging.getLogger("service.w").info("line %d %s", number, "x" * 150)
 """
 
 

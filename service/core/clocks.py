@@ -45,11 +45,28 @@ class ClockReading:
         return None if self.offset_s is None else abs(self.offset_s) <= self.limit_s
 
     @property
+    def name(self) -> str:
+        """Whose clock it is, for people."""
+        return "this machine" if self.device == "host" else self.device
+
+    @property
+    def other(self) -> str:
+        """What it was compared with, for people."""
+        return {"host UTC": "this machine", "NTP": "the network's time"}.get(self.against, "this machine, its change")
+
+    @property
+    def difference(self) -> str:
+        """`1.250 s behind`; "–" where it is not known."""
+        if self.offset_s is None:
+            return "–"
+        return f"{abs(self.offset_s):.3f} s {'ahead' if self.offset_s > 0 else 'behind'}"
+
+    @property
     def words(self) -> str:
         """For people, of a clock beyond its limit."""
         ahead = "ahead of" if (self.offset_s or 0.0) > 0 else "behind"
-        other = {"host UTC": "this machine's", "NTP": "the network's"}.get(self.against, "this machine's")
-        what = f"The clock of {self.device} is {abs(self.offset_s or 0.0):.2f} s {ahead} {other}"
+        other = "the network's" if self.against == "NTP" else "this machine's"
+        what = f"The clock of {self.name} is {abs(self.offset_s or 0.0):.2f} s {ahead} {other}"
         if self.against == "host since it was opened":
             return f"{what}, counted from the first image: more than {self.limit_s:.2f} s. Look at its controller"
         return f"{what}: more than {self.limit_s:g} s. Set it, for the record's times are compared with it"
@@ -106,7 +123,8 @@ def _readings(name: str, opened: Event, captures: tuple[Event, Event] | None) ->
 
 def _drift(name: str, opened: Event, captures: tuple[Event, Event] | None) -> ClockReading:
     if captures is None:
-        return ClockReading(name, "host since it was opened", None, _DRIFT_LIMIT_S, opened.at_utc)
+        note = "no image since it was opened"
+        return ClockReading(name, "host since it was opened", None, _DRIFT_LIMIT_S, opened.at_utc, note)
     first, last = captures[0].payload, captures[1].payload
     assert isinstance(first, ViewpointCaptured)
     assert isinstance(last, ViewpointCaptured)

@@ -16,12 +16,13 @@ from service.logs.secrets import without_secrets
 from service.logs.where import at, where_now
 
 _LONGEST = 20_000  # characters of one text: a traceback of a deep recursion must not turn the file over
+_OURS = ("service", "drivers", "orthocapture")  # other libraries speak of every move they make
 _CHILDREN = "drivers.host."  # loggers under which drivers.host passes on what a driver's own process writes
 
 
 @contextmanager
 def file_log(data: Path, process: str, *, run: str = "", handler: BoundedFile | None = None) -> Generator[None]:
-    """Within this block everything from INFO on that the process logs goes to `data`/logs as well.
+    """Within this block what the process logs goes to `data`/logs as well: our own from INFO on, others' warnings.
 
     Args:
         data: the data folder; nothing is written before it is there.
@@ -38,15 +39,19 @@ def file_log(data: Path, process: str, *, run: str = "", handler: BoundedFile | 
     levels = [other.level for other in shown]
     for other in shown:
         other.setLevel(before)
+    ours = [logging.getLogger(name) for name in _OURS]
+    levels_of_ours = [logger.level for logger in ours]
+    for logger in ours:
+        logger.setLevel(min(before, logging.INFO))
     root.addHandler(handler)
-    root.setLevel(min(before, logging.INFO))
     at(run=run)
     try:
         yield
     finally:
         at(run="", step="", viewpoint="", job="")
-        root.setLevel(before)
         root.removeHandler(handler)
+        for logger, level in zip(ours, levels_of_ours, strict=True):
+            logger.setLevel(level)
         for other, level in zip(shown, levels, strict=True):
             other.setLevel(level)
         handler.close()

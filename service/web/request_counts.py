@@ -39,7 +39,8 @@ class RequestCounts:
         def count(status: str) -> None:
             # The route as it is written, never the address as it was asked for: a label for each run, or for
             # whatever a stranger types, would grow without end.
-            route = str(getattr(scope.get("route"), "path", "other"))
+            unrouted = "/static" if scope["path"].startswith("/static/") else "other"
+            route = str(getattr(scope.get("route"), "path", unrouted))
             method = scope["method"] if scope["method"] in _METHODS else "other"
             self._answers.labels(method, route, status).inc()
             seconds = time.monotonic() - begun_s

@@ -159,7 +159,7 @@ def readings(
         Reading("Light", "unknown" if snapshot.light_lux is None else f"{snapshot.light_lux:.0f} lx"),
         Reading("Temperature", "unknown" if snapshot.temperature_c is None else f"{snapshot.temperature_c:.1f} °C"),
         *(
-            Reading(f"Clock of {clock.device}", f"{clock.offset_s:+.2f} s", "attention", "set it")
+            Reading(f"Clock of {clock.name}", clock.difference, "attention", "set it")
             for clock in clocks
             if clock.within is False
         ),
@@ -168,8 +168,8 @@ def readings(
 
 def _disk(space: Forecast) -> Reading:
     tone = {"enough": "", "short": "attention", "stop": "stop"}[space.verdict]
-    to_come = f"{size_words(space.needed_bytes)} to come"
-    note = {"enough": to_come, "short": f"will not do: {to_come}", "stop": "full: make room"}[space.verdict]
+    to_come = f"{size_words(space.needed_bytes)} to come" if space.needed_bytes > 1e6 else ""
+    note = {"enough": to_come, "short": f"will not do, {to_come}", "stop": "full: make room"}[space.verdict]
     return Reading("Disk", f"{size_words(space.free_bytes)} free", tone, note)
 
 
