@@ -133,6 +133,7 @@ class StepEvidence:
         self.log.store.record(self.log.run_id, [], actor="runner", jobs=jobs, lease=self.lease)
         while True:
             self.checkpoint()
+            self.space()  # a worker begins nothing on a disk that is nearly full
             state = self.log.refresh()
             mine = {job.idempotency_key: job for job in state.steps[self.step].jobs.values()}
             if any(key not in mine for key in keys):

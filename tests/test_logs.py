@@ -21,7 +21,7 @@ from service.logs.secrets import without_secrets
 from service.store.records import NewJob
 from service.store.store import Store
 from service.worker.loop import work
-from tests.support.bench_run import PROTOCOL, begin_run
+from tests.support.bench_run import PROTOCOL, begin_run, record_runs
 from tests.support.host_fake_driver import Fake, FakeConfig
 from tests.support.rig import REPOSITORY, command
 from tests.support.store import capture, start_run
@@ -74,6 +74,20 @@ def test_a_run_says_of_what_it_speaks_and_the_terminal_shows_what_it_showed(
     assert "step_passed" in {line["event"] for line in said}
     assert {line["logger"].split(".")[0] for line in said} == {"service"}  # not every library's every move
     assert terminal.getvalue() == "the lens is cold\n"
+
+
+def test_the_processes_of_a_run_log_and_speak_to_the_terminal_as_ever(tmp_path: Path) -> None:
+    _, begun = record_runs(tmp_path)
+    resume = command("resume", "latest", "--data", str(tmp_path / "data"))
+    done = subprocess.run(
+        resume, cwd=REPOSITORY, input="abort a test\n", capture_output=True, text=True, timeout=100, check=False
+    )
+    assert f"Run {begun} is aborted" in done.stdout
+    assert "Type one of: confirm" in done.stderr
+    assert '{"' not in done.stdout + done.stderr
+    said = [line for line in lines(tmp_path / "data") if line["process"] == "runner"]
+    assert {line["run"] for line in said} == {begun}
+    assert [line["event"] for line in said] == ["session_started", "operator_action"]
 
 
 def test_what_a_drivers_own_process_says_is_there_under_its_name(tmp_path: Path) -> None:

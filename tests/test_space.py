@@ -20,8 +20,10 @@ from service.core.space import LEAST_FREE_BYTES, Usage, forecast
 from service.rig import load_rig
 from service.runs import start_run
 from service.steps import params_models
+from service.store.records import NewJob
 from service.store.space import forecast_of
 from service.store.store import Store
+from service.worker.loop import work
 from tests.support.bench_run import PROTOCOL, Bench, begin_run
 from tests.support.web import web_site
 
@@ -162,3 +164,32 @@ def test_doctor_and_pages_say_it_before_a_run(tmp_path: Path, set_free: SetFree)
     assert "The disk will not do: 2.0 GB are free, and the run needs about 4.0 GB more" in done.stdout
     found = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)["data"]["forecast"]
     assert (found["verdict"], found["views_left"]) == ("short", 1000)
+
+
+def test_an_export_leaves_the_evidence_its_room(bench: Bench, tmp_path: Path, set_free: SetFree) -> None:
+    bench.run()
+    set_free(LEAST_FREE_BYTES + 100)
+    words = ["audit", "export", bench.run_id, str(tmp_path / "b.zip"), "--data", str(bench.data), "--json"]
+    refused = CliRunner().invoke(app, words)
+    assert refused.exit_code == 1
+    assert "this export needs about" in json.loads(refused.stdout)["error"]["what"]
+    assert list(tmp_path.glob("*.zip")) == []
+    set_free(100 * GB)
+    assert CliRunner().invoke(app, words).exit_code == 0
+
+
+def test_a_worker_begins_nothing_on_a_disk_that_is_nearly_full(bench: Bench, set_free: SetFree) -> None:
+    arguments = {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10}
+    bench.store.enqueue_job(bench.run_id, NewJob("locate_spheres", "fixation", 1, "key", arguments), actor="test")
+    set_free(LEAST_FREE_BYTES - 1)
+    looks: list[str] = []
+
+    def stop() -> bool:
+        looks.append(bench.store.jobs(bench.run_id)[0].state)
+        if len(looks) == 4:
+            set_free(100 * GB)
+        return len(looks) > 5
+
+    assert work(bench.store, until_idle=True, stop=stop, progress=lambda _what, _done, _total: None) == 1
+    assert looks[:4] == ["queued"] * 4
+    assert bench.store.jobs(bench.run_id)[0].state == "failed"  # there is no such mesh

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, func, select, text
 from service.core.errors import SpaceShortError
 from service.core.protocol import Protocol
 from service.core.run_state import RunState
-from service.core.space import Forecast, Usage, forecast, size_words
+from service.core.space import LEAST_FREE_BYTES, Forecast, Usage, forecast, size_words
 from service.store.store import Store
 from service.store.tables import artefacts, event_index
 
@@ -34,13 +34,12 @@ def forecast_of(
     with store.database.reading() as connection:
         here = read_usage(connection, run_id) if run_id else Usage()
         before = _before(connection, run_id, protocol.id, simulated=simulated if state is None else state.simulated)
-    folder = store.database_path.parent
     return forecast(
         protocol,
         state,
         here,
         before,
-        shutil.disk_usage(folder).free,
+        store.free_bytes(),
         simulated=simulated if state is None else state.simulated,
     )
 
@@ -50,6 +49,29 @@ def require_space(store: Store, found: Forecast) -> None:
     if found.verdict == "stop":
         folder = store.database_path.parent
         raise SpaceShortError(found.words, where=str(folder), remedy=_helps(folder))
+
+
+def require_export_space(store: Store, run_id: str, target: Path) -> None:
+    """Raises SpaceShortError where a run's files, copied once more, would not leave the evidence its room."""
+    with store.database.reading() as connection:
+        usage = read_usage(connection, run_id)
+    needed = usage.view_bytes + usage.computed_bytes + usage.other_bytes
+    try:
+        free, same = shutil.disk_usage(target.parent).free, _same_disk(target.parent, store.database_path.parent)
+    except OSError:  # which writing will say in its own words
+        return
+    kept = LEAST_FREE_BYTES if same else 0
+    if free - kept < needed:
+        last = f"; the last {size_words(kept)} are kept for the evidence" if kept else ""
+        raise SpaceShortError(
+            f"this export needs about {size_words(needed)}, and {size_words(free)} are free{last}",
+            where=str(target.parent),
+            remedy="Export to another disk, or make room; nothing was written",
+        )
+
+
+def _same_disk(one: Path, other: Path) -> bool:
+    return one.stat().st_dev == other.stat().st_dev
 
 
 def read_usage(connection: Connection, run_id: str) -> Usage:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
@@ -86,6 +87,15 @@ class Store:
     def clock(self) -> Clock:
         """Where its times come from."""
         return self._clock
+
+    def free_bytes(self) -> int:
+        """Free space on the disk of the data folder."""
+        try:
+            return shutil.disk_usage(self.database_path.parent).free
+        except OSError as error:
+            raise StoreError(
+                f"the data folder cannot be reached: {error.strerror}", where=str(error.filename)
+            ) from error
 
     def close(self) -> None:
         """Close the database."""
