@@ -68,6 +68,7 @@ _LEASE_S = 30.0
 _POLL_S = 0.1
 _PEDAL_RETRY_S = 30.0
 _WRITE_NOTHING = ("checklist", "timed_application")  # step kinds that go on when the disk is full
+_FORECAST_EVERY_S = 30.0
 _SPACE_EVERY_S = 2.0  # in which a camera fills no more than the room that is kept
 # Where the robot will move, one press arms the pedal and a second one within this time confirms: what holding the
 # button is on a screen.
@@ -135,6 +136,8 @@ class Runner:
     _pedal_again_s: float = field(init=False, default=0.0)
     _clocks_told: set[str] = field(init=False, default_factory=set[str])
     _space_due_s: float = field(init=False, default=0.0)
+    _forecast_due_s: float = field(init=False, default=0.0)
+    _stop_below_bytes: int = field(init=False, default=0)
     _space_told: Verdict = field(init=False, default="enough")
     _armed_s: float | None = field(init=False, default=None)  # time of the press that armed the pedal
 
@@ -365,9 +368,15 @@ class Runner:
     def _require_space(self) -> None:
         """Follows the disk; raises SpaceShortError when it is time to stop."""
         now_s = self.monotonic_s()
-        if now_s >= self._space_due_s:
-            require_space(self.store, self._follow_space())
-            self._space_due_s = now_s + _SPACE_EVERY_S
+        if now_s < self._space_due_s:
+            return
+        plenty = self.store.free_bytes() > 2 * self._stop_below_bytes
+        if now_s >= self._forecast_due_s or not plenty:  # of a large run it takes a tenth of a second
+            found = self._follow_space()
+            require_space(self.store, found)
+            self._stop_below_bytes = found.stop_below_bytes
+            self._forecast_due_s = now_s + _FORECAST_EVERY_S
+        self._space_due_s = now_s + _SPACE_EVERY_S
 
     def _follow_space(self) -> Forecast:
         """The forecast; told and recorded whenever it turns worse."""

@@ -62,7 +62,7 @@ def serve_command(
     json: JsonOption = False,
 ) -> None:
     """Serve the guided screen and the audit. Runs go on when this ends; stop them on the screen."""
-    with reporting_errors(json), file_log(data, "web"):
+    with reporting_errors(json):
         tls = _tls(tls_certificate, tls_key)
         lan = _leaves_this_machine(host)
         if lan and tls is None and not insecure_lan:
@@ -72,7 +72,7 @@ def serve_command(
                 remedy="Give --tls-certificate and --tls-key, or say --insecure-lan in a network you trust",
             )
         rig_file = load_rig(rig)
-        with _listening(host, port) as listener, Store.open(data) as store:
+        with _listening(host, port) as listener, Store.open(data) as store, file_log(data, "web"):
             address = f"{'https' if tls else 'http'}://{_shown(host)}:{listener.getsockname()[1]}"
             people = People(store)
             site = Site(

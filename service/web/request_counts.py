@@ -45,7 +45,7 @@ class RequestCounts:
             self._answers.labels(method, route, status).inc()
             seconds = time.monotonic() - begun_s
             self._seconds.labels(route).observe(seconds)
-            if method != "GET" or status >= "400":
+            if method != "GET" or status >= "500":  # a stranger's guesses at addresses would fill the log
                 said = {"method": method, "route": route, "status": int(status), "seconds": round(seconds, 3)}
                 _log.info("answered", extra=said)
 
