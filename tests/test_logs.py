@@ -71,6 +71,8 @@ def test_a_run_says_of_what_it_speaks_and_the_terminal_shows_what_it_showed(
         for e in Store.open(tmp_path / "data").events(bench.run_id)
         if e.payload.kind == "viewpoint_captured"
     ]
+    (measured,) = [line for line in said if line["event"] == "step_measured" and line["step"] == "capture"]
+    assert "viewpoint" not in measured
     assert "step_passed" in {line["event"] for line in said}
     assert {line["logger"].split(".")[0] for line in said} == {"service"}  # not every library's every move
     assert terminal.getvalue() == "the lens is cold\n"

@@ -90,6 +90,7 @@ def capture_viewpoints(
         loop.run(refused)
     finally:
         loop.keep()  # whatever ends the loop, an image that has arrived is recorded
+        at(viewpoint="")
     context.progress("viewpoints", len(viewpoints), len(viewpoints))
     captures = context.evidence.captures(context.step.id)
     return CaptureTotals(
