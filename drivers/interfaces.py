@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,8 @@ class DeviceReport:
     """The health of an open device, for `orthocapture doctor` and the run's start-up log."""
 
     identity: DeviceIdentity
-    clock_offset_s: float | None = None  # device clock minus host UTC, or minus host monotonic for a uptime clock
+    clock_offset_s: float | None = None  # device clock minus host UTC, or minus host monotonic for an uptime clock
+    clock: Literal["utc", "uptime"] = "utc"  # uptime: it counts from power-on, and only its change means anything
     free_bytes: int | None = None
     battery_fraction: float | None = None
     details: Mapping[str, str] = field(default_factory=dict[str, str])

@@ -94,6 +94,7 @@ class StepEvidence:
     checkpoint: Callable[[], None]
     progress: Callable[[str, int, int], None]
     wait: Callable[[float], None]
+    space: Callable[[], None]
 
     def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "runner") -> None:
         """Append events and artefact rows in one transaction."""
@@ -132,6 +133,7 @@ class StepEvidence:
         self.log.store.record(self.log.run_id, [], actor="runner", jobs=jobs, lease=self.lease)
         while True:
             self.checkpoint()
+            self.space()  # a worker begins nothing on a disk that is nearly full
             state = self.log.refresh()
             mine = {job.idempotency_key: job for job in state.steps[self.step].jobs.values()}
             if any(key not in mine for key in keys):
@@ -167,6 +169,10 @@ class StepEvidence:
     def state(self) -> RunState:
         """See service.steps.context.Evidence."""
         return self.log.refresh()
+
+    def require_space(self) -> None:
+        """See service.steps.context.Evidence."""
+        self.space()
 
     def _key(self, request: JobRequest) -> str:
         """The same for the same work: after a restart or a retry its result is used, not computed again."""

@@ -17,6 +17,7 @@ from typing import Protocol as Interface
 from drivers.errors import DeviceError
 from drivers.interfaces import DeviceReport
 from service.core.actions import refuse
+from service.core.clocks import clock_readings
 from service.core.decide import (
     AbortRun,
     Accept,
@@ -42,6 +43,7 @@ from service.core.model import (
     SessionStarted,
     StepFailed,
     StepMeasured,
+    StepNote,
     StepPassed,
     StepRetried,
     StepStarted,
@@ -49,18 +51,25 @@ from service.core.model import (
 from service.core.protocol import Protocol
 from service.core.recovery import recovery_policy
 from service.core.run_state import RunState
+from service.core.space import Forecast, Verdict
 from service.evidence import RunLog, StepEvidence
+from service.logs.where import at
+from service.monitor.host_clock import host_clock
 from service.monitor.snapshot import Doing
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
 from service.store.leases import RunLease
 from service.store.signature_copy import keep_elsewhere
+from service.store.space import forecast_of, require_space
 from service.store.store import Store
 from service.store.timestamping import Authority, stamp_end
 
 _LEASE_S = 30.0
 _POLL_S = 0.1
 _PEDAL_RETRY_S = 30.0
+_WRITE_NOTHING = ("checklist", "timed_application")  # step kinds that go on when the disk is full
+_FORECAST_EVERY_S = 30.0
+_SPACE_EVERY_S = 2.0  # in which a camera fills no more than the room that is kept
 # Where the robot will move, one press arms the pedal and a second one within this time confirms: what holding the
 # button is on a screen.
 _PEDAL_SECOND_PRESS_S = (0.5, 6.0)
@@ -125,6 +134,11 @@ class Runner:
     _asked: AskOperator | None = field(init=False, default=None)
     _pedal: int | None = field(init=False, default=None)  # presses when the open question was first asked
     _pedal_again_s: float = field(init=False, default=0.0)
+    _clocks_told: set[str] = field(init=False, default_factory=set[str])
+    _space_due_s: float = field(init=False, default=0.0)
+    _forecast_due_s: float = field(init=False, default=0.0)
+    _stop_below_bytes: int = field(init=False, default=0)
+    _space_told: Verdict = field(init=False, default="enough")
     _armed_s: float | None = field(init=False, default=None)  # time of the press that armed the pedal
 
     def run(self) -> RunState:
@@ -143,9 +157,16 @@ class Runner:
             if resumed:
                 self._seal()  # what the runner before could not sign any more
             self._append(
-                SessionStarted(resumed=resumed, software=software_versions(), host=socket.gethostname(), pid=getpid())
+                SessionStarted(
+                    resumed=resumed,
+                    software=software_versions(),
+                    host=socket.gethostname(),
+                    pid=getpid(),
+                    host_clock=host_clock(),
+                )
             )
             self.devices.watch(self._opened)
+            self._follow_space()
             try:
                 while True:
                     state = self._log.refresh()
@@ -261,14 +282,27 @@ class Runner:
 
     def _opened(self, device: str, report: DeviceReport) -> None:
         self._append(DeviceOpened(device=device, report=dataclasses.asdict(report)))
+        self._log.refresh()
+        self._look_at_clocks()
+
+    def _look_at_clocks(self) -> None:
+        """A clock beyond its limit is told once a session."""
+        for reading in clock_readings(self._log.events):
+            if reading.within is False and reading.device not in self._clocks_told:
+                self._clocks_told.add(reading.device)
+                self.operator.tell(reading.words)
 
     # --- steps ---
 
     def _execute(self, step_id: str, attempt: int) -> None:
         step = self.protocol.step(step_id)
+        at(step=step_id, viewpoint="")
         kind = step_kinds()[step.kind]
         checkpoint = partial(self._checkpoint, step_id, attempt)
-        evidence = StepEvidence(self._log, self._lease, step_id, attempt, checkpoint, self.operator.show, self.wait)
+        space = self._require_space
+        evidence = StepEvidence(
+            self._log, self._lease, step_id, attempt, checkpoint, self.operator.show, self.wait, space
+        )
         context = StepContext(
             protocol=self.protocol,
             step=step,
@@ -287,6 +321,8 @@ class Runner:
             self.devices.let_move(LeaveToMove(leave.seq, leave.by, self._log.leave_not_before_s))
         try:
             checkpoint()
+            if step.kind not in _WRITE_NOTHING:
+                space()
             outcome = kind.execute(context, step.params)
         except StepInterruptedError as interruption:
             self.operator.tell(str(interruption))
@@ -296,6 +332,7 @@ class Runner:
             self._measured(step_id, attempt, outcome)
 
     def _measured(self, step: str, attempt: int, outcome: StepOutcome) -> None:
+        self._look_at_clocks()
         self._append(
             StepMeasured(
                 step=step,
@@ -327,6 +364,32 @@ class Runner:
             raise StepInterruptedError("paused")
         if state.terminal or (state.current, state.step.attempt, state.phase) != (step, attempt, "running"):
             raise StepInterruptedError(f"the operator has ended this attempt; the run is {state.status}")
+
+    def _require_space(self) -> None:
+        """Follows the disk; raises SpaceShortError when it is time to stop."""
+        now_s = self.monotonic_s()
+        if now_s < self._space_due_s:
+            return
+        plenty = self.store.free_bytes() > 2 * self._stop_below_bytes
+        if now_s >= self._forecast_due_s or not plenty:  # of a large run it takes a tenth of a second
+            found = self._follow_space()
+            require_space(self.store, found)
+            self._stop_below_bytes = found.stop_below_bytes
+            self._forecast_due_s = now_s + _FORECAST_EVERY_S
+        self._space_due_s = now_s + _SPACE_EVERY_S
+
+    def _follow_space(self) -> Forecast:
+        """The forecast; told and recorded whenever it turns worse."""
+        state = self._log.refresh()
+        found = forecast_of(self.store, self.protocol, state)
+        worse = found.verdict not in ("enough", self._space_told)
+        self._space_told = found.verdict
+        if worse:
+            data = dataclasses.asdict(found) | {"verdict": found.verdict}
+            self._append(StepNote(step=state.current, attempt=state.step.attempt, note="disk_space", data=data))
+            if found.verdict == "short":
+                self.operator.tell(f"{found.words}. The run stops and asks before the disk is full")
+        return found
 
     def _append(self, *payloads: Payload, actor: str = "runner") -> None:
         self.store.record(self.run_id, payloads, actor=actor, lease=self._lease)

@@ -12,6 +12,7 @@ from service.evidence import recorded_protocol, recorded_root
 from service.rig import Rig, load_rig, parse_rig
 from service.runner import software_versions
 from service.store.records import NewArtefact
+from service.store.space import forecast_of, require_space
 from service.store.store import Store
 from service.store.timestamping import Authority
 
@@ -21,10 +22,12 @@ _SCHEMES = ("ptpip:", "socket://")
 def start_run(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, auto_confirm: bool) -> str:
     """Record the root of a new run's chain; its name.
 
-    Raises ConfigurationError when automatic confirmation is asked for on anything but a simulated rig.
+    Raises ConfigurationError when automatic confirmation is asked for on anything but a simulated rig, and
+    SpaceShortError on a disk on which nothing could be captured.
     """
     if auto_confirm:
         require_simulated(rig)
+    require_space(store, forecast_of(store, loaded.protocol, simulated=rig.section.simulated))
     source = loaded.source.encode()
     protocol = store.put_bytes(
         source, kind="protocol", media_type="application/yaml", original_name=f"{loaded.protocol.id}.yaml"

@@ -165,6 +165,7 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture register --images DIR --camera camera.json --poses poses.csv --mesh scan.ply --radius-mm 15 "
     "--out result.json": registers,
     "orthocapture audit show latest --data runs": succeeds,
+    "orthocapture store backup BACKUP --data runs": succeeds,
     "orthocapture audit verify latest --data runs": succeeds,
     "orthocapture audit verify all --data runs": succeeds,
     "orthocapture audit verify latest --json --data runs": succeeds,
@@ -205,6 +206,20 @@ RUN_ELSEWHERE = {
     ),
     "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
         "tests/test_handheld.py::test_the_evidence_verifies"
+    ),
+    **dict.fromkeys(
+        (
+            "orthocapture store restore BACKUP restored",
+            "orthocapture audit verify all --data restored",
+            "orthocapture resume latest --data restored",
+        ),
+        "tests/test_backup.py::test_a_run_goes_on_in_the_restored_folder",
+    ),
+    'orthocapture audit rotate-key --lost --reason "disk died" --data restored': (
+        "tests/test_backup.py::test_the_signing_key_leaves_only_when_asked_and_a_restored_run_can_be_signed"
+    ),
+    "orthocapture doctor --rig rig.yaml --protocol protocols/exvivo_spine.yaml --data runs": (
+        "tests/test_space.py::test_doctor_and_pages_say_it_before_a_run"
     ),
     "orthocapture audit verify --signatures FILE": (
         "tests/test_signature_log.py::test_a_run_keeps_the_copy_that_its_rig_file_names"

@@ -23,7 +23,7 @@ from service.store.signing import checkpoint, rotate_key
 from service.store.store import Store
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.store import CountedIds, SteppedClock, capture, start_run, tamper
-from tests.support.tampering import WORDS_AGAIN, rewrite_to_the_end
+from tests.support.tampering import WORDS_AGAIN, cut, rewrite_to_the_end, without_signatures_from
 
 
 @pytest.fixture
@@ -55,24 +55,6 @@ def sign_again(data: Path) -> None:
     with Store.open(data) as store:
         capture(store, run_of(data), "v9")
         checkpoint(store, run_of(data))
-
-
-def without_signatures_from(run: str, seq: int) -> list[str]:
-    return [f"DELETE FROM checkpoints WHERE run_id = '{run}' AND seq >= {seq}"]
-
-
-def cut(run: str, seq: int) -> list[str]:
-    """The chain ends before `seq`, and everything says so."""
-    of = f"run_id = '{run}' AND seq >= {seq}"
-    last = f"(SELECT sha256 FROM events WHERE run_id = '{run}' AND seq = {seq - 1})"
-    return [
-        *without_signatures_from(run, seq),
-        f"DELETE FROM artefacts WHERE {of}",
-        f"DELETE FROM event_index WHERE {of}",
-        f"DELETE FROM events WHERE {of}",
-        f"UPDATE heads SET seq = {seq - 1}, sha256 = {last} WHERE run_id = '{run}'",
-        *WORDS_AGAIN,
-    ]
 
 
 def deleted(run: str) -> list[str]:

@@ -24,6 +24,7 @@ from service.store.database import database_path
 from service.store.events import ROOT, canonical, event_sha256, parse_canonical
 from service.store.keys import public_bytes
 from service.store.records import SITE, Checkpoint
+from service.store.seam import DurableFiles
 from service.store.signature_log import NAME, SignatureLog
 from tests.support.tampering import WORDS_AGAIN
 
@@ -290,7 +291,7 @@ class _Forger:
         if keys and "database" in self._can:
             order = [parse_canonical(line.decode())["checkpoint"] for line in lines]
             left = [present[place] for item in order if (place := (item["run_id"], item["seq"])) in present]
-            SignatureLog(path.parent).add(left, keys[-1])
+            SignatureLog(path.parent, DurableFiles()).add(left, keys[-1])
 
 
 def _checkpoints(record: Record, *, stamped: bool = False) -> list[tuple[Any, ...]]:

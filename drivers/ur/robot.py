@@ -170,6 +170,7 @@ class UrRobot:
         return DeviceReport(
             identity=self._identity(),
             clock_offset_s=self._streaming().clock_offset_s(),
+            clock="uptime",
             details={
                 "robot mode": state.robot_mode,
                 "safety": state.sample.safety.value,

@@ -30,6 +30,7 @@ from service.store.checkpoints import read_checkpoints, read_timestamps
 from service.store.events import canonical, event_text, parse_canonical, read_events
 from service.store.records import SITE, Artefact
 from service.store.signing import PublicKey, checkpoint, public_keys, sign
+from service.store.space import require_export_space
 from service.store.store import Store
 from service.store.tables import artefacts as artefact_table
 from service.store.tables import events as event_table
@@ -162,8 +163,11 @@ def export_bundle(
         IntegrityError: the evidence does not verify. Nothing was written.
         IllegalTransitionError: the run has not been released. Nothing was written.
         DataError: the file exists.
+        SpaceShortError: the bundle would take the room that is kept for the evidence. Nothing was written.
         StoreError: the disk refused, or the signing key cannot be used.
     """
+    if not hashes_only:
+        require_export_space(store, run_id, target)
     exportable = require_exportable(store, run_id, progress)
     protocol, root = exportable.protocol, exportable.root
     target = target.with_name(marked_name(target.name, simulated=root.simulated))

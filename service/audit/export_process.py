@@ -18,6 +18,7 @@ from service.audit.bundle_report import bundle_report
 from service.audit.bundle_zip import writing_bundle
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.store.artefacts import chunks_of
+from service.store.space import require_export_space
 from service.store.store import Store
 
 if TYPE_CHECKING:
@@ -41,6 +42,8 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
                 store, run_id, target, actor=actor, hashes_only=hashes_only, report=report, progress=progress
             )
             return made.path
+        if what == "dataset":
+            require_export_space(store, run_id, target)
         exportable = require_exportable(store, run_id, progress)
         # These load the numerics and the typesetting, which a bundle does without.
         from service.audit.recorded import read_run  # noqa: PLC0415

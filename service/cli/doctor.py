@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import shutil
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
@@ -23,9 +24,18 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run import RigOption
+from service.core.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S
 from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.model import HostClock
+from service.core.protocol import Protocol, load_protocol
+from service.core.space import Forecast, Usage, forecast
+from service.monitor.host_clock import host_clock
 from service.rig import load_rig
 from service.station import Station
+from service.steps import params_models
+from service.store.database import database_path
+from service.store.space import forecast_of
+from service.store.store import Store
 
 # Libraries without a ready-made package for every Python and machine, and what cannot be done without them.
 _PARTS = {
@@ -36,11 +46,20 @@ _PARTS = {
 _LOW_DISK_BYTES = 20e9  # a full capture of RAW and JPEG with its scans
 
 
-def doctor_command(rig: RigOption, data: DataOption = DEFAULT_DATA, json: JsonOption = False) -> None:
+def doctor_command(
+    rig: RigOption,
+    data: DataOption = DEFAULT_DATA,
+    protocol: Annotated[
+        Path | None, typer.Option("--protocol", help="Say whether the disk will do for a run of this protocol.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
     """Open every device of a rig: versions, clock offsets, free space, and what is wrong."""
     found: dict[str, DeviceReport | OrthocaptureError] = {}
     with reporting_errors(json):
-        station = Station(load_rig(rig))
+        rig_file = load_rig(rig)
+        loaded = None if protocol is None else load_protocol(protocol, params_models()).protocol
+        station = Station(rig_file)
         try:
             with progress_bar(quiet=json) as progress:
                 for i, name in enumerate(station.names()):
@@ -51,14 +70,20 @@ def doctor_command(rig: RigOption, data: DataOption = DEFAULT_DATA, json: JsonOp
                         found[name] = error
         finally:
             station.close()
-    existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
-    free_bytes = shutil.disk_usage(existing).free
+        existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
+        free_bytes = shutil.disk_usage(existing).free
+        space = None if loaded is None else _foresee(data, loaded, free_bytes, simulated=rig_file.section.simulated)
     healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
+    healthy = healthy and (space is None or space.verdict == "enough")
+    clock = host_clock()
     missing = [what for module, what in _PARTS.items() if importlib.util.find_spec(module) is None]
     if json:
         devices = {name: _record(report) for name, report in found.items()}
-        space = {"folder": str(data), "free_bytes": free_bytes}
-        print_json({"ok": healthy, "devices": devices, "data": space, "missing": missing})
+        folder: dict[str, Any] = {"folder": str(data), "free_bytes": free_bytes}
+        if space is not None:
+            folder["forecast"] = dataclasses.asdict(space) | {"verdict": space.verdict, "words": space.words}
+        found_clock = clock.model_dump()
+        print_json({"ok": healthy, "devices": devices, "data": folder, "host_clock": found_clock, "missing": missing})
     else:
         for what in missing:
             console.print(f"[bold yellow]![/] not installed: {escape(what)} (see docs/installation.md)")
@@ -66,8 +91,29 @@ def doctor_command(rig: RigOption, data: DataOption = DEFAULT_DATA, json: JsonOp
             _print(name, report)
         note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"
         console.print(f"[bold]data folder[/] {escape(str(data))}: {free_bytes / 1e9:.1f} GB free{note}")
+        console.print(f"[bold]this machine's clock[/] {escape(_clock_words(clock))}")
+        if space is not None:
+            colour = {"enough": "green", "short": "yellow", "stop": "red"}[space.verdict]
+            console.print(f"    [{colour}]{escape(space.words)}[/]")
     if not healthy:
         raise typer.Exit(1)
+
+
+def _clock_words(clock: HostClock) -> str:
+    if clock.offset_s is not None:
+        beyond = f", more than {HOST_LIMIT_S:g} s" if abs(clock.offset_s) > HOST_LIMIT_S else ""
+        return f"{clock.offset_s:+.6f} s against the network's time (chrony){beyond}"
+    if clock.synchronised:
+        error = "" if clock.error_s is None else f", within {clock.error_s:.3f} s by its own word"
+        return f"is set by the network's time{error}"
+    return "is not known to be set" if clock.synchronised is None else "is not set by the network's time"
+
+
+def _foresee(data: Path, protocol: Protocol, free_bytes: int, *, simulated: bool) -> Forecast:
+    if not database_path(data).is_file():
+        return forecast(protocol, None, Usage(), None, free_bytes, simulated=simulated)
+    with Store.open(data, create=False) as store:
+        return forecast_of(store, protocol, simulated=simulated)
 
 
 def _record(report: DeviceReport | OrthocaptureError) -> dict[str, Any]:
@@ -87,7 +133,10 @@ def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
     )
     console.print(f"    {escape(who.driver)} {escape(who.driver_version)} at {escape(who.address)}")
     if report.clock_offset_s is not None:
-        console.print(f"    clock offset {report.clock_offset_s:+.3f} s")
+        since = " (counted from power-on: only its change means anything)" if report.clock == "uptime" else ""
+        late = report.clock == "utc" and abs(report.clock_offset_s) > DEVICE_LIMIT_S
+        beyond = f"  [yellow]more than {DEVICE_LIMIT_S:g} s: set it[/]" if late else ""
+        console.print(f"    clock offset {report.clock_offset_s:+.3f} s{since}{beyond}")
     if report.free_bytes is not None:
         console.print(f"    {report.free_bytes / 1e9:.1f} GB free")
     if report.battery_fraction is not None:

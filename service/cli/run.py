@@ -39,6 +39,7 @@ from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState, StepState
 from service.core.ways_on import takes_words, ways_on
 from service.evidence import RunLog, results_to_come
+from service.logs.file_log import file_log
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.people import People
 from service.people.proof import Identity, identity_for, who_acts
@@ -343,7 +344,8 @@ def drive(
     # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with worker_beside(data, error_console.print) if worker else nullcontext():
+        beside = worker_beside(data, error_console.print) if worker else nullcontext()
+        with file_log(data, "runner", run=run_id), beside:
             authority, copy = time_stamp_authority(rig), signature_copy(rig)
             try:
                 state = Runner(store, run_id, protocol, station, operator, authority, copy).run()

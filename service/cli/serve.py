@@ -22,6 +22,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.core.errors import ConfigurationError
+from service.logs.file_log import file_log
 from service.people.people import People
 from service.rig import load_rig
 from service.runs import signature_copy
@@ -36,7 +37,7 @@ from service.web.launch import Launcher
 from service.web.listener import affordable_connections
 from service.web.server import known_proxies, listening, server
 from service.web.site import Site
-from service.web.sparing_log import sparing_log
+from service.web.sparing_log import sparing_log, told
 
 _PROTOCOLS = Path(__file__).parents[2] / "protocols"
 _LIMITS = ConnectionLimits()
@@ -93,7 +94,12 @@ def serve_command(
         rig_file = load_rig(rig)
         proxies = known_proxies(trusted_proxy or [])
         limits = ConnectionLimits(affordable_connections(connections), address_connections, client_wait_s)
-        with listening(host, port, limits, proxies) as listener, Store.open(data) as store, sparing_log() as log:
+        with (
+            listening(host, port, limits, proxies) as listener,
+            Store.open(data) as store,
+            sparing_log() as log,
+            file_log(data, "web", admits=told),
+        ):
             address = f"{'https' if tls else 'http'}://{_shown(host)}:{listener.getsockname()[1]}"
             people = People(store)
             site = Site(

@@ -17,6 +17,7 @@ from service.cli.common import (
     print_json,
     reporting_errors,
 )
+from service.cli.store_backup import backup_command, restore_command
 from service.people.people import People
 from service.people.proof import who_acts
 from service.store.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
@@ -30,6 +31,10 @@ store_app = typer.Typer(name="store", help="Look after the folder that holds the
 @store_app.callback()
 def store() -> None:
     """Look after the folder that holds the evidence."""
+
+
+store_app.command("backup")(backup_command)
+store_app.command("restore")(restore_command)
 
 
 @store_app.command("gc")

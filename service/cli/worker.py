@@ -17,6 +17,7 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
+from service.logs.file_log import file_log
 from service.worker.pool import work_side_by_side
 
 
@@ -39,7 +40,7 @@ def worker_command(
         stopped = True
 
     signal.signal(signal.SIGTERM, on_terminate)
-    with reporting_errors(json), progress_bar(quiet=json) as progress:
+    with reporting_errors(json), file_log(data, "worker"), progress_bar(quiet=json) as progress:
         done = work_side_by_side(
             data,
             at_once=jobs or os.cpu_count() or 1,

@@ -68,6 +68,10 @@ class IntegrityError(StoreError):
     """Evidence does not verify: a hash, a chain link or a file is wrong."""
 
 
+class SpaceShortError(StoreError):
+    """The disk will soon be full: nothing more is begun, so that what was begun can be recorded."""
+
+
 class DataError(OrthocaptureError):
     """Input data (image, mesh, DICOM series, pose file) cannot be used."""
 

@@ -80,6 +80,15 @@ class RunStarted(Record):
     origin: Literal["captured", "imported"] = "captured"
 
 
+class HostClock(Record):
+    """How well the host's clock is set; None: not known."""
+
+    source: Literal["chrony", "kernel", ""]
+    synchronised: bool | None  # with the network's time
+    offset_s: float | None  # host minus network
+    error_s: float | None = None  # at most, as the kernel states it
+
+
 class SessionStarted(Record):
     """The runner's process started (first start or resume): versions again, and the clocks."""
 
@@ -88,6 +97,7 @@ class SessionStarted(Record):
     software: dict[str, str]
     host: str
     pid: int
+    host_clock: HostClock | None = None
 
 
 class DeviceOpened(Record):
@@ -471,6 +481,16 @@ class TimeStampKept(Record):
     token_sha256: str  # of the token's text
 
 
+class DataRestored(Record):
+    """This data folder was made from a backup: what was recorded after it, in the folder of then, is not here."""
+
+    kind: Literal["data_restored"] = "data_restored"
+    state: str  # name of the backup's state
+    at_utc: str  # when the backup was made
+    folder: str  # of which it was made
+    host: str
+
+
 # --- end -----------------------------------------------------------------------------------------------------
 
 
@@ -524,8 +544,9 @@ Payload = Annotated[
     | SignInRecorded
     | KeyChanged
     | RunSigned
-    | TimeStampKept,
-    | LeftoversRemoved,
+    | TimeStampKept
+    | LeftoversRemoved
+    | DataRestored,
     Field(discriminator="kind"),
 ]
 PAYLOAD: TypeAdapter[Payload] = TypeAdapter(Payload)

@@ -14,7 +14,14 @@ PASSING = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "DeviceBusy
 # Only a person at the table can put these right, whatever the protocol says.
 # (a damaged file of the evidence is put back from a copy; what is read again is checked against its hash again).
 NEEDS_A_PERSON = frozenset(
-    {"SafetyStopError", "LeaveNeededError", "DeviceStorageFullError", "IntegrityError", "ImagesSpoiltError"}
+    {
+        "SafetyStopError",
+        "LeaveNeededError",
+        "DeviceStorageFullError",
+        "IntegrityError",
+        "ImagesSpoiltError",
+        "SpaceShortError",
+    }
 )
 
 

@@ -62,6 +62,7 @@ REMEDIES: Mapping[str, str] = {
     "ConfigurationError": "Put right what the message names",
     "ProtocolError": "Put right what the message names",
     "StoreError": "Look at the disk that holds the evidence: room, cable, permissions",
+    "SpaceShortError": "Make room on the disk of the data folder, as the message says",
     "IntegrityError": "Put the damaged file back from a copy: what is read is checked against its hash",
 }
 UNKNOWN_REMEDY = "Put right what the message names"

@@ -19,6 +19,7 @@ from drivers.errors import (
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, SettleReport
 from service.core.geometry import Array, Transform
 from service.core.model import ViewpointFailed
+from service.logs.where import at
 from service.steps.context import StepContext
 from service.steps.exposure import Shot, environment_now, expose, expose_when_free, record_shot, wanted_settings
 from service.steps.motion import MotionLimits, move_and_settle, settle_criteria
@@ -89,6 +90,7 @@ def capture_viewpoints(
         loop.run(refused)
     finally:
         loop.keep()  # whatever ends the loop, an image that has arrived is recorded
+        at(viewpoint="")
     context.progress("viewpoints", len(viewpoints), len(viewpoints))
     captures = context.evidence.captures(context.step.id)
     return CaptureTotals(
@@ -132,6 +134,7 @@ class _CaptureLoop:
             self.context.checkpoint()
             if self.until():
                 return
+            self.context.evidence.require_space()
             self.context.progress("viewpoints", len(self.viewpoints) - len(todo), len(self.viewpoints))
             viewpoint = todo[0]
             if viewpoint.name in refused:
@@ -178,6 +181,7 @@ class _CaptureLoop:
 
     def _capture_with_retries(self, viewpoint: Viewpoint, later: Sequence[Viewpoint]) -> Shot:
         context = self.context
+        at(viewpoint=viewpoint.name)
         robot = context.devices.robot(viewpoint.station)
         for tries_left in range(context.step.recovery.retries, -1, -1):
             arrived = False

@@ -172,6 +172,10 @@ class Evidence(Protocol):
         """The run as it stands at this moment."""
         ...
 
+    def require_space(self) -> None:
+        """Before each photograph: raises SpaceShortError where the disk would soon be full."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class StepContext:

@@ -50,6 +50,7 @@ class HeldCamera:
     def new_views(self) -> list[ViewHeld]:
         """Waits a moment for images, which are evidence at once. An image that cannot be read is noted, not kept."""
         context = self.context
+        context.evidence.require_space()
         camera = context.devices.camera()
         with tempfile.TemporaryDirectory(prefix="orthocapture-") as folder:
             by, images = self._images(camera, Path(folder))

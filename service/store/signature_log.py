@@ -171,8 +171,7 @@ def _add(files: Files, path: Path, checkpoints: Sequence[Checkpoint], key: Ed255
             number += 1
             signature = base64.b64encode(key.sign(_message(number, previous, checkpoint, key_id))).decode()
             data = _fields(number, previous, checkpoint, key_id) | {"signature": signature}
-            raw = canonical_parsed(data).encode() + b"
-"
+            raw = canonical_parsed(data).encode() + b"\n"
             new += raw
             previous = hashlib.sha256(raw).hexdigest()
         files.append(path, end, new)

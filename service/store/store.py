@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,7 @@ from service.store.leases import RunLease, acquire, check_lease, held_runs, is_h
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
 from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock
 from service.store.tables import event_index, events, heads, runs
+from service.store.told import tell
 
 _ENDS = ("run_completed", "run_aborted")
 _OWN_KINDS = frozenset({"run_started", "site_opened", "job_enqueued", "job_finished", "job_failed"})
@@ -99,6 +101,15 @@ class Store:
     def clock(self) -> Clock:
         """Where its times come from."""
         return self._clock
+
+    def free_bytes(self) -> int:
+        """Free space on the disk of the data folder."""
+        try:
+            return shutil.disk_usage(self.database_path.parent).free
+        except OSError as error:
+            raise StoreError(
+                f"the data folder cannot be reached: {error.strerror}", where=str(error.filename)
+            ) from error
 
     def close(self) -> None:
         """Close the database."""
@@ -239,6 +250,7 @@ class Store:
             events = append(connection, self._clock, run_id, payloads, actor)
             events += queue.enqueue(connection, self._clock, self._ids, run_id, jobs, actor=actor)
             insert_artefacts(connection, self._folder, events, artefacts)
+        tell(events)
         return events
 
     def events(self, run_id: str, after_seq: int = 0) -> list[Event]:
@@ -399,6 +411,7 @@ class Store:
                 after_seq, following = follow
                 new = following(read_events(connection, job.run_id, after_seq))
                 queue.enqueue(connection, self._clock, self._ids, job.run_id, new, actor=job.worker or "worker")
+        tell([event])
         return event
 
     def fail_job(self, job: Job, error: Exception, *, retry: bool) -> list[Event]:
@@ -410,7 +423,9 @@ class Store:
         name, message = type(error).__name__, str(error) if foreseen else repr(error)
         trace = "" if foreseen else "".join(traceback.format_exception(error))
         with self._database.writing() as connection:
-            return queue.fail(connection, self._clock, job, name, message, retry=retry, traceback=trace)
+            events = queue.fail(connection, self._clock, job, name, message, retry=retry, traceback=trace)
+        tell(events)
+        return events
 
     def release_jobs(self, pids: Collection[int]) -> None:
         """Queue the jobs of these processes of this host again, untried: they were told to stop, and have."""

@@ -14,6 +14,7 @@ from service.web import (
     calibration_pages,
     capture_pages,
     export_pages,
+    health_pages,
     held_pages,
     home_pages,
     media,
@@ -38,6 +39,7 @@ _PAGES = (
     calibration_pages,
     audit_pages,
     export_pages,
+    health_pages,
 )
 
 
@@ -52,6 +54,7 @@ def create_app(site: Site) -> FastAPI:
     )
     app.state.site = site
     install_security(app)
+    health_pages.install_metrics(app)
     for page in _PAGES:
         app.include_router(page.router)
     app.mount("/static", StaticFiles(directory=Path(__file__).with_name("static")), name="static")

@@ -17,6 +17,7 @@ from service.audit.first_page import GROUPS, ListedRun, RunFilter
 from service.audit.provenance import origin
 from service.audit.provenance_drawing import draw
 from service.audit.queries import EventFilter
+from service.core.clocks import clock_readings
 from service.evidence import results_to_come
 from service.steps.time_left import Left
 from service.store.records import SITE
@@ -403,6 +404,7 @@ def devices_page(request: Request, audit: Auditing, run_id: str) -> Response:
         troubles = findings.events_of(connection, run_id, "device_trouble", newest=True)
         trouble_count = queries.count_of_kind(connection, run_id, "device_trouble")
         clocks = findings.clock_offsets(connection, run_id)
+    readings = clock_readings(audit.site.run(run_id).events)
     return render(
         request,
         "audit_devices.html.j2",
@@ -412,6 +414,7 @@ def devices_page(request: Request, audit: Auditing, run_id: str) -> Response:
         troubles=troubles[-50:],
         trouble_count=trouble_count,
         clocks=clocks,
+        readings=readings,
     )
 
 

@@ -12,6 +12,7 @@ from service.core.errors import OrthocaptureError
 from service.core.protocol import LoadedProtocol, load_protocol
 from service.steps import params_models
 from service.store.records import RunRow
+from service.store.space import forecast_of
 from service.web.pages import render
 from service.web.run_frame import driven_frames, robot_banner
 from service.web.security import Signed, requires
@@ -46,6 +47,7 @@ class Startable:
     file: str
     loaded: LoadedProtocol | None
     fault: str = ""
+    space: str = ""  # why the disk will not do for it
 
 
 @router.get("/", name="home", dependencies=[Depends(requires("read"))])
@@ -133,6 +135,8 @@ def _line(site: Site, row: RunRow) -> RunLine:
 
 def _startable(name: str, site: Site) -> Startable:
     try:
-        return Startable(name, load_protocol(site.protocols / name, params_models()))
+        loaded = load_protocol(site.protocols / name, params_models())
+        space = forecast_of(site.store, loaded.protocol, simulated=site.rig.section.simulated)
+        return Startable(name, loaded, space="" if space.verdict == "enough" else space.words)
     except OrthocaptureError as error:
         return Startable(name, None, str(error))

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
 
+from service.core.clocks import ClockReading
 from service.core.gates import figure
 from service.core.model import Event, GateVerdict, SessionStarted, View
 from service.core.protocol import Gate, Protocol, Step
 from service.core.run_state import RunState, StepState
+from service.core.space import Forecast, size_words
 from service.monitor.snapshot import Snapshot
 from service.web.run_words import gate_word, limit, measure_name, planned_views
 
@@ -133,11 +135,19 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def readings(snapshot: Snapshot) -> tuple[Reading, ...]:
-    """What the runner last told of the machine and the devices; what it did not tell is said to be unknown."""
+def readings(
+    snapshot: Snapshot, space: Forecast | None = None, clocks: Sequence[ClockReading] = ()
+) -> tuple[Reading, ...]:
+    """What the runner last told of the machine and the devices; what it did not tell is said to be unknown.
+
+    Args:
+        snapshot: of the runner.
+        space: what the run will still write, where it is known.
+        clocks: as last compared; those beyond their limits are shown.
+    """
     battery = snapshot.camera_battery_fraction
     return (
-        _space("Disk", snapshot.disk_free_bytes, low_gib=20, out_gib=5),
+        _space("Disk", snapshot.disk_free_bytes, low_gib=20, out_gib=5) if space is None else _disk(space),
         _space("Camera card", snapshot.camera_free_bytes, low_gib=8, out_gib=2),
         Reading("Battery", "unknown")
         if battery is None
@@ -148,7 +158,19 @@ def readings(snapshot: Snapshot) -> tuple[Reading, ...]:
         ),
         Reading("Light", "unknown" if snapshot.light_lux is None else f"{snapshot.light_lux:.0f} lx"),
         Reading("Temperature", "unknown" if snapshot.temperature_c is None else f"{snapshot.temperature_c:.1f} °C"),
+        *(
+            Reading(f"Clock of {clock.name}", clock.difference, "attention", "set it")
+            for clock in clocks
+            if clock.within is False
+        ),
     )
+
+
+def _disk(space: Forecast) -> Reading:
+    tone = {"enough": "", "short": "attention", "stop": "stop"}[space.verdict]
+    to_come = f"{size_words(space.needed_bytes)} to come" if space.needed_bytes > 1e6 else ""
+    note = {"enough": to_come, "short": f"will not do, {to_come}", "stop": "full: make room"}[space.verdict]
+    return Reading("Disk", f"{size_words(space.free_bytes)} free", tone, note)
 
 
 def _space(name: str, free_bytes: int | None, *, low_gib: float, out_gib: float) -> Reading:

@@ -17,6 +17,7 @@ from service.evidence import RunLog, results_to_come
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Person
+from service.store.space import forecast_of
 from service.web.pages import part_names, render
 from service.web.run_frame import run_frame
 from service.web.run_view import Looker, run_view
@@ -59,6 +60,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         driven=site.launcher.driven(run_id),
         show=step,
         to_come=[left.text for left in results_to_come(log)],
+        space=None if log.state.terminal else forecast_of(site.store, log.protocol, log.state),
     )
     return {
         "view": view,

@@ -9,12 +9,14 @@ from typing import Protocol as Interface
 
 from service.core.acceptance import acceptors, demanded_role, failed_gates
 from service.core.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
+from service.core.clocks import clock_readings
 from service.core.decide import AskOperator, decide
 from service.core.dependence import AcceptedGate, dependent_steps, depends_on
 from service.core.model import Event, OperatorVerb
 from service.core.protocol import Protocol, Step
 from service.core.registered import evaluated
 from service.core.run_state import Deviation, RunState
+from service.core.space import Forecast
 from service.core.ways_on import WayOn, takes_words
 from service.monitor.snapshot import Snapshot
 from service.web.run_figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
@@ -226,7 +228,14 @@ class RunView:
 
 
 def run_view(
-    log: Recorded, snapshot: Snapshot, looker: Looker, *, driven: bool, show: str = "", to_come: Sequence[str] = ()
+    log: Recorded,
+    snapshot: Snapshot,
+    looker: Looker,
+    *,
+    driven: bool,
+    show: str = "",
+    to_come: Sequence[str] = (),
+    space: Forecast | None = None,
 ) -> RunView:
     """The page of a run that has begun.
 
@@ -234,6 +243,7 @@ def run_view(
         to_come: what is still being computed, in words.
         driven: whether a living process drives the run.
         show: step to look at; the current one when it is "" or unknown.
+        space: what the run will still write, where it is known.
     """
     protocol, state = log.protocol, log.state
     shown = show if show in state.steps else state.current
@@ -264,7 +274,7 @@ def run_view(
         redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
         skip_overrides=bool(state.step.verdicts) and not state.step.gates_passed,
         progress=capture_progress(protocol, state, log.events),
-        readings=readings(snapshot),
+        readings=readings(snapshot, space, clock_readings(log.events)),
         working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
         deviations=tuple(reversed(state.deviations)),
         news=tuple((m.at_utc, m.text) for m in reversed(snapshot.messages)),

@@ -12,6 +12,7 @@ from typing import TextIO
 
 EVERY_S = 60.0
 _KINDS = 200  # all further ones count as one
+_LEFT_OUT = "left_out"  # in a record, for handlers that come after
 _FAULTS = 10  # of the software in a time: people are told a reference that is to be found
 
 Kind = tuple[str | int, ...]
@@ -52,6 +53,7 @@ class SparingHandler(logging.StreamHandler[TextIO]):
             super().emit(record)
         else:
             told.left_out += 1
+            vars(record)[_LEFT_OUT] = True
 
     async def tell(self) -> None:
         """Say how many were left out in times that are over; to be called now and then."""
@@ -72,6 +74,11 @@ class SparingHandler(logging.StreamHandler[TextIO]):
             if told.left_out:
                 words = f"{told.left_out} more messages like this were left out: {told.words}"
                 super().emit(logging.makeLogRecord({"name": told.name, "levelname": "WARNING", "msg": words}))
+
+
+def told(record: logging.LogRecord) -> bool:
+    """Whether the sparing handler, which comes first, has not left this message out."""
+    return not vars(record).get(_LEFT_OUT)
 
 
 def _kind(record: logging.LogRecord) -> Kind:

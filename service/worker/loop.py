@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
 from service.core.priorities import Lane
+from service.core.space import LEAST_FREE_BYTES
+from service.logs.where import at
 from service.store.errors import LeaseLostError
 from service.store.records import Job
 from service.store.store import Store
@@ -86,7 +88,15 @@ def work(
     name = f"worker {socket.gethostname()}:{os.getpid()}"
     following: Following | None = None
     done = 0
+    waiting = False
     while not stop():
+        if store.free_bytes() < LEAST_FREE_BYTES:
+            if not waiting:
+                _log.warning("the disk of the data folder is nearly full: no job is begun before there is more room")
+            waiting = True
+            time.sleep(_POLL_S)
+            continue
+        waiting = False
         job = store.claim_job(name, _LEASE_S, kinds=list(HANDLERS), lane=lane)
         if job is None:
             if until_idle:
@@ -109,6 +119,7 @@ def _following(store: Store) -> Following:
 
 def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], following: Following) -> None:
     started_s = time.monotonic()
+    at(run=job.run_id, step=job.step, job=job.job_id)
     answer = JobAnswer({})
     attempt = _Attempt(store, job)
     progress(job.kind.replace("_", " "), 0, 0)

@@ -23,6 +23,8 @@ from pathlib import Path
 
 from service.compute.memory import keep_freed_memory
 from service.core.priorities import Lane
+from service.logs.file_log import file_log
+from service.monitor.worker_sign import SignOfLife
 from service.store.store import Store
 from service.worker.loop import work
 
@@ -138,9 +140,10 @@ def work_side_by_side(
     with Store.open(data) as store:
         if until_idle and not store.open_jobs():
             return 0
-        with Pool(store, data, at_once) as pool:
+        with Pool(store, data, at_once) as pool, contextlib.closing(SignOfLife(data)) as sign:
             while not stop():
                 pool.tend(progress)
+                sign.give(pool.done)
                 if until_idle and not store.open_jobs():
                     while pool.tend(progress, 1.0):  # a job's end is in the store before its child says so
                         pass
@@ -164,7 +167,7 @@ def _serve(data: Path, lane: Lane, scratch: Path, pipe: Connection, parent: int)
         with contextlib.suppress(OSError):  # the worker has gone, and this process goes too
             pipe.send((what, done, total))
 
-    with Store.open(data) as store:
+    with file_log(data, "worker"), Store.open(data) as store:
         work(store, until_idle=False, stop=lambda: False, progress=tell, lane=lane, finished=lambda: tell("", 0, -1))
 
 

@@ -65,3 +65,22 @@ def alter_row(data: Path, run_id: str, seq: int, device: str) -> None:
     ((event,),) = rows(data, f"SELECT sha256 FROM events WHERE {where}")
     tamper(data, f"UPDATE artefacts SET device = '{device}' WHERE {where}")
     tamper(data, *_rows_again(data, where, str(event)))
+
+
+def without_signatures_from(run: str, seq: int) -> list[str]:
+    """SQL that takes the signatures of a chain away, from an event on."""
+    return [f"DELETE FROM checkpoints WHERE run_id = '{run}' AND seq >= {seq}"]
+
+
+def cut(run: str, seq: int) -> list[str]:
+    """SQL after which a chain ends before `seq`, and everything says so."""
+    of = f"run_id = '{run}' AND seq >= {seq}"
+    last = f"(SELECT sha256 FROM events WHERE run_id = '{run}' AND seq = {seq - 1})"
+    return [
+        *without_signatures_from(run, seq),
+        f"DELETE FROM artefacts WHERE {of}",
+        f"DELETE FROM event_index WHERE {of}",
+        f"DELETE FROM events WHERE {of}",
+        f"UPDATE heads SET seq = {seq - 1}, sha256 = {last} WHERE run_id = '{run}'",
+        *WORDS_AGAIN,
+    ]

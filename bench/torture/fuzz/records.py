@@ -31,7 +31,7 @@ from service.store.checkpoints import key_fingerprint
 from service.store.events import to_event
 from service.store.keys import KeyFolder, public_bytes
 from service.store.records import Checkpoint, Timestamp
-from service.store.seam import SystemClock
+from service.store.seam import DurableFiles, SystemClock
 from service.store.signature_copy import bring_up_to_date
 from service.store.signature_log import NAME, log_findings, read_log
 from service.store.signing import checkpoint, rotate_key
@@ -193,7 +193,7 @@ def _log(data: bytes, folder: Path) -> None:
 
 
 def _keys(folder: Path) -> list[bytes]:
-    KeyFolder(folder).make()
+    KeyFolder(folder, DurableFiles()).make()
     return [path.read_bytes() for path in (folder / "keys").iterdir()]
 
 
@@ -203,7 +203,7 @@ def _key(data: bytes, folder: Path) -> None:
     path = folder / "keys" / f"{key_id}.pem"
     path.touch(mode=0o600)
     path.write_bytes(data)
-    KeyFolder(folder).load(key_id)
+    KeyFolder(folder, DurableFiles()).load(key_id)
 
 
 # --- events, database, snapshots ----------------------------------------------------------------------------------

@@ -1,0 +1,163 @@
+"""The figures of a data folder that whoever operates it watches, read from the record and from what processes say."""
+
+from __future__ import annotations
+
+import shutil
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, case, func, select
+
+from service.core.priorities import EARLY
+from service.monitor.snapshot import Doing, RobotPhase, read_snapshot
+from service.monitor.worker_sign import living_workers
+from service.store.events import parse_canonical
+from service.store.records import SITE
+from service.store.store import Store, read_open_runs
+from service.store.tables import event_index, events, jobs, runs
+
+CAPTURED = ("viewpoint_captured", "view_held", "view_imported")
+_LAST_CAPTURES = 21  # of which the seconds a viewpoint are the median
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceFigures:
+    """What a run last recorded of a device."""
+
+    run_id: str
+    device: str  # name in rig.yaml
+    kind: str  # robot, camera, …
+    answers: bool  # it was opened, and no trouble was recorded since
+    problems: int  # that its report named
+
+
+@dataclass(frozen=True, slots=True)
+class DrivenRun:
+    """A run that a process drives now."""
+
+    run_id: str
+    doing: Doing
+    robot: RobotPhase
+    silent_s: float  # since its runner last said anything; inf: never
+    viewpoint_s: float | None  # between the last exposures of one step, median; None: too few yet
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """All of them, at one moment."""
+
+    runs: Mapping[str, int]  # completed, aborted, open
+    driven: Sequence[DrivenRun]
+    shown: Sequence[str]  # the runs whose devices are meant: those that are driven, else the newest
+    captures: int  # photographs recorded, of all runs
+    jobs: Mapping[tuple[str, str], int]  # kind and state
+    job_seconds: Mapping[str, tuple[int, float]]  # kind → how many were computed, and how long in all
+    queue: Mapping[str, int]  # jobs that nobody computes yet: waited (a step waits for them), background
+    devices: Sequence[DeviceFigures]
+    workers: int
+    database_bytes: int
+    free_bytes: int
+
+
+def read_figures(store: Store, data: Path, driven: Sequence[str]) -> Figures:
+    """Read them. `driven`: the runs that a process drives. Raises StoreError; OSError of the data folder's disk."""
+    with store.database.reading() as connection:
+        latest = select(runs.c.run_id).where(runs.c.run_id != SITE).order_by(runs.c.created_utc.desc()).limit(1)
+        shown = list(driven) or list(connection.execute(latest).scalars())
+        return Figures(
+            runs=_runs(connection),
+            driven=[_driven(connection, data, run_id) for run_id in driven],
+            shown=shown,
+            captures=connection.execute(
+                select(func.count()).select_from(event_index).where(event_index.c.kind.in_(CAPTURED))
+            ).scalar_one(),
+            jobs={
+                (row.kind, row.state): row.n
+                for row in connection.execute(
+                    select(jobs.c.kind, jobs.c.state, func.count().label("n")).group_by(jobs.c.kind, jobs.c.state)
+                )
+            },
+            job_seconds=_job_seconds(connection),
+            queue=_queue(connection),
+            devices=[device for run_id in shown for device in _devices(connection, run_id)],
+            workers=len(living_workers(data)),
+            database_bytes=_database_bytes(store.database_path),
+            free_bytes=shutil.disk_usage(data).free,
+        )
+
+
+def _runs(connection: Connection) -> dict[str, int]:
+    known = connection.execute(select(func.count()).select_from(runs).where(runs.c.run_id != SITE)).scalar_one()
+    ended = select(func.count(event_index.c.run_id.distinct())).where(event_index.c.kind == "run_completed")
+    completed = connection.execute(ended).scalar_one()
+    still = len(read_open_runs(connection))
+    return {"completed": completed, "aborted": known - completed - still, "open": still}
+
+
+def _driven(connection: Connection, data: Path, run_id: str) -> DrivenRun:
+    snapshot = read_snapshot(data, run_id)
+    silent_s = snapshot.age_s() if snapshot.at_utc_s else float("inf")
+    return DrivenRun(run_id, snapshot.doing, snapshot.robot, max(0.0, silent_s), _viewpoint_s(connection, run_id))
+
+
+def _viewpoint_s(connection: Connection, run_id: str) -> float | None:
+    of_event = (events.c.run_id == event_index.c.run_id) & (events.c.seq == event_index.c.seq)
+    last = (
+        select(event_index.c.step, events.c.monotonic_s)
+        .join(events, of_event)
+        .where(event_index.c.run_id == run_id, event_index.c.kind.in_(CAPTURED))
+        .order_by(event_index.c.seq.desc())
+        .limit(_LAST_CAPTURES)
+    )
+    rows = connection.execute(last).all()
+    between = [new.monotonic_s - old.monotonic_s for new, old in pairwise(rows) if new.step == old.step]
+    return statistics.median(between) if between else None
+
+
+def _job_seconds(connection: Connection) -> dict[str, tuple[int, float]]:
+    taken_s = (func.julianday(jobs.c.ended_utc) - func.julianday(jobs.c.started_utc)) * 86400
+    found = (
+        select(jobs.c.kind, func.count().label("n"), func.sum(taken_s).label("seconds"))
+        .where(jobs.c.state == "finished", jobs.c.started_utc.is_not(None))
+        .group_by(jobs.c.kind)
+    )
+    return {row.kind: (row.n, max(0.0, float(row.seconds))) for row in connection.execute(found)}
+
+
+def _queue(connection: Connection) -> dict[str, int]:
+    lane = case((jobs.c.priority < EARLY, "waited"), else_="background")
+    found = select(lane.label("lane"), func.count().label("n")).where(jobs.c.state == "queued").group_by(lane)
+    return {"waited": 0, "background": 0} | {row.lane: row.n for row in connection.execute(found)}
+
+
+def _devices(connection: Connection, run_id: str) -> list[DeviceFigures]:
+    of_event = (events.c.run_id == event_index.c.run_id) & (events.c.seq == event_index.c.seq)
+    found = (
+        select(events.c.payload)
+        .join(event_index, of_event)
+        .where(event_index.c.run_id == run_id, event_index.c.kind.in_(("device_opened", "device_trouble")))
+        .order_by(event_index.c.seq)
+    )
+    devices: dict[str, DeviceFigures] = {}
+    for text in connection.execute(found).scalars():
+        payload: dict[str, Any] = parse_canonical(text)
+        name = str(payload["device"])
+        known = devices.get(name)
+        if payload["kind"] == "device_opened":
+            report: dict[str, Any] = payload["report"]
+            kind = str(dict(report.get("identity") or {}).get("kind", ""))
+            problems = len(report.get("problems") or ())
+            devices[name] = DeviceFigures(run_id, name, kind, True, problems)
+        elif known is not None:  # the trouble of what is no device of the rig file names a step
+            devices[name] = DeviceFigures(run_id, name, known.kind, False, known.problems)
+    return list(devices.values())
+
+
+def _database_bytes(path: Path) -> int:
+    """With its write-ahead log."""
+    parts = (path, path.with_name(path.name + "-wal"))
+    return sum(part.stat().st_size for part in parts if part.exists())

@@ -1,0 +1,68 @@
+"""Whether a data folder's database, disk, workers and runners live, in words."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import text
+
+from service.core.errors import OrthocaptureError
+from service.core.space import LEAST_FREE_BYTES
+from service.monitor.snapshot import read_snapshot
+from service.monitor.worker_sign import living_workers
+from service.store.store import Store
+
+_SILENT_S = 60.0  # for which a runner says nothing; fetching one photograph takes less
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """What is wrong with each part; "" for nothing."""
+
+    database: str
+    data_folder: str
+    worker: str
+    runners: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is."""
+        return not (self.database or self.data_folder or self.worker or self.runners)
+
+
+def read_health(store: Store, data: Path, driven: Sequence[str]) -> Health:
+    """Look. The words name neither runs nor people nor paths: whoever asks may not be known."""
+    try:
+        with store.database.reading() as connection:
+            connection.execute(text("SELECT 1 FROM heads LIMIT 1")).all()
+        store.database.require_in_place()
+        database, queued = "", store.open_jobs()
+    except OrthocaptureError as error:
+        database, queued = error.what, 0
+    return Health(database, _data_folder(data), _worker(data, queued), _runners(data, driven))
+
+
+def _data_folder(data: Path) -> str:
+    try:
+        free = shutil.disk_usage(data).free
+    except OSError as error:
+        return f"it cannot be reached: {error.strerror}"
+    if not os.access(data / "artefacts", os.W_OK):
+        return "it cannot be written to"
+    return f"{free / 1e9:.2f} GB are free: too little to capture" if free < LEAST_FREE_BYTES else ""
+
+
+def _worker(data: Path, queued: int) -> str:
+    if not queued or living_workers(data):
+        return ""
+    return f"{queued} jobs wait, and no worker lives"
+
+
+def _runners(data: Path, driven: Sequence[str]) -> str:
+    snapshots = [read_snapshot(data, run_id) for run_id in driven]
+    silent = [snapshot for snapshot in snapshots if snapshot.at_utc_s and snapshot.age_s() > _SILENT_S]
+    return f"{len(silent)} of {len(driven)} runners have said nothing for {_SILENT_S:.0f} s" if silent else ""

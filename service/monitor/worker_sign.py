@@ -1,0 +1,83 @@
+"""That a worker lives: one small file a worker, written again every two seconds, taken away when it ends."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import socket
+import time
+from pathlib import Path
+
+import psutil
+from pydantic import ValidationError
+
+from service.core.model import Record
+
+_EVERY_S = 2.0
+_STALE_S = 15.0
+_log = logging.getLogger(__name__)
+
+
+class WorkerSign(Record):
+    """What a worker says of itself."""
+
+    host: str
+    pid: int
+    at_utc_s: float
+    jobs_done: int
+
+    @property
+    def lives(self) -> bool:
+        """Whether it has written lately, and is not known to be dead."""
+        if self.host == socket.gethostname() and not psutil.pid_exists(self.pid):
+            return False
+        return abs(time.time() - self.at_utc_s) <= _STALE_S
+
+
+class SignOfLife:
+    """The file of this process. What cannot be written is logged: it disturbs no computation."""
+
+    def __init__(self, data: Path) -> None:
+        self._path = _folder(data) / f"{socket.gethostname()}-{os.getpid()}.json"
+        self._due_s = 0.0
+
+    def give(self, jobs_done: int) -> None:
+        """Write it, when it is time again."""
+        now_s = time.monotonic()
+        if now_s < self._due_s:
+            return
+        self._due_s = now_s + _EVERY_S
+        sign = WorkerSign(host=socket.gethostname(), pid=os.getpid(), at_utc_s=time.time(), jobs_done=jobs_done)
+        part = self._path.with_suffix(".part")
+        try:
+            part.parent.mkdir(parents=True, exist_ok=True)
+            part.write_text(sign.model_dump_json())
+            part.replace(self._path)
+        except OSError as error:
+            _log.warning("the worker cannot say that it lives: %s", error)
+
+    def close(self) -> None:
+        """Take it away."""
+        with contextlib.suppress(OSError):
+            self._path.unlink(missing_ok=True)
+
+
+def living_workers(data: Path) -> list[WorkerSign]:
+    """The workers of a data folder that live, as far as is known; files of dead ones are taken away."""
+    found: list[WorkerSign] = []
+    for path in sorted(_folder(data).glob("*.json")):
+        try:
+            sign = WorkerSign.model_validate_json(path.read_bytes())
+        except (OSError, ValidationError):
+            continue
+        if sign.lives:
+            found.append(sign)
+        elif sign.host == socket.gethostname():
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+    return found
+
+
+def _folder(data: Path) -> Path:
+    return data / "monitor" / "workers"

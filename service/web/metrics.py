@@ -1,0 +1,159 @@
+"""The figures of a data folder in Prometheus' words, read anew at each scrape."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric, SummaryMetricFamily
+from prometheus_client.registry import Collector
+
+from service.core.clocks import ClockReading
+from service.core.errors import OrthocaptureError
+from service.core.space import Forecast
+from service.monitor.figures import Figures
+from service.monitor.health import Health
+
+_PREFIX = "orthocapture_"
+
+
+class DataFolderMetrics(Collector):
+    """A collector over one data folder; where the record cannot be read, health alone is told."""
+
+    def __init__(
+        self,
+        figures: Callable[[], Figures],
+        forecasts: Callable[[], Mapping[str, Forecast]],
+        clocks: Callable[[Sequence[str]], Mapping[str, Sequence[ClockReading]]],
+        health: Callable[[], Health],
+    ) -> None:
+        self._figures = figures
+        self._forecasts = forecasts
+        self._clocks = clocks
+        self._health = health
+
+    def describe(self) -> Iterable[Metric]:
+        """Nothing beforehand: registering asks the database nothing."""
+        return ()
+
+    def collect(self) -> Iterable[Metric]:
+        """One scrape."""
+        health = self._health()
+        parts = {
+            "database": health.database,
+            "data_folder": health.data_folder,
+            "worker": health.worker,
+            "runners": health.runners,
+        }
+        yield _gauge(
+            "healthy", "1 where nothing is wrong with a part.", ("part",), {(p,): not w for p, w in parts.items()}
+        )
+        try:
+            figures, forecasts = self._figures(), self._forecasts()
+            clocks = self._clocks(figures.shown)
+        except (OrthocaptureError, OSError):
+            return
+        yield from _record(figures)
+        yield from _processes(figures)
+        yield from _devices(figures)
+        yield from _clocks(clocks)
+        yield _gauge(
+            "forecast_bytes",
+            "What a run that is driven will still write.",
+            ("run",),
+            {(run_id,): space.needed_bytes for run_id, space in forecasts.items()},
+        )
+        yield _gauge(
+            "forecast_views",
+            "Photographs that it will still take.",
+            ("run",),
+            {(run_id,): space.views_left for run_id, space in forecasts.items()},
+        )
+
+
+def _record(figures: Figures) -> Iterable[Metric]:
+    yield _gauge("runs", "Runs by state.", ("state",), {(state,): n for state, n in figures.runs.items()})
+    yield _total("captures", "Photographs recorded, of all runs.", figures.captures)
+    yield _gauge("jobs", "Jobs by kind and state.", ("kind", "state"), figures.jobs)
+    seconds = SummaryMetricFamily(_PREFIX + "job_seconds", "Computing time of finished jobs.", labels=("kind",))
+    for kind, (count, total_s) in figures.job_seconds.items():
+        seconds.add_metric((kind,), count, total_s)
+    yield seconds
+    yield _gauge(
+        "queue_length",
+        "Jobs that nobody computes yet: a step waits for them, or they are background.",
+        ("lane",),
+        {(lane,): n for lane, n in figures.queue.items()},
+    )
+    yield _gauge("database_bytes", "Size of the database with its log.", (), {(): figures.database_bytes})
+    yield _gauge("free_bytes", "Free space on the data folder's disk.", (), {(): figures.free_bytes})
+
+
+def _processes(figures: Figures) -> Iterable[Metric]:
+    yield _gauge("workers", "Workers that live.", (), {(): figures.workers})
+    yield _gauge("driven_runs", "Runs that a process drives now.", (), {(): len(figures.driven)})
+    yield _gauge(
+        "runner_silent_seconds",
+        "Since a runner last said anything.",
+        ("run",),
+        {(run.run_id,): run.silent_s for run in figures.driven if math.isfinite(run.silent_s)},
+    )
+    yield _gauge(
+        "viewpoint_seconds",
+        "Between the last exposures of a run, median.",
+        ("run",),
+        {(run.run_id,): run.viewpoint_s for run in figures.driven if run.viewpoint_s is not None},
+    )
+    yield _gauge(
+        "robot_state",
+        "1 for what the arm of a run does.",
+        ("run", "state"),
+        {(r.run_id, r.robot): 1 for r in figures.driven},
+    )
+
+
+def _devices(figures: Figures) -> Iterable[Metric]:
+    labels = ("run", "device", "kind")
+    yield _gauge(
+        "device_up",
+        "1 for a device that was opened, without trouble since; of the runs that are driven, or else the newest.",
+        labels,
+        {(d.run_id, d.device, d.kind): d.answers for d in figures.devices},
+    )
+    yield _gauge(
+        "device_problems",
+        "What a device reported of itself when it was opened.",
+        labels,
+        {(d.run_id, d.device, d.kind): d.problems for d in figures.devices},
+    )
+
+
+def _clocks(clocks: Mapping[str, Sequence[ClockReading]]) -> Iterable[Metric]:
+    known = {(run_id, clock.device): clock for run_id, found in clocks.items() for clock in found}
+    yield _gauge(
+        "clock_offset_seconds",
+        "A clock minus the one it is compared with: a device's minus the host's, the host's minus the network's.",
+        ("run", "device", "against"),
+        {(*of, clock.against): clock.offset_s for of, clock in known.items() if clock.offset_s is not None},
+    )
+    yield _gauge(
+        "clock_within_limit",
+        "0 for a clock beyond its limit.",
+        ("run", "device"),
+        {of: clock.within for of, clock in known.items() if clock.within is not None},
+    )
+
+
+def _gauge(
+    name: str, text: str, labels: tuple[str, ...], values: Mapping[tuple[str, ...], float]
+) -> GaugeMetricFamily:
+    family = GaugeMetricFamily(_PREFIX + name, text, labels=labels)
+    for of, value in values.items():
+        family.add_metric(of, value)
+    return family
+
+
+def _total(name: str, text: str, value: float) -> Metric:
+    family = CounterMetricFamily(_PREFIX + name, text)
+    family.add_metric((), value)
+    return family
