@@ -15,8 +15,8 @@ from tests.support.rig import REPOSITORY
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 FORGETFUL = """
-from bench.torture.crash import main
-from bench.torture.mortal import MortalFiles
+from bench.torture.crash.__main__ import main
+from bench.torture.crash.mortal import MortalFiles
 MortalFiles.sync_file = lambda _self, _path: None  # a store that writes and renames, and does not sync
 main()
 """

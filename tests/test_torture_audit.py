@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from bench.torture.audit import DOCUMENT, documented_codes, main, problems
-from bench.torture.audit_tally import Tally
+from bench.torture.audit.__main__ import DOCUMENT, documented_codes, main, problems
+from bench.torture.audit.tally import Tally
 
 
 @pytest.fixture(scope="module")

@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from bench.torture.crash_scene import CAMERA, LAYOUT, VIEWPOINTS, CrashRig, prepare_files
-from bench.torture.mortal import MortalFiles, Point
-from bench.torture.remembered import remembering
+from bench.torture.crash.mortal import MortalFiles, Point
+from bench.torture.crash.remembered import remembering
+from bench.torture.crash.scene import CAMERA, LAYOUT, VIEWPOINTS, CrashRig, prepare_files
 from service import runner
 from service.core.fold import fold
 from service.core.gates import evaluate_gates
@@ -113,7 +113,7 @@ class Place:
 
     folder: Path
     files: Path  # what prepare_files has made
-    remember: bool = True  # the answers of jobs, see bench.torture.remembered
+    remember: bool = True  # the answers of jobs, see bench.torture.crash.remembered
 
     @property
     def data(self) -> Path:

@@ -10,7 +10,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from bench.torture.mortal import read_journal
+from bench.torture.crash.mortal import read_journal
 from service.store.database import database_path
 
 

@@ -13,10 +13,10 @@ from typing import Any
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-from bench.torture import audit_outcome as outcome
-from bench.torture.audit_outcome import Verdict, verdict
-from bench.torture.audit_record import Record, put_back
-from bench.torture.audit_tally import Tallies, Tally
+from bench.torture.audit import outcome
+from bench.torture.audit.outcome import Verdict, verdict
+from bench.torture.audit.record import Record, put_back
+from bench.torture.audit.tally import Tallies, Tally
 from service.store.artefacts import record_sha256
 from service.store.checkpoints import RowsDigest, key_fingerprint
 from service.store.checkpoints import statement as signed_text

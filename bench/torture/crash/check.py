@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.torture.crash_run import Place, Role
-from bench.torture.crash_scene import import_list, planned
-from bench.torture.mortal import read_journal
+from bench.torture.crash.mortal import read_journal
+from bench.torture.crash.run import Place, Role
+from bench.torture.crash.scene import import_list, planned
 from service.core.model import Event, JobFinished, OperatorAction, SessionStarted, StepMeasured, View
 from service.evidence import RunLog
 from service.runs import recorded_run

@@ -10,10 +10,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from bench.torture import audit_outcome as outcome
-from bench.torture.audit_outcome import verdict
-from bench.torture.audit_record import Record, put_back
-from bench.torture.audit_tally import Tallies, Tally
+from bench.torture.audit import outcome
+from bench.torture.audit.outcome import verdict
+from bench.torture.audit.record import Record, put_back
+from bench.torture.audit.tally import Tallies, Tally
 from service.store.database import database_path
 from service.store.tables import metadata
 

@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 from sqlalchemy import Connection
 
-from bench.torture.audit_record import Record
+from bench.torture.audit.record import Record
 from service.core.errors import OrthocaptureError
 from service.store import audit, audit_checks, audit_signatures, audit_words, database, signature_log
 from service.store.audit_checks import Fault

@@ -2,7 +2,7 @@
 
 `python -m bench.torture.crash` (or `make torture-crash`) kills at every point, by SIGKILL and by a loss of power, and
 then at random over the real wires. After each death the run is resumed, confirmed, brought to its end and checked:
-bench/torture/crash_check.py says for what. The table goes to bench/results.
+bench/torture/crash/check.py says for what. The table goes to bench/results.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from typing import Any
 import cv2
 
 from bench.machine import commit, machine
-from bench.torture.crash_random import Kill, random_kills
-from bench.torture.crash_sweep import Case, How, Sweep, Verdict
+from bench.torture.crash.random_kills import Kill, random_kills
+from bench.torture.crash.sweep import Case, How, Sweep, Verdict
 
-RESULTS = Path(__file__).parents[1] / "results"
+RESULTS = Path(__file__).parents[2] / "results"
 _WAYS: tuple[How, ...] = ("kill", "power")
 _TWICE = 10  # one case of so many dies once more after the resumption
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from bench.torture import audit_outcome as outcome
-from bench.torture.audit_outcome import Verdict, verdict
-from bench.torture.audit_record import Record, State, put, put_back
-from bench.torture.audit_tally import Tallies, Tally
+from bench.torture.audit import outcome
+from bench.torture.audit.outcome import Verdict, verdict
+from bench.torture.audit.record import Record, State, put, put_back
+from bench.torture.audit.tally import Tallies, Tally
 
 # What is rolled back → whether the second place is compared with.
 WAYS = {

@@ -13,10 +13,10 @@ from pathlib import Path
 from random import Random
 from typing import Literal
 
-from bench.torture.crash_check import ROLES, Outcome, after_the_crash, at_the_end, of_a_beginning, outcome
-from bench.torture.crash_run import Place, Role, prepare, start
-from bench.torture.mortal import Point, points, read_journal
-from bench.torture.power import lose_power
+from bench.torture.crash.check import ROLES, Outcome, after_the_crash, at_the_end, of_a_beginning, outcome
+from bench.torture.crash.mortal import Point, points, read_journal
+from bench.torture.crash.power import lose_power
+from bench.torture.crash.run import Place, Role, prepare, start
 from service.store.store import Store
 
 How = Literal["kill", "power"]

@@ -25,13 +25,13 @@ from pathlib import Path
 from typing import Any
 
 from bench.machine import REPOSITORY, commit, machine
-from bench.torture.audit_edits import Edits
-from bench.torture.audit_flips import ArtefactFlips, DatabaseFlips, LogFlips
-from bench.torture.audit_forger import Forgeries
-from bench.torture.audit_outcome import quickened, verdict
-from bench.torture.audit_record import Record, make_record, put_back
-from bench.torture.audit_rollback import RollBacks
-from bench.torture.audit_tally import Sweep, Tallies, Tally, add_all, in_a_process
+from bench.torture.audit.edits import Edits
+from bench.torture.audit.flips import ArtefactFlips, DatabaseFlips, LogFlips
+from bench.torture.audit.forger import Forgeries
+from bench.torture.audit.outcome import quickened, verdict
+from bench.torture.audit.record import Record, make_record, put_back
+from bench.torture.audit.rollback import RollBacks
+from bench.torture.audit.tally import Sweep, Tallies, Tally, add_all, in_a_process
 
 RESULTS = REPOSITORY / "bench" / "results"
 DOCUMENT = REPOSITORY / "docs" / "evidence.md"

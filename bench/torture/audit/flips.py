@@ -7,10 +7,10 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from bench.torture import audit_outcome as outcome
-from bench.torture.audit_outcome import Verdict, verdict
-from bench.torture.audit_record import WAL_NAME, Record, put_back
-from bench.torture.audit_tally import Tallies, Tally
+from bench.torture.audit import outcome
+from bench.torture.audit.outcome import Verdict, verdict
+from bench.torture.audit.record import WAL_NAME, Record, put_back
+from bench.torture.audit.tally import Tallies, Tally
 from service.store.database import database_path
 from service.store.signature_log import NAME
 from service.store.wal import wal_findings

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, Self
 
-from bench.torture.audit_outcome import Verdict
+from bench.torture.audit.outcome import Verdict
 
 _A_CHANGE_S = 10.0
 

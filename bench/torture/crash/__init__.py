@@ -1,0 +1,1 @@
+"""The sweep of crashes: `make torture-crash`."""
