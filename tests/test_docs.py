@@ -193,12 +193,15 @@ RUN_ELSEWHERE = {
     ),
     "orthocapture layout --spheres spheres.json": "tests/test_layout.py::test_command",
     "make demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
+    'python -m pip install ".[fuzz]"': (
+        "tests/test_torture_fuzz.py::test_every_parser_refuses_bad_input_as_people_can_understand"
+    ),
     "make torture-crash": "tests/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind",
     "python -m bench.torture.crash --sample 100 --random-runs 1": (
         "tests/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
     ),
     **dict.fromkeys(
-        ("make test", "make lint", "make test-versions", "make torture-audit", "make clean"),
+        ("make test", "make lint", "make test-versions", "make torture-audit", "make torture-fuzz", "make clean"),
         "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
     ),
     "orthocapture import FOLDER --data runs": (
@@ -259,6 +262,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("test-versions", ".ci/versions"),
         ("torture-audit", ".venv/bin/python -m bench.torture.audit"),
         ("torture-crash", ".venv/bin/python -m bench.torture.crash"),
+        ("torture-fuzz", ".venv/bin/python -m bench.torture.fuzz --seconds-per-target 60 --record"),
         ("clean", "rm -rf .venv build *.egg-info"),
     ):
         done = subprocess.run(
