@@ -19,10 +19,12 @@ from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
 from tests.support.browser import DESKTOP, PASSWORD, Screen, Served, add_people, chromium, screen, served
 from tests.support.rig import REPOSITORY, orthocapture, simulated_rig
+from tests.support.waiting import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 MOST_MENDS = 4  # of one step, as of the automatic operator
+PRESSED_IN_VAIN = 3  # in the whole run
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +91,7 @@ class Technician:
 
     def __init__(self, tablet: Screen) -> None:
         self.tablet, self.page = tablet, tablet.page
-        self.held = self.signed = 0
+        self.held = self.signed = self.in_vain = 0
         self.mends: Counter[str] = Counter()  # title of a step → how often its advice was followed
 
     def do_what_is_asked(self) -> None:
@@ -116,10 +118,13 @@ class Technician:
             page.wait_for_timeout(400)
 
     def _follow_advice(self, trouble: Locator) -> None:
-        """Try again where the page says what helps and recommends it; any other trouble is an error."""
+        """Try again where the page says what helps and recommends it; any other trouble is an error.
+
+        On a busy machine the watchdog may stop the arm: the page says so, and that a person lets it move on.
+        """
         words = trouble.inner_text(timeout=1_000)
         recommended = self.page.locator("table.ways tbody tr").first.inner_text(timeout=1_000)
-        assert "What helps" in words, words
+        assert "What helps" in words or "gave no sign of life" in words, words
         assert "Recommended" in recommended, words
         assert "with the large button below" in recommended, words
         step = self.page.get_by_role("heading", level=1).inner_text()
@@ -129,33 +134,45 @@ class Technician:
         self._confirm(again)
 
     def _sign(self, sign: Any) -> None:
-        heading = self.page.get_by_role("heading", level=1).inner_text()
+        asked = self._asked()
         sign.click()
         self.page.get_by_label("Your password").fill(PASSWORD)
         self.page.get_by_role("button", name="Sign", exact=True).click()
         expect(self.page.locator("dialog[open]")).to_have_count(0)
         self.signed += 1
-        self._until_something_else_is_asked(heading, lambda: sign.count() == 0)
+        self._until_something_else_is_asked(asked, lambda: sign.count() == 0)
 
     def _confirm(self, confirm: Any) -> None:
-        heading = self.page.get_by_role("heading", level=1).inner_text()
+        asked = self._asked()
         if confirm.get_attribute("data-hold", timeout=1_000):
             confirm.hover()
             self.page.mouse.down()
             self.page.wait_for_timeout(1800)
+            until(lambda: confirm.locator("xpath=self::*[contains(@class, 'held')]").count() == 0, "it was held")
             self.page.mouse.up()
             self.held += 1
         else:
             confirm.click(timeout=5_000)
         self._until_something_else_is_asked(
-            heading, lambda: confirm.count() == 0 or not confirm.is_enabled(timeout=1_000)
+            asked, lambda: confirm.count() == 0 or not confirm.is_enabled(timeout=1_000)
         )
 
-    def _until_something_else_is_asked(self, heading: str, gone: Callable[[], bool]) -> None:
-        """Another step comes, or the same one asks for something else."""
-        deadline_s = time.monotonic() + 60
-        while self.page.get_by_role("heading", level=1).inner_text() == heading and not gone():
-            assert time.monotonic() < deadline_s, heading
+    def _asked(self) -> tuple[str, str]:
+        """The step, and the actions that are offered: the next question may come between two looks."""
+        heading = self.page.get_by_role("heading", level=1).inner_text(timeout=5_000)
+        return heading, self.page.locator(".actions").inner_text(timeout=5_000)
+
+    def _until_something_else_is_asked(self, asked: tuple[str, str], gone: Callable[[], bool]) -> None:
+        """Another step comes, the same one asks for something else, or the page says why not: then he looks again.
+
+        While a page on a busy machine has lost its connection, a press does nothing; then he presses again.
+        """
+        deadline_s = time.monotonic() + 20
+        while self._asked() == asked and not gone() and not self.page.locator("#problem").is_visible():
+            if time.monotonic() > deadline_s:
+                self.in_vain += 1
+                assert self.in_vain <= PRESSED_IN_VAIN, f"{asked}: {self.tablet.words()}"
+                return
             self.page.wait_for_timeout(200)
 
 

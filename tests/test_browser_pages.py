@@ -84,6 +84,8 @@ PAGES: dict[str, tuple[tuple[Role | None, str], ...]] = {
 # What a GET answers with that is no page of its own.
 NO_PAGES = {
     "/vendor/plotly.js",
+    "/health",  # for machines
+    "/metrics",
     "/robots",
     "/runs/{run_id}/parts/{names}",
     "/runs/{run_id}/capture/parts/{names}",

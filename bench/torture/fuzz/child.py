@@ -11,6 +11,7 @@ import contextlib
 import faulthandler
 import importlib
 import json
+import logging
 import os
 import resource
 import shutil
@@ -211,6 +212,7 @@ def main() -> None:
     faulthandler.enable(trace)
     faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
     warnings.simplefilter("ignore")
+    logging.disable(logging.CRITICAL)  # simulators say in their logs what they refuse
     slot = Slot(folder / "slot")
     atheris = importlib.import_module("atheris") if plan["engine"] == "atheris" else None
     with atheris.instrument_imports(include=INSTRUMENTED) if atheris else contextlib.nullcontext():

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import itertools
 import json
-import logging
 import os
 import socket
 import struct
@@ -41,7 +40,6 @@ from simulators.world import Scene
 
 _HOST = f"127.{100 + os.getpid() % 100}.{os.getpid() // 100 % 250}.7"  # the ports of a robot are fixed
 _CYCLES = 4  # of the controller, after the bytes
-logging.disable(logging.CRITICAL)  # simulators say in their logs what they refuse
 
 
 # --- the simulated robot ------------------------------------------------------------------------------------------
