@@ -66,9 +66,11 @@ def test_a_run_says_of_what_it_speaks_and_the_terminal_shows_what_it_showed(
     assert [line["viewpoint"] for line in released] == bench.captured()
     assert {line["step"] for line in released} == {"capture"}
     recorded = [line for line in said if line["event"] == "viewpoint_captured"]
+    with Store.open(tmp_path / "data") as store:
+        events = store.events(bench.run_id)
     assert [(line["viewpoint"], line["seq"]) for line in recorded] == [
         (e.payload.viewpoint, e.seq)  # type: ignore[union-attr]
-        for e in Store.open(tmp_path / "data").events(bench.run_id)
+        for e in events
         if e.payload.kind == "viewpoint_captured"
     ]
     (measured,) = [line for line in said if line["event"] == "step_measured" and line["step"] == "capture"]

@@ -112,10 +112,10 @@ def open_database(data_dir: Path, files: Files) -> Database:
             with database.writing() as connection:
                 _upgrade(connection, path)
         database.require_in_place()
+        files.sync_directory(data_dir)
     except BaseException:
         database.close()
         raise
-    files.sync_directory(data_dir)
     return database
 
 
@@ -159,13 +159,14 @@ def _engine(address: str, *, writable: bool) -> Engine:
     def on_connect(connection: sqlite3.Connection, _record: ConnectionPoolEntry) -> None:
         # The driver's own BEGIN comes too late and is never IMMEDIATE; on_begin below sends it.
         connection.isolation_level = None
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA recursive_triggers = ON")
-        if writable:
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = FULL")
-        else:
-            connection.execute("PRAGMA query_only = ON")
+        pragmas = ["foreign_keys = ON", "recursive_triggers = ON"]
+        pragmas += ["journal_mode = WAL", "synchronous = FULL"] if writable else ["query_only = ON"]
+        try:
+            for pragma in pragmas:
+                connection.execute(f"PRAGMA {pragma}")
+        except sqlite3.Error:  # no database, or a damaged one: the pool does not know of this connection yet
+            connection.close()
+            raise
 
     def on_begin(connection: Connection) -> None:
         writes = connection.get_execution_options().get("writes", False)
