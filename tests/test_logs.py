@@ -59,15 +59,14 @@ def test_a_run_says_of_what_it_speaks_and_the_terminal_shows_what_it_showed(
         with file_log(tmp_path / "data", "runner", run=bench.run_id):
             bench.run()
             _log.warning("the lens is cold")
+        captured, events = bench.captured(), store.events(bench.run_id)
     said = lines(tmp_path / "data")
     assert {(line["process"], line["run"]) for line in said} == {("runner", bench.run_id)}
     assert all(line["at_utc"].endswith("Z") and line["level"] in ("info", "warning") for line in said)
     released = [line for line in said if line["event"] == "the shutter was released"]
-    assert [line["viewpoint"] for line in released] == bench.captured()
+    assert [line["viewpoint"] for line in released] == captured
     assert {line["step"] for line in released} == {"capture"}
     recorded = [line for line in said if line["event"] == "viewpoint_captured"]
-    with Store.open(tmp_path / "data") as store:
-        events = store.events(bench.run_id)
     assert [(line["viewpoint"], line["seq"]) for line in recorded] == [
         (e.payload.viewpoint, e.seq)  # type: ignore[union-attr]
         for e in events
@@ -177,11 +176,11 @@ def test_on_the_last_gigabyte_the_log_stops_with_one_line_and_the_run_goes_on(tm
             free[0] = 2 << 30
             _log.error("this again")
         bench.must_verify()
+        assert len(bench.captured()) == 4
     said = lines(data)
     stops = [number for number, line in enumerate(said) if "no more is written here" in line["event"]]
     assert len(stops) == 1
     assert [line["event"] for line in said[stops[0] + 1 :]] == ["the log goes on: there is space again", "this again"]
-    assert len(bench.captured()) == 4
     assert sum(line["event"] == "viewpoint_captured" for line in said) < 4
 
 
