@@ -1,9 +1,9 @@
 """The fault matrix: every message of every wire spoilt in every way, and what devices and disks do by themselves.
 
-`python -m bench.torture.faults` (or `make torture-faults`) tries every case on a small rig: the real drivers over their
-real wires, the real runner, and a simulated person who takes the first way on that the screen lists. Each case is
-judged by the same rules (bench/torture/faults/rules.py). What happened is compared with the table in docs/faults.md;
-`--record` writes that table, and the results to bench/results.
+`python -m bench.torture.faults` (or `make torture-faults`) tries every case on a small rig: the real drivers over
+their real wires, the real runner, and a simulated person who takes the first way on that the screen lists. Each case
+is judged by the same rules (bench/torture/faults/rules.py). What happened is compared with the table in
+docs/faults.md; `--record` writes that table, and the results to bench/results.
 Exit status: 0 when every rule held and the table is right, 1 otherwise.
 """
 
@@ -132,7 +132,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     differing = differences(verdicts, read_table(DOCUMENT))
     for line in differing:
         print(line)
-    print(f"{len(verdicts)} of {len(cases())} cases, {len(broken)} with a fault, {len(differing)} not as in the table")
+    print(
+        f"{len(verdicts)} of {len(cases())} cases, {len(broken)} with a fault, {len(differing)} not as in the table"
+    )
     if options.out:
         options.out.write_text(json.dumps([verdict.told() for verdict in verdicts], indent=1) + "\n")
     if options.record:

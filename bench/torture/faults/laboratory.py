@@ -19,15 +19,13 @@ from numpy.typing import NDArray
 from drivers.interfaces import Camera, Device, RobotArm
 from service.rig import load_rig
 from service.station import Station
-from service.steps.context import LeaveToMove
+from service.steps.context import LeaveToMove, StationLayout
 from simulators.__main__ import main as simulate
 from tests.support.bench_rig import BenchArm, BenchCamera, numbered
 
 _READY_S = 30.0
-STATIONS = {
-    "arm": {"robot": "robot", "scene_centre_m": [0.75, 0.0, -0.1], "approach_azimuth_deg": 180},
-    "memory": {"robot": "robot", "scene_centre_m": [0.0, 0.8, 0.0], "approach_azimuth_deg": -90},
-}
+_STATION = {"robot": "robot", "scene_centre_m": [0.75, 0.0, -0.1], "approach_azimuth_deg": 180}
+_BENCH = StationLayout("station_1", "robot", (0.0, 0.8, 0.0), (0.0, -1.0, 0.0))  # of the arm in memory
 VIEWS = ("v001", "v002", "v003")
 PROTOCOL = """\
 id: faults
@@ -106,6 +104,10 @@ class Laboratory(Station):
         """See service.steps.context.Devices."""
         return self.shutter if self.shutter is not None else super().camera()
 
+    def layout(self, station: str) -> StationLayout:
+        """See service.steps.context.Devices."""
+        return _BENCH if self.arm is not None else super().layout(station)
+
     def let_move(self, leave: LeaveToMove) -> None:
         """See service.steps.context.Devices."""
         super().let_move(leave)
@@ -121,14 +123,14 @@ class Laboratory(Station):
             super().reopen(device)
 
 
-def write_rig(folder: Path, devices: dict[str, Any], station: str) -> Path:
+def write_rig(folder: Path, devices: dict[str, Any]) -> Path:
     """A rig file."""
     path = folder / "rig.yaml"
     rig = {
         "name": "faults",
         "simulated": True,
         "devices": devices,
-        "stations": {"station_1": STATIONS[station]},
+        "stations": {"station_1": _STATION} if "robot" in devices else {},
         "T_flange_camera_nominal": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]],
         "collision": {"arm": "not in the table"},
         "lens": {"focal_length_mm": 50, "sensor_width_mm": 35.7, "image_px": [900, 600]},

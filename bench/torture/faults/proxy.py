@@ -395,4 +395,3 @@ def start_proxy(wires: list[Wire], spoil: Spoil | None, journal: Path, seed: int
     if ours.recv(1) != b"r":
         raise RuntimeError("the proxy did not start")
     return RunningProxy(pid, ours, journal)
-

@@ -1,4 +1,4 @@
-"""The table in docs/faults.md, and the results: what went wrong, what was done about it, how it ended, what was said."""
+"""The table in docs/faults.md, and the results: what went wrong, what was done about it, how it ended."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from bench.torture.faults.trial import Verdict
 _HEAD = """\
 # What happens when something goes wrong
 
-Made by `make torture-faults`, which tries each case with the real drivers and the real runner, and checks this table
-(docs/torture.md). Each row is one case: what goes wrong, what the program does about it, how the run ends for a person
-who takes the first way on that the screen lists, and the words that the person reads first (N stands for a figure).
+Made by `make torture-faults`, which tries each case with the real drivers and the real runner, and checks this
+table ([torture.md](torture.md)). Each row is one case: what goes wrong, what the program does about it, how the run
+ends for a person who takes the first way on that the screen lists, and the words that the person reads first (N
+stands for a figure).
 
-What is done: *again*, the same view at once, on a device that is opened again where it had gone; *reopen*, the device
-is opened again; *retry*, the step is tried again after a wait; *skip*, a view is given up; *ask*, the run waits for a
-person; *stop*, the program ends with these words and the run is resumed later. Where nothing is done, the case does no
-harm: what comes out is right all the same.
+What is done: *again*, the same view at once, on a device that is opened again where it had gone; *reopen*, the
+device is opened again; *retry*, the step is tried again after a wait; *skip*, a view is given up; *ask*, the run
+waits for a person; *stop*, the program ends with these words and the run is resumed later. Where nothing is done,
+the case does no harm: what comes out is right all the same.
 
 """
 _COLUMNS = "| case | what goes wrong | what is done | how it ends | errors | words on the screen |"
@@ -113,8 +114,8 @@ def report(about: Mapping[str, Any], verdicts: Sequence[Verdict], stem: Path) ->
         f"{len(verdicts)} of {about['cases']} cases in {about['seconds']} s, "
         f"{sum(v.reached for v in verdicts)} in which what was to go wrong did, **{len(broken)} with a fault**.",
         "",
-        "| wire or state | cases | nothing lost, no question | again, reopen or retry | asked | stopped | completed | "
-        "left open | longest s |",
+        "| wire or state | cases | no notice needed | again, reopen or retry | asked | stopped | completed "
+        "| left open | longest s |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     for name, some in sorted(groups.items()):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import pickle
 import re
 import time
 import traceback
@@ -17,11 +18,12 @@ from typing import Any
 from bench.torture.faults import rules
 from bench.torture.faults.acts import ACTS, MENDS, SEAMS
 from bench.torture.faults.case import Case
+from bench.torture.faults.disk import FaultyDisk, JumpingClock
 from bench.torture.faults.laboratory import CT, PROTOCOL, SCAN, VIEWS, Laboratory, Simulators, exposed, write_rig
-from bench.torture.faults.material import ct_folder, scan_folder
+from bench.torture.faults.material import ct_folder, make_material, scan_folder
 from bench.torture.faults.person import ArmEye, LeftError, Motions, Person
 from bench.torture.faults.proxy import RunningProxy, Wire, start_proxy
-from service.core.decide import initial_state
+from service.core.decide import AskOperator, initial_state
 from service.core.errors import OrthocaptureError
 from service.core.model import DeviceOpened, Event, StepFailed, ViewpointCaptured, ViewpointFailed
 from service.core.protocol import parse_protocol
@@ -29,6 +31,7 @@ from service.core.run_state import RunState
 from service.runner import Runner
 from service.runs import recorded_run, start_run
 from service.steps import params_models
+from service.store.database import database_path
 from service.store.store import Store
 from service.worker import loop
 from tests.support.bench_rig import BenchArm, BenchCamera
@@ -69,6 +72,16 @@ class Verdict:
         return asdict(self)
 
 
+@dataclass
+class Session:
+    """How one program that drove the run ended: by itself, by an error, or with a question that is left open."""
+
+    status: str = ""
+    error: OrthocaptureError | None = None
+    open: AskOperator | None = None
+    stopped: list[AskOperator] = field(default_factory=list[AskOperator])
+
+
 class Trial:
     """The case while it runs. Acts and mends (bench/torture/faults/acts.py) reach what they need through it."""
 
@@ -82,6 +95,11 @@ class Trial:
         self.acted = False
         self.ends: list[Callable[[], None]] = []  # what is undone at the end
         self.scene_folder = folder / "export"
+        self.material = folder.parent / "material"
+        self.arm: BenchArm | None = None
+        self.shutter: BenchCamera | None = None
+        self.disk: FaultyDisk | None = None
+        self.clock: JumpingClock | None = None
         self.words: list[str] = []
         self.verdict = Verdict(case.name)
         self._eye: Motions = Motions()
@@ -100,9 +118,7 @@ class Trial:
         devices: dict[str, Any] = {}
         near = self.arm_host[:-1] + "2"
         if scene == "arm":
-            self.simulators.start(
-                "ur", "--host", self.arm_host, "--speed-up", "3", *self._plan(), *self.case.options
-            )
+            self.simulators.start("ur", "--host", self.arm_host, "--speed-up", "3", *self._plan(), *self.case.options)
             ports = (("rtde", 30004), ("dashboard", 29999), ("script", 30003))
             self._wired(*(Wire("robot", kind, (near, port), (self.arm_host, port)) for kind, port in ports))  # type: ignore[arg-type]
             devices["robot"] = {
@@ -129,14 +145,14 @@ class Trial:
                 "timeout_s": 0.3,
             }
         if scene == "scan":
-            scan_folder(self.scene_folder)
+            scan_folder(self.scene_folder, self.material)
             devices["scanner"] = {"driver": "scan_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
         if scene == "ct":
-            ct_folder(self.scene_folder)
+            ct_folder(self.scene_folder, self.material)
             devices["ct"] = {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
-        rig = write_rig(self.folder, devices, "arm" if scene == "arm" else "memory")
-        arm = None if scene == "arm" else BenchArm()
-        shutter = None if scene == "camera" else BenchCamera(picture=exposed)
+        rig = write_rig(self.folder, devices)
+        self.arm = arm = None if scene == "arm" else BenchArm()
+        self.shutter = shutter = None if scene == "camera" else BenchCamera(picture=exposed)
         if arm is not None:
             arm.on_move = self._eye.began
         else:
@@ -179,38 +195,75 @@ class Trial:
 
     def _drive(self, run_id: str, station: Laboratory) -> None:
         person = Person(fix=self._mend, patience=self.case.patience, look=self._look)
-        person.on_show = lambda _what: self._work(run_id)
+        person.on_show = lambda _what: self._work()
         self._arm_now(-1)
         status = ""
         for _ in range(_SESSIONS):
-            try:
-                status = self._session(run_id, station, person)
+            if self.case.scene == "store":
+                ended = self._apart(lambda: self._session(run_id, station, person))
+            else:
+                ended = self._session(run_id, station, person)
+            person.open, person.stopped = ended.open, ended.stopped
+            status = ended.status
+            if ended.error is None:
                 break
-            except LeftError:
-                break
-            except OrthocaptureError as error:
-                # What the command line prints; the person does what it says, and resumes.
-                self.words.append(str(error))
-                self.verdict.policy.append("stop")
-                self.verdict.errors.append(type(error).__name__)
-                if not rules.tells(str(error)):
-                    self.verdict.broken.append(f"no place or no remedy: {type(error).__name__}: {error}")
-                self._mend()
+            # What the command line prints; the person does what it says, and resumes.
+            self.words.append(str(ended.error))
+            self.verdict.policy.append("stop")
+            self.verdict.errors.append(type(ended.error).__name__)
+            if not rules.tells(str(ended.error)):
+                words = f"{type(ended.error).__name__}: {ended.error}"
+                self.verdict.broken.append(f"no place or no remedy: {words}")
+            self._mend()
         self._judge(run_id, person, status)
 
-    def _session(self, run_id: str, station: Laboratory, person: Person) -> str:
-        """As one program that drives the run; the status at its end."""
-        with Store.open(self.data, **SEAMS.get(self.case.act, lambda _trial: {})(self)) as store:
-            protocol, _ = recorded_run(store, run_id)
+    def _session(self, run_id: str, station: Laboratory, person: Person) -> Session:
+        """As one program that drives the run, to its end."""
+        ended = Session()
+        try:
+            with Store.open(self.data, **SEAMS.get(self.case.act, lambda _trial: {})(self)) as store:
+                protocol, _ = recorded_run(store, run_id)
+                try:
+                    ended.status = Runner(store, run_id, protocol, station, person).run().status
+                finally:
+                    station.close()
+        except LeftError:
+            pass
+        except OrthocaptureError as error:
+            ended.error = error
+        ended.open, ended.stopped = person.open, person.stopped
+        return ended
+
+    def _apart(self, session: Callable[[], Session]) -> Session:
+        """In a process of its own, which dies at its end as a program does; arm and camera live on in this one."""
+        path = self.folder / "session.pickle"
+        pid = os.fork()
+        if pid == 0:
+            status = 1
             try:
-                return Runner(store, run_id, protocol, station, person).run().status
+                ended = session()
+                assert self.shutter is not None
+                told = (ended, self._eye, self.shutter.exposures, self.disk, self.acted, self.armed)
+                path.write_bytes(pickle.dumps(told))
+                status = 0
+            except BaseException:  # noqa: BLE001 - the case's process reads the status
+                traceback.print_exc()
             finally:
-                station.close()
+                os._exit(status)
+        _, status = os.waitpid(pid, 0)
+        if status:
+            raise RuntimeError("an exception escaped from the program that drives the run")
+        ended, self._eye, exposures, self.disk, self.acted, self.armed = pickle.loads(path.read_bytes())
+        assert self.shutter is not None
+        self.shutter.exposures = exposures
+        if self.arm is not None:
+            self.arm.on_move = self._eye.began
+        return ended
 
     def _look(self, state: RunState) -> None:
         self._arm_now(len(state.steps["capture"].captured) if "capture" in state.steps else 0)
         if state.current and self.case.scene in ("scan", "ct"):
-            self._work("")
+            self._work()
 
     def _arm_now(self, captured: int) -> None:
         """Arm the fault once so many images are in the record."""
@@ -244,10 +297,11 @@ class Trial:
                 return
             time.sleep(0.1)
 
-    def _work(self, run_id: str) -> None:
+    def _work(self) -> None:
         """What a worker process does, in this one."""
-        del run_id
         if self.case.scene not in ("scan", "ct"):
+            return
+        if not database_path(self.data).exists():
             return
         with Store.open(self.data) as store:
             if store.open_jobs():
@@ -261,7 +315,8 @@ class Trial:
             events = store.events(run_id)
         deeds = self.proxy.deeds() if self.proxy is not None else []
         wire = any(deed["what"] == (self.case.spoil.column if self.case.spoil else "") for deed in deeds)
-        verdict.reached = wire or self.acted or bool(self.case.faults) or self.case.act in SEAMS
+        disk = self.disk is None or self.disk.failed > 0
+        verdict.reached = wire or (self.acted and disk) or bool(self.case.faults)
         verdict.policy = _policy(events) + verdict.policy
         verdict.errors = list(dict.fromkeys([*_errors(events), *verdict.errors]))
         verdict.events = {}
@@ -329,6 +384,7 @@ def prepare_seed(folder: Path) -> Path:
     with Store.open(folder):
         pass
     loaded = parse_protocol(PROTOCOL.replace("DISTANCE", "0.5").encode(), params_models(), name="faults.yaml")
+    make_material(folder.with_name("material"))
     initial_state(loaded.protocol)  # which makes the table of its states
     return folder
 
@@ -343,5 +399,3 @@ def run_in_child(case: Case, folder: Path, seed: int) -> None:
         trial.verdict.broken.append(f"{type(error).__name__} escaped: {error}")
     trial.verdict.words = masked(trial.verdict.words, folder)
     (folder / "verdict.json").write_text(json.dumps(trial.verdict.told()))
-
-
