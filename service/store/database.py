@@ -254,4 +254,4 @@ def _advise(error: DBAPIError) -> str:
         "SQLITE_NOTADB": RESTORE,
         "SQLITE_READONLY": "Check the permissions of the data folder",
         "SQLITE_CANTOPEN": "Check that the data folder exists and its permissions",
-    }.get(str(code), "Nothing of this action was recorded")
+    }.get(str(code), LOOK)

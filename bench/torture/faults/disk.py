@@ -16,9 +16,8 @@ from service.store.seam import DurableFiles, SystemClock
 
 # What SQLite says where the system says this, as its result codes SQLITE_FULL, SQLITE_READONLY, SQLITE_IOERR do.
 _SQLITE = {
-    errno.ENOSPC: "database or disk is full",
-    errno.EROFS: "attempt to write a readonly database",
-    errno.EIO: "disk I/O error",
+    errno.ENOSPC: ("SQLITE_FULL", "database or disk is full"),
+    errno.EROFS: ("SQLITE_READONLY", "attempt to write a readonly database"),
 }
 
 
@@ -98,7 +97,9 @@ class FaultyDisk:
         try:
             self._check("commit", Path())
         except OSError as error:
-            plain = sqlite3.OperationalError(_SQLITE.get(self.number, "disk I/O error"))
+            name, words = _SQLITE.get(self.number, ("SQLITE_IOERR", "disk I/O error"))
+            plain = sqlite3.OperationalError(words)
+            plain.sqlite_errorname = name
             raise OperationalError("COMMIT", None, plain) from error
         commit()
 

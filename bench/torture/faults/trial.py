@@ -25,7 +25,7 @@ from bench.torture.faults.person import ArmEye, LeftError, Motions, Person
 from bench.torture.faults.proxy import RunningProxy, Wire, start_proxy
 from service.core.decide import AskOperator, initial_state
 from service.core.errors import OrthocaptureError
-from service.core.model import DeviceOpened, Event, StepFailed, ViewpointCaptured, ViewpointFailed
+from service.core.model import DeviceOpened, Event, StepFailed, ViewpointFailed
 from service.core.protocol import parse_protocol
 from service.core.run_state import RunState
 from service.runner import Runner
@@ -340,8 +340,6 @@ def _policy(events: Iterable[Event]) -> list[str]:
         payload = event.payload
         if isinstance(payload, ViewpointFailed):
             done.append("skip" if payload.skipped else "again")
-        elif isinstance(payload, ViewpointCaptured) and not all(payload.verdicts.values()):
-            done.append("again")
         elif isinstance(payload, StepFailed):
             done.append(payload.recovery)
         elif isinstance(payload, DeviceOpened):
