@@ -16,7 +16,7 @@ from bench.torture.faults import rules
 from bench.torture.faults.matrix import COLUMNS, cases
 from bench.torture.faults.person import Motions
 from bench.torture.faults.table import Row, differences, read_table, table
-from bench.torture.faults.trial import Verdict, masked
+from bench.torture.faults.verdict import Verdict, masked
 from service.store.store import Store
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.rig import REPOSITORY

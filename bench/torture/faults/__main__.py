@@ -31,7 +31,8 @@ from bench.machine import REPOSITORY, commit, machine
 from bench.torture.faults.case import Case
 from bench.torture.faults.matrix import cases
 from bench.torture.faults.table import differences, read_table, report, table
-from bench.torture.faults.trial import Verdict, prepare_seed, run_in_child
+from bench.torture.faults.trial import prepare_seed, run_in_child
+from bench.torture.faults.verdict import Verdict
 
 DOCUMENT = REPOSITORY / "docs" / "faults.md"
 RESULTS = REPOSITORY / "bench" / "results"

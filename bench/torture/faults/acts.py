@@ -81,12 +81,21 @@ def _background(trial: Trial, work: Callable[[], None]) -> None:
 # --- export folders -------------------------------------------------------------------------------------------
 
 
-def _cut(trial: Trial, share: float = 0.6) -> bytes:
+def _cut(trial: Trial) -> bytes:
     """Leave the beginning of the export; the rest of it."""
     path = trial.scene_folder / SCAN
     data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * share)])
-    return data[int(len(data) * share) :]
+    kept = len(data) * 6 // 10
+    path.write_bytes(data[:kept])
+    return data[kept:]
+
+
+def _truncated(trial: Trial) -> None:
+    _cut(trial)
+
+
+def _empty(trial: Trial) -> None:
+    (trial.scene_folder / SCAN).write_bytes(b"")
 
 
 def _half_written(trial: Trial) -> None:
@@ -234,8 +243,8 @@ ACTS: Mapping[str, Callable[[Trial], None]] = {
     "nothing": lambda _trial: None,
     "slider": lambda trial: _slider(trial, float(trial.case.value["fraction"])),
     "half_written": _half_written,
-    "truncated": lambda trial: _cut(trial) and None,
-    "empty": lambda trial: (trial.scene_folder / SCAN).write_bytes(b"") and None,
+    "truncated": _truncated,
+    "empty": _empty,
     "corrupt": _noise,
     "replaced": _replaced,
     "scaled": lambda trial: _scaled(trial, float(trial.case.value["factor"])),

@@ -134,10 +134,10 @@ def _camera_itself() -> Iterator[Case]:
 
 
 def _more_of_the_robot() -> Iterator[Case]:
-    local = {"options": ("--local",), "act": "nothing"}
-    yield Case("robot/itself/local_control", "arm", "remote control is off", mend="remote", **local)  # type: ignore[arg-type]
-    yield Case("robot/itself/local_control_on", "arm", "remote control is off and stays so", **local)  # type: ignore[arg-type]
-    yield Case("robot/itself/switched_off", "arm", "the controller loses its power", after=1, act="arm_off")
+    own, local = "robot/itself", ("--local",)
+    yield Case(f"{own}/local_control", "arm", "remote control is off", options=local, act="nothing", mend="remote")
+    yield Case(f"{own}/local_control_on", "arm", "remote control is off and stays so", options=local, act="nothing")
+    yield Case(f"{own}/switched_off", "arm", "the controller loses its power", after=1, act="arm_off")
 
 
 def _files() -> Iterator[Case]:

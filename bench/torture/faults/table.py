@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from bench.torture.faults.case import Case
-from bench.torture.faults.trial import Verdict
+from bench.torture.faults.verdict import Verdict
 
 _HEAD = """\
 # What happens when something goes wrong
@@ -96,25 +96,38 @@ def table(cases: Sequence[Case], verdicts: Sequence[Verdict], before: Mapping[st
     return _HEAD + "\n".join(sections)
 
 
-def report(about: Mapping[str, Any], verdicts: Sequence[Verdict], stem: Path) -> None:
-    """The results of this sweep, as JSON and Markdown."""
-    rows = [verdict.told() for verdict in verdicts]
-    stem.with_suffix(".json").write_text(json.dumps({**about, "verdicts": rows}, indent=1) + "\n", encoding="utf-8")
+def report(about: Mapping[str, Any], new: Sequence[Verdict], stem: Path) -> None:
+    """The results as JSON and Markdown; those of the same day that were not tried again stay."""
+    path = stem.with_suffix(".json")
+    before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"sweeps": [], "verdicts": []}
+    rows = {row["name"]: row for row in before["verdicts"]}
+    rows |= {verdict.name: {**verdict.told(), "commit": about["commit"]} for verdict in new}
+    now: dict[str, Any] = {key: about[key] for key in ("options", "commit", "seconds")}
+    sweeps: list[dict[str, Any]] = [*before["sweeps"], now | {"tried": len(new)}]
+    whole = {key: about[key] for key in ("date", "machine", "cases")}
+    whole |= {"sweeps": sweeps, "verdicts": list(rows.values())}
+    path.write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")
+    told = {field.name for field in fields(Verdict)}
+    verdicts = [Verdict(**{key: row[key] for key in row if key in told}) for row in rows.values()]
     groups: dict[str, list[Verdict]] = defaultdict(list)
     for verdict in verdicts:
         groups["/".join(verdict.name.split("/")[:2])].append(verdict)
     broken = [verdict for verdict in verdicts if verdict.broken]
-    command = " ".join(["python -m bench.torture.faults", *about["options"]])
+    commands = [" ".join(["python -m bench.torture.faults", *sweep["options"]]) for sweep in sweeps]
     lines = [
         "# Fault matrix",
         "",
-        f"`{command}`, {about['date']}, {about['commit']}; {about['machine']['processor']}, "
-        f"{about['machine']['cores']} cores shared with other work.",
+        f"{about['date']}; {about['machine']['processor']}, {about['machine']['cores']} cores shared with others.",
         "",
-        f"{len(verdicts)} of {about['cases']} cases in {about['seconds']} s, "
+        *(
+            f"- `{c}`, {s['commit']}: {s['tried']} cases, {s['seconds']} s"
+            for c, s in zip(commands, sweeps, strict=True)
+        ),
+        "",
+        f"{len(verdicts)} of {about['cases']} cases were tried, "
         f"{sum(v.reached for v in verdicts)} in which what was to go wrong did, **{len(broken)} with a fault**.",
         "",
-        "| wire or state | cases | no notice needed | again, reopen or retry | asked | stopped | completed "
+        "| wire or state | cases | nothing | again, reopen or retry | asked | stopped | completed "
         "| left open | longest s |",
         "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]

@@ -6,12 +6,11 @@ import json
 import logging
 import os
 import pickle
-import re
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,9 @@ from bench.torture.faults.laboratory import CT, PROTOCOL, SCAN, VIEWS, Laborator
 from bench.torture.faults.material import ct_folder, make_material, scan_folder
 from bench.torture.faults.person import ArmEye, LeftError, Motions, Person
 from bench.torture.faults.proxy import RunningProxy, Wire, start_proxy
+from bench.torture.faults.verdict import Verdict, errors_of, first_words, listed, masked, policy_of
 from service.core.decide import AskOperator, initial_state
 from service.core.errors import OrthocaptureError
-from service.core.model import DeviceOpened, Event, StepFailed, ViewpointFailed
 from service.core.protocol import parse_protocol
 from service.core.run_state import RunState
 from service.runner import Runner
@@ -37,39 +36,6 @@ from service.worker import loop
 from tests.support.bench_rig import BenchArm, BenchCamera
 
 _SESSIONS = 3  # programs that drive the run, one after the other, where an error ends them
-_DIGITS = re.compile(r"\d+(?:[.,]\d+)*")
-
-
-@dataclass
-class Verdict:
-    """What a case showed.
-
-    Attributes:
-        name: of the case.
-        reached: whether what was to go wrong did.
-        broken: rules that do not hold, in words.
-        policy: what was done about it, in order: `again` (the same viewpoint or step, at once), `reopen`, `retry`
-            (of the step), `skip` (of a viewpoint), `ask`, `stop` (of the program).
-        errors: classes of the errors, in order of their first appearance.
-        words: on the screen.
-        end: `completed`, or the ways on that are listed.
-        events: kinds of the run's events and how many of each.
-        seconds: of all of it.
-    """
-
-    name: str
-    reached: bool = False
-    broken: list[str] = field(default_factory=list[str])
-    policy: list[str] = field(default_factory=list[str])
-    errors: list[str] = field(default_factory=list[str])
-    words: str = ""
-    end: str = ""
-    events: dict[str, int] = field(default_factory=dict[str, int])
-    seconds: float = 0.0
-
-    def told(self) -> dict[str, Any]:
-        """For the file that the sweep reads."""
-        return asdict(self)
 
 
 @dataclass
@@ -119,8 +85,11 @@ class Trial:
         near = self.arm_host[:-1] + "2"
         if scene == "arm":
             self.simulators.start("ur", "--host", self.arm_host, "--speed-up", "3", *self._plan(), *self.case.options)
-            ports = (("rtde", 30004), ("dashboard", 29999), ("script", 30003))
-            self._wired(*(Wire("robot", kind, (near, port), (self.arm_host, port)) for kind, port in ports))  # type: ignore[arg-type]
+            self._wired(
+                Wire("robot", "rtde", (near, 30004), (self.arm_host, 30004)),
+                Wire("robot", "dashboard", (near, 29999), (self.arm_host, 29999)),
+                Wire("robot", "script", (near, 30003), (self.arm_host, 30003)),
+            )
             devices["robot"] = {
                 "driver": "ur",
                 "host": near if self.proxy else self.arm_host,
@@ -317,64 +286,19 @@ class Trial:
         wire = any(deed["what"] == (self.case.spoil.column if self.case.spoil else "") for deed in deeds)
         disk = self.disk is None or self.disk.failed > 0
         verdict.reached = wire or (self.acted and disk) or bool(self.case.faults)
-        verdict.policy = _policy(events) + verdict.policy
-        verdict.errors = list(dict.fromkeys([*_errors(events), *verdict.errors]))
+        verdict.policy = policy_of(events) + verdict.policy
+        verdict.errors = list(dict.fromkeys([*errors_of(events), *verdict.errors]))
         verdict.events = {}
         for event in events:
             verdict.events[event.payload.kind] = verdict.events.get(event.payload.kind, 0) + 1
-        verdict.words = _first_words(events, person, self.words)
-        verdict.end = "completed" if status == "completed" else _listed(person)
+        verdict.words = first_words(events, person.stopped, self.words)
+        verdict.end = "completed" if status == "completed" else listed(person.open)
         if not verdict.end:
             verdict.end = f"the run is {status or 'stopped'}"
             verdict.broken.append(f"{verdict.end}, and no way on is listed")
         views = VIEWS if self.case.scene not in ("scan", "ct") else ()
         logs = (self.folder / "program.log", self.folder / "said.log")
         verdict.broken += rules.broken(events, self._eye, self.data, views, status, logs)
-
-
-def _policy(events: Iterable[Event]) -> list[str]:
-    """What was done, each kind where it came first."""
-    done: list[str] = []
-    opened: set[str] = set()
-    for event in events:
-        payload = event.payload
-        if isinstance(payload, ViewpointFailed):
-            done.append("skip" if payload.skipped else "again")
-        elif isinstance(payload, StepFailed):
-            done.append(payload.recovery)
-        elif isinstance(payload, DeviceOpened):
-            if payload.device in opened:
-                done.append("reopen")
-            opened.add(payload.device)
-        elif payload.kind == "gates_evaluated" and not payload.passed:
-            done.append("ask")
-    return list(dict.fromkeys(done))
-
-
-def _errors(events: Iterable[Event]) -> list[str]:
-    return list(dict.fromkeys(e.payload.error for e in events if isinstance(e.payload, StepFailed | ViewpointFailed)))
-
-
-def _first_words(events: Iterable[Event], person: Person, printed: list[str]) -> str:
-    """What a person read first about it, figures left out."""
-    failed = [e.payload.message for e in events if isinstance(e.payload, StepFailed)]
-    asked = [question.text for question in person.stopped]
-    tried = [e.payload.message for e in events if isinstance(e.payload, ViewpointFailed)]
-    return next(iter([*failed, *printed, *tried, *asked]), "")
-
-
-def masked(words: str, folder: Path | None = None) -> str:
-    """Words without what differs from run to run."""
-    plain = words.replace(str(folder), "…") if folder is not None else words
-    return _DIGITS.sub("N", " ".join(plain.split()))
-
-
-def _listed(person: Person) -> str:
-    """The ways on of the question that was left open."""
-    if person.open is None:
-        return ""
-    ways = [way.verb for way in person.open.ways if way.available and way.verb != "abort"]
-    return f"waits: {', '.join(dict.fromkeys(ways))}" if ways else ""
 
 
 def prepare_seed(folder: Path) -> Path:
