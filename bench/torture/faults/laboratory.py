@@ -74,8 +74,14 @@ steps:
   - id: ct
     kind: ct_import
     title: CT
-    params: {spheres: 3, wait_s: 6}
-    gates: [{measure: slices, min: 20}, {measure: spheres_found, min: 3, max: 3}]
+    params: {spheres: 5, wait_s: 6}
+    gates: [{measure: slices, min: 20}, {measure: spheres_found, min: 5, max: 5}]
+    recovery: {retries: 1, wait_s: 0.2}
+  - id: scan
+    kind: scan_import
+    title: Scan
+    params: {spheres: 5, wait_s: 6, compare_with: ct}
+    gates: [{measure: spheres_compared, min: 5}, {measure: sphere_change_max_mm, max: 1}]
     recovery: {retries: 1, wait_s: 0.2}
 """
 

@@ -16,16 +16,17 @@ from tests.support.sphere_images import REGISTRATION_M
 from tests.support.sphere_meshes import MeshBuilder, cap
 
 SCAN, CT = "scan.ply", "ct"
-_VOXEL_M, _SHAPE = 1.5e-3, (36, 44, 96)
-_CENTRES_MM = np.array([[24.0, 30.0, 26.0], [70.0, 36.0, 28.0], [116.0, 31.0, 25.0]])
+FIVE = "five.ply"
+_VOXEL_M, _SHAPE = 1.5e-3, (56, 72, 96)
+_CENTRES_MM = np.array([[24, 28, 26], [70, 32, 44], [118, 24, 31], [37, 80, 58], [104, 76, 22]], dtype=np.float64)
 _AIR, _PLASTIC = -1000, 120
 
 
 def make_material(folder: Path) -> None:
-    """An export of ten spheres, one of eight, and a CT series of three."""
+    """An export of ten spheres, one of eight, one of five, and a CT series of these five."""
     folder.mkdir()
     rng = np.random.default_rng(3)
-    for name, centres in ((SCAN, REGISTRATION_M), ("eight.ply", REGISTRATION_M[:8])):
+    for name, centres in ((SCAN, REGISTRATION_M), ("eight.ply", REGISTRATION_M[:8]), (FIVE, _CENTRES_MM * 1e-3)):
         built = MeshBuilder()
         for centre in centres:
             built.add(*cap(centre, 1.3, rng, level=4, white_m=2e-5))

@@ -29,6 +29,7 @@ from bench.torture.faults.framing import (
     denied,
     refused,
 )
+from bench.torture.faults.streams import Pipe, Stream
 
 Column = Literal[
     "drop", "stall", "truncate", "corrupt", "duplicate", "reorder", "reject",
@@ -71,59 +72,6 @@ class _Link:
     refusing: bool = False
 
 
-class _Pipe:
-    """A terminal as a stream."""
-
-    def __init__(self, descriptor: int) -> None:
-        self.descriptor = descriptor
-        os.set_blocking(descriptor, False)
-
-    async def read(self) -> bytes:
-        """The next bytes; none when the terminal is gone."""
-        loop = asyncio.get_running_loop()
-        ready = loop.create_future()
-        loop.add_reader(self.descriptor, lambda: ready.done() or ready.set_result(None))
-        try:
-            await ready
-            return os.read(self.descriptor, 65536)
-        except OSError:
-            return b""
-        finally:
-            with contextlib.suppress(OSError, ValueError):
-                loop.remove_reader(self.descriptor)
-
-    async def write(self, data: bytes) -> None:
-        """A serial line is slow to fill."""
-        with contextlib.suppress(OSError):
-            os.write(self.descriptor, data)
-
-
-class _Stream:
-    """A TCP connection as a stream."""
-
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._reader, self._writer = reader, writer
-
-    async def read(self) -> bytes:
-        """The next bytes; none at the end."""
-        try:
-            return await self._reader.read(1 << 16)
-        except OSError:
-            return b""
-
-    async def write(self, data: bytes) -> None:
-        """Raises OSError when the other side has gone."""
-        self._writer.write(data)
-        await self._writer.drain()
-
-    def cut(self) -> None:
-        """With a reset, as a cable that is pulled and a device that is switched off leave it."""
-        link: socket.socket = self._writer.get_extra_info("socket")
-        with contextlib.suppress(OSError):
-            link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        self._writer.transport.abort()
-
-
 class Proxy:
     """All wires of one device. What it did is one JSON line each in `journal`."""
 
@@ -142,7 +90,7 @@ class Proxy:
         """Until the other end of `control` is closed; a byte there arms it."""
         await self._plug_in()
         os.write(control, b"r")
-        pipe = _Pipe(control)
+        pipe = Pipe(control)
         while await pipe.read():
             self._armed = True
             self._note("armed")
@@ -171,17 +119,23 @@ class Proxy:
         link_path.unlink(missing_ok=True)
         link_path.symlink_to(os.ttyname(slave))
         self._terminals.append((master, slave, wire.listen))
-        near_pipe, far_pipe = _Pipe(master), _Pipe(far)
+        near_pipe, far_pipe = Pipe(master), Pipe(far)
 
         def close() -> None:
+            for descriptor in (master, far):
+                asyncio.get_running_loop().remove_reader(descriptor)  # its number is another's soon
+            for pump in pumps:
+                pump.cancel()
             for descriptor in (master, slave, far):
                 with contextlib.suppress(OSError):
                     os.close(descriptor)
 
         link = _Link(close)
         self._links.add(link)
-        self._begin(self._pump(wire, link, near_pipe, far_pipe, answers=False))
-        self._begin(self._pump(wire, link, far_pipe, near_pipe, answers=True))
+        pumps = [
+            self._begin(self._pump(wire, link, near_pipe, far_pipe, answers=False)),
+            self._begin(self._pump(wire, link, far_pipe, near_pipe, answers=True)),
+        ]
 
     def _unplug_terminals(self) -> None:
         for _, _, path in self._terminals:
@@ -192,10 +146,10 @@ class Proxy:
         self, wire: Wire
     ) -> Callable[[asyncio.StreamReader, asyncio.StreamWriter], Coroutine[Any, Any, None]]:
         async def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            near = _Stream(reader, writer)
+            near = Stream(reader, writer)
             assert not isinstance(wire.upstream, str)
             try:
-                far = _Stream(*await asyncio.open_connection(*wire.upstream))
+                far = Stream(*await asyncio.open_connection(*wire.upstream))
             except OSError:
                 near.cut()
                 return
@@ -219,13 +173,14 @@ class Proxy:
 
         return connected
 
-    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+    def _begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+        return task
 
     async def _pump(
-        self, wire: Wire, link: _Link, source: _Stream | _Pipe, target: _Stream | _Pipe, *, answers: bool
+        self, wire: Wire, link: _Link, source: Stream | Pipe, target: Stream | Pipe, *, answers: bool
     ) -> None:
         framer = _framer(wire, link, answers=answers)
         reading: asyncio.Task[bytes] | None = None
@@ -252,7 +207,7 @@ class Proxy:
     # --- messages ---------------------------------------------------------------------------------------
 
     async def _pass(
-        self, wire: Wire, link: _Link, kind: str, message: bytes, target: _Stream | _Pipe, *, answers: bool
+        self, wire: Wire, link: _Link, kind: str, message: bytes, target: Stream | Pipe, *, answers: bool
     ) -> None:
         if answers in link.stalled:
             return

@@ -19,7 +19,7 @@ from bench.torture.faults.acts import ACTS, MENDS, SEAMS
 from bench.torture.faults.case import Case
 from bench.torture.faults.disk import FaultyDisk, JumpingClock
 from bench.torture.faults.laboratory import CT, PROTOCOL, SCAN, VIEWS, Laboratory, Simulators, exposed, write_rig
-from bench.torture.faults.material import ct_folder, make_material, scan_folder
+from bench.torture.faults.material import FIVE, ct_folder, make_material, scan_folder
 from bench.torture.faults.person import ArmEye, LeftError, Motions, Person
 from bench.torture.faults.proxy import RunningProxy, Wire, start_proxy
 from bench.torture.faults.verdict import Verdict, errors_of, first_words, listed, masked, policy_of
@@ -118,6 +118,9 @@ class Trial:
             devices["scanner"] = {"driver": "scan_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
         if scene == "ct":
             ct_folder(self.scene_folder, self.material)
+            scans = self.folder / "scans"
+            scans.mkdir()
+            devices["scanner"] = {"driver": "scan_folder", "folder": str(scans), "stable_s": 0.5}
             devices["ct"] = {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
         rig = write_rig(self.folder, devices)
         self.arm = arm = None if scene == "arm" else BenchArm()
@@ -164,6 +167,7 @@ class Trial:
 
     def _drive(self, run_id: str, station: Laboratory) -> None:
         person = Person(fix=self._mend, patience=self.case.patience, look=self._look)
+        person.on_prepare = lambda: self._prepare(person.prepared[-1][0])
         person.on_show = lambda _what: self._work()
         self._arm_now(-1)
         status = ""
@@ -245,6 +249,11 @@ class Trial:
         if act is not None:
             act(self)
             self.acted = True
+
+    def _prepare(self, step: str) -> None:
+        """A technician does what a step begins with."""
+        if self.case.scene == "ct" and step == "scan":
+            scan_folder(self.folder / "scans", self.material, FIVE)
 
     def _mend(self) -> None:
         mend = MENDS.get(self.case.mend)
