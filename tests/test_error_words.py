@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import errno
 import inspect
 import socket
 import threading
@@ -12,11 +13,14 @@ from pathlib import Path
 
 import pytest
 
+from bench.torture.faults.disk import FaultyDisk
 from drivers import errors as device_errors
 from drivers.ur.link import probe
 from service.core import errors as core_errors
 from service.core.errors import OrthocaptureError
+from service.store.audit import verify
 from service.store.store import Store
+from tests.support.bench_run import PROTOCOL, begin_run
 
 ROOT = Path(__file__).parents[1]
 # Steps and drivers speak to a person whatever they raise; elsewhere some errors are for programmers only.
@@ -74,3 +78,21 @@ def test_a_data_folder_that_is_gone_is_told_with_what_to_do(tmp_path: Path) -> N
         (tmp_path / "aside").rename(tmp_path / "data")
     assert raised_error.value.where
     assert raised_error.value.remedy
+
+
+def test_a_run_that_could_not_be_signed_says_how_it_is(tmp_path: Path) -> None:
+    """The disk is full when the run ends; the run resumed as told is signed, and verifies."""
+    disk = FaultyDisk("append", 1, errno.ENOSPC)
+    with Store.open(tmp_path / "data", files=disk) as store:
+        bench = begin_run(store, PROTOCOL, tmp_path)
+        disk.armed = True
+        bench.run()
+        assert disk.failed
+        told = [words for words in bench.operator.told if words.startswith("the record could not be signed")]
+        assert told
+        assert all(f"`orthocapture resume {bench.run_id}` signs it" in words for words in told)
+        assert any("is not in signatures.jsonl yet" in note for note in verify(tmp_path / "data").notes)
+        disk.mended = True
+        bench.run()
+    assert not any("signatures.jsonl" in note for note in verify(tmp_path / "data").notes)
+    bench.must_verify()
