@@ -22,8 +22,8 @@ stands for a figure).
 
 What is done: *again*, the same view at once, on a device that is opened again where it had gone; *reopen*, the
 device is opened again; *retry*, the step is tried again after a wait; *skip*, a view is given up; *ask*, the run
-waits for a person; *stop*, the program ends with these words and the run is resumed later. Where nothing is done,
-the case does no harm: what comes out is right all the same.
+waits for a person; *told*, the person reads it, and the run goes on; *stop*, the program ends with these words and
+the run is resumed later. Where nothing is done, the case does no harm: what comes out is right all the same.
 
 """
 _COLUMNS = "| case | what goes wrong | what is done | how it ends | errors | words on the screen |"

@@ -35,6 +35,7 @@ from service.store.store import Store
 from service.worker import loop
 from tests.support.bench_rig import BenchArm, BenchCamera
 
+_UNSIGNED = "the record could not be signed"
 _SESSIONS = 3  # programs that drive the run, one after the other, where an error ends them
 
 
@@ -46,6 +47,7 @@ class Session:
     error: OrthocaptureError | None = None
     open: AskOperator | None = None
     stopped: list[AskOperator] = field(default_factory=list[AskOperator])
+    told: list[str] = field(default_factory=list[str])
 
 
 class Trial:
@@ -178,8 +180,14 @@ class Trial:
                 ended = self._session(run_id, station, person)
             person.open, person.stopped = ended.open, ended.stopped
             status = ended.status
-            if ended.error is None:
+            unsigned = [words for words in ended.told if words.startswith(_UNSIGNED)]
+            if ended.error is None and not unsigned:
                 break
+            if ended.error is None:  # the person reads this, does what it says, and resumes: then it is signed
+                self.words += unsigned[:1]
+                self.verdict.policy.append("told")
+                self._mend()
+                continue
             # What the command line prints; the person does what it says, and resumes.
             self.words.append(str(ended.error))
             self.verdict.policy.append("stop")
@@ -193,6 +201,7 @@ class Trial:
     def _session(self, run_id: str, station: Laboratory, person: Person) -> Session:
         """As one program that drives the run, to its end."""
         ended = Session()
+        person.told = []
         try:
             with Store.open(self.data, **SEAMS.get(self.case.act, lambda _trial: {})(self)) as store:
                 protocol, _ = recorded_run(store, run_id)
@@ -204,7 +213,7 @@ class Trial:
             pass
         except OrthocaptureError as error:
             ended.error = error
-        ended.open, ended.stopped = person.open, person.stopped
+        ended.open, ended.stopped, ended.told = person.open, person.stopped, person.told
         return ended
 
     def _apart(self, session: Callable[[], Session]) -> Session:

@@ -23,7 +23,7 @@ class Verdict:
         reached: whether what was to go wrong did.
         broken: rules that do not hold, in words.
         policy: what was done about it, in order: `again` (the same viewpoint or step, at once), `reopen`, `retry`
-            (of the step), `skip` (of a viewpoint), `ask`, `stop` (of the program).
+            (of the step), `skip` (of a viewpoint), `ask`, `told` (and nothing stopped), `stop` (of the program).
         errors: classes of the errors, in order of their first appearance.
         words: on the screen.
         end: `completed`, or the ways on that are listed.
