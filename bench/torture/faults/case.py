@@ -28,8 +28,7 @@ class Case:
         value: what the act needs to know.
         mend: name of what the person does before taking the first way on that the screen lists.
         patience: how many times the same question is answered before the person leaves it open.
-        views: of the capture.
-        stands_alone: the case is also tried in CI.
+        longer_s: what the program itself waits before it asks, beyond the bound of all cases.
     """
 
     name: str
@@ -43,9 +42,10 @@ class Case:
     value: Mapping[str, Any] = field(default_factory=dict[str, Any])
     mend: str = ""
     patience: int = 3
+    longer_s: float = 0.0
 
     @property
     def bound_s(self) -> float:
         """No case may take longer."""
         away_s = AWAY_S.get(self.spoil.column, 0.0) if self.spoil is not None else 0.0
-        return BOUND_S + (away_s or 0.0)
+        return BOUND_S + (away_s or 0.0) + self.longer_s
