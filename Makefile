@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-versions lint format docs bench torture-audit torture-crash torture-fuzz lock clean
+.PHONY: demo test test-versions lint format docs bench torture-audit torture-crash torture-faults torture-fuzz lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -56,6 +56,11 @@ torture-audit: $(TOOLS)
 # Searches for faults that no single test looks for (docs/torture.md); takes most of an hour.
 torture-crash: $(TOOLS)
 	$(BIN)/python -m bench.torture.crash
+
+# Every message of every wire spoilt in every way, and what devices and disks do by themselves (docs/faults.md): hours.
+# MINUTES=30 ends it early; ONLY='robot/rtde/*' chooses. What differs from the table is told.
+torture-faults: $(TOOLS)
+	$(strip $(BIN)/python -m bench.torture.faults $(if $(ONLY),--only '$(ONLY)') $(if $(MINUTES),--minutes $(MINUTES)))
 
 # New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \

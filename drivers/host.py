@@ -355,7 +355,9 @@ def load_spec(spec_path: str) -> DriverSpec:
     try:
         spec = getattr(importlib.import_module(module_name), attribute, None)
     except ImportError as error:
-        raise ConfigurationError(f"driver cannot be imported: {error}", where=spec_path) from error
+        raise ConfigurationError(
+            f"driver cannot be imported: {error}", where=spec_path, remedy="Install what the driver needs"
+        ) from error
     if not isinstance(spec, DriverSpec):
         raise ConfigurationError("this is not a DriverSpec", where=spec_path, remedy="See drivers/plugin.py")
     return spec

@@ -20,6 +20,7 @@ from service.core.run_state import JobState, RunState
 from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
 from service.steps.time_left import Left, missing_results
+from service.store.database import RESTORE
 from service.store.leases import RunLease
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
@@ -29,7 +30,7 @@ def recorded_root(store: Store, run_id: str) -> RunStarted:
     """The first event of a run. Raises IntegrityError where it is of another kind."""
     root = store.first_event(run_id).payload
     if not isinstance(root, RunStarted):
-        raise IntegrityError("the run's first event is not run_started", where=run_id)
+        raise IntegrityError("the run's first event is not run_started", where=run_id, remedy=RESTORE)
     return root
 
 
@@ -137,11 +138,17 @@ class StepEvidence:
             state = self.log.refresh()
             mine = {job.idempotency_key: job for job in state.steps[self.step].jobs.values()}
             if any(key not in mine for key in keys):
-                raise IntegrityError("a job just enqueued is not in the record", where=f"step {self.step}")
+                raise IntegrityError(
+                    "a job just enqueued is not in the record",
+                    where=f"step {self.step}",
+                    remedy="Run `orthocapture audit verify` on the data folder",
+                )
             for key in keys:
                 if mine[key].status == "failed":
                     raise ComputeError(
-                        f"the worker could not do {mine[key].kind}: {mine[key].message}", where=f"step {self.step}"
+                        f"the worker could not do {mine[key].kind}: {mine[key].message}",
+                        where=f"step {self.step}",
+                        remedy="Put right what its words name, or take what is missing; then try again",
                     )
             done = sum(mine[key].status == "finished" for key in keys)
             open_kinds = [mine[key].kind for key in keys if mine[key].status != "finished"]

@@ -402,7 +402,8 @@ class Runner:
         try:
             stamp_end(self.store, self.run_id, self.authority if self._log.state.terminal else None)
         except StoreError as error:
-            self.operator.tell(f"the record could not be signed: {error}")
+            resume = f"`orthocapture resume {self.run_id}` signs it"
+            self.operator.tell(f"the record could not be signed: {error}. Once that is put right, {resume}")
         folder, files = self.store.database_path.parent, self.store.files
         keep_elsewhere(folder, self.signature_copy, self.operator.tell, files)
 

@@ -201,7 +201,15 @@ RUN_ELSEWHERE = {
         "tests/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
     ),
     **dict.fromkeys(
-        ("make test", "make lint", "make test-versions", "make torture-audit", "make torture-fuzz", "make clean"),
+        (
+            "make test",
+            "make lint",
+            "make test-versions",
+            "make torture-audit",
+            "make torture-faults",
+            "make torture-fuzz",
+            "make clean",
+        ),
         "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
     ),
     "orthocapture import FOLDER --data runs": (
@@ -209,6 +217,14 @@ RUN_ELSEWHERE = {
     ),
     "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
         "tests/test_handheld.py::test_the_evidence_verifies"
+    ),
+    **dict.fromkeys(
+        (
+            "python -m bench.torture.faults --only 'robot/rtde/*'",
+            "python -m bench.torture.faults --sample 40 --seed 7 --minutes 10",
+            "python -m bench.torture.faults --record",
+        ),
+        "tests/test_torture_faults.py::test_a_few_cases_of_each_device_go_as_the_table_says",
     ),
     **dict.fromkeys(
         (
@@ -262,6 +278,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("test-versions", ".ci/versions"),
         ("torture-audit", ".venv/bin/python -m bench.torture.audit"),
         ("torture-crash", ".venv/bin/python -m bench.torture.crash"),
+        ("torture-faults", ".venv/bin/python -m bench.torture.faults"),
         ("torture-fuzz", ".venv/bin/python -m bench.torture.fuzz --seconds-per-target 60 --record"),
         ("clean", "rm -rf .venv build *.egg-info"),
     ):

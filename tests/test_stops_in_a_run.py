@@ -217,3 +217,21 @@ def test_a_confirmation_from_before_the_stop_lets_nothing_move(tmp_path: Path, s
         assert run.drive().status == "completed"
     assert run.failures() == ["SafetyStopError"]
     assert run.captured() == VIEWS
+
+
+def test_a_key_turned_to_remote_while_a_person_is_asked_is_seen(tmp_path: Path, store: Store) -> None:
+    """The controller was in local control when it was connected."""
+    host = address(83)
+    with simulated_ur(host, "--speed-up", "3", "--local") as ready:
+        run = Run(store, tmp_path, host)
+
+        def turn_key(question: AskOperator, _state: RunState) -> OperatorAction:
+            assert "local control" in question.text
+            os.kill(int(ready["pid"]), signal.SIGUSR1)
+            time.sleep(0.3)
+            return answer(question, "confirm")
+
+        run.answers(turn_key)
+        assert run.drive().status == "completed"
+    assert run.failures() == ["DeviceRefusedError"]
+    assert run.captured() == VIEWS

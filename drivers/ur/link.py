@@ -63,7 +63,9 @@ def _ask(host: str, port: int, question: bytes | None, timeout_s: float, name: s
                 return
             connection.sendall(question)
             if not connection.recv(64):
-                raise DeviceUnavailableError(f"the {name} server closed the connection", where=where)
+                raise DeviceUnavailableError(
+                    f"the {name} server closed the connection", where=where, remedy="Restart the controller"
+                )
     except TimeoutError:
         remedy = "Restart the controller; check that no firewall swallows the answer"
         raise DeviceUnavailableError(

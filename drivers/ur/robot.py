@@ -71,6 +71,8 @@ READ_BACK_S = 1.0
 TOOL_CHANGE_S = 0.05  # of the controller's clock, for a new tool to show in the stream
 LONGEST_RINGING_S = 10.0  # after a motion; how far back its end is looked for
 MOTION_START_S = 0.06  # for the target velocity to show in the stream
+_RESTART = "Restart the controller; see the log of the pendant if it happens again"
+_SET_ELSEWHERE = "Look on the pendant whether another program sets it, end that, then try again"
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -217,7 +219,9 @@ class UrRobot:
         difference = inverse(self._T_flange_tcp) @ T_flange_tcp - np.eye(4)
         if float(np.max(np.abs(difference))) > 1e-6:
             raise DeviceFaultError(
-                "the tool centre point reads back differently from what was set", where=self._where
+                "the tool centre point reads back differently from what was set",
+                where=self._where,
+                remedy=_SET_ELSEWHERE,
             )
         if _opened(self._facts, self._where).version >= (5, 6):
             receive = _opened(self._receive, self._where)
@@ -260,10 +264,14 @@ class UrRobot:
             joints = control.getInverseKinematics(pose, near)
             if len(joints) != 6:
                 self._raise_unless_running(control)
-                raise DeviceFaultError("inverse kinematics returned no joints", where=self._where)
+                raise DeviceFaultError("inverse kinematics returned no joints", where=self._where, remedy=_RESTART)
             if not control.isJointsWithinSafetyLimits(joints):
                 self._raise_unless_running(control)
-                raise UnreachablePoseError("the pose lies beyond the controller's safety limits", where=self._where)
+                raise UnreachablePoseError(
+                    "the pose lies beyond the controller's safety limits",
+                    where=self._where,
+                    remedy="Choose another viewpoint, or widen the limits on the pendant if that is safe",
+                )
             return joints
 
         return np.asarray(self._perform("inverse kinematics", ask), dtype=np.float64)
@@ -331,11 +339,15 @@ class UrRobot:
     def set_digital_output(self, index: int, on: bool) -> None:
         """See RobotArm."""
         if not 0 <= index <= 7:
-            raise DeviceRefusedError(f"there is no standard digital output {index}", where=self._where)
+            raise DeviceRefusedError(
+                f"there is no standard digital output {index}", where=self._where, remedy="Choose one of 0 to 7"
+            )
         io, receive = _opened(self._io, self._where), _opened(self._receive, self._where)
         with vendor(self._where, "switching a digital output"):
             if not io.setStandardDigitalOut(index, on):
-                raise DeviceRefusedError(f"digital output {index} was not switched", where=self._where)
+                raise DeviceRefusedError(
+                    f"digital output {index} was not switched", where=self._where, remedy=_SET_ELSEWHERE
+                )
         self._read_back(lambda: bool(receive.getActualDigitalOutputBits() >> index & 1) == on, f"output {index}")
 
     # --- parts -------------------------------------------------------------------------------------------
@@ -383,10 +395,17 @@ class UrRobot:
         if state.robot_mode != "RUNNING":
             remedy = "Power the arm on and release its brakes on the pendant"
             return DeviceRefusedError(f"the arm is in mode {state.robot_mode}", where=self._where, remedy=remedy)
-        if self._facts is not None and not self._facts.remote_control:
-            remedy = "Switch the pendant from Local to Remote, then reconnect"
+        if self._facts is not None and not self._facts.remote_control and not self._taken_remote(self._facts):
+            remedy = "Switch the pendant from Local to Remote, then try again"
             return DeviceRefusedError("the controller is in local control", where=self._where, remedy=remedy)
         return None
+
+    def _taken_remote(self, facts: ControllerFacts) -> bool:
+        """Whether somebody has turned the key to Remote since the controller was asked last."""
+        with vendor(self._where, "asking for remote control"):
+            remote = _opened(self._dashboard, self._where).isInRemoteControl()
+        self._facts = dataclasses.replace(facts, remote_control=remote)
+        return remote
 
     def _safety_error(self, sample: RobotSample) -> SafetyStopError:
         name = sample.safety.value.replace("_", " ")
@@ -417,7 +436,7 @@ class UrRobot:
             pose = control.getTCPOffset()
         if len(pose) != 6:
             self._raise_unless_running(control)
-            raise DeviceFaultError("the tool centre point cannot be read back", where=self._where)
+            raise DeviceFaultError("the tool centre point cannot be read back", where=self._where, remedy=_RESTART)
         self._T_flange_tcp = from_rotation_vector(np.array(pose))
         self._tool_read = self._script.sent
 
@@ -449,7 +468,9 @@ class UrRobot:
                 wait(agrees, READ_BACK_S, what, self._where)
             except DeviceTimeoutError:
                 raise DeviceFaultError(
-                    f"the {what} reads back differently from what was set", where=self._where
+                    f"the {what} reads back differently from what was set",
+                    where=self._where,
+                    remedy=_SET_ELSEWHERE,
                 ) from None
 
 
@@ -462,5 +483,7 @@ def _opened(part: T | None, where: str) -> T:
 def _joints(values: Array, where: str) -> list[float]:
     joints = np.asarray(values, dtype=np.float64)
     if joints.shape != (6,) or not np.all(np.isfinite(joints)):
-        raise DeviceRefusedError(f"joints must be six finite numbers, not {values}", where=where)
+        raise DeviceRefusedError(
+            f"joints must be six finite numbers, not {values}", where=where, remedy="Choose another viewpoint"
+        )
     return [float(v) for v in joints]

@@ -116,5 +116,9 @@ def wait(done: Callable[[], bool], timeout_s: float, what: str, where: str) -> N
     deadline_s = time.monotonic() + timeout_s
     while not done():
         if time.monotonic() > deadline_s:
-            raise DeviceTimeoutError(f"waited {timeout_s:g} s for {what}", where=where)
+            raise DeviceTimeoutError(
+                f"waited {timeout_s:g} s for {what}",
+                where=where,
+                remedy="Look at the pendant for what keeps the controller from it, then try again",
+            )
         time.sleep(0.01)

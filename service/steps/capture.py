@@ -138,7 +138,7 @@ class _CaptureLoop:
             self.context.progress("viewpoints", len(self.viewpoints) - len(todo), len(self.viewpoints))
             viewpoint = todo[0]
             if viewpoint.name in refused:
-                self._give_up(viewpoint, UnreachablePoseError(f"the plan leaves it out: {refused[viewpoint.name]}"))
+                self._give_up(viewpoint, _left_out(viewpoint, refused[viewpoint.name]))
                 continue
             try:
                 shot = self._capture_with_retries(viewpoint, todo[1:])
@@ -248,6 +248,14 @@ class _CaptureLoop:
                 skipped=skipped,
             )
         )
+
+
+def _left_out(viewpoint: Viewpoint, why: str) -> UnreachablePoseError:
+    return UnreachablePoseError(
+        f"the plan leaves it out: {why}",
+        where=viewpoint.name,
+        remedy="Move what stands in the way, or choose another viewpoint",
+    )
 
 
 def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, folder: Path) -> CapturedImage:

@@ -155,6 +155,7 @@ def _mean_pose(window: Sequence[RobotSample], settled: SettleReport) -> Exposure
     if not window:
         raise DeviceUnavailableError(
             "the robot's pose stream has no sample during the exposure",
+            where="robot",
             remedy="The image cannot be used without its pose; the viewpoint is taken again",
         )
     poses = np.stack([s.T_base_flange for s in window])
@@ -258,5 +259,7 @@ def camera_record(image: CapturedImage) -> dict[str, object]:
 
 def _rows(T: Transform) -> Matrix4:
     if T.shape != (4, 4):
-        raise DataError(f"a pose is a 4×4 matrix, not {T.shape}")
+        raise DataError(
+            f"a pose is a 4×4 matrix, not {T.shape}", where="robot", remedy="Report this: the driver is at fault"
+        )
     return tuple((float(r[0]), float(r[1]), float(r[2]), float(r[3])) for r in T)

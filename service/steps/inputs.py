@@ -16,6 +16,7 @@ def result_of(context: StepContext, step_id: str) -> Mapping[str, Any]:
     if state is None or not state.result:
         raise ConfigurationError(
             f"step {context.step.id!r} needs the result of step {step_id!r}, which has none",
+            where=f"step {context.step.id}",
             remedy=f"Pass step {step_id!r} first, or correct the protocol",
         )
     return state.result
@@ -28,6 +29,7 @@ def artefact_of(context: StepContext, step_id: str, kind: str) -> ArtefactRef:
     if not found:
         raise ConfigurationError(
             f"step {context.step.id!r} needs a {kind} of step {step_id!r}, which has none",
+            where=f"step {context.step.id}",
             remedy=f"Pass step {step_id!r} first, or correct the protocol",
         )
     return found[-1]
@@ -59,7 +61,11 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[dict[
                 }
             )
     if not images:
-        raise ConfigurationError(f"no usable image from {', '.join(step_ids)}", where=f"step {context.step.id}")
+        raise ConfigurationError(
+            f"no usable image from {', '.join(step_ids)}",
+            where=f"step {context.step.id}",
+            remedy="Take the images again",
+        )
     return images
 
 

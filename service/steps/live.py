@@ -276,7 +276,9 @@ def describe_view(job: JobState) -> str:
 def _result(context: StepContext, step: str, name: str) -> Any:
     found = result_of(context, step).get(name)
     if found is None:
-        raise ConfigurationError(f"step {step!r} gives no {name}", where=f"step {context.step.id}, live")
+        raise ConfigurationError(
+            f"step {step!r} gives no {name}", where=f"step {context.step.id}, live", remedy="Do that step first"
+        )
     return found
 
 

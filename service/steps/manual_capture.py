@@ -135,7 +135,11 @@ def _shared(context: StepContext, params: Params) -> dict[str, Any]:
     if board:
         described = context.protocol.board
         if described is None:
-            raise ConfigurationError("the protocol describes no calibration board", remedy="Add a section `board`")
+            raise ConfigurationError(
+                "the protocol describes no calibration board",
+                where=f"step {context.step.id}",
+                remedy="Add a section `board`",
+            )
         size = {"columns": described.columns, "rows": described.rows, "square_m": described.square_mm / 1000}
         return {**shared, **size, "sensor_width_mm": params.sensor_width_mm}
     if params.calibration is None:

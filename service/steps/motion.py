@@ -74,6 +74,7 @@ def _wait_settled(
         if not safety.may_move:
             raise SafetyStopError(
                 f"the robot reports {safety.value.replace('_', ' ')}",
+                where=context.step.id,
                 remedy="Find and clear the cause at the robot; the step goes on after you confirm",
             )
         if stopped_s is None and not robot.is_moving():
@@ -86,6 +87,7 @@ def _wait_settled(
         if now_s > deadline_s:
             raise DeviceTimeoutError(
                 "the robot did not arrive and settle in time",
+                where=context.step.id,
                 remedy="Look for vibration of the mount or a joint that drifts",
             )
         # The stop is seen up to three polls after it happened.

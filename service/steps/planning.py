@@ -192,6 +192,7 @@ def usual_posture(model: ArmModel, layout: StationLayout, T_flange_camera: Trans
     if joints is None:
         raise ConfigurationError(
             f"the {model.name} does not reach the scene of station {layout.name!r}",
+            where=f"station {layout.name}",
             remedy="Check scene_centre_m and approach_azimuth_deg in the rig file",
         )
     return joints

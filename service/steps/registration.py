@@ -75,7 +75,11 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         found = ways(state, context.step.id, wanted, waited, outlines, root)
         for name in waited:
             if name in found.failed:
-                raise ComputeError(f"no registration with {name} poses: {found.failed[name]}", where=context.step.id)
+                raise ComputeError(
+                    f"no registration with {name} poses: {found.failed[name]}",
+                    where=context.step.id,
+                    remedy="Put right what these words name, or take what is missing; then try again",
+                )
         context.progress(_words(found), len(found.arrived.keys() & set(waited)), len(waited))
         if all(name in found.arrived for name in waited):
             return _outcome(found)

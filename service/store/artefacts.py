@@ -15,6 +15,7 @@ from sqlalchemy import Connection, Row, insert, select
 
 from service.core.errors import IntegrityError, StoreError
 from service.core.model import ArtefactRef, Event
+from service.store.database import RESTORE
 from service.store.events import canonical_parsed, references, sha256_text
 from service.store.records import Artefact, NewArtefact
 from service.store.seam import Files, Ids
@@ -178,6 +179,7 @@ def _check_arrival(sha256: str, expected_sha256: str | None) -> None:
     if expected_sha256 is not None and sha256 != expected_sha256:
         raise StoreError(
             f"the file changed on its way: SHA-256 {sha256} instead of {expected_sha256}",
+            where="artefacts",
             remedy="Fetch it from the device again",
         )
 
@@ -231,7 +233,9 @@ def _insert(
     path = folder.path(artefact.ref.sha256)
     size = path.stat().st_size
     if size != artefact.ref.size_bytes:
-        raise IntegrityError(f"the file has {size} bytes instead of {artefact.ref.size_bytes}", where=str(path))
+        raise IntegrityError(
+            f"the file has {size} bytes instead of {artefact.ref.size_bytes}", where=str(path), remedy=RESTORE
+        )
     fields: dict[str, Any] = {
         "run_id": event.run_id,
         "seq": event.seq,

@@ -21,7 +21,7 @@ from service.store import audit
 from service.store.artefacts import chunks_of, hash_file, relative_path
 from service.store.backup_folder import PART, STATE_FILE, BackupFolder, BackupState, folder_errors
 from service.store.checkpoints import read_every_checkpoint
-from service.store.database import DATABASE_NAME, open_read_only
+from service.store.database import DATABASE_NAME, LOOK, open_read_only
 from service.store.keys import FOLDER as KEYS
 from service.store.keys import KeyFolder
 from service.store.seam import Clock, DurableFiles, Files, RandomIds, SystemClock, utc_text
@@ -168,7 +168,7 @@ class _Backup:
                     raw.backup(copy)
                     copy.execute("PRAGMA journal_mode = DELETE")  # one file, which reading does not change
         except sqlite3.Error as error:
-            raise StoreError(f"the database could not be copied: {error}", where=str(target)) from error
+            raise StoreError(f"the database could not be copied: {error}", where=str(target), remedy=LOOK) from error
         finally:
             source.close()
         self.folder.files.sync_file(target)

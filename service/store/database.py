@@ -22,6 +22,7 @@ DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0
 REVISIONS = ("0001", "0002", "0003", "0004")  # of migrations/versions, in order
 RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
+LOOK = "Look at the disk of the data folder: room, cable, permissions; then resume the run. What was recorded is safe"
 _MIGRATIONS = Path(__file__).with_name("migrations")
 
 
@@ -234,10 +235,10 @@ def _store_errors(path: Path) -> Generator[None]:
             "the database is damaged: it holds text that is no UTF-8", where=str(path), remedy=RESTORE
         ) from error
     except SQLAlchemyError as error:
-        raise StoreError(f"the database refused: {error}", where=str(path)) from error
+        raise StoreError(f"the database refused: {error}", where=str(path), remedy=LOOK) from error
     except OSError as error:
         raise StoreError(
-            f"the data folder refused: {error.strerror or error}", where=str(error.filename or path)
+            f"the data folder refused: {error.strerror or error}", where=str(error.filename or path), remedy=LOOK
         ) from error
 
 
@@ -254,4 +255,4 @@ def _advise(error: DBAPIError) -> str:
         "SQLITE_NOTADB": RESTORE,
         "SQLITE_READONLY": "Check the permissions of the data folder",
         "SQLITE_CANTOPEN": "Check that the data folder exists and its permissions",
-    }.get(str(code), "Nothing of this action was recorded")
+    }.get(str(code), LOOK)

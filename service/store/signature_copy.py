@@ -7,6 +7,7 @@ from pathlib import Path
 
 from service.core.errors import IntegrityError, StoreError
 from service.store.audit_checks import Fault
+from service.store.database import LOOK
 from service.store.seam import DurableFiles, Files
 from service.store.signature_log import NAME
 
@@ -59,7 +60,9 @@ def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
         StoreError: the copy is missing or cannot be read.
     """
     if not copy.exists():
-        raise StoreError("there is no such copy of the log of signatures", where=str(copy))
+        raise StoreError(
+            "there is no such copy of the log of signatures", where=str(copy), remedy="Name the copy of this folder"
+        )
     log, held = (_whole_lines(_bytes(path)).splitlines(keepends=True) for path in (data_dir / NAME, copy))
     for number, line in enumerate(held, start=1):
         if number > len(log):
@@ -81,4 +84,6 @@ def _bytes(path: Path) -> bytes:
     except FileNotFoundError:
         return b""
     except OSError as error:
-        raise StoreError(f"the log of signatures cannot be read: {error.strerror}", where=str(path)) from error
+        raise StoreError(
+            f"the log of signatures cannot be read: {error.strerror}", where=str(path), remedy=LOOK
+        ) from error

@@ -95,6 +95,12 @@ class SignatureLog:
             raise _unwritten(self.path, error) from error
 
 
+def unlogged(checkpoints: Sequence[Checkpoint], lines: Sequence[Line]) -> bool:
+    """Whether a signature has no line yet: the log could not be written when it was made."""
+    held = {(one.checkpoint.run_id, one.checkpoint.seq) for one in lines if one.checkpoint is not None}
+    return any((one.run_id, one.seq) not in held for one in checkpoints)
+
+
 def _unwritten(path: Path, error: OSError) -> StoreError:
     return StoreError(
         f"what is signed cannot be written down: {error.strerror or error}",

@@ -25,7 +25,7 @@ from service.store.events import read_head
 from service.store.keys import KeyFolder, public_bytes
 from service.store.records import SITE, Checkpoint
 from service.store.seam import utc_text
-from service.store.signature_log import SignatureLog
+from service.store.signature_log import SignatureLog, unlogged
 from service.store.soundness import require_sound
 from service.store.store import Store
 from service.store.tables import runs
@@ -68,17 +68,19 @@ def checkpoint(store: Store, run_id: str) -> Checkpoint:
         if lines is None:
             log.begin()
             lines = []
+        every = read_every_checkpoint(connection)
         signed = _signed_end(connection, run_id)
-        if signed is not None:
+        if signed is not None and not unlogged(every, lines):
             return signed
         key = _present_key(store, connection)
-        signed = _sign(store, connection, run_id, key)
-        if run_id != SITE:
-            require_sound(store, connection, SITE, lines)
-            entry = RunSigned(run=run_id, seq=signed.seq, sha256=signed.sha256)
-            store.append_site(connection, [entry], actor=_ACTOR)
-            _sign(store, connection, SITE, key)
-        every = read_every_checkpoint(connection)  # also those before whose lines a power cut came
+        if signed is None:
+            signed = _sign(store, connection, run_id, key)
+            if run_id != SITE:
+                require_sound(store, connection, SITE, lines)
+                entry = RunSigned(run=run_id, seq=signed.seq, sha256=signed.sha256)
+                store.append_site(connection, [entry], actor=_ACTOR)
+                _sign(store, connection, SITE, key)
+            every = read_every_checkpoint(connection)  # also those whose lines a power cut or a full disk kept out
     log.add(every, key)
     return signed
 

@@ -17,7 +17,7 @@ from service.core.priorities import Lane
 from service.store import jobs as queue
 from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, read_artefacts
 from service.store.checkpoints import read_checkpoints, read_timestamps
-from service.store.database import Database, database_path, open_database
+from service.store.database import LOOK, RESTORE, Database, database_path, open_database
 from service.store.errors import UnknownRunError
 from service.store.events import ROOT, append, read_events, to_event
 from service.store.leases import RunLease, acquire, check_lease, held_runs, is_held
@@ -108,7 +108,7 @@ class Store:
             return shutil.disk_usage(self.database_path.parent).free
         except OSError as error:
             raise StoreError(
-                f"the data folder cannot be reached: {error.strerror}", where=str(error.filename)
+                f"the data folder cannot be reached: {error.strerror}", where=str(error.filename), remedy=LOOK
             ) from error
 
     def close(self) -> None:
@@ -265,7 +265,7 @@ class Store:
             self._require_run(connection, run_id)
             row = connection.execute(select(events).where(events.c.run_id == run_id, events.c.seq == 1)).one_or_none()
         if row is None:
-            raise IntegrityError("the run has no first event", where=run_id)
+            raise IntegrityError("the run has no first event", where=run_id, remedy=RESTORE)
         return to_event(row)
 
     def head(self, run_id: str) -> int:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from service.core.errors import StoreError
 from service.store.audit_checks import Fault
-from service.store.database import DATABASE_NAME
+from service.store.database import DATABASE_NAME, LOOK
 
 _HEADER = struct.Struct(">8I")
 _FRAME = struct.Struct(">6I")
@@ -46,7 +46,9 @@ def _passed_over(log: Path) -> int:
     except FileNotFoundError:
         return 0
     except OSError as error:
-        raise StoreError(f"the write-ahead log cannot be read: {error.strerror}", where=str(log)) from error
+        raise StoreError(
+            f"the write-ahead log cannot be read: {error.strerror}", where=str(log), remedy=LOOK
+        ) from error
     if len(content) <= _HEADER.size:
         return 0
     magic, _format, page, _checkpoint, *salts, one, two = _HEADER.unpack_from(content)

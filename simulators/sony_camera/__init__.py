@@ -9,6 +9,7 @@ from pathlib import Path
 
 from simulators.serve import SimulatorError, Termination, announce
 from simulators.sony_camera.body import BodyOptions, CameraBody
+from simulators.sony_camera.properties import Code
 from simulators.sony_camera.scene import ImageSource, PictureFiles, StillLife, WorldSource
 from simulators.sony_camera.server import CameraServer
 
@@ -27,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first-counter", type=int, default=1, help="number of the first file")
     parser.add_argument("--announce", choices=("event", "property", "both"), default="both", help="of a new file")
     parser.add_argument("--send-to", type=Path, metavar="DIR", help="no cable: send every file into this folder")
+    parser.add_argument("--battery", type=int, default=87, metavar="PERCENT", help="charge of the battery")
     parser.add_argument("--fast", action="store_true", help="exposures take no time")
 
 
@@ -59,6 +61,7 @@ def serve(args: argparse.Namespace) -> None:
     options = BodyOptions(args.fast, args.first_counter, args.exposures_log, args.announce, args.send_to)
     source, stop = _source(args), threading.Event()
     body = CameraBody(source, args.faults, options)
+    body.properties.put(Code.BATTERY, args.battery)
     if isinstance(source, WorldSource):
         threading.Thread(target=source.warm_up, args=(stop,), name="warm-up", daemon=True).start()
         threading.Thread(target=_attend_button, args=(source, body, stop), name="button", daemon=True).start()

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -167,11 +167,13 @@ class CameraBody:
         self, moment: Moment, settings: ExposureSettings, shot: Shot, fault: Fault | None
     ) -> list[CameraFile]:
         picture = self._lens.picture(self._source.develop(moment, settings), fault, moment.view)
+        if fault is not None and fault.kind == "wrong_exif":  # somebody turned a dial at the last moment
+            shot = replace(shot, settings=replace(settings, iso=2 * settings.iso))
         captured = f"{shot.taken:%Y%m%dT%H%M%S}"
         height, width = picture.shape[:2]
         stem = f"DSC{(moment.counter - 1) % 9999 + 1:05d}"
         files: list[CameraFile] = []
-        if settings.file_format != FILE_RAW:
+        if settings.file_format != FILE_RAW and not (fault is not None and fault.kind == "raw_only"):
             jpeg = encode_jpeg(picture, shot)
             files.append(CameraFile(f"{stem}.JPG", FORMAT_JPEG, jpeg, width, height, captured))
         if settings.file_format != FILE_JPEG:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import os
+import signal
+from types import FrameType
 
 import numpy as np
 
@@ -23,11 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="motions take 1/N of their time")
     parser.add_argument("--initial-joints", default="", metavar="Q1,…,Q6", help="joints at start-up in radians")
     parser.add_argument("--world", default="", metavar="HOST:PORT", help="world socket that is told the joints")
+    parser.add_argument("--local", action="store_true", help="in local control, until SIGUSR1 turns the key")
     parser.add_argument("--arm", default="robot", help="name of the arm in the world and in fault plans")
 
 
 def serve(args: argparse.Namespace) -> None:
-    """Listen, announce, serve until SIGTERM. Raises SimulatorError."""
+    """Listen, announce, serve until SIGTERM; SIGUSR1 turns the pendant's key. Raises SimulatorError."""
     termination = Termination(with_parent=args.with_parent)
     model = MODELS[args.model]
     controller = Controller(
@@ -39,6 +43,13 @@ def serve(args: argparse.Namespace) -> None:
         device=args.arm,
         speed_up=args.speed_up,
     )
+    controller.local = args.local
+
+    def turn_key(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        controller.local = not controller.local
+
+    signal.signal(signal.SIGUSR1, turn_key)
     world = None
     if args.world:
         host, _, port = args.world.rpartition(":")
@@ -52,6 +63,7 @@ def serve(args: argparse.Namespace) -> None:
         model=args.model,
         version=args.version,
         serial=controller.serial,
+        pid=os.getpid(),
     )
     try:
         server.run(termination)

@@ -92,6 +92,7 @@ class Controller:
         self.payload_kg, self.payload_cog_m, self.payload_inertia = 0.0, [0.0] * 3, [0.0] * 6
         self.tcp_pose_m = np.zeros(6)
         self.speed_fraction = 1.0
+        self.local = False  # the pendant's key: nobody commands from outside
         self.digital_outputs = 0
         self.analog_outputs = [0.0, 0.0]
         self.operational_since_s = 0.0

@@ -13,11 +13,12 @@ _FIXED = {
     "close popup": "closing popup",
     "close safety popup": "closing safety popup",
     "restart safety": "Restarting safety",
-    "is in remote control": "true",
     "get operational mode": "NONE",
     "quit": "Disconnected",
     "shutdown": "Shutting down",
 }
+
+_REMOTE_ONLY = ("power on", "brake release", "play", "unlock protective stop")
 
 
 class Dashboard:
@@ -36,6 +37,8 @@ class Dashboard:
         queries = self._queries()
         if word in queries:
             return queries[word]()
+        if self._controller.local and word in _REMOTE_ONLY:
+            return f"{command} is not allowed due to safety reasons: the robot is in local control"
         return self._act(command, word)
 
     def _queries(self) -> dict[str, Callable[[], str]]:
@@ -49,6 +52,7 @@ class Dashboard:
             "robotmode": lambda: f"Robotmode: {c.robot_mode.name}",
             "safetymode": lambda: f"Safetymode: {c.safety.name}",
             "safetystatus": lambda: f"Safetystatus: {c.safety.name}",
+            "is in remote control": lambda: str(not c.local).lower(),
             "running": lambda: f"Program running: {str(c.runtime is Runtime.PLAYING).lower()}",
             "programstate": lambda: f"{c.runtime.name} {loaded or '<unnamed>'}",
             "get loaded program": lambda: f"Loaded program: {loaded}" if loaded else "No program loaded",

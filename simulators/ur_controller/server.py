@@ -206,7 +206,9 @@ class ScriptLink(Link):
     def receive(self, data: bytes) -> None:
         """Script text."""
         for program in self._reader.feed(data):
-            if not self._server.faulty(self, "script"):
+            if self._server.controller.local:
+                _LOG.warning("a program was left out: the controller is in local control")
+            elif not self._server.faulty(self, "script"):
                 self._server.interpreter.load(program)
 
 

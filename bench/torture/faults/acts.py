@@ -1,0 +1,274 @@
+"""What somebody or something does in a case besides the wire, and what the person does before going on."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import socket
+import sqlite3
+import struct
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from random import Random
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import trimesh
+
+from bench.torture.faults.disk import FaultyDisk, JumpingClock
+from bench.torture.faults.material import SCAN, ct_folder, mirrored_ct, other_ct, scan_folder, spoilt_ct
+from service.store.database import database_path
+from tests.support.ur_rtde_protocol import RtdeClient
+
+if TYPE_CHECKING:
+    from bench.torture.faults.trial import Trial
+
+_DASHBOARD = 29999
+
+
+def _say(trial: Trial, *orders: str) -> list[str]:
+    """To the simulated controller's dashboard, as at the pendant."""
+    with (
+        socket.create_connection((trial.arm_host, _DASHBOARD), timeout=3) as link,
+        link.makefile("rw") as lines,
+    ):
+        lines.readline()
+        answers: list[str] = []
+        for order in orders:
+            lines.write(f"{order}\n")
+            lines.flush()
+            answers.append(lines.readline().strip())
+        return answers
+
+
+def _slider(trial: Trial, fraction: float) -> None:
+    """Somebody moves the speed slider at the pendant."""
+    client = RtdeClient(trial.arm_host)
+    recipe, _ = client.input_setup(["speed_slider_mask", "speed_slider_fraction"])
+    client.send("U", struct.pack(">BId", recipe, 1, fraction))
+    time.sleep(0.1)
+    client.close()
+
+
+def _unlock(trial: Trial) -> None:
+    """The protective stop, which the controller releases some seconds after it happened."""
+    deadline_s = time.monotonic() + 15.0
+    while time.monotonic() < deadline_s:
+        if _say(trial, "unlock protective stop")[0].startswith(("Protective stop rel", "Failed")):
+            return
+        time.sleep(0.3)
+
+
+def _power_up(trial: Trial) -> None:
+    """Turn the emergency stop out, power on, release the brakes."""
+    deadline_s = time.monotonic() + 15.0
+    while time.monotonic() < deadline_s:
+        _say(trial, "power on", "brake release")
+        if "RUNNING" in _say(trial, "robotmode")[0]:
+            return
+        time.sleep(0.3)
+
+
+def _background(trial: Trial, work: Callable[[], None]) -> None:
+    """While the run goes on."""
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    trial.ends.append(lambda: thread.join(20.0))
+
+
+# --- export folders -------------------------------------------------------------------------------------------
+
+
+def _cut(trial: Trial) -> bytes:
+    """Leave the beginning of the export; the rest of it."""
+    path = trial.scene_folder / SCAN
+    data = path.read_bytes()
+    kept = len(data) * 6 // 10
+    path.write_bytes(data[:kept])
+    return data[kept:]
+
+
+def _truncated(trial: Trial) -> None:
+    _cut(trial)
+
+
+def _empty(trial: Trial) -> None:
+    (trial.scene_folder / SCAN).write_bytes(b"")
+
+
+def _half_written(trial: Trial) -> None:
+    rest = _cut(trial)
+
+    def go_on() -> None:
+        time.sleep(2.0)
+        with (trial.scene_folder / SCAN).open("ab") as export:
+            export.write(rest)
+
+    _background(trial, go_on)
+
+
+def _replaced(trial: Trial) -> None:
+    """Exported again and again for some seconds: whenever it is read, it changes."""
+    path = trial.scene_folder / SCAN
+    whole = (trial.material / SCAN).read_bytes()
+    other = (trial.material / "eight.ply").read_bytes()
+
+    def go_on() -> None:
+        until_s = time.monotonic() + 3.0
+        while time.monotonic() < until_s:
+            for data in (other, whole):
+                path.write_bytes(data)
+                time.sleep(0.05)
+
+    _background(trial, go_on)
+
+
+def _noise(trial: Trial) -> None:
+    path = trial.scene_folder / SCAN
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 256] = Random(trial.seed).randbytes(256)
+    path.write_bytes(bytes(data))
+
+
+def _scaled(trial: Trial, factor: float) -> None:
+    mesh = trimesh.load_mesh(trial.material / SCAN, process=False)
+    trimesh.Trimesh(np.asarray(mesh.vertices) * factor, mesh.faces, process=False).export(trial.scene_folder / SCAN)
+
+
+def _away(trial: Trial, seconds: float | None) -> None:
+    """The share is gone, and comes back or does not."""
+    aside = trial.scene_folder.with_name("aside")
+    trial.scene_folder.rename(aside)
+
+    def back() -> None:
+        assert seconds is not None
+        time.sleep(seconds)
+        aside.rename(trial.scene_folder)
+
+    if seconds is not None:
+        _background(trial, back)
+
+
+def _emptied(trial: Trial) -> None:
+    for path in list(trial.scene_folder.rglob("*")):
+        if path.is_file():
+            path.unlink()
+
+
+def _ct(trial: Trial, kind: str) -> None:
+    _emptied(trial)
+    if kind == "mirrored":
+        mirrored_ct(trial.scene_folder)
+    elif kind == "two_series":
+        ct_folder(trial.scene_folder, trial.material)
+        other_ct(trial.scene_folder)
+    else:
+        spoilt_ct(trial.scene_folder, kind)
+
+
+def _whole_scan(trial: Trial) -> None:
+    """Scanned and exported again."""
+    scan_folder(trial.scene_folder, trial.material)
+
+
+def _whole_ct(trial: Trial) -> None:
+    _emptied(trial)
+    ct_folder(trial.scene_folder, trial.material)
+
+
+def _share_back(trial: Trial) -> None:
+    aside = trial.scene_folder.with_name("aside")
+    if aside.exists():
+        aside.rename(trial.scene_folder)
+
+
+# --- disk, database, clock ------------------------------------------------------------------------------------
+
+
+def _faulty_disk(trial: Trial) -> dict[str, Any]:
+    """Keywords of Store.open."""
+    if trial.disk is None:
+        value = trial.case.value
+        trial.disk = FaultyDisk(str(value["effect"]), int(value["nth"]), int(value["errno"]))
+    return {"files": trial.disk}
+
+
+def _arm_disk(trial: Trial) -> None:
+    assert trial.disk is not None
+    trial.disk.armed = True
+
+
+def _mend_disk(trial: Trial) -> None:
+    assert trial.disk is not None
+    trial.disk.mended = True
+
+
+def _jumping(trial: Trial) -> dict[str, Any]:
+    trial.clock = trial.clock or JumpingClock()
+    return {"clock": trial.clock}
+
+
+def _jump(trial: Trial) -> None:
+    assert trial.clock is not None
+    trial.clock.ahead_s = float(trial.case.value["seconds"])
+
+
+def _lock(trial: Trial) -> None:
+    """Another program holds the database for writing: a browser of databases that somebody has left open."""
+
+    def hold() -> None:
+        with closing(sqlite3.connect(database_path(trial.data), timeout=10.0, isolation_level=None)) as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            time.sleep(float(trial.case.value["seconds"]))
+            connection.execute("ROLLBACK")
+
+    _background(trial, hold)
+
+
+def _data_away(trial: Trial) -> None:
+    trial.data.rename(trial.data.with_name("data-aside"))
+
+
+def _data_back(trial: Trial) -> None:
+    aside = trial.data.with_name("data-aside")
+    if aside.exists():
+        shutil.rmtree(trial.data, ignore_errors=True)
+        aside.rename(trial.data)
+
+
+ACTS: Mapping[str, Callable[[Trial], None]] = {
+    "nothing": lambda _trial: None,
+    "slider": lambda trial: _slider(trial, float(trial.case.value["fraction"])),
+    "half_written": _half_written,
+    "truncated": _truncated,
+    "empty": _empty,
+    "corrupt": _noise,
+    "replaced": _replaced,
+    "scaled": lambda trial: _scaled(trial, float(trial.case.value["factor"])),
+    "wrong_specimen": lambda trial: scan_folder(trial.scene_folder, trial.material, "eight.ply"),
+    "no_export": _emptied,
+    "share_away": lambda trial: _away(trial, trial.case.value.get("seconds")),
+    "ct": lambda trial: _ct(trial, str(trial.case.value["kind"])),
+    "disk": _arm_disk,
+    "clock": _jump,
+    "lock": _lock,
+    "data_away": _data_away,
+    "unplug": lambda trial: trial.simulators.stop(("lightbox",)),
+    "camera_off": lambda trial: trial.simulators.stop(("camera",)),
+    "arm_off": lambda trial: trial.simulators.stop(("ur",)),
+}
+MENDS: Mapping[str, Callable[[Trial], None]] = {
+    "unlock": _unlock,
+    "power_up": _power_up,
+    "slider_up": lambda trial: _slider(trial, 1.0),
+    "scan": _whole_scan,
+    "ct": _whole_ct,
+    "share_back": _share_back,
+    "disk": _mend_disk,
+    "data_back": _data_back,
+    "remote": lambda trial: trial.simulators.signal("ur", signal.SIGUSR1),
+}
+SEAMS: Mapping[str, Callable[[Trial], dict[str, Any]]] = {"disk": _faulty_disk, "clock": _jumping}

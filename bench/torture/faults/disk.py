@@ -1,0 +1,123 @@
+"""A disk, a database and a clock that go wrong under the store, through its own seam."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sqlite3
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from sqlalchemy.exc import OperationalError
+
+from service.store.seam import DurableFiles, SystemClock
+
+# What SQLite says where the system says this, as its result codes SQLITE_FULL, SQLITE_READONLY, SQLITE_IOERR do.
+_SQLITE = {
+    errno.ENOSPC: ("SQLITE_FULL", "database or disk is full"),
+    errno.EROFS: ("SQLITE_READONLY", "attempt to write a readonly database"),
+}
+
+
+@dataclass
+class FaultyDisk:
+    """service.store.seam.Files on a disk that fails from one call on, until somebody has mended it.
+
+    Attributes:
+        effect: the kind of call that fails; empty: every one of them.
+        nth: the first call that fails, from 1, counted from when it is armed.
+        number: of the system's error.
+    """
+
+    effect: str
+    nth: int
+    number: int
+    armed: bool = False
+    failed: int = 0
+    mended: bool = False
+    calls: dict[str, int] = field(default_factory=dict[str, int])
+    _real: DurableFiles = field(default_factory=DurableFiles)
+
+    def make_directory(self, path: Path, *, private: bool = False) -> None:
+        """See Files."""
+        self._check("make_directory", path)
+        self._real.make_directory(path, private=private)
+
+    def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
+        """See Files. A full disk takes the beginning of a file."""
+        try:
+            self._check("write", path)
+        except OSError:
+            if self.number == errno.ENOSPC:
+                data = b"".join(chunks)
+                self._real.write(path, [data[: len(data) // 2]], private=private)
+            raise
+        self._real.write(path, chunks, private=private)
+
+    def append(self, path: Path, offset: int, data: bytes) -> None:
+        """See Files."""
+        try:
+            self._check("append", path)
+        except OSError:
+            if self.number == errno.ENOSPC:
+                self._real.append(path, offset, data[: len(data) // 2])
+            raise
+        self._real.append(path, offset, data)
+
+    def make_read_only(self, path: Path) -> None:
+        """See Files."""
+        self._check("make_read_only", path)
+        self._real.make_read_only(path)
+
+    def sync_file(self, path: Path) -> None:
+        """See Files."""
+        self._check("sync_file", path)
+        self._real.sync_file(path)
+
+    def rename(self, source: Path, target: Path) -> None:
+        """See Files."""
+        self._check("rename", target)
+        self._real.rename(source, target)
+
+    def sync_directory(self, path: Path) -> None:
+        """See Files."""
+        self._check("sync_directory", path)
+        self._real.sync_directory(path)
+
+    def remove(self, path: Path) -> None:
+        """See Files. A full disk lets go of files."""
+        if self.number != errno.ENOSPC:
+            self._check("remove", path)
+        self._real.remove(path)
+
+    def commit(self, commit: Callable[[], None]) -> None:
+        """See Files. SQLite has words of its own for what the system says."""
+        try:
+            self._check("commit", Path())
+        except OSError as error:
+            name, words = _SQLITE.get(self.number, ("SQLITE_IOERR", "disk I/O error"))
+            plain = sqlite3.OperationalError(words)
+            plain.sqlite_errorname = name
+            raise OperationalError("COMMIT", None, plain) from error
+        commit()
+
+    def _check(self, effect: str, path: Path) -> None:
+        if not self.armed or self.mended or self.effect not in ("", effect):
+            return
+        self.calls[effect] = self.calls.get(effect, 0) + 1
+        if sum(self.calls.values()) >= self.nth:
+            self.failed += 1
+            raise OSError(self.number, os.strerror(self.number), str(path))
+
+
+@dataclass
+class JumpingClock(SystemClock):
+    """The host's UTC is set by somebody; its monotonic time goes on."""
+
+    ahead_s: float = 0.0
+
+    def utc_now(self) -> datetime:
+        """See Clock."""
+        return datetime.now(UTC) + timedelta(seconds=self.ahead_s)

@@ -1,0 +1,178 @@
+"""Just enough of each wire to cut it into messages, to name their kinds, and to say no in its own words."""
+
+from __future__ import annotations
+
+import struct
+from typing import Protocol
+
+Message = tuple[str, bytes]  # kind and bytes; an empty kind is passed on whatever is planned
+
+
+class Framer(Protocol):
+    """Cuts one direction of one connection into messages."""
+
+    def feed(self, data: bytes) -> list[Message]:
+        """The messages that are whole with these bytes."""
+        ...
+
+    def rest(self) -> bytes:
+        """What is left over and is passed on as it is, since nothing followed it."""
+        ...
+
+
+class _Buffered:
+    def __init__(self) -> None:
+        self._buffer = b""
+
+    def rest(self) -> bytes:
+        """See Framer."""
+        left, self._buffer = self._buffer, b""
+        return left
+
+
+_RTDE_ANSWERS = {
+    "V": "version",
+    "v": "controller",
+    "O": "outputs",
+    "I": "inputs",
+    "S": "start",
+    "P": "pause",
+    "U": "stream",
+}
+
+
+class Rtde(_Buffered):
+    """Frames of port 30004: size with header (big-endian u16), type, payload."""
+
+    def __init__(self, *, answers: bool) -> None:
+        super().__init__()
+        self._answers = answers
+
+    def feed(self, data: bytes) -> list[Message]:
+        """See Framer."""
+        self._buffer += data
+        found: list[Message] = []
+        while len(self._buffer) >= 3:
+            size = int.from_bytes(self._buffer[:2], "big")
+            if size < 3 or len(self._buffer) < size:
+                break
+            message, self._buffer = self._buffer[:size], self._buffer[size:]
+            kind = _RTDE_ANSWERS.get(chr(message[2]), "")
+            if not self._answers:
+                kind = "command" if kind == "stream" else ""
+            found.append((kind, message))
+        return found
+
+
+class Lines(_Buffered):
+    """Lines of a dashboard or a light box; `kinds` names them by their first word, in small letters."""
+
+    def __init__(self, kinds: dict[str, str], otherwise: str = "") -> None:
+        super().__init__()
+        self._kinds, self._otherwise = kinds, otherwise
+
+    def feed(self, data: bytes) -> list[Message]:
+        """See Framer."""
+        *whole, self._buffer = (self._buffer + data).split(b"\n")
+        found: list[Message] = []
+        for line in whole:
+            word = line.split(b" ")[0].strip().decode("ascii", "replace").lower()
+            found.append((self._kinds.get(word, self._otherwise), line + b"\n"))
+        return found
+
+
+class Script(_Buffered):
+    """Programs of the script port: each ends with a line `end` that is not indented."""
+
+    def feed(self, data: bytes) -> list[Message]:
+        """See Framer."""
+        self._buffer += data
+        found: list[Message] = []
+        while (at := self._buffer.find(b"\nend\n")) >= 0:
+            cut = at + len(b"\nend\n")
+            found.append(("script", self._buffer[:cut]))
+            self._buffer = self._buffer[cut:]
+        return found
+
+
+REQUEST, RESPONSE, EVENT, START_DATA, DATA, END_DATA = 6, 7, 8, 9, 10, 12
+_OPERATIONS = {
+    0x1001: "device_info",
+    0x1002: "session",
+    0x1008: "file_info",
+    0x1009: "file",
+    0x9205: "set",
+    0x9207: "release",
+    0x9209: "properties",
+}
+
+
+class PtpTalk:
+    """The operation that is under way on one command connection: answers are named after it."""
+
+    def __init__(self) -> None:
+        self.operation = ""
+
+
+class PtpIp(_Buffered):
+    """Packets of PTP/IP: length with header, type (little-endian u32 each), body.
+
+    An answer without data is named after its operation; of one with data, each packet of the data is.
+    """
+
+    def __init__(self, talk: PtpTalk, *, answers: bool) -> None:
+        super().__init__()
+        self._talk, self._answers = talk, answers
+        self._with_data = False
+
+    def feed(self, data: bytes) -> list[Message]:
+        """See Framer."""
+        self._buffer += data
+        found: list[Message] = []
+        while len(self._buffer) >= 8:
+            size, kind = struct.unpack_from("<II", self._buffer)
+            if size < 8 or len(self._buffer) < size:
+                break
+            message, self._buffer = self._buffer[:size], self._buffer[size:]
+            found.append((self._named(kind, message), message))
+        return found
+
+    def _named(self, kind: int, message: bytes) -> str:
+        if not self._answers:
+            if kind == REQUEST:
+                self._talk.operation = _OPERATIONS.get(struct.unpack_from("<H", message, 12)[0], "")
+                return "request"
+            return ""
+        if kind in (START_DATA, DATA, END_DATA):
+            self._with_data = True
+            return self._talk.operation
+        if kind == RESPONSE:
+            with_data, self._with_data = self._with_data, False
+            return "" if with_data else self._talk.operation
+        return {2: "connect", 4: "event_connect", EVENT: "event"}.get(kind, "")
+
+
+# --- saying no ------------------------------------------------------------------------------------------------
+
+_ACCESS_DENIED = 0x200F
+
+
+def refused(device: str, kind: str, message: bytes) -> bytes:
+    """What this device says in place of a message to refuse what was asked. Raises KeyError where it cannot."""
+    if device == "camera":
+        if kind in ("connect", "event_connect"):
+            return struct.pack("<III", 12, 5, 1)
+        if struct.unpack_from("<I", message, 4)[0] == RESPONSE:
+            return message[:8] + struct.pack("<H", _ACCESS_DENIED) + message[10:14] + bytes(len(message) - 14)
+        raise KeyError(kind)
+    if device == "lightbox":
+        return b"ERR 2 refused\r\n"
+    if kind == "answer":
+        return b"could not understand: ''\n"
+    payload = {"version": b"\0", "start": b"\0", "outputs": b"\0NOT_FOUND", "inputs": b"\0IN_USE"}[kind]
+    return struct.pack(">HB", 3 + len(payload), message[2]) + payload
+
+
+def denied(transaction: bytes) -> bytes:
+    """The response that takes the place of a camera's data: little-endian transaction number (4 bytes)."""
+    return struct.pack("<IIH", 14, RESPONSE, _ACCESS_DENIED) + transaction

@@ -1,0 +1,102 @@
+"""The person of a case, who takes the first way on that the screen lists, and the watch over what moves."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from service.core.decide import AskOperator
+from service.core.model import OperatorAction
+from service.core.run_state import RunState
+from service.runner import Spoken
+from tests.support.bench_rig import ScriptedOperator, agree, answer
+from tests.support.ur_rtde_protocol import RtdeClient
+
+_MAY_MOVE = 0b11  # safety_status_bits: normal, reduced
+
+
+class LeftError(Exception):
+    """The person has left the question open, and gone home."""
+
+
+@dataclass
+class Person(ScriptedOperator):
+    """Does what the screen lists, a few times.
+
+    Attributes:
+        fix: what is done at the device before an answer.
+        patience: answers to one and the same question, before it is left open.
+        look: called several times a second.
+    """
+
+    fix: Callable[[], None] = lambda: None
+    patience: int = 3
+    look: Callable[[RunState], None] = lambda _state: None
+    open: AskOperator | None = None
+    stopped: list[AskOperator] = field(default_factory=list[AskOperator])
+
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
+        """See service.runner.Operator."""
+        if question.for_ != "recovery":
+            return agree(question, state)
+        self.stopped.append(question)
+        ways = [way for way in question.ways if way.available and way.verb != "abort"]
+        if len(self.stopped) > self.patience or not ways:
+            self.open = question
+            raise LeftError
+        self.fix()
+        way = ways[0]
+        if way.verb == "confirm":
+            return answer(question, "confirm")
+        return OperatorAction(action=way.verb, step=way.step, reason="as the screen says")
+
+    def attend(self, doing: object, state: RunState, *, pedal_armed: bool) -> None:
+        """See service.runner.Operator."""
+        del doing, pedal_armed
+        self.look(state)
+
+
+class Motions:
+    """When an arm began to move, and when it was in a safety stop: host time.monotonic()."""
+
+    def __init__(self) -> None:
+        self.begun_s: list[float] = []
+        self.stopped_s: list[float] = []
+
+    def began(self, _number: int = 0) -> None:
+        """An arm in memory says so itself."""
+        self.begun_s.append(time.monotonic())
+
+
+class ArmEye(Motions):
+    """Looks at a simulated controller over a connection of its own, past the proxy."""
+
+    def __init__(self, host: str) -> None:
+        super().__init__()
+        self._client = RtdeClient(host)
+        self._client.output_setup(["target_qd", "safety_status_bits"], 125.0)
+        self._client.start()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Look no more."""
+        with contextlib.suppress(OSError):
+            self._client.shutdown()
+        self._thread.join(5.0)
+        self._client.close()
+
+    def _run(self) -> None:
+        moving = False
+        with contextlib.suppress(OSError):
+            while True:
+                data, now_s = self._client.data(), time.monotonic()
+                moves = any(data["target_qd"])
+                if moves and not moving:
+                    self.begun_s.append(now_s)
+                moving = moves
+                if not int(data["safety_status_bits"][0]) & _MAY_MOVE:
+                    self.stopped_s.append(now_s)

@@ -1,0 +1,341 @@
+"""One case, in a process of its own: simulators, proxy, rig, run, person; then the rules."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import pickle
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from bench.torture.faults import rules
+from bench.torture.faults.acts import ACTS, MENDS, SEAMS
+from bench.torture.faults.case import Case
+from bench.torture.faults.disk import FaultyDisk, JumpingClock
+from bench.torture.faults.laboratory import CT, PROTOCOL, SCAN, VIEWS, Laboratory, Simulators, exposed, write_rig
+from bench.torture.faults.material import FIVE, ct_folder, make_material, scan_folder
+from bench.torture.faults.person import ArmEye, LeftError, Motions, Person
+from bench.torture.faults.proxy import RunningProxy, Wire, start_proxy
+from bench.torture.faults.verdict import Verdict, errors_of, first_words, listed, masked, policy_of
+from service.core.decide import AskOperator, initial_state
+from service.core.errors import OrthocaptureError
+from service.core.protocol import parse_protocol
+from service.core.run_state import RunState
+from service.runner import Runner
+from service.runs import recorded_run, start_run
+from service.steps import params_models
+from service.store.database import database_path
+from service.store.store import Store
+from service.worker import loop
+from tests.support.bench_rig import BenchArm, BenchCamera
+
+_UNSIGNED = "the record could not be signed"
+_SESSIONS = 3  # programs that drive the run, one after the other, where an error ends them
+
+
+@dataclass
+class Session:
+    """How one program that drove the run ended: by itself, by an error, or with a question that is left open."""
+
+    status: str = ""
+    error: OrthocaptureError | None = None
+    open: AskOperator | None = None
+    stopped: list[AskOperator] = field(default_factory=list[AskOperator])
+    told: list[str] = field(default_factory=list[str])
+
+
+class Trial:
+    """The case while it runs. Acts and mends (bench/torture/faults/acts.py) reach what they need through it."""
+
+    def __init__(self, case: Case, folder: Path, seed: int) -> None:
+        self.case, self.folder, self.seed = case, folder, seed
+        self.data = folder / "data"
+        self.simulators = Simulators(folder)
+        self.proxy: RunningProxy | None = None
+        self.arm_host = f"127.{101 + os.getpid() % 100}.{os.getpid() // 100 % 250}.1"
+        self.armed = False
+        self.acted = False
+        self.ends: list[Callable[[], None]] = []  # what is undone at the end
+        self.scene_folder = folder / "export"
+        self.material = folder.parent / "material"
+        self.arm: BenchArm | None = None
+        self.shutter: BenchCamera | None = None
+        self.disk: FaultyDisk | None = None
+        self.clock: JumpingClock | None = None
+        self.words: list[str] = []
+        self.verdict = Verdict(case.name)
+        self._eye: Motions = Motions()
+
+    # --- the rig ------------------------------------------------------------------------------------------
+
+    def _wired(self, *wires: Wire) -> None:
+        if self.case.spoil is not None:
+            self.proxy = start_proxy(list(wires), self.case.spoil, self.folder / "wire.jsonl", self.seed)
+
+    def _plan(self) -> list[str]:
+        return ["--faults", json.dumps(list(self.case.faults))] if self.case.faults else []
+
+    def _laboratory(self) -> Laboratory:
+        scene = self.case.scene
+        devices: dict[str, Any] = {}
+        near = self.arm_host[:-1] + "2"
+        if scene == "arm":
+            self.simulators.start("ur", "--host", self.arm_host, "--speed-up", "3", *self._plan(), *self.case.options)
+            self._wired(
+                Wire("robot", "rtde", (near, 30004), (self.arm_host, 30004)),
+                Wire("robot", "dashboard", (near, 29999), (self.arm_host, 29999)),
+                Wire("robot", "script", (near, 30003), (self.arm_host, 30003)),
+            )
+            devices["robot"] = {
+                "driver": "ur",
+                "host": near if self.proxy else self.arm_host,
+                "connect_timeout_s": 2.0,
+                "watchdog_s": 1.0,
+                "stale_after_s": 2.0,
+            }
+        if scene == "camera":
+            words = ("camera", "--port", "0", "--fast", "--image-width", "96", *self._plan(), *self.case.options)
+            ready = self.simulators.start(*words)
+            port, near_port = int(ready["port"]), 15740
+            self._wired(Wire("camera", "ptpip", (near, near_port), ("127.0.0.1", port)))
+            address = f"ptpip:{near}:{near_port}" if self.proxy else str(ready["gphoto_port"])
+            devices["camera"] = {"driver": "gphoto", "port": address, "capture_timeout_s": 5.0}
+        if scene == "lightbox":
+            far, line = self.folder / "far", self.folder / "line"
+            self.simulators.start("lightbox", "--link", str(far), *self._plan(), *self.case.options)
+            self._wired(Wire("lightbox", "serial", str(line), str(far)))
+            devices["lightbox"] = {
+                "driver": "lightbox",
+                "port": str(line if self.proxy else far),
+                "timeout_s": 0.3,
+            }
+        if scene == "scan":
+            scan_folder(self.scene_folder, self.material)
+            devices["scanner"] = {"driver": "scan_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
+        if scene == "ct":
+            ct_folder(self.scene_folder, self.material)
+            scans = self.folder / "scans"
+            scans.mkdir()
+            devices["scanner"] = {"driver": "scan_folder", "folder": str(scans), "stable_s": 0.5}
+            devices["ct"] = {"driver": "dicom_folder", "folder": str(self.scene_folder), "stable_s": 0.5}
+        rig = write_rig(self.folder, devices)
+        self.arm = arm = None if scene == "arm" else BenchArm()
+        self.shutter = shutter = None if scene == "camera" else BenchCamera(picture=exposed)
+        if arm is not None:
+            arm.on_move = self._eye.began
+        else:
+            eye = ArmEye(self.arm_host)
+            self.ends.append(eye.close)
+            self._eye = eye
+        return Laboratory(rig, arm, shutter)
+
+    # --- the run ------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """To its end, or to the question that is left open."""
+        began_s = time.monotonic()
+        station = self._laboratory()
+        self._log()
+        try:
+            with Store.open(self.data) as store:
+                run_id = self._begin(store, station)
+            self._drive(run_id, station)
+        finally:
+            for end in reversed(self.ends):
+                with suppress(OSError):
+                    end()
+            self.simulators.stop()
+            self.verdict.seconds = round(time.monotonic() - began_s, 1)
+
+    def _log(self) -> None:
+        """Only now: simulators and proxy, which are forked, have logs of their own."""
+        words = "%(levelname)s %(name)s: %(message)s"
+        logging.basicConfig(filename=self.folder / "program.log", level=logging.INFO, format=words)
+        for chatty in ("transitions", "alembic"):
+            logging.getLogger(chatty).setLevel(logging.WARNING)
+
+    def _begin(self, store: Store, station: Laboratory) -> str:
+        text = {"scan": SCAN, "ct": CT}.get(self.case.scene, PROTOCOL)
+        distance_m = self.case.value.get("distance_m", 0.5 if self.case.scene == "arm" else 0.6)
+        source = text.replace("DISTANCE", str(distance_m)).encode()
+        loaded = parse_protocol(source, params_models(), name="faults.yaml")
+        return start_run(store, loaded, station.rig, operator="Ada", auto_confirm=False)
+
+    def _drive(self, run_id: str, station: Laboratory) -> None:
+        person = Person(fix=self._mend, patience=self.case.patience, look=self._look)
+        person.on_prepare = lambda: self._prepare(person.prepared[-1][0])
+        person.on_show = lambda _what: self._work()
+        self._arm_now(-1)
+        status = ""
+        for _ in range(_SESSIONS):
+            if self.case.scene == "store":
+                ended = self._apart(lambda: self._session(run_id, station, person))
+            else:
+                ended = self._session(run_id, station, person)
+            person.open, person.stopped = ended.open, ended.stopped
+            status = ended.status
+            unsigned = [words for words in ended.told if words.startswith(_UNSIGNED)]
+            if ended.error is None and not unsigned:
+                break
+            if ended.error is None:  # the person reads this, does what it says, and resumes: then it is signed
+                self.words += unsigned[:1]
+                self.verdict.policy.append("told")
+                self._mend()
+                continue
+            # What the command line prints; the person does what it says, and resumes.
+            self.words.append(str(ended.error))
+            self.verdict.policy.append("stop")
+            self.verdict.errors.append(type(ended.error).__name__)
+            if not rules.tells(str(ended.error)):
+                words = f"{type(ended.error).__name__}: {ended.error}"
+                self.verdict.broken.append(f"no place or no remedy: {words}")
+            self._mend()
+        self._judge(run_id, person, status)
+
+    def _session(self, run_id: str, station: Laboratory, person: Person) -> Session:
+        """As one program that drives the run, to its end."""
+        ended = Session()
+        person.told = []
+        try:
+            with Store.open(self.data, **SEAMS.get(self.case.act, lambda _trial: {})(self)) as store:
+                protocol, _ = recorded_run(store, run_id)
+                try:
+                    ended.status = Runner(store, run_id, protocol, station, person).run().status
+                finally:
+                    station.close()
+        except LeftError:
+            pass
+        except OrthocaptureError as error:
+            ended.error = error
+        ended.open, ended.stopped, ended.told = person.open, person.stopped, person.told
+        return ended
+
+    def _apart(self, session: Callable[[], Session]) -> Session:
+        """In a process of its own, which dies at its end as a program does; arm and camera live on in this one."""
+        path = self.folder / "session.pickle"
+        pid = os.fork()
+        if pid == 0:
+            status = 1
+            try:
+                ended = session()
+                assert self.shutter is not None
+                told = (ended, self._eye, self.shutter.exposures, self.disk, self.acted, self.armed)
+                path.write_bytes(pickle.dumps(told))
+                status = 0
+            except BaseException:  # noqa: BLE001 - the case's process reads the status
+                traceback.print_exc()
+            finally:
+                os._exit(status)
+        _, status = os.waitpid(pid, 0)
+        if status:
+            raise RuntimeError("an exception escaped from the program that drives the run")
+        ended, self._eye, exposures, self.disk, self.acted, self.armed = pickle.loads(path.read_bytes())
+        assert self.shutter is not None
+        self.shutter.exposures = exposures
+        if self.arm is not None:
+            self.arm.on_move = self._eye.began
+        return ended
+
+    def _look(self, state: RunState) -> None:
+        self._arm_now(len(state.steps["capture"].captured) if "capture" in state.steps else 0)
+        if state.current and self.case.scene in ("scan", "ct"):
+            self._work()
+
+    def _arm_now(self, captured: int) -> None:
+        """Arm the fault once so many images are in the record."""
+        if self.armed or captured < self.case.after:
+            return
+        self.armed = True
+        if self.proxy is not None:
+            self.proxy.arm()
+        act = ACTS.get(self.case.act)
+        if act is not None:
+            act(self)
+            self.acted = True
+
+    def _prepare(self, step: str) -> None:
+        """A technician does what a step begins with."""
+        if self.case.scene == "ct" and step == "scan":
+            scan_folder(self.folder / "scans", self.material, FIVE)
+
+    def _mend(self) -> None:
+        mend = MENDS.get(self.case.mend)
+        if mend is not None:
+            mend(self)
+        elif self.proxy is not None and self.case.spoil is not None and self.case.spoil.column.startswith("away_"):
+            self._await_return()
+
+    def _await_return(self) -> None:
+        """The person looks after the cable until the device is back, where it comes back at all."""
+        assert self.proxy is not None
+        assert self.case.spoil is not None
+        if self.case.spoil.column == "away_never":
+            return
+        deadline_s = time.monotonic() + 35.0
+        while time.monotonic() < deadline_s:
+            deeds = self.proxy.deeds()
+            if not any(d["what"].startswith("away_") for d in deeds) or deeds[-1]["what"] == "back":
+                return
+            time.sleep(0.1)
+
+    def _work(self) -> None:
+        """What a worker process does, in this one."""
+        if self.case.scene not in ("scan", "ct"):
+            return
+        if not database_path(self.data).exists():
+            return
+        with Store.open(self.data) as store:
+            if store.open_jobs():
+                loop.work(store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _total: None)
+
+    # --- the verdict --------------------------------------------------------------------------------------
+
+    def _judge(self, run_id: str, person: Person, status: str) -> None:
+        verdict = self.verdict
+        with Store.open(self.data) as store:
+            events = store.events(run_id)
+        deeds = self.proxy.deeds() if self.proxy is not None else []
+        wire = any(deed["what"] == (self.case.spoil.column if self.case.spoil else "") for deed in deeds)
+        disk = self.disk is None or self.disk.failed > 0
+        verdict.reached = wire or (self.acted and disk) or bool(self.case.faults)
+        verdict.policy = policy_of(events) + verdict.policy
+        verdict.errors = list(dict.fromkeys([*errors_of(events), *verdict.errors]))
+        verdict.events = {}
+        for event in events:
+            verdict.events[event.payload.kind] = verdict.events.get(event.payload.kind, 0) + 1
+        verdict.words = first_words(events, person.stopped, self.words)
+        verdict.end = "completed" if status == "completed" else listed(person.open)
+        if not verdict.end:
+            verdict.end = f"the run is {status or 'stopped'}"
+            verdict.broken.append(f"{verdict.end}, and no way on is listed")
+        views = VIEWS if self.case.scene not in ("scan", "ct") else ()
+        logs = (self.folder / "program.log", self.folder / "said.log")
+        verdict.broken += rules.broken(events, self._eye, self.data, views, status, logs)
+
+
+def prepare_seed(folder: Path) -> Path:
+    """An empty data folder, which each case copies; and what all of them need is loaded by then."""
+    with Store.open(folder):
+        pass
+    loaded = parse_protocol(PROTOCOL.replace("DISTANCE", "0.5").encode(), params_models(), name="faults.yaml")
+    make_material(folder.with_name("material"))
+    initial_state(loaded.protocol)  # which makes the table of its states
+    return folder
+
+
+def run_in_child(case: Case, folder: Path, seed: int) -> None:
+    """In the forked process: run the case and write verdict.json; whatever escapes is a fault of its own."""
+    trial = Trial(case, folder, seed)
+    try:
+        trial.run()
+    except BaseException as error:  # noqa: BLE001 - what nobody has caught is what the sweep looks for
+        traceback.print_exc()
+        trial.verdict.broken.append(f"{type(error).__name__} escaped: {error}")
+    trial.verdict.words = masked(trial.verdict.words, folder)
+    (folder / "verdict.json").write_text(json.dumps(trial.verdict.told()))
