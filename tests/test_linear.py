@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from bench.soak.large_record import STEP, LargeRecord
+from service.core.model import StepNote
 from service.evidence import RunLog, StepEvidence
 from service.runs import recorded_run
 from service.store.audit import show
@@ -64,6 +65,13 @@ def test_twice_as_many_viewpoints_are_twice_the_work(
     small, large = (instructions_of(asked(record), "/service/") for record in records)
     assert small > SMALL, "nothing was counted"
     assert large < MOST * small
+
+
+def test_a_page_that_follows_a_run_does_not_plan_it_anew(records: tuple[LargeRecord, LargeRecord]) -> None:
+    _, record = records
+    capture_page(record)()
+    record.store.record(record.run_id, [StepNote(step=STEP, attempt=1, note="seen")], actor="runner")
+    assert instructions_of(capture_page(record), "/service/core/geometry.py") == 0
 
 
 def test_whether_a_photograph_is_there_already_is_asked_without_reading_them_all(

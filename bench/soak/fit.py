@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import linregress
 from scipy.stats import t as student
 
 BLOCKS = 12
+
+
+class Took(NamedTuple):
+    """How long something took: on the wall, and of this process's processors, which other work does not lengthen."""
+
+    wall_s: float
+    cpu_s: float
+
+    @classmethod
+    def now(cls) -> Took:
+        """The clocks, for a difference."""
+        return cls(time.perf_counter(), time.process_time())
+
+    def since(self, earlier: Took) -> Took:
+        """The difference."""
+        return Took(self.wall_s - earlier.wall_s, self.cpu_s - earlier.cpu_s)
 
 
 @dataclass(frozen=True, slots=True)

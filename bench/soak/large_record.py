@@ -8,12 +8,11 @@ a job that looks at it, enqueued, claimed and finished. The photographs are spar
 from __future__ import annotations
 
 import json
-import statistics
-import time
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+from bench.soak.fit import Took
 from bench.soak.sparse import SparseFiles, sparse_photograph
 from service.core.model import ViewpointCaptured
 from service.core.protocol import parse_protocol
@@ -73,36 +72,36 @@ class LargeRecord:
         """Close the store."""
         self.store.close()
 
-    def grow(self, until: int) -> list[float]:
-        """Bring viewpoints to the record until there are so many; the seconds that each of the last ones took.
+    def grow(self, until: int) -> list[Took]:
+        """Bring viewpoints to the record until there are so many; what each of the last ones took.
 
         Those before the last ones are not synced one by one, which would take an hour of the disk's time.
         """
-        seconds: list[float] = []
+        took: list[Took] = []
         photograph = self.folder / "photograph.jpg"
         while self.taken < until:
             number = self.taken + 1
             self._files.unhurried = until - self.taken <= TIMED
             sparse_photograph(photograph, number, self.photograph_bytes)
-            began_s = time.perf_counter()
+            began = Took.now()
             self._bring(photograph, f"v{number:03d}", number)
             if self._files.unhurried:
-                seconds.append(time.perf_counter() - began_s)
+                took.append(Took.now().since(began))
             self.taken += 1
-        return seconds
+        return took
 
-    def take(self, count: int) -> dict[str, float]:
-        """A runner resumes the run, takes so many more and dies: seconds to the first exposure, and between them."""
+    def take(self, count: int) -> tuple[Took, list[Took]]:
+        """A runner resumes the run, takes so many more and dies: what the first exposure took, and the others."""
         bench = Bench(self.store, self.run_id, self.folder / "data")
-        at_s: list[float] = []
+        at: list[Took] = []
 
         def exposed(_number: int) -> None:
-            at_s.append(time.perf_counter())
-            if len(at_s) > count:
+            at.append(Took.now())
+            if len(at) > count:
                 raise _DiedError
 
         bench.rig.shutter.on_capture = exposed
-        began_s = time.perf_counter()
+        began = Took.now()
         try:
             bench.run()
         except _DiedError:
@@ -110,8 +109,7 @@ class LargeRecord:
         else:
             raise AssertionError("the run ended before its time")
         self.taken += count
-        between = [later - earlier for earlier, later in pairwise(at_s)]
-        return {"until_first_s": at_s[0] - began_s, "viewpoint_s": statistics.median(between)}
+        return at[0].since(began), [later.since(earlier) for earlier, later in pairwise(at)]
 
     def _bring(self, photograph: Path, name: str, number: int) -> None:
         store, step = self.store, STEP
