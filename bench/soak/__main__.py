@@ -43,7 +43,9 @@ def measured(part: str, folder: Path, options: argparse.Namespace) -> dict[str, 
     """One part at the size that was asked for."""
     match part:
         case "captures":
-            return captures.captures(folder, options.minutes, options.sample_s, options.planned)
+            return captures.captures(
+                folder, options.minutes, options.sample_s, options.planned, calibrated=not options.uncalibrated
+            )
         case "large":
             sizes = [options.viewpoints // share for share in (8, 4, 2, 1)]
             return large.large(folder, sizes, options.gigabytes)
@@ -84,6 +86,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=60.0, help="captures: for so long")
     parser.add_argument("--sample-s", type=float, default=5.0, help="captures: seconds from one sample to the next")
     parser.add_argument("--planned", type=int, default=9000, help="captures: viewpoints planned, more than are taken")
+    parser.add_argument("--uncalibrated", action="store_true", help="captures: begin at once; the worker is idle")
     parser.add_argument("--viewpoints", type=int, default=10_000, help="large: in one run")
     parser.add_argument("--gigabytes", type=float, default=50.0, help="large: of photographs (sparse)")
     parser.add_argument("--together-minutes", type=float, default=5.0, help="together: for so long")

@@ -19,8 +19,8 @@ import httpx
 import psutil
 import yaml
 
-from bench.soak.creep import Sample, judge
-from service.core.model import ViewpointCaptured
+from bench.soak.creep import CHILD, Sample, judge
+from service.core.model import Payload, ViewpointCaptured
 from service.core.run_state import RunState
 from service.evidence import RunLog
 from service.runs import recorded_run
@@ -31,21 +31,27 @@ from tests.support.serving import Server, serving
 
 _HOST = "127.0.0.81"
 _SPEED_UP = 20
-_WIDTH_PX = 480
+_WIDTH_PX = 640
 _ROBOT_PORTS = {29999, 30001, 30002, 30003, 30004}  # fixed by the maker
-_LONGEST_S = 300.0  # until the first capture, on a busy machine
+_LONGEST_S = 600.0  # until the first capture, on a busy machine
 _LOOK_S = 0.5  # between two pages that are asked for
 _ENDS_S = 120.0  # the runner is told to end, and does
 
 
-def captures(folder: Path, minutes: float, every_s: float, planned: int, scene: int = 7) -> dict[str, Any]:
-    """Capture for so long; samples, lines, and the faults."""
+def captures(folder: Path, minutes: float, every_s: float, planned: int, *, calibrated: bool) -> dict[str, Any]:
+    """Capture for so long; samples, lines, and the faults. See `protocol_of` for the others."""
     folder.mkdir(parents=True, exist_ok=True)
     rig = folder / "rig"
     rig.mkdir()
-    options = ("--scene", str(scene), "--image-width", str(_WIDTH_PX), "--speed-up", str(_SPEED_UP))
+    options = ("--scene", "7", "--image-width", str(_WIDTH_PX), "--speed-up", str(_SPEED_UP))
     with simulated_rig(rig, *options, host=_HOST) as ready, serving(rig / "rig.yaml") as server:
-        soak = _Soak(rig / "data", protocol_of(folder, planned), Path(ready["rig"]), server, folder / "run.log")
+        soak = _Soak(
+            rig / "data",
+            protocol_of(folder, planned, calibrated=calibrated),
+            Path(ready["rig"]),
+            server,
+            folder / "run.log",
+        )
         soak.go(60 * minutes, every_s)
     report = verify(rig / "data")
     faults = soak.faults + [str(fault) for fault in report.faults]
@@ -64,17 +70,35 @@ def captures(folder: Path, minutes: float, every_s: float, planned: int, scene: 
     }
 
 
-def protocol_of(folder: Path, planned: int) -> Path:
-    """One step: a capture of so many viewpoints at a station."""
+def protocol_of(folder: Path, planned: int, *, calibrated: bool) -> Path:
+    """A capture of so many viewpoints at a station.
+
+    When `calibrated`, the camera is calibrated before, and a registration after it is planned, which is never
+    reached: so the worker has features and matches to compute for every image. The live numbers are left out: each of their
+    jobs names all the images before it, which is not linear (docs/soak.md).
+    """
     whole = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
-    (capture,) = (step for step in whole["steps"] if step["id"] == "viewpoint_capture_1")
+    steps: dict[str, dict[str, Any]] = {step["id"]: step for step in whole["steps"]}
+    capture = steps["viewpoint_capture_1"]
     capture["params"]["viewpoints"][0]["arcs"] = [
         {"tilt_deg": 25, "azimuth_from_deg": -45, "azimuth_to_deg": 45, "count": planned, "distance_m": 0.64}
     ]
-    without_calibration_and_ct(capture)
     capture["gates"][0]["min"] = planned
-    capture["simulated_hands"] = [{"action": "mount_camera"}]
-    whole |= {"id": "soak", "title": "A capture that does not end", "steps": [capture]}
+    if calibrated:
+        capture["params"].pop("live")
+        not_measured = ("predicted_target_error_mm", "specimen_coverage")
+        capture["gates"] = [gate for gate in capture["gates"] if gate["measure"] not in not_measured]
+        scan, registration = steps["scanning"], steps["registration"]
+        scan["params"] = {"spheres": 10, "wait_s": 60}
+        scan["gates"] = [gate for gate in scan["gates"] if gate["measure"] == "spheres_found"]
+        registration["params"] |= {"images_of": [capture["id"]], "control_images_of": []}
+        before = [steps[name] for name in ("camera_set_up", "camera_calibration", "board_removal")]
+        whole["steps"] = [*before, capture, scan, registration]
+    else:
+        without_calibration_and_ct(capture)
+        capture["simulated_hands"] = [{"action": "mount_camera"}]
+        whole["steps"] = [capture]
+    whole |= {"id": "soak", "title": "A capture that does not end"}
     path = folder / "protocol.yaml"
     path.write_text(yaml.safe_dump(whole, sort_keys=False))
     return path
@@ -128,7 +152,7 @@ class _Soak:
                     log = RunLog(store, run_id, recorded_run(store, run_id)[0])
                 if log is not None:
                     log.refresh()
-                    count += sum(isinstance(event.payload, ViewpointCaptured) for event in log.events[seen:])
+                    count += sum(_is_of_the_capture(event.payload) for event in log.events[seen:])
                     seen = len(log.events)
                     self._look(client, log.run_id, log.state)
                 if count and not ends_s:
@@ -160,9 +184,13 @@ class _Soak:
 
     def _sample(self, runner: int, count: int) -> Sample:
         processes: dict[str, dict[str, float]] = {}
-        for process in psutil.Process().children(recursive=True):
+        children = 0
+        for process in sorted(psutil.Process().children(recursive=True), key=lambda p: p.pid):
             with suppress(psutil.Error):
                 name = role_of(process, runner)
+                if name == CHILD:  # there are several, and they stay
+                    children += 1
+                    name = f"{name} {children}"
                 if name:
                     processes[name] = figures_of(process)
         sizes = {
@@ -172,6 +200,10 @@ class _Soak:
             "monitor": sum(_size(path) for path in (self.data / "monitor").glob("*")),
         }
         return Sample(time.monotonic(), count, processes, sizes)
+
+
+def _is_of_the_capture(payload: Payload) -> bool:
+    return isinstance(payload, ViewpointCaptured) and payload.step == "viewpoint_capture_1"
 
 
 def role_of(process: psutil.Process, runner: int) -> str:
@@ -191,7 +223,7 @@ def role_of(process: psutil.Process, runner: int) -> str:
         "simulate rig ": "simulated rig",
     }
     if "multiprocessing.spawn" in words:
-        return "worker's child"
+        return CHILD
     return next((name for part, name in named.items() if part in words), "")
 
 

@@ -55,6 +55,8 @@ def growth(x: Sequence[float], y: Sequence[float]) -> Growth | None:
     mean = [float(np.mean(np.asarray(y)[part])) for part in blocks]
     if len(set(at)) < 4:
         return None
+    if len(set(mean)) == 1:
+        return Growth(0.0, 0.0)
     line = linregress(at, mean)
     return Growth(float(line.slope), float(line.stderr * student.ppf(0.975, len(at) - 2)))
 
