@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-versions lint format docs bench torture-audit torture-crash torture-fuzz lock clean
+.PHONY: demo test test-versions lint format docs bench torture-audit torture-crash torture-fuzz soak lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -56,6 +56,10 @@ torture-audit: $(TOOLS)
 # Searches for faults that no single test looks for (docs/torture.md); takes most of an hour.
 torture-crash: $(TOOLS)
 	$(BIN)/python -m bench.torture.crash
+
+# Long and large (docs/soak.md): an hour of captures, a run of 10,000 viewpoints, many on one file, speed. Two hours.
+soak: $(TOOLS)
+	$(BIN)/python -m bench.soak
 
 # New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \

@@ -200,8 +200,19 @@ RUN_ELSEWHERE = {
     "python -m bench.torture.crash --sample 100 --random-runs 1": (
         "tests/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
     ),
+    "python -m bench.soak --only large --viewpoints 2000 --gigabytes 5": (
+        "tests/test_soak.py::test_each_part_runs_small_and_its_figures_stand_beside_the_others"
+    ),
     **dict.fromkeys(
-        ("make test", "make lint", "make test-versions", "make torture-audit", "make torture-fuzz", "make clean"),
+        (
+            "make test",
+            "make lint",
+            "make test-versions",
+            "make torture-audit",
+            "make torture-fuzz",
+            "make soak",
+            "make clean",
+        ),
         "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
     ),
     "orthocapture import FOLDER --data runs": (
@@ -263,6 +274,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("torture-audit", ".venv/bin/python -m bench.torture.audit"),
         ("torture-crash", ".venv/bin/python -m bench.torture.crash"),
         ("torture-fuzz", ".venv/bin/python -m bench.torture.fuzz --seconds-per-target 60 --record"),
+        ("soak", ".venv/bin/python -m bench.soak"),
         ("clean", "rm -rf .venv build *.egg-info"),
     ):
         done = subprocess.run(

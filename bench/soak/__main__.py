@@ -85,7 +85,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--minutes", type=float, default=60.0, help="captures: for so long")
     parser.add_argument("--sample-s", type=float, default=5.0, help="captures: seconds from one sample to the next")
-    parser.add_argument("--planned", type=int, default=9000, help="captures: viewpoints planned, more than are taken")
+    parser.add_argument("--planned", type=int, default=4000, help="captures: viewpoints planned, more than are taken")
     parser.add_argument("--uncalibrated", action="store_true", help="captures: begin at once; the worker is idle")
     parser.add_argument("--viewpoints", type=int, default=10_000, help="large: in one run")
     parser.add_argument("--gigabytes", type=float, default=50.0, help="large: of photographs (sparse)")

@@ -60,6 +60,8 @@ def together(folder: Path, minutes: float) -> dict[str, Any]:
             broken = [f"{role.name} ended by itself: {role.complaint()}" for role in roles if role.process.poll()]
         finally:
             for role in roles:
+                role.process.terminate()
+            for role in roles:
                 role.end()
     report = verify(data)
     with Store.open(data) as store:
@@ -105,8 +107,7 @@ class _Role:
         return self.errors.read_text().strip()[-400:]
 
     def end(self) -> None:
-        """Told to end, as by Ctrl-C; killed where it does not."""
-        self.process.terminate()
+        """Wait for its end after it was told to; it is killed where it does not."""
         with suppress(subprocess.TimeoutExpired):
             self.process.wait(timeout=_GRACE_S)
             return
