@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-versions lint format docs bench torture-audit torture-crash torture-faults torture-fuzz lock clean
+.PHONY: demo test test-versions lint format docs bench torture-audit torture-crash torture-faults torture-fuzz soak lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -61,6 +61,10 @@ torture-crash: $(TOOLS)
 # MINUTES=30 ends it early; ONLY='robot/rtde/*' chooses. What differs from the table is told.
 torture-faults: $(TOOLS)
 	$(strip $(BIN)/python -m bench.torture.faults $(if $(ONLY),--only '$(ONLY)') $(if $(MINUTES),--minutes $(MINUTES)))
+
+# Long and large (docs/soak.md): an hour of captures, a run of 10,000 viewpoints, many on one file, speed. Two hours.
+soak: $(TOOLS)
+	$(BIN)/python -m bench.soak
 
 # New locks: needs uv (pip install uv). The second holds the first and the tools of tests and lint.
 COMPILE = uv pip compile --universal --generate-hashes --no-emit-index-url --no-annotate --no-header \

@@ -115,7 +115,7 @@ class StepEvidence:
 
     def holds(self, sha256: str) -> bool:
         """See service.steps.context.Evidence."""
-        return any(row.ref.sha256 == sha256 for row in self.log.store.artefacts(self.log.run_id))
+        return self.log.store.holds(self.log.run_id, sha256)
 
     def captures(self, step_id: str) -> tuple[View, ...]:
         """See service.steps.context.Evidence."""

@@ -200,6 +200,9 @@ RUN_ELSEWHERE = {
     "python -m bench.torture.crash --sample 100 --random-runs 1": (
         "tests/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
     ),
+    "python -m bench.soak --only large --viewpoints 2000 --gigabytes 5": (
+        "tests/test_soak.py::test_each_part_runs_small_and_its_figures_stand_beside_the_others"
+    ),
     **dict.fromkeys(
         (
             "make test",
@@ -208,6 +211,7 @@ RUN_ELSEWHERE = {
             "make torture-audit",
             "make torture-faults",
             "make torture-fuzz",
+            "make soak",
             "make clean",
         ),
         "tests/test_docs.py::test_make_targets_do_what_the_documents_say",
@@ -280,6 +284,7 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("torture-crash", ".venv/bin/python -m bench.torture.crash"),
         ("torture-faults", ".venv/bin/python -m bench.torture.faults"),
         ("torture-fuzz", ".venv/bin/python -m bench.torture.fuzz --seconds-per-target 60 --record"),
+        ("soak", ".venv/bin/python -m bench.soak"),
         ("clean", "rm -rf .venv build *.egg-info"),
     ):
         done = subprocess.run(

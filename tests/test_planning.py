@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -282,3 +283,17 @@ def test_a_step_without_a_board_has_no_board_poses(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text(RIG + "collision: {arm: UR10e}\n")
     rig, protocol = load_rig(tmp_path / "rig.yaml"), load_protocol(PROTOCOL, params_models()).protocol
     assert preview_board_poses(protocol, protocol.step("fixation"), rig, partial(layout_of, rig)) is None
+
+
+def test_a_plan_in_the_listed_order_does_not_compare_every_viewpoint_with_every_other(situation: Situation) -> None:
+    poses = [camera_at((0.001 * number, -0.1, 0.62)) for number in range(150)]
+    planned(situation, *poses[:2])  # what is loaded once is not counted
+    tracemalloc.start()
+    try:
+        plan = planned(situation, *poses)
+        _, most_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(plan.feasible) == 150
+    assert plan.listed_s == pytest.approx(plan.total_s)
+    assert most_bytes < 8 * 150 * 150 * 3, "less than a few numbers for each pair"

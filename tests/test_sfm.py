@@ -17,6 +17,7 @@ from service.compute.poses.sfm import SfmModel, reconstruct, reconstruct_from
 from service.compute.poses.sfm_options import SfmOptions
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Transform, align_points, apply, inverse, transform
+from tests.support.counting import instructions_of
 from tests.support.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
 OPTIONS = SfmOptions(max_features=1500, neighbours=4)
@@ -220,6 +221,17 @@ def test_pairs_are_neighbours_and_connected() -> None:
     del prior["v07"]
     assert sum(7 in pair for pair in choose_pairs(names, prior, 6, 60.0)) == 23
     assert len(choose_pairs(names, None, 8, 60.0)) == 24 * 23 / 2
+
+
+def test_twice_as_many_images_are_twice_the_work() -> None:
+    """Of two thousand the choice once took minutes, and memory for every pair."""
+
+    def work(count: int) -> int:
+        names = [f"v{k:03d}" for k in range(count)]
+        prior = dict(zip(names, ring_of_poses(count), strict=True))
+        return instructions_of(lambda: choose_pairs(names, prior, 6, 60.0), "/service/")
+
+    assert work(120) < 2.3 * work(60)
 
 
 def test_across_stations_every_pair_is_kept() -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.soak.large_record import LargeRecord
 from service.core.geometry import apply, inverse, look_at
 from service.core.model import StepNote, ViewpointFailed
 from service.dataset.scene_view import Scene, SceneSphere, figure_json, scene_figure, viewing_frame
@@ -75,6 +76,28 @@ def test_the_plan_shows_how_every_viewpoint_stands(shown: Shown) -> None:
     for said in ("Done 1", "Next 1", "Failed 1", "Left out by the plan 1", "too near to the table", "1 of 4"):
         assert said in page, said
     assert "no <file> arrived" in page  # escaped in the page, or it would have been taken for a tag
+
+
+def test_a_run_of_a_thousand_viewpoints_is_shown_in_pages_and_drawn_without_overlap(tmp_path: Path) -> None:
+    record = LargeRecord(tmp_path, 1200, 2000)
+    record.close()
+    with web_site(tmp_path) as site:
+        shown = Shown(site, site.browser("technician"), record.run_id)
+        html = shown.browser.get(f"/runs/{record.run_id}/capture").text
+        assert "3 of 1200" in words(html)
+        assert "All 1200 viewpoints as a table" in words(html)
+        assert html.count('<th scope="row"><a class="button quiet"') == 200
+        assert "Page 1 of 6" in words(html)
+        assert "drawn as one" in words(html)
+        symbols = re.findall(r'<g data-viewpoint="(v\d+)"', html)
+        assert {"v004"} <= set(symbols), "the next one is among them"
+        assert len(symbols) < 400
+        last = shown.browser.get(f"/runs/{record.run_id}/capture?views=6").text
+        assert "v1200" in last
+        assert '<details id="viewpoints" data-keep="viewpoints" open>' in last
+        chosen = shown.browser.get(f"/runs/{record.run_id}/capture?viewpoint=v777").text
+        assert '<g data-viewpoint="v777"' in chosen
+        assert "Page 4 of 6" in words(chosen)
 
 
 def test_an_image_is_judged_in_words_with_the_figures_behind_them(shown: Shown) -> None:

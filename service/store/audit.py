@@ -249,7 +249,9 @@ def show(data_dir: Path, run_id: str) -> list[EvidenceRecord]:
             if run_id not in {run.run_id for run in read_runs(connection)}:
                 raise UnknownRunError(f"there is no run {run_id!r}", where=str(database_path(data_dir)))
             recorded = read_events(connection, run_id, 0)
-            brought = read_artefacts(connection, run_id)
+            brought: dict[int, list[Artefact]] = {}
+            for artefact in read_artefacts(connection, run_id):
+                brought.setdefault(artefact.seq, []).append(artefact)
     finally:
         database.close()
     return [
@@ -261,7 +263,7 @@ def show(data_dir: Path, run_id: str) -> list[EvidenceRecord]:
             kind=event.payload.kind,
             summary=checks.summary(event.payload.model_dump(mode="json")),
             sha256=event.sha256,
-            artefacts=tuple(artefact for artefact in brought if artefact.seq == event.seq),
+            artefacts=tuple(brought.get(event.seq, ())),
         )
         for event in recorded
     ]

@@ -23,7 +23,7 @@ from service.store.events import ROOT, append, read_events, to_event
 from service.store.leases import RunLease, acquire, check_lease, held_runs, is_held
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
 from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock
-from service.store.tables import event_index, events, heads, runs
+from service.store.tables import artefacts, event_index, events, heads, runs
 from service.store.told import tell
 
 _ENDS = ("run_completed", "run_aborted")
@@ -281,6 +281,12 @@ class Store:
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return read_artefacts(connection, run_id)
+
+    def holds(self, run_id: str, sha256: str) -> bool:
+        """Whether a run has recorded a file of this content."""
+        found = select(artefacts.c.seq).where(artefacts.c.sha256 == sha256, artefacts.c.run_id == run_id).limit(1)
+        with self._database.reading() as connection:
+            return connection.execute(found).first() is not None
 
     def checkpoints(self, run_id: str) -> list[Checkpoint]:
         """All signatures over a run's chain (or the site's), oldest first; service.store.signing makes them."""

@@ -20,9 +20,13 @@ router = APIRouter(tags=["capture"])
 RunId = Annotated[str, Path(max_length=64)]
 Name = Annotated[str, Query(max_length=64)]
 Page = Annotated[int, Query(ge=1, le=100_000)]
+ViewsPage = Annotated[
+    int, Query(ge=0, le=100_000, description="of the table; 0: the one that shows where the run is")
+]
 Seq = Annotated[int, Query(ge=0, le=2**53)]
 Parts = Annotated[str, part_names("image", "plan", "sheet")]
 SHEET = 60  # images on one page of the contact sheet
+LISTED = 200  # viewpoints on one page of the table
 
 
 @router.get("/runs/{run_id}/capture", name="capture", dependencies=[Depends(requires("read"))])
@@ -35,11 +39,12 @@ def capture(
     viewpoint: Name = "",
     seq: Seq = 0,
     page: Page = 1,
+    views: ViewsPage = 0,
     replaced: bool = False,
     plain: bool = False,
 ) -> HTMLResponse:
     """Everything about the images of one step."""
-    shown = _shown(site, person, run_id, step, viewpoint, seq, page, replaced=replaced, plain=plain)
+    shown = _shown(site, person, run_id, step, viewpoint, seq, page, views, replaced=replaced, plain=plain)
     return render(request, "capture.html.j2", frame=run_frame(site, run_id), **shown)
 
 
@@ -54,11 +59,12 @@ def capture_parts(
     viewpoint: Name = "",
     seq: Seq = 0,
     page: Page = 1,
+    views: ViewsPage = 0,
     replaced: bool = False,
     plain: bool = False,
 ) -> HTMLResponse:
     """Parts of the page, all of one moment, for the script that keeps it up to date."""
-    shown = _shown(site, person, run_id, step, viewpoint, seq, page, replaced=replaced, plain=plain)
+    shown = _shown(site, person, run_id, step, viewpoint, seq, page, views, replaced=replaced, plain=plain)
     return render(request, "capture_parts.html.j2", names=names.split(","), **shown)
 
 
@@ -70,6 +76,7 @@ def _shown(
     viewpoint: str,
     seq: int,
     page: int,
+    listed_page: int,
     *,
     replaced: bool,
     plain: bool,
@@ -98,10 +105,14 @@ def _shown(
     stations = list(dict.fromkeys(v.station for v in views if v.station))
     there = {station: planned.station_of(log, station) for station in stations}
     drawings = [
-        plan_drawing.plan_drawing(known, [v for v in views if v.station == station])
+        plan_drawing.plan_drawing(known, [v for v in views if v.station == station], name)
         for station, known in there.items()
         if known is not None
     ]
+    # The page of the table that was asked for, or the one with the viewpoint that is shown or comes next.
+    views_pages = max(1, -(-len(views) // LISTED))
+    here = next((k for k, v in enumerate(views) if v is view or (view is None and v.state == "next")), 0)
+    views_page = min(listed_page or 1 + here // LISTED, views_pages)
     advice, suggestions = capture_view.suggestions_of(log, step)
     counts = {state: sum(v.state == state for v in views) for state in capture_view.WORDS}
     holder = Control(site.store).holder(run_id)
@@ -110,6 +121,9 @@ def _shown(
         "step": step,
         "state": log.state.steps[step.id],
         "views": views,
+        "rows": views[(views_page - 1) * LISTED : views_page * LISTED],
+        "views_page": views_page,
+        "views_pages": views_pages,
         "counts": {state: count for state, count in counts.items() if count},
         "words": capture_view.WORDS,
         "tones": capture_view.TONES,
@@ -128,5 +142,12 @@ def _shown(
         "suggestions": suggestions,
         "registered": best_registration(log) is not None and (chosen is None or chosen.replaced is None),
         "following": not viewpoint and not seq,
-        "query": {"step": step.id, "viewpoint": viewpoint, "seq": seq, "replaced": replaced, "plain": plain},
+        "query": {
+            "step": step.id,
+            "viewpoint": viewpoint,
+            "seq": seq,
+            "views": listed_page,
+            "replaced": replaced,
+            "plain": plain,
+        },
     }

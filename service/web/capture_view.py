@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -106,6 +107,7 @@ def views_of(log: RunLog, step: Step) -> list[View]:
     refused = _refused(state)
     failures = last_failures(log, step.id)
     captures = captures_of(log, step.id)
+    replaced_of = Counter(c.payload.viewpoint for c in captures if c.replaced is not None)
     valid = {c.payload.viewpoint: c for c in captures if state.captured.get(c.payload.viewpoint) == c.seq}
     order = [name for name in _order(state) if name in planned]
     names = list(dict.fromkeys([*order, *planned, *valid, *state.skipped_viewpoints, *state.viewpoint_failures]))
@@ -114,7 +116,7 @@ def views_of(log: RunLog, step: Step) -> list[View]:
     next_found = state.phase not in ("ready", "running", "recovering") or log.state.current != step.id
     for name in names:
         capture = valid.get(name)
-        replaced = sum(c.payload.viewpoint == name and c.replaced is not None for c in captures)
+        replaced = replaced_of[name]
         now, why = _state(name, state, capture, refused, failures, replaced=replaced > 0)
         if now in ("open", "again", "failed") and not next_found:
             next_found = True

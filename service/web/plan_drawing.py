@@ -14,6 +14,10 @@ WIDTH = 640.0  # of the drawing; its height follows from what is on it
 _MARGIN = 62.0
 _TICK = 30.0  # length of the line that tells where a camera looks
 _MOST_LABELS = 40
+_MOST_SYMBOLS = 400  # of more, those that would lie on one another are drawn as one
+_CELL = 6.0  # edge of the square in which they do
+# Which of them is drawn: what a person has to look at comes first.
+_FIRST: Sequence[ViewState] = ("failed", "again", "departs", "left_out", "skipped", "open", "done", "next")
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +44,7 @@ class PlanDrawing:
     """
 
     station: str
+    merged: bool  # some symbols stand for several viewpoints
     width: float
     height: float
     symbols: tuple[Symbol, ...]
@@ -48,8 +53,8 @@ class PlanDrawing:
     robot: tuple[float, float] | None
 
 
-def plan_drawing(station: Station, views: Sequence[View]) -> PlanDrawing | None:
-    """None without a viewpoint whose place is known."""
+def plan_drawing(station: Station, views: Sequence[View], chosen: str = "") -> PlanDrawing | None:
+    """None without a viewpoint whose place is known. `chosen` is drawn in any case."""
     placed = [(v, v.position_m, v.looks) for v in views if v.position_m is not None and v.looks is not None]
     if not placed:
         return None
@@ -66,19 +71,21 @@ def plan_drawing(station: Station, views: Sequence[View]) -> PlanDrawing | None:
     def at(x: float, y: float) -> tuple[float, float]:
         return round(shift + scale * (x - left), 1), round(_MARGIN + scale * (y - top), 1)
 
-    symbols: list[Symbol] = []
+    every: list[Symbol] = []
     for (view, _, looks), point in zip(placed, points, strict=True):
         x, y = at(*point)
         dx, dy = _above(looks, (0.0, 0.0, 0.0), layout.approach)
         length = math.hypot(dx, dy)
         reach = 0.0 if length < 0.05 else _TICK / length * min(1.0, length / 0.3)
         label = _short(view.name) if len(placed) <= _MOST_LABELS else ""
-        symbols.append(Symbol(view.name, label, view.state, x, y, round(x + reach * dx, 1), round(y + reach * dy, 1)))
+        every.append(Symbol(view.name, label, view.state, x, y, round(x + reach * dx, 1), round(y + reach * dy, 1)))
+    symbols = every if len(every) <= _MOST_SYMBOLS else _apart(every, chosen)
     corner, far = at(-across / 2, -deep / 2), at(across / 2, deep / 2)
     base = at(*_above((0.0, 0.0, 0.0), layout.scene_centre_m, layout.approach))
     inside = 0 <= base[0] <= WIDTH and 0 <= base[1] <= height
     return PlanDrawing(
         station=layout.name,
+        merged=len(symbols) < len(every),
         width=WIDTH,
         height=round(height, 1),
         symbols=tuple(symbols),
@@ -86,6 +93,15 @@ def plan_drawing(station: Station, views: Sequence[View]) -> PlanDrawing | None:
         bar=round(0.1 * scale, 1),
         robot=base if inside else None,
     )
+
+
+def _apart(symbols: Sequence[Symbol], chosen: str) -> list[Symbol]:
+    """One of those that would lie on one another; what is chosen, and what comes next, in any case."""
+    wanted = [symbol for symbol in symbols if symbol.name == chosen or symbol.state == "next"]
+    kept: dict[tuple[int, int], Symbol] = {}
+    for symbol in sorted(symbols, key=lambda s: _FIRST.index(s.state)):
+        kept.setdefault((int(symbol.x // _CELL), int(symbol.y // _CELL)), symbol)
+    return [*(symbol for symbol in kept.values() if symbol not in wanted), *wanted]
 
 
 def _short(name: str) -> str:

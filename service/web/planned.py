@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from service.steps.context import StationLayout
 from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 
 Vector = tuple[float, float, float]
+_lock = Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +56,39 @@ def station_of(log: RunLog, name: str) -> Station | None:
 
 def planned_poses(log: RunLog, step: Step) -> tuple[Viewpoint, ...]:
     """Those of the protocol, then those that an attempt of the step has suggested."""
+    return _planned(log, step)[0]
+
+
+def planned_viewpoints(log: RunLog, step: Step) -> tuple[Planned, ...]:
+    """The same as places and directions."""
+    return _planned(log, step)[1]
+
+
+_known: OrderedDict[tuple[str, str, tuple[int, ...]], tuple[tuple[Viewpoint, ...], tuple[Planned, ...]]] = (
+    OrderedDict()
+)
+_KNOWN = 32  # plans that are kept: pages of a run under way ask for the same one again and again
+_OF_PLANS = ("board_poses", "suggested_viewpoints")
+
+
+def _planned(log: RunLog, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[Planned, ...]]:
+    """They follow from the root of the chain (protocol, rig) and the step's notes: computed once for each."""
+    notes = tuple(note.seq for note in log.state.steps[step.id].notes if note.note in _OF_PLANS)
+    key = (log.events[0].sha256, step.id, notes)
+    with _lock:
+        if key in _known:
+            _known.move_to_end(key)
+            return _known[key]
+    poses = _computed_poses(log, step)
+    computed = poses, tuple(Planned(v.name, v.station, *place(v.T_base_camera)) for v in poses)
+    with _lock:
+        _known[key] = computed
+        while len(_known) > _KNOWN:
+            _known.popitem(last=False)
+    return computed
+
+
+def _computed_poses(log: RunLog, step: Step) -> tuple[Viewpoint, ...]:
     sets: tuple[ViewpointSet, ...] = getattr(step.params, "viewpoints", ())
     board: Any = getattr(step.params, "board_poses", None)
     out: list[Viewpoint] = []
@@ -74,11 +110,6 @@ def planned_poses(log: RunLog, step: Step) -> tuple[Viewpoint, ...]:
         if wanted and last is not None:
             out += [v for v in denser_viewpoints(viewpoint_set, last.layout) if v.name in wanted]
     return tuple(out)
-
-
-def planned_viewpoints(log: RunLog, step: Step) -> tuple[Planned, ...]:
-    """The same as places and directions."""
-    return tuple(Planned(v.name, v.station, *place(v.T_base_camera)) for v in planned_poses(log, step))
 
 
 def place(T_base_camera: Transform) -> tuple[Vector, Vector]:

@@ -79,12 +79,12 @@ def plan_motion(views: Sequence[tuple[str, Transform]], situation: Situation, or
     placed = [_place(name, T, situation) for name, T in views]
     able = [view for view in placed if view.outcome != "refused"]
     refused = [view for view in placed if view.outcome == "refused"]
-    joints = np.array([view.joints_rad for view in able]).reshape(-1, 6)
-    times = travel_times_s(np.vstack([situation.start_rad, joints]), situation)
-    listed = list(range(len(able)))
-    sequence = shortest_order(times) if order == "shortest" and len(able) > 2 else listed
+    way = np.vstack([situation.start_rad, *(view.joints_rad for view in able)])
+    sequence: Sequence[int] = range(len(able))
+    if order == "shortest" and len(able) > 2:
+        sequence = shortest_order(travel_times_s(way, situation))
     kept: list[PlannedView] = []
-    here, at = situation.start_rad, 0
+    here = situation.start_rad
     total = 0.0
     for i in sequence:
         blocked = _blocked(here, able[i].joints_rad, situation)
@@ -95,10 +95,11 @@ def plan_motion(views: Sequence[tuple[str, Transform]], situation: Situation, or
         if blocked:
             refused.append(replace(able[i], outcome="refused", reason=f"on the way there {blocked}"))
             continue
-        kept.append(replace(able[i], travel_s=float(times[at, i + 1])))
-        total += float(times[at, i + 1]) + situation.pause_s
-        here, at = able[i].joints_rad, i + 1
-    listed_s = float(sum(times[a, b] for a, b in zip([0, *(i + 1 for i in listed)], [i + 1 for i in listed])))  # noqa: B905 - the last has no successor
+        travel_s = float(_legs_s(np.stack([here, able[i].joints_rad]), situation)[0])
+        kept.append(replace(able[i], travel_s=travel_s))
+        total += travel_s + situation.pause_s
+        here = able[i].joints_rad
+    listed_s = float(_legs_s(way, situation).sum())
     return MotionPlan((*kept, *refused), order, total, listed_s + situation.pause_s * len(able))
 
 
@@ -123,8 +124,16 @@ def _blurred(T_base_camera: Transform, situation: Situation) -> str:
 
 def travel_times_s(joints_rad: Array, situation: Situation) -> Array:
     """(K, K) time between joint positions (K, 6), by the joint that turns furthest: ramp up, constant, ramp down."""
-    distance = np.abs(joints_rad[:, None] - joints_rad[None]).max(axis=2)
+    distance = np.zeros((len(joints_rad), len(joints_rad)))
+    for turns in joints_rad.T:
+        np.maximum(distance, np.abs(turns[:, None] - turns[None]), out=distance)
     return turn_times_s(distance, situation.speed_rad_s, situation.acceleration_rad_s2)
+
+
+def _legs_s(joints_rad: Array, situation: Situation) -> Array:
+    """(K - 1,) time from each of the joint positions (K, 6) to the next."""
+    turns = np.abs(np.diff(joints_rad, axis=0)).max(axis=1)
+    return turn_times_s(turns, situation.speed_rad_s, situation.acceleration_rad_s2)
 
 
 def turn_times_s(turns_rad: Array, speed_rad_s: float, acceleration_rad_s2: float) -> Array:

@@ -11,6 +11,8 @@ from scipy.sparse.csgraph import connected_components
 
 from service.core.geometry import Array, Transform
 
+_ROWS = 2000  # of angles that are in memory at a time
+
 
 def choose_pairs(
     names: Sequence[str],
@@ -36,23 +38,29 @@ def choose_pairs(
         return _by_station(names, prior, neighbours, max_angle_deg, stations)
     n = len(names)
     known = [k for k, name in enumerate(names) if prior is not None and name in prior]
-    every = {(i, j) for i in range(n) for j in range(i + 1, n)}
     if prior is None or len(known) < 3:
-        return sorted(every)
+        return [(i, j) for i in range(n) for j in range(i + 1, n)]
     poses = np.stack([prior[names[k]] for k in known])
     axes, centres = poses[:, :3, 2], poses[:, :3, 3]
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     scene = np.linalg.lstsq(projectors.sum(axis=0), np.einsum("nij,nj->i", projectors, centres), rcond=None)[0]
     rays = centres - scene
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    angle = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
-    np.fill_diagonal(angle, np.inf)
-    chosen = {pair for pair in every if pair[0] not in known or pair[1] not in known}
-    for row in range(len(known)):
-        for column in np.argsort(angle[row])[:neighbours]:
-            if angle[row, column] <= max_angle_deg:
-                chosen.add(_ordered(known[row], known[int(column)]))
-    return sorted(chosen | _bridges(chosen, known, angle, n))
+    unknown = set(range(n)).difference(known)
+    chosen = {_ordered(k, other) for k in unknown for other in range(n) if other != k}
+    for first in range(0, len(known), _ROWS):
+        angle = _angles_deg(rays[first : first + _ROWS], rays)
+        for row, to_others in enumerate(angle, start=first):
+            to_others[row] = np.inf
+            for column in np.argsort(to_others)[:neighbours]:
+                if to_others[column] <= max_angle_deg:
+                    chosen.add(_ordered(known[row], known[int(column)]))
+    return sorted(chosen | _bridges(chosen, known, rays, n))
+
+
+def _angles_deg(rays: Array, others: Array) -> Array:
+    """(K, L) angles between unit vectors (K, 3) and (L, 3)."""
+    return np.degrees(np.arccos(np.clip(rays @ others.T, -1, 1)))
 
 
 def _by_station(
@@ -76,7 +84,7 @@ def _ordered(i: int, j: int) -> tuple[int, int]:
     return (i, j) if i < j else (j, i)
 
 
-def _bridges(chosen: set[tuple[int, int]], known: list[int], angle: Array, n: int) -> set[tuple[int, int]]:
+def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int) -> set[tuple[int, int]]:
     """The nearest pairs between parts of the graph that are not connected: several for each, one may not match."""
     added: set[tuple[int, int]] = set()
     while True:
@@ -89,7 +97,10 @@ def _bridges(chosen: set[tuple[int, int]], known: list[int], angle: Array, n: in
         rows, columns = np.flatnonzero(inside), np.flatnonzero(~inside)
         if len(columns) == 0:
             return added
-        block = angle[np.ix_(rows, columns)]
+        if len(rays) <= _ROWS:  # to the last bit as they were chosen above: of equal angles the first one counts
+            block = _angles_deg(rays, rays)[np.ix_(rows, columns)]
+        else:
+            block = _angles_deg(rays[rows], rays[columns])
         for flat in np.argsort(block, axis=None)[:6]:
             r, c = divmod(int(flat), len(columns))
             added.add(_ordered(known[int(rows[r])], known[int(columns[c])]))

@@ -1,0 +1,245 @@
+"""`captures`: the real programs capture on a simulated rig for an hour; what they hold and write must not creep.
+
+`simulate rig` (the arm at many times its speed), `run` with its drivers' processes and its worker, and `serve`, which
+somebody reads all the while. Every few seconds memory (USS and RSS), descriptors and threads of every process are
+sampled, and the sizes of database, write-ahead log and logs. After a warm-up a line is fitted over the number of
+captures; bench/soak/creep.py judges it.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+import yaml
+
+from bench.soak.creep import CHILD, Sample, judge
+from service.core.model import Payload, ViewpointCaptured
+from service.core.run_state import RunState
+from service.evidence import RunLog
+from service.runs import recorded_run
+from service.store.audit import verify
+from service.store.store import Store
+from tests.support.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
+from tests.support.serving import Server, serving
+
+_HOST = "127.0.0.81"
+_SPEED_UP = 20
+_WIDTH_PX = 640
+_ROBOT_PORTS = {29999, 30001, 30002, 30003, 30004}  # fixed by the maker
+_LONGEST_S = 600.0  # until the first capture, on a busy machine
+_LOOK_S = 0.5  # between two pages that are asked for
+_ENDS_S = 120.0  # the runner is told to end, and does
+
+
+def captures(folder: Path, minutes: float, every_s: float, planned: int, *, calibrated: bool) -> dict[str, Any]:
+    """Capture for so long; samples, lines, and the faults. See `protocol_of` for the others."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rig = folder / "rig"
+    rig.mkdir()
+    options = ("--scene", "7", "--image-width", str(_WIDTH_PX), "--speed-up", str(_SPEED_UP))
+    with simulated_rig(rig, *options, host=_HOST) as ready, serving(rig / "rig.yaml") as server:
+        soak = _Soak(
+            rig / "data",
+            protocol_of(folder, planned, calibrated=calibrated),
+            Path(ready["rig"]),
+            server,
+            folder / "run.log",
+        )
+        soak.go(60 * minutes, every_s)
+    report = verify(rig / "data")
+    faults = soak.faults + [str(fault) for fault in report.faults]
+    if (folder / "run.log").read_text().count("Traceback"):
+        faults.append(f"the runner wrote a traceback: {(folder / 'run.log').read_text()[-500:]}")
+    found = judge(soak.samples)
+    return {
+        "minutes": minutes,
+        "captured": soak.samples[-1].captured if soak.samples else 0,
+        "pages": soak.pages,
+        "events": report.events,
+        "jobs": report.jobs,
+        "samples": len(soak.samples),
+        **found,
+        "faults": faults + found["faults"],
+    }
+
+
+def protocol_of(folder: Path, planned: int, *, calibrated: bool) -> Path:
+    """A capture of so many viewpoints at a station.
+
+    When `calibrated`, the camera is calibrated before, and a registration after it is planned, which is never
+    reached: so the worker has features and matches to compute for every image. The live numbers are left out: each of
+    their jobs names all the images before it, which is not linear (docs/soak.md).
+    """
+    whole = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
+    steps: dict[str, dict[str, Any]] = {step["id"]: step for step in whole["steps"]}
+    capture = steps["viewpoint_capture_1"]
+    capture["params"]["viewpoints"][0]["arcs"] = [
+        {"tilt_deg": 25, "azimuth_from_deg": -45, "azimuth_to_deg": 45, "count": planned, "distance_m": 0.64}
+    ]
+    capture["gates"][0]["min"] = planned
+    if calibrated:
+        capture["params"].pop("live")
+        not_measured = ("predicted_target_error_mm", "specimen_coverage")
+        capture["gates"] = [gate for gate in capture["gates"] if gate["measure"] not in not_measured]
+        scan, registration = steps["scanning"], steps["registration"]
+        scan["params"] = {"spheres": 10, "wait_s": 60}
+        scan["gates"] = [gate for gate in scan["gates"] if gate["measure"] == "spheres_found"]
+        registration["params"] |= {"images_of": [capture["id"]], "control_images_of": []}
+        before = [steps[name] for name in ("camera_set_up", "camera_calibration", "board_removal")]
+        whole["steps"] = [*before, capture, scan, registration]
+    else:
+        without_calibration_and_ct(capture)
+        capture["simulated_hands"] = [{"action": "mount_camera"}]
+        whole["steps"] = [capture]
+    whole |= {"id": "soak", "title": "A capture that does not end"}
+    path = folder / "protocol.yaml"
+    path.write_text(yaml.safe_dump(whole, sort_keys=False))
+    return path
+
+
+@dataclass
+class _Soak:
+    data: Path
+    protocol: Path
+    rig: Path
+    server: Server
+    log: Path
+    samples: list[Sample] = field(default_factory=list[Sample])
+    faults: list[str] = field(default_factory=list[str])
+    pages: int = 0
+
+    def go(self, seconds: float, every_s: float) -> None:
+        """Run, read and sample until the time is over; then end the run and what belongs to it."""
+        words = ("run", str(self.protocol), "--rig", str(self.rig), "--data", str(self.data))
+        with self.log.open("wb") as log:
+            runner = subprocess.Popen(
+                command(*words, "--operator", "soak", "--auto-confirm", "--json"),
+                cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
+        try:
+            headers = self.server.signed_in()
+            with httpx.Client(base_url=self.server.url, headers=headers, timeout=60) as client:
+                self._follow(runner, client, seconds, every_s)
+        finally:
+            runner.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                runner.wait(timeout=_ENDS_S)
+            if runner.poll() is None:
+                self.faults.append(f"the runner had not ended {_ENDS_S:.0f} s after SIGTERM")
+                runner.kill()
+                runner.wait()
+
+    def _follow(self, runner: subprocess.Popen[bytes], client: httpx.Client, seconds: float, every_s: float) -> None:
+        gives_up_s = time.monotonic() + _LONGEST_S
+        ends_s = next_s = 0.0
+        told_s = time.monotonic()
+        with Store.open(self.data) as store:
+            log: RunLog | None = None
+            count = seen = 0
+            while not ends_s or time.monotonic() < ends_s:
+                if runner.poll() is not None:
+                    self.faults.append(f"the run ended by itself: {self.log.read_text()[-500:]}")
+                    return
+                if log is None and store.runs():
+                    run_id = store.find_run("latest")
+                    log = RunLog(store, run_id, recorded_run(store, run_id)[0])
+                if log is not None:
+                    log.refresh()
+                    count += sum(_is_of_the_capture(event.payload) for event in log.events[seen:])
+                    seen = len(log.events)
+                    self._look(client, log.run_id, log.state)
+                if count and not ends_s:
+                    ends_s = time.monotonic() + seconds
+                if not ends_s and time.monotonic() > gives_up_s:
+                    self.faults.append(f"nothing was captured: {self.log.read_text()[-500:]}")
+                    return
+                if count and time.monotonic() >= next_s:
+                    next_s = time.monotonic() + every_s
+                    self.samples.append(self._sample(runner.pid, count))
+                if time.monotonic() - told_s > 60:
+                    told_s = time.monotonic()
+                    print(f"captures: {count} so far", flush=True)
+                time.sleep(_LOOK_S)
+
+    def _look(self, client: httpx.Client, run: str, state: RunState) -> None:
+        """What an open page asks for when something has happened, and whole pages in turn."""
+        whole = ("/", f"/runs/{run}", f"/runs/{run}/capture", f"/audit/runs/{run}", "/metrics", "/health")
+        parts = (f"/runs/{run}/parts/banner,control,vitals,step", f"/runs/{run}/capture/parts/image,plan,sheet")
+        for address in (whole[self.pages % len(whole)], *parts):
+            try:
+                answer = client.get(address)
+            except httpx.HTTPError as error:
+                self.faults.append(f"{address} did not answer at event {state.seq}: {error!r}")
+                return
+            if answer.status_code != 200:
+                self.faults.append(f"{address} answers {answer.status_code}: {answer.text[:200]}")
+        self.pages += 1
+
+    def _sample(self, runner: int, count: int) -> Sample:
+        processes: dict[str, dict[str, float]] = {}
+        children = 0
+        for process in sorted(psutil.Process().children(recursive=True), key=lambda p: p.pid):
+            with suppress(psutil.Error):
+                name = role_of(process, runner)
+                if name == CHILD:  # there are several, and they stay
+                    children += 1
+                    name = f"{name} {children}"
+                if name:
+                    processes[name] = figures_of(process)
+        sizes = {
+            "database": _size(self.data / "orthocapture.sqlite"),
+            "write-ahead log": _size(self.data / "orthocapture.sqlite-wal"),
+            "logs": sum(_size(path) for path in (self.data / "logs").glob("*")),
+            "monitor": sum(_size(path) for path in (self.data / "monitor").glob("*")),
+        }
+        return Sample(time.monotonic(), count, processes, sizes)
+
+
+def _is_of_the_capture(payload: Payload) -> bool:
+    return isinstance(payload, ViewpointCaptured) and payload.step == "viewpoint_capture_1"
+
+
+def role_of(process: psutil.Process, runner: int) -> str:
+    """What a process is, in a word or two; "" for what is no part of it. Raises psutil.Error."""
+    words = " ".join(process.cmdline())
+    if process.pid == runner:
+        return "runner"
+    if "-m drivers.host" in words:
+        ports = {link.raddr.port for link in process.net_connections("tcp") if link.raddr}
+        return "driver of the robot" if ports & _ROBOT_PORTS else "driver of the camera"
+    named = {
+        "service.cli.main worker": "worker",
+        "service.cli.main serve": "web",
+        "simulators ur ": "simulated robot",
+        "simulators camera ": "simulated camera",
+        "simulators lightbox ": "simulated light box",
+        "simulate rig ": "simulated rig",
+    }
+    if "multiprocessing.spawn" in words:
+        return CHILD
+    return next((name for part, name in named.items() if part in words), "")
+
+
+def figures_of(process: psutil.Process) -> dict[str, float]:
+    """What one process holds. Raises psutil.Error."""
+    memory = process.memory_full_info()
+    return {
+        "uss_mb": memory.uss / 1e6,
+        "rss_mb": memory.rss / 1e6,
+        "descriptors": float(process.num_fds()),
+        "threads": float(process.num_threads()),
+    }
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0

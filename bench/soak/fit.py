@@ -1,0 +1,68 @@
+"""Lines through measurements: how fast something grows, how well that is known, and of which order a duration is."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import linregress
+from scipy.stats import t as student
+
+BLOCKS = 12
+
+
+class Took(NamedTuple):
+    """How long something took: on the wall, and of this process's processors, which other work does not lengthen."""
+
+    wall_s: float
+    cpu_s: float
+
+    @classmethod
+    def now(cls) -> Took:
+        """The clocks, for a difference."""
+        return cls(time.perf_counter(), time.process_time())
+
+    def since(self, earlier: Took) -> Took:
+        """The difference."""
+        return Took(self.wall_s - earlier.wall_s, self.cpu_s - earlier.cpu_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """Slope of a line, with the half-width of its 95 % interval; both in units of y per unit of x."""
+
+    slope: float
+    half_width: float
+
+    @property
+    def least(self) -> float:
+        """What it grows by at least, with 97.5 % confidence."""
+        return self.slope - self.half_width
+
+
+def growth(x: Sequence[float], y: Sequence[float]) -> Growth | None:
+    """How fast y grows with x; None for fewer than four distinct places.
+
+    Samples that follow one another closely say nearly the same: they count as the mean of their block, of which there
+    are at most BLOCKS, so that the interval is not narrower than what is known.
+    """
+    blocks = [part for part in np.array_split(np.arange(len(x)), min(BLOCKS, len(x))) if len(part)]
+    at = [float(np.mean(np.asarray(x)[part])) for part in blocks]
+    mean = [float(np.mean(np.asarray(y)[part])) for part in blocks]
+    if len(set(at)) < 4:
+        return None
+    if len(set(mean)) == 1:
+        return Growth(0.0, 0.0)
+    line = linregress(at, mean)
+    return Growth(float(line.slope), float(line.stderr * student.ppf(0.975, len(at) - 2)))
+
+
+def exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float:
+    """The p of seconds ∝ sizes**p, by least squares of the logarithms; 1: linear."""
+    shortest = 1e-6  # of a clock
+    logarithms = [math.log(max(taken, shortest)) for taken in seconds]
+    return float(np.polyfit(np.log(sizes), logarithms, 1)[0])

@@ -1,0 +1,147 @@
+"""One run that grows to thousands of viewpoints: the real runner begins and resumes it, the rest fills it up.
+
+The runner takes the first viewpoints, and a few at each size, on the rig in memory of the tests. Those between come
+to the record as a capture brings them: photograph and poses into the store, one transaction with rows and event; then
+a job that looks at it, enqueued, claimed and finished. The photographs are sparse (bench/soak/sparse.py).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+from bench.soak.fit import Took
+from bench.soak.sparse import SparseFiles, sparse_photograph
+from service.core.model import ViewpointCaptured
+from service.core.protocol import parse_protocol
+from service.rig import load_rig
+from service.runs import start_run
+from service.steps import params_models
+from service.store.records import NewArtefact, NewJob
+from service.store.store import Store
+from tests.support.bench_run import PROTOCOL, Bench
+
+STEP = "capture"
+TIMED = 200  # viewpoints before each size that are brought with every fsync, and timed
+_POSES = 4  # of a pose log; a real one has a hundred, which here would only be written to the disk
+_RIG = """\
+name: large
+simulated: true
+devices: {robot: {driver: ur, host: 127.0.0.1}}
+stations:
+  station_1: {robot: robot, scene_centre_m: [0.0, 0.8, 0.0], approach_azimuth_deg: -90}
+T_flange_camera_nominal: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]]
+"""
+
+
+class _DiedError(BaseException):
+    """The runner's process is gone; nothing catches this."""
+
+
+@dataclass
+class LargeRecord:
+    """A store in folder/data with one run that plans `planned` viewpoints."""
+
+    folder: Path
+    planned: int
+    photograph_bytes: int
+    store: Store = field(init=False)
+    run_id: str = field(init=False)
+    taken: int = field(init=False, default=0)
+    _files: SparseFiles = field(init=False)
+    _like: ViewpointCaptured = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._files = SparseFiles()
+        self.store = Store.open(self.folder / "data", files=self._files)
+        text = PROTOCOL.replace("count: 4", f"count: {self.planned}")
+        assert text != PROTOCOL
+        rig = self.folder / "large.yaml"
+        rig.write_text(_RIG)
+        loaded = parse_protocol(text.encode(), params_models(), name="large.yaml")
+        self.run_id = start_run(self.store, loaded, load_rig(rig), operator="Ada", auto_confirm=False)
+        self.take(3)
+        bench = Bench(self.store, self.run_id, self.folder / "data")
+        self._like = bench.payloads(ViewpointCaptured)[0]
+        self.taken = len(bench.captured())
+
+    def close(self) -> None:
+        """Close the store."""
+        self.store.close()
+
+    def grow(self, until: int) -> list[Took]:
+        """Bring viewpoints to the record until there are so many; what each of the last ones took.
+
+        Those before the last ones are not synced one by one, which would take an hour of the disk's time.
+        """
+        took: list[Took] = []
+        photograph = self.folder / "photograph.jpg"
+        while self.taken < until:
+            number = self.taken + 1
+            self._files.unhurried = until - self.taken <= TIMED
+            sparse_photograph(photograph, number, self.photograph_bytes)
+            began = Took.now()
+            self._bring(photograph, f"v{number:03d}", number)
+            if self._files.unhurried:
+                took.append(Took.now().since(began))
+            self.taken += 1
+        return took
+
+    def take(self, count: int) -> tuple[Took, list[Took]]:
+        """A runner resumes the run, takes so many more and dies: what the first exposure took, and the others."""
+        bench = Bench(self.store, self.run_id, self.folder / "data")
+        at: list[Took] = []
+
+        def exposed(_number: int) -> None:
+            at.append(Took.now())
+            if len(at) > count:
+                raise _DiedError
+
+        bench.rig.shutter.on_capture = exposed
+        began = Took.now()
+        try:
+            bench.run()
+        except _DiedError:
+            pass
+        else:
+            raise AssertionError("the run ended before its time")
+        self.taken += count
+        return at[0].since(began), [later.since(earlier) for earlier, later in pairwise(at)]
+
+    def _bring(self, photograph: Path, name: str, number: int) -> None:
+        store, step = self.store, STEP
+        image = store.put_file(
+            photograph, kind="image", media_type="image/jpeg", original_name=f"DSC{number:05d}.JPG"
+        )
+        pose = {"controller_time_s": 1.25 * number, "T_base_flange": self._like.T_base_flange}
+        log = store.put_bytes(
+            "".join(json.dumps(pose) + "\n" for _ in range(_POSES)).encode(),
+            kind="pose_log",
+            media_type="application/x-ndjson",
+            original_name=f"{name}.poses.jsonl",
+        )
+        captured = self._like.model_copy(
+            update={"viewpoint": name, "artefacts": (image, log), "trigger_monotonic_s": 1.25 * number}
+        )
+        rows = [NewArtefact(ref, device, step, 1, name) for ref, device in ((image, "camera"), (log, "robot"))]
+        store.record(self.run_id, [captured], actor="runner", artefacts=rows)
+        looked = NewJob(
+            "live_view", step, 1, f"{step}/1/live_view/{name}", {"image": {"viewpoint": name, "sha256": image.sha256}}
+        )
+        store.record(self.run_id, [], actor="runner", jobs=[looked])
+        job = store.claim_job("worker", 60.0)
+        assert job is not None
+        found = json.dumps({"viewpoint": name, "spheres": number}).encode()
+        answer = store.put_bytes(
+            found, kind="live_view", media_type="application/json", original_name=f"{name}.live.json"
+        )
+        store.finish_job(
+            job,
+            measures={"spheres_seen": 10.0, "edge_width_px": 2.5, "outline_rms_px": 0.2, "clipped_fraction": 0.0},
+            result={"viewpoint": name},
+            duration_s=0.1,
+            artefacts=[NewArtefact(answer, "worker", step, 1, name)],
+        )

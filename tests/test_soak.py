@@ -1,0 +1,110 @@
+"""The soak, short: each part at a small size, and what its judges say of figures that creep, wait or slow down."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from bench.soak.__main__ import main
+from bench.soak.creep import JUDGED_S, Sample, judge
+from bench.soak.fit import Took, exponent, growth
+from bench.soak.large import judge as judge_large
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+SMALL = (
+    "--minutes", "0.15", "--sample-s", "0.4", "--planned", "40", "--uncalibrated",
+    "--viewpoints", "64", "--gigabytes", "0.02", "--together-minutes", "0.05",
+    "--rounds", "2", "--images", "2", "--image-mb", "1",
+)  # fmt: skip
+
+
+def test_each_part_runs_small_and_its_figures_stand_beside_the_others(tmp_path: Path) -> None:
+    for part in ("captures", "together", "large", "speed"):
+        main([*SMALL, "--only", part, "--results", str(tmp_path)])  # so small a size says nothing of speed
+    (written,) = tmp_path.glob("soak-*.json")
+    found: dict[str, Any] = json.loads(written.read_text())
+    assert set(found) == {"captures", "large", "together", "speed"}
+    assert [fault for fault in found["captures"]["faults"] if "say nothing" not in fault] == []
+    assert found["captures"]["captured"] >= 2
+    assert {"runner: threads", "web: descriptors", "driver of the robot: resident memory, MB", "database, MB"} <= {
+        row["what"] for row in found["captures"]["rows"]
+    } or found["captures"]["samples"] < 16  # on a machine that has no time
+    assert found["together"]["faults"] == []
+    assert {row["who"]: row["processes"] for row in found["together"]["rows"]} == {
+        "runner": 1, "worker": 4, "status": 3, "pages": 3, "audit show": 2, "person": 1,
+    }  # fmt: skip
+    assert found["large"]["sizes"] == [8, 16, 32, 64]
+    assert found["large"]["artefact_bytes"] > 0.018e9
+    assert found["large"]["disk_bytes"] < 0.5 * found["large"]["artefact_bytes"], "the photographs are not sparse"
+    assert {"status", "audit show", "audit verify", "page: capture", "ingest of a viewpoint"} <= {
+        row["what"] for row in found["large"]["rows"]
+    }
+    assert {row["what"] for row in found["speed"]["rows"]} >= {"ingest", "verify, cached", "verify, from the disk"}
+    text = written.with_suffix(".md").read_text()
+    assert all(f"`{part}`" in text for part in found)
+
+
+def samples(**per_capture: float) -> list[Sample]:
+    """Six hundred of them over an hour, with noise; named figures of the web process grow with each capture."""
+    draw = random.Random(3)
+    out: list[Sample] = []
+    for number in range(600):
+        grown = {name: rate * number for name, rate in per_capture.items()}
+        web = {
+            "uss_mb": 100 + draw.gauss(0, 1) + grown.get("uss_mb", 0),
+            "rss_mb": 150 + draw.gauss(0, 1),
+            "descriptors": 20 + draw.choice((0, 1)) + grown.get("descriptors", 0),
+            "threads": 9.0,
+        }
+        sizes = {"database": 1000 * number, "write-ahead log": 4_000_000, "logs": 10 * number, "monitor": 900}
+        out.append(Sample(number * JUDGED_S / 50, number, {"web": web}, sizes))
+    return out
+
+
+def test_what_stays_is_no_fault_and_what_creeps_is_one() -> None:
+    assert judge(samples())["faults"] == []
+    (fault,) = judge(samples(descriptors=0.01))["faults"]
+    assert "web: descriptors" in fault
+    (fault,) = judge(samples(uss_mb=0.2))["faults"]
+    assert "web: memory of its own" in fault
+    assert "200" in fault
+    assert judge(samples(uss_mb=0.02))["faults"] == [], "it holds the events of the run"
+
+
+def test_what_was_too_short_is_not_judged_and_too_few_samples_are_told() -> None:
+    hasty = [Sample(s.at_s / 100, s.captured, s.processes, s.sizes) for s in samples(descriptors=0.01)]
+    found = judge(hasty)
+    assert (found["judged"], found["faults"]) == (False, [])
+    assert "say nothing" in judge(samples()[:6])["faults"][0]
+
+
+def test_a_line_knows_how_well_it_is_known() -> None:
+    exact = growth([0, 1, 2, 3, 4], [1, 3, 5, 7, 9])
+    assert exact is not None
+    assert exact.slope == pytest.approx(2)
+    assert exact.half_width < 1e-6
+    draw = random.Random(1)
+    x = [number / 100 for number in range(400)]
+    noisy = growth(x, [0.5 * one + draw.gauss(0, 1) for one in x])
+    assert noisy is not None
+    assert noisy.least < 0.5 < noisy.slope + noisy.half_width
+    assert growth([1, 1, 1, 1, 1], [1, 2, 3, 4, 5]) is None
+
+
+def test_what_grows_with_the_square_is_a_fault_and_so_is_a_slow_page() -> None:
+    sizes = (1250, 2500, 5000, 10_000)
+    assert exponent(sizes, [1, 2, 4, 8]) == pytest.approx(1)
+    assert exponent(sizes, [1, 4, 16, 64]) == pytest.approx(2)
+
+    def found(**seconds: float) -> list[str]:
+        at = {n: {name: Took(s * n / 10_000, s * n / 10_000) for name, s in seconds.items()} for n in sizes}
+        at |= {n: at[n] | {"status": Took(1, (n / 10_000) ** 2)} for n in sizes}
+        return [fault for row in judge_large(at) for fault in row["faults"]]
+
+    assert found() == ["status grows with the power 2.00 of the viewpoints"]
+    assert len(found(**{"page: run": 1.4})) == 2
+    assert len(found(**{"page: run": 0.9, "audit verify": 90})) == 1
