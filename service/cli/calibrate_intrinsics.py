@@ -13,9 +13,27 @@ from rich.markup import escape
 
 from drivers.errors import UnreadableFileError
 from drivers.photo_file import read_exif
-from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
+from service.cli.board_options import (
+    DEFAULT_DICTIONARY,
+    BoardOption,
+    DictionaryOption,
+    LegacyOption,
+    MarkerOption,
+    PatternOption,
+    SquareOption,
+    described_board,
+    require_board,
+)
+from service.cli.common import (
+    JsonOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable,
+    require_writable_folder,
+)
 from service.compute.calibration.adjustment import LensModel
-from service.compute.calibration.board import Board, Pattern
 from service.compute.calibration.board_images import UsableViews, find_boards, usable_views
 from service.compute.calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
 from service.compute.calibration.intrinsics_record import intrinsics_record
@@ -35,28 +53,13 @@ _IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
 def intrinsics_command(
     images: Annotated[Path, typer.Option("--images", help="Folder of the board images.")],
-    board: Annotated[
-        str,
-        typer.Option(
-            "--board",
-            metavar="COLSxROWS",
-            help="Inner corners, where four squares meet: 16x23 for a board of 17 × 24 squares; of a ChArUco board "
-            "too. Of circles: in a row, and rows.",
-        ),
-    ],
-    square_mm: Annotated[
-        float, typer.Option("--square-mm", help="Side of a square; of circles the distance between two rows.")
-    ],
+    board: BoardOption,
+    square_mm: SquareOption,
     out: Annotated[Path, typer.Option("--out", help="The camera.json to write.")],
-    pattern: Annotated[Pattern, typer.Option("--pattern", help="What is printed.")] = "checkerboard",
-    marker_mm: Annotated[
-        float | None,
-        typer.Option("--marker-mm", help="Side of a ChArUco marker; without: ¾ of a square."),
-    ] = None,
-    dictionary: Annotated[str, typer.Option("--dictionary", help="Of the ChArUco markers.")] = "DICT_5X5_1000",
-    legacy: Annotated[
-        bool, typer.Option("--legacy", help="A ChArUco board as OpenCV printed it before version 4.6.")
-    ] = False,
+    pattern: PatternOption = "checkerboard",
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = DEFAULT_DICTIONARY,
+    legacy: LegacyOption = False,
     model: Annotated[
         LensModel,
         typer.Option("--model", help="Distortion: none, k1 k2, + p1 p2, + k3, rational k1 … k6."),
@@ -73,10 +76,12 @@ def intrinsics_command(
 ) -> None:
     """Calibrate a camera from images of a flat board, and say how far to trust it."""
     with reporting_errors(json):
-        seen = Board(
-            *_counts(board), square_mm * 1e-3, pattern, None if marker_mm is None else marker_mm * 1e-3, dictionary
-        )
+        seen = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
         files = image_files(images)
+        require_writable(out)
+        if report is not None:
+            require_writable_folder(report)
+        require_board(files, seen)
         with progress_bar(quiet=json) as progress:
             found = find_boards(
                 files,
@@ -125,13 +130,6 @@ def image_files(folder: Path) -> list[Path]:
     if not files:
         raise DataError("no image in this folder", where=str(folder), remedy="JPEG, PNG or TIFF files are read")
     return files
-
-
-def _counts(board: str) -> tuple[int, int]:
-    columns, _, rows = board.lower().replace("×", "x").partition("x")
-    if not (columns.isdigit() and rows.isdigit()):
-        raise typer.BadParameter(f"--board takes COLSxROWS such as 16x23, not {board!r}")
-    return int(columns), int(rows)
 
 
 def _with_reasons(error: ComputeError, views: UsableViews, files: Sequence[Path]) -> ComputeError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
+import tempfile
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from typer.models import OptionInfo
 
-from service.core.errors import OrthocaptureError
+from service.core.errors import ConfigurationError, OrthocaptureError
 
 PROGRESS_AFTER_S = 2.0
 
@@ -67,6 +68,42 @@ def reporting_errors(json: bool = False) -> Generator[None]:
         yield
     except OrthocaptureError as error:
         raise fail(error, json=json) from error
+
+
+def require_writable(file: Path) -> None:
+    """Raise ConfigurationError unless the file can be written: said before a computation, not after it."""
+    if file.is_dir():
+        raise ConfigurationError("this is a folder, a file is to be written", where=str(file), remedy="Name the file")
+    if not file.parent.is_dir():
+        raise ConfigurationError(
+            "the folder of the file to write does not exist",
+            where=str(file),
+            remedy="Make the folder, or name another",
+        )
+    there = file.exists()
+    try:
+        with file.open("ab"):
+            pass
+    except OSError as error:
+        raise _unwritable(file, error) from error
+    if not there:
+        file.unlink()
+
+
+def require_writable_folder(folder: Path) -> None:
+    """Make the folder if need be, and raise ConfigurationError unless files can be written into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> ConfigurationError:
+    return ConfigurationError(
+        f"this cannot be written: {error.strerror}", where=str(path), remedy="Check the path and its permissions"
+    )
 
 
 @contextmanager
