@@ -22,8 +22,15 @@ from service.cli.board_options import (
     described_board,
     require_board,
 )
-from service.cli.calibrate_intrinsics import image_files
-from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors, require_writable
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable,
+)
 from service.compute.calibration.board_images import find_boards, usable_views
 from service.compute.calibration.board_plan import SuggestedPose, suggest_board_poses
 from service.compute.calibration.board_plan_plot import draw_board_plan
@@ -33,8 +40,9 @@ from service.compute.calibration.hand_eye_setup import Setup
 from service.compute.calibration.intrinsics import locate_view
 from service.compute.calibration.joint_file import read_joints_csv
 from service.compute.calibration.kinematics import ArmModel, arm_model, matching_arm, solve_joints
-from service.compute.poses.pose_files import read_camera_json, read_poses
-from service.core.errors import ConfigurationError, DataError
+from service.compute.image_folder import image_folder
+from service.compute.poses.pose_files import posed_images, read_camera_json
+from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
 
 
@@ -67,6 +75,7 @@ def hand_eye_command(
     preview: Annotated[
         Path | None, typer.Option("--preview", help="PNG of the suggested poses beside those taken.")
     ] = None,
+    strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
     """Calibrate the camera's place on the robot's flange, and say how far to trust it."""
@@ -77,7 +86,9 @@ def hand_eye_command(
         if setup == "eye-to-hand" and preview is not None:
             raise typer.BadParameter("--preview shows suggested places of a camera that the robot moves")
         model = read_camera_json(camera)
-        files = image_files(images)
+        folder = image_folder(images, size=(model.width, model.height), strict=strict)
+        known, folder = posed_images(robot_poses, folder, images, strict=strict)
+        files = folder.files
         for file in (out, preview):
             if file is not None:
                 require_writable(file)
@@ -90,16 +101,8 @@ def hand_eye_command(
                 progress=lambda done, total: progress("board images", done, total),
             )
         usable = usable_views(found)
-        if usable.size != (model.width, model.height):
-            raise DataError(
-                f"the images are {usable.size[0]} × {usable.size[1]} px, the camera was calibrated at "
-                f"{model.width} × {model.height}",
-                where=str(camera),
-                remedy="Use images of the calibrated size",
-            )
         names = [files[k].name for k in usable.indices]
-        poses = read_poses(robot_poses, names)
-        T_base_flange = np.array([poses[name] for name in names])
+        T_base_flange = np.array([known[name] for name in names])
         joints_rad, kinematics = _arm(joints, arm, names, T_base_flange)
         corners = board_corners(usable.views, target, model)
         result = calibrate_hand_eye(
@@ -127,6 +130,7 @@ def hand_eye_command(
         )
         record: dict[str, Any] = {
             **hand_eye_record(result, names, setup),
+            "left_out": folder.left_out,
             "images_without_board": {files[k].name: reason for k, reason in sorted(usable.excluded.items())},
             "suggested_poses": [_suggestion(pose) for pose in suggested],
             "suggestions_reachable": kinematics is not None,
@@ -206,7 +210,7 @@ def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
         )
     elif len(result.arm_held_out_mm) > 1:
         console.print("estimating the arm's own error gains nothing on held-out images: not used")
-    for name, reason in {**record["excluded"], **record["images_without_board"]}.items():
+    for name, reason in {**record["left_out"], **record["excluded"], **record["images_without_board"]}.items():
         console.print(f"not used: {escape(name)}: {escape(reason)}")
     suggested = record["suggested_poses"]
     if suggested:

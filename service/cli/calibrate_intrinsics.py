@@ -26,6 +26,7 @@ from service.cli.board_options import (
 )
 from service.cli.common import (
     JsonOption,
+    StrictOption,
     console,
     print_json,
     progress_bar,
@@ -46,9 +47,11 @@ from service.compute.calibration.validation import (
     calibration_warnings,
     cross_validate,
 )
+from service.compute.image_folder import image_folder
+from service.compute.images import image_size
 from service.core.errors import ComputeError, DataError
 
-_IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+_WITHOUT_EXIF = {".pgm", ".ppm", ".pnm"}
 
 
 def intrinsics_command(
@@ -72,12 +75,14 @@ def intrinsics_command(
         typer.Option("--capture-images", help="Folder of images to be used with this camera: was the lens the same?"),
     ] = None,
     report: Annotated[Path | None, typer.Option("--report", help="Folder for plots (PNG).")] = None,
+    strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
     """Calibrate a camera from images of a flat board, and say how far to trust it."""
     with reporting_errors(json):
         seen = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
-        files = image_files(images)
+        folder = image_folder(images, strict=strict)
+        files = folder.files
         require_writable(out)
         if report is not None:
             require_writable_folder(report)
@@ -108,7 +113,7 @@ def intrinsics_command(
                 uncertainty,
                 warnings,
                 [files[k].name for k in used],
-                {files[k].name: excluded[k] for k in sorted(excluded)},
+                folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)},
             ),
             "optics": optics,
         }
@@ -120,16 +125,6 @@ def intrinsics_command(
             return
         _tell(record, result, validation, uncertainty)
         console.print(f"written: {out}")
-
-
-def image_files(folder: Path) -> list[Path]:
-    """Image files of a folder, by name. Raises DataError when there are none."""
-    if not folder.is_dir():
-        raise DataError("the image folder does not exist", where=str(folder))
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGE_SUFFIXES)
-    if not files:
-        raise DataError("no image in this folder", where=str(folder), remedy="JPEG, PNG or TIFF files are read")
-    return files
 
 
 def _with_reasons(error: ComputeError, views: UsableViews, files: Sequence[Path]) -> ComputeError:
@@ -145,7 +140,7 @@ def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[d
     record: dict[str, Any] = {"calibration_departures": [str(departure) for departure in within.departures]}
     warnings = [f"the lens changed during the calibration: {line}" for line in summary(within.departures)]
     if capture_folder is not None:
-        comparison = compare_optics(calibrated, [optics_of(file) for file in image_files(capture_folder)])
+        comparison = compare_optics(calibrated, [optics_of(file) for file in image_folder(capture_folder).files])
         record |= {
             "capture_departures": [str(departure) for departure in comparison.departures],
             "capture_images": list(comparison.images),
@@ -165,6 +160,9 @@ def optics_of(file: Path) -> Optics:
     Raises:
         DataError: the file is no picture.
     """
+    if file.suffix.lower() in _WITHOUT_EXIF:
+        width, height = image_size(file)
+        return Optics(image=file.name, width=width, height=height)
     try:
         exif = read_exif(file)
     except UnreadableFileError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json as json_module
 import tempfile
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,8 +33,13 @@ data_option: OptionInfo = typer.Option(
 )
 json_option: OptionInfo = typer.Option("--json", help="Print the result as JSON, for other programs.")
 
+strict_option: OptionInfo = typer.Option(
+    "--strict", help="Refuse odd files (copies, other sizes, images without a pose) instead of leaving them out."
+)
+
 DataOption = Annotated[Path, data_option]
 JsonOption = Annotated[bool, json_option]
+StrictOption = Annotated[bool, strict_option]
 DEFAULT_DATA = Path("runs")
 
 
@@ -68,6 +73,12 @@ def reporting_errors(json: bool = False) -> Generator[None]:
         yield
     except OrthocaptureError as error:
         raise fail(error, json=json) from error
+
+
+def tell_left_out(left_out: Mapping[str, str]) -> None:
+    """Name the files that took no part, each with its reason."""
+    for name, reason in left_out.items():
+        error_console.print(f"[yellow]left out[/] {escape(name)}: {escape(reason)}")
 
 
 def require_writable(file: Path) -> None:
