@@ -85,6 +85,20 @@ def test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads(folde
     assert any("8 views" in warning for warning in record["warnings"])
 
 
+def test_a_focus_motor_that_moved_is_named_and_a_body_that_does_not_tell_is_said(
+    folder: Path, tmp_path: Path
+) -> None:
+    at = [
+        Optics(f"{k}.jpg", focus_mode="Manual", focus_position=position) for k, position in enumerate((117, 117, 60))
+    ]
+    (departure,) = compare_optics(at, at).departures
+    assert str(departure) == "2.jpg: focus_position 60, calibrated at 117"
+    near = [Optics("a.jpg", focus_position=117), Optics("b.jpg", focus_position=118)]
+    assert not compare_optics(near, near).departures
+    done = _run(folder, tmp_path / "camera.json")
+    assert "do not say where the lens was focused: a changed focus would go unseen" in done.output
+
+
 def test_a_zoom_that_moved_after_the_calibration_is_named(folder: Path, tmp_path: Path) -> None:
     capture = tmp_path / "capture"
     capture.mkdir()

@@ -38,7 +38,7 @@ from service.compute.calibration.adjustment import LensModel
 from service.compute.calibration.board_images import UsableViews, find_boards, usable_views
 from service.compute.calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
 from service.compute.calibration.intrinsics_record import intrinsics_record
-from service.compute.calibration.optics import Optics, compare_optics, summary
+from service.compute.calibration.optics import Optics, compare_optics, states_focus, summary
 from service.compute.calibration.plots import calibration_plots
 from service.compute.calibration.uncertainty import ProjectionUncertainty, board_distance_m, projection_uncertainty
 from service.compute.calibration.validation import (
@@ -139,6 +139,8 @@ def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[d
     within = compare_optics(calibrated, calibrated)
     record: dict[str, Any] = {"calibration_departures": [str(departure) for departure in within.departures]}
     warnings = [f"the lens changed during the calibration: {line}" for line in summary(within.departures)]
+    if not states_focus(calibrated):
+        warnings.append("the images do not say where the lens was focused: a changed focus would go unseen")
     if capture_folder is not None:
         comparison = compare_optics(calibrated, [optics_of(file) for file in image_folder(capture_folder).files])
         record |= {
@@ -175,6 +177,7 @@ def optics_of(file: Path) -> Optics:
         aperture_f=exif.aperture_f,
         focus_distance_m=exif.focus_distance_m,
         focus_mode=exif.focus_mode,
+        focus_position=exif.focus_position,
         lens=exif.lens,
         lens_serial=exif.lens_serial,
         body=f"{exif.make} {exif.model}".strip(),
