@@ -39,7 +39,7 @@ from service.compute.calibration.hand_eye_record import board_corners, hand_eye_
 from service.compute.calibration.hand_eye_setup import Setup
 from service.compute.calibration.intrinsics import locate_view
 from service.compute.calibration.joint_file import read_joints_csv
-from service.compute.calibration.kinematics import ArmModel, arm_model, matching_arm, solve_joints
+from service.compute.calibration.kinematics import ARM_MODELS, ArmModel, arm_model, matching_arm, solve_joints
 from service.compute.image_folder import image_folder
 from service.compute.poses.pose_files import posed_images, read_camera_json
 from service.core.errors import ConfigurationError
@@ -69,7 +69,7 @@ def hand_eye_command(
         typer.Option("--joints", help="CSV image,q1,…,q6 in radians: the arm's own error is then estimated too."),
     ] = None,
     arm: Annotated[
-        str | None, typer.Option("--arm", help="Model, such as UR10e; without: found from the joints.")
+        str | None, typer.Option("--arm", help=f"Model: {', '.join(ARM_MODELS)}; without: found from the joints.")
     ] = (None),
     suggest: Annotated[int, typer.Option("--suggest", help="How many next board poses to suggest.", min=0)] = 6,
     preview: Annotated[
@@ -85,6 +85,8 @@ def hand_eye_command(
             raise typer.BadParameter("--joints and --arm are for a camera on the flange, not for --setup eye-to-hand")
         if setup == "eye-to-hand" and preview is not None:
             raise typer.BadParameter("--preview shows suggested places of a camera that the robot moves")
+        if arm is not None:
+            arm_model(arm)  # an unknown one is refused before images are searched
         model = read_camera_json(camera)
         folder = image_folder(images, size=(model.width, model.height), strict=strict)
         known, folder = posed_images(robot_poses, folder, images, strict=strict)

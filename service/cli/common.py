@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
+import re
 import tempfile
 import time
 from collections.abc import Callable, Generator, Mapping
@@ -11,14 +12,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
 from typer.models import OptionInfo
 
 from service.core.errors import ConfigurationError, OrthocaptureError
 
 PROGRESS_AFTER_S = 2.0
+_NUMBER = re.compile(r"[-+−±]?\d[\d.,:+−± e%-]*|more|–|-|")
 
 # The streams are looked up at each print, so that a redirected stdout is followed; results there, the rest on stderr.
 console = Console(highlight=False, soft_wrap=True)
@@ -41,6 +45,23 @@ DataOption = Annotated[Path, data_option]
 JsonOption = Annotated[bool, json_option]
 StrictOption = Annotated[bool, strict_option]
 DEFAULT_DATA = Path("runs")
+
+
+def print_table(table: Table, to: Console | None = None) -> None:
+    """Print a table; words wrap at the terminal's edge, but no number is ever cut or broken.
+
+    Where the numbers alone are wider than the terminal, the table is too.
+    """
+    least = 1
+    for column in table.columns:
+        cells = [str(cell) for cell in column.cells]
+        numeric = bool(cells) and all(not cell or _NUMBER.fullmatch(cell) for cell in cells)
+        width = max((cell_len(cell) for cell in cells), default=0) if numeric else 8
+        column.no_wrap, column.overflow = numeric, "fold"
+        column.min_width = width if numeric else None
+        least += width + 3
+    shown = to or console
+    shown.print(table, width=max(shown.width, least), soft_wrap=False, crop=False)
 
 
 def print_json(value: Any) -> None:

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from drivers.mesh_file import MeshUnit, read_mesh_file
 from drivers.point_cloud import is_point_cloud, read_point_cloud
-from service.cli.common import JsonOption, console, print_json, reporting_errors, require_writable
+from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
 from service.compute.surfaces.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
 from service.compute.surfaces.sphere_records import spheres_document
 from service.core.errors import ComputeError, DataError
@@ -81,7 +81,7 @@ def spheres_command(
                 f"{1e3 * sphere.radius_residual_m:+.3f} ± {1e3 * sphere.radius_sigma_m:.3f}",
                 f"{sphere.coverage:.2f}",
             )
-        console.print(table)
+        print_table(table)
         console.print(f"written: {out}")
 
 
