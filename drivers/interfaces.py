@@ -242,6 +242,7 @@ class CapturedImage:
     lens_serial: str = ""
     body_serial: str = ""
     focus_distance_m: float = 0.0
+    focus_position: int | None = None  # of the focus motor, in its own steps; None where the file does not tell
     found_at: str = ""  # path of the file that it came as; "" where it came from the camera itself
 
     @property

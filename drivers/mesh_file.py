@@ -20,9 +20,10 @@ from drivers.mesh_format import check_complete, companions, file_has_normals
 MeshUnit = Literal["auto", "mm", "m"]
 METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
 # Diagonal of the bounding box. To infer the unit, that of a scene with its spheres, so that centimetres or inches are
-# not taken for millimetres. A configured unit must only be credible for whatever may be scanned, a single bone too.
+# not taken for millimetres. A configured unit must only be credible for whatever may be scanned, of a bone
+# or a room: within a factor of a thousand, so that millimetres and metres are never both credible.
 SCENE_DIAGONAL_M = (0.1, 3.0)
-OBJECT_DIAGONAL_M = (0.02, 3.0)
+OBJECT_DIAGONAL_M = (0.02, 20.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
 
 IntArray = NDArray[np.int64]

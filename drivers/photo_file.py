@@ -39,6 +39,7 @@ class ExifRecord:
     lens_serial: str = ""
     focus_distance_m: float | None = None  # as far as the lens tells; many do not
     focus_mode: str = ""  # in the maker's words
+    focus_position: int | None = None  # of the lens's focus motor, in its own steps; where the body tells
 
     def settings(self, *, focus_mode: str, image_quality: str) -> CameraSettings:
         """Aperture, time and ISO of the file with two settings that EXIF has no standard tag for.
@@ -62,7 +63,9 @@ _KEYS = {
     "lens": ("Exif.Photo.LensModel",),
     "lens_serial": ("Exif.Photo.LensSerialNumber",),
     "focus_distance": ("Exif.Photo.SubjectDistance", "Exif.Image.SubjectDistance"),
+    "focus_position": ("Exif.Sony2Fp.FocusPosition2",),
     "focus_mode": (
+        "Exif.Sony2Fp.FocusMode",
         "Exif.Sony1.FocusMode",
         "Exif.Sony2.FocusMode",
         "Exif.Nikon3.Focus",
@@ -103,7 +106,8 @@ def read_exif(path: Path) -> ExifRecord:
             height=int(image.pixelHeight()),
             lens_serial=_text(exif, "lens_serial"),
             focus_distance_m=_number(exif, "focus_distance"),
-            focus_mode=_text(exif, "focus_mode"),
+            focus_mode=_text(exif, "focus_mode", in_words=True),
+            focus_position=_integer(exif, "focus_position"),
         )
     except exiv2.Exiv2Error as error:
         raise UnreadableFileError(
@@ -118,12 +122,16 @@ def _find(exif: Any, name: str) -> Any:
     return None
 
 
-def _text(exif: Any, name: str) -> str:
+def _text(exif: Any, name: str, *, in_words: bool = False) -> str:
     found = _find(exif, name)
     if found is None:
         return ""
     # A file may hold any bytes for a text; what is no UTF-8 comes as lone surrogates, which nothing can write down.
-    words = str(found.toString()).encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    words = (
+        str(found.print() if in_words else found.toString())
+        .encode("utf-8", "surrogateescape")
+        .decode("utf-8", "replace")
+    )
     return words[:_LONGEST_TEXT].replace("\0", " ").strip()
 
 

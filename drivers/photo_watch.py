@@ -247,6 +247,7 @@ class PhotoWatch:
             lens_serial=exif.lens_serial,
             body_serial=exif.body_serial,
             focus_distance_m=exif.focus_distance_m or 0.0,
+            focus_position=exif.focus_position,
             found_at=str(path),
         )
 

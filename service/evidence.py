@@ -17,6 +17,7 @@ from service.core.job_keys import arguments_name, job_key
 from service.core.model import ArtefactRef, Event, Payload, RunStarted, View
 from service.core.protocol import Protocol, parse_protocol
 from service.core.run_state import JobState, RunState
+from service.core.terms import term
 from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
 from service.steps.time_left import Left, missing_results
@@ -146,13 +147,13 @@ class StepEvidence:
             for key in keys:
                 if mine[key].status == "failed":
                     raise ComputeError(
-                        f"the worker could not do {mine[key].kind}: {mine[key].message}",
+                        f"the worker could not do {term(mine[key].kind)}: {mine[key].message}",
                         where=f"step {self.step}",
                         remedy="Put right what its words name, or take what is missing; then try again",
                     )
             done = sum(mine[key].status == "finished" for key in keys)
             open_kinds = [mine[key].kind for key in keys if mine[key].status != "finished"]
-            self.progress(", ".join(open_kinds) or "computed", done, len(keys))
+            self.progress(", ".join(map(term, dict.fromkeys(open_kinds))) or "computed", done, len(keys))
             if done == len(keys):
                 return tuple(JobResult(mine[key].measures, mine[key].artefacts, mine[key].result) for key in keys)
             self.wait(0.2)

@@ -190,6 +190,7 @@ def camera_record(exif: ExifRecord) -> dict[str, Any]:
         "focal_length_mm": exif.focal_length_mm,
         "focus_distance_m": exif.focus_distance_m,
         "focus_mode": exif.focus_mode,
+        "focus_position": exif.focus_position,
         "exif_time": exif.taken,
         "width": exif.width,
         "height": exif.height,

@@ -146,6 +146,13 @@ def load_rig(path: Path) -> Rig:
     """Read rig.yaml; ConfigurationError names the file and the field."""
     try:
         source = path.read_bytes()
+    except FileNotFoundError as error:
+        raise ConfigurationError(
+            "there is no such rig file",
+            where=str(path),
+            remedy="Write one as docs/your_hardware.md shows, or try a simulated one: "
+            "orthocapture simulate rig --scene 7 --dir rig, then --rig rig/rig.yaml",
+        ) from error
     except OSError as error:
         raise ConfigurationError(
             f"cannot read the rig file: {error.strerror}",

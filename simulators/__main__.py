@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import importlib
+import json
 import logging
 import os
 import sys
@@ -44,16 +45,47 @@ def _load(name: str) -> SimulatorModule:
 
 
 def _parser(chosen: str | None) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="simulators", description=__doc__)
+    parser = argparse.ArgumentParser(prog="orthocapture simulate", description=__doc__)
     commands = parser.add_subparsers(dest="simulator", required=True, metavar="NAME")
     for name, (_, what) in SIMULATORS.items():
         command = commands.add_parser(name, help=what, description=what, conflict_handler="resolve")
-        command.add_argument("--faults", metavar="FILE|JSON", default="[]", help="fault plan: a JSON list or a file")
-        command.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
-        command.add_argument("--log-level", default="WARNING", help="of the log on stderr")
+        _common(command)
         if name == chosen:
             _load(name).add_arguments(command)
     return parser
+
+
+def _described(name: str) -> dict[str, object]:
+    """The simulators, or the options of one, as plain data: for a command line that shows them in its own way."""
+    if name not in SIMULATORS:
+        return {"simulators": {known: what for known, (_, what) in SIMULATORS.items()}}
+    options = argparse.ArgumentParser(add_help=False, conflict_handler="resolve")
+    _common(options)
+    _load(name).add_arguments(options)
+    # Without a public list of its options, argparse leaves only this one.
+    actions: list[argparse.Action] = options._actions
+    return {
+        "what": SIMULATORS[name][1],
+        "options": [
+            {
+                "flags": list(action.option_strings),
+                "metavar": str(action.metavar or ""),
+                "help": action.help or "",
+                "default": "" if action.default in (None, False, "[]") else str(action.default),
+                "required": action.required,
+                "flag": action.nargs == 0,
+                "choices": [str(choice) for choice in action.choices or ()],
+            }
+            for action in actions
+            if action.help != argparse.SUPPRESS
+        ],
+    }
+
+
+def _common(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--faults", metavar="FILE|JSON", default="[]", help="fault plan: a JSON list or a file")
+    command.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
+    command.add_argument("--log-level", default="WARNING", help="of the log on stderr")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -62,6 +94,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _keep_freed_memory()
     words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["--describe"]:
+        sys.stdout.write(json.dumps(_described(words[1] if len(words) > 1 else "")) + "\n")
+        return 0
     chosen = words[0] if words and words[0] in SIMULATORS else None
     try:
         args = _parser(chosen).parse_args(words)

@@ -12,13 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from service.compute.camera_model import CameraModel
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.colours import chromaticity, learn_colour
 from service.compute.markers.cones import Cone, angles_to, cone_ellipse, cone_of_sphere, fit_cone, ransac_cone
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.detectors import options_for
 from service.compute.markers.records import DetectionOptions, SphereOutline
-from service.compute.markers.refine import refine_outline
+from service.compute.markers.refine import approach_outlines, refine_outline
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array
 from tests.support.sphere_conditions import COLOURS_BGR, Look, render_look
@@ -271,3 +272,24 @@ def test_a_stain_on_a_sphere_is_no_sphere_and_green_cloth_has_none() -> None:
     centres = np.array([[-0.08, -0.03, 0.55], [0.08, 0.03, 0.6]])
     found = detect_spheres(render_look(cam, centres, Look("white", "wood", stains=3), seed=3), cam)
     assert sorted(errors_px(found, centres, cam.fx)[2]) == [0, 1]
+
+
+def test_an_arc_that_fills_the_image_is_no_outline_and_no_fault() -> None:
+    # A sphere larger than the image shows arcs alone: fits to them ran to radii below nothing, an IndexError.
+    rng = np.random.default_rng(0)
+    width = 256
+    y, x = np.mgrid[:width, :width].astype(np.float64)
+    lens = CameraModel(width, width, 400, 400, 127.5, 127.5)
+    for _ in range(12):
+        middle, radius = rng.uniform(-0.5, 1.5, 2) * width, rng.uniform(0.2, 1.5) * width
+        off = np.hypot(x - middle[0], y - middle[1])
+        height = np.sqrt(np.clip(1 - (off / radius) ** 2, 0, 1))[..., None]
+        ball = rng.uniform(30, 250, 3) * (0.3 + 0.7 * height)
+        shown = np.where((off < radius)[..., None], ball, rng.uniform(0, 255, 3))
+        image = np.clip(shown + rng.normal(0, 4, shown.shape), 0, 255).astype(np.uint8)
+        for radius_px in (1.5, 3.0, 12.0, radius):
+            for at in middle + radius * np.array([[0, 0], [1, 0], [0, -1]]):
+                ray = np.append((at - 127.5) / 400, 1.0)
+                cone = Cone(ray / float(np.linalg.norm(ray)), float(np.arctan(radius_px / 400)))
+                for found in approach_outlines(image, lens, [cone]):
+                    assert found is None or 0 < found.cone.half_angle_rad < np.pi / 2

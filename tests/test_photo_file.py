@@ -11,7 +11,7 @@ import skimage
 from PIL import Image
 
 from drivers.errors import UnreadableFileError
-from drivers.photo_file import check_jpeg_complete, read_exif, sha256_of
+from drivers.photo_file import check_jpeg_complete, exiv2, read_exif, sha256_of
 
 SHIPPED = sorted((Path(skimage.__file__).parent / "data").glob("*.jpg"))
 EXIF_IFD = 0x8769
@@ -35,6 +35,22 @@ def test_pictures_without_exif_are_read_and_say_so(path: Path) -> None:
     check_jpeg_complete(path)
     with pytest.raises(UnreadableFileError, match="does not state"):
         record.settings(focus_mode="Manual", image_quality="JPEG")
+
+
+def sony(path: Path, focus_position: int) -> Path:
+    """A JPEG with the maker's note in which Sony's ILCE bodies tell their focus; exiv2 enciphers it as they do."""
+    Image.new("RGB", (90, 60), (90, 120, 80)).save(path, "JPEG")
+    image = exiv2.ImageFactory.open(str(path))
+    image.readMetadata()
+    exif = image.exifData()
+    exif["Exif.Image.Make"], exif["Exif.Image.Model"] = "SONY", "ILCE-7RM5"
+    for key, value in (("FocusMode", 0), ("FocusPosition2", focus_position)):
+        number = exiv2.Value.create(exiv2.TypeId.unsignedByte)
+        number.read(str(value))
+        exif.add(exiv2.ExifKey(f"Exif.Sony2Fp.{key}"), number)
+    image.setExifData(exif)
+    image.writeMetadata()
+    return path
 
 
 def test_there_are_pictures_that_others_made() -> None:
@@ -63,6 +79,17 @@ def test_a_canon(tmp_path: Path) -> None:
     assert record.exposure_s == pytest.approx(1 / 125)
     assert (record.orientation, record.taken) == (6, "2025:01:02 03:04:05")
     assert record.settings(focus_mode="Manual", image_quality="JPEG").iso == 400
+
+
+def test_a_sony_states_how_it_was_focused(tmp_path: Path) -> None:
+    first, second = (sony(tmp_path / f"{position}.jpg", position) for position in (117, 0))
+    for path, position in ((first, 117), (second, 0)):
+        record = read_exif(path)
+        assert (record.focus_mode, record.focus_position) == ("Manual", position)
+    with Image.open(first) as picture:
+        picture.save(tmp_path / "bare.jpg")
+    record = read_exif(tmp_path / "bare.jpg")
+    assert (record.focus_mode, record.focus_position) == ("", None)
 
 
 def test_time_with_fraction_and_offset_and_a_silent_lens(tmp_path: Path) -> None:

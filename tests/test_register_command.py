@@ -253,7 +253,11 @@ def test_an_image_without_a_pose(capture: Capture, tmp_path: Path) -> None:
     lines = (capture.folder / "poses.csv").read_text().splitlines(keepends=True)
     (tmp_path / "poses.csv").write_text("".join(line for line in lines if not line.startswith("DSC00003.JPG")))
     out = tmp_path / "result.json"
-    refused(register(capture, out, poses=tmp_path / "poses.csv"), out, "DSC00003.JPG", "no pose")
+    refused(register(capture, out, poses=tmp_path / "poses.csv", strict=True), out, "DSC00003.JPG", "no pose")
+    left = register(capture, out, poses=tmp_path / "poses.csv")
+    assert left.exit_code == 0, left.output
+    assert "left out DSC00003.JPG: no pose in poses.csv" in left.output
+    assert json.loads(out.read_text())["left_out"] == {"DSC00003.JPG": "no pose in poses.csv"}
 
 
 def test_a_truncated_photograph(capture: Capture, few: Path, tmp_path: Path) -> None:
@@ -269,7 +273,7 @@ def test_photographs_of_another_size_than_the_calibrated(capture: Capture, few: 
         assert picture is not None
         cv2.imwrite(str(file), picture[:-40])
     out = tmp_path / "result.json"
-    refused(register(capture, out, images=few), out, f"{WIDTH}", "440", "DSC00001.JPG")
+    refused(register(capture, out, images=few), out, f"{WIDTH} × 440 px", "camera model is for")
 
 
 def test_photographs_that_show_too_few_spheres(capture: Capture, few: Path, tmp_path: Path) -> None:

@@ -248,6 +248,7 @@ class GphotoCamera:
             lens_serial=exif.lens_serial,
             body_serial=exif.body_serial,
             focus_distance_m=exif.focus_distance_m or 0.0,
+            focus_position=exif.focus_position,
         )
         self._check_new(image)
         self._clock_offset_s = _clock_offset_s(exif.taken, trigger_s)

@@ -14,6 +14,7 @@ from service.audit.report_words import clock
 from service.compute.budget.closure import Alignment
 from service.core.errors import IntegrityError
 from service.core.model import DeviceOpened, JobFinished, SessionStarted, View, ViewpointCaptured
+from service.core.terms import term
 from service.dataset.summary import RunSummary
 
 _COMPUTES = ("orthocapture", "numpy", "scipy", "opencv-python-headless", "pycolmap", "trimesh", "scikit-image")
@@ -151,7 +152,7 @@ def software_section(run: RecordedRun) -> Section:
             jobs[event.payload.job_kind] = count + 1, seconds + event.payload.duration_s
     if jobs:
         columns = (Column("computed", 2.0), Column("times", 1.0, "number"), Column("seconds together", 1.0, "number"))
-        rows = tuple((kind.replace("_", " "), str(n), f"{seconds:.1f}") for kind, (n, seconds) in jobs.items())
+        rows = tuple((term(kind), str(n), f"{seconds:.1f}") for kind, (n, seconds) in jobs.items())
         blocks.append(Table(columns, rows))
     names = sorted(software, key=str.lower)
     texts = [f"{name} {software[name]}" for name in names]

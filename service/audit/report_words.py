@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from service.audit.report_blocks import Cell
 from service.core.gates import Standing, figure, limits, standing
 from service.core.model import GateVerdict
+from service.core.terms import term
 
 
 def utc(text: str) -> str:
@@ -33,7 +34,7 @@ def duration(start: str, end: str) -> str:
 
 def words(name: str) -> str:
     """A name of the records as words: viewpoint_skipped → viewpoint skipped."""
-    return name.replace("_", " ")
+    return term(name)
 
 
 def limit(verdict: GateVerdict) -> str:

@@ -20,6 +20,7 @@ from service.cli.common import (
     JsonOption,
     console,
     print_json,
+    print_table,
     progress_bar,
     reporting_errors,
 )
@@ -239,7 +240,7 @@ def _print_records(run_id: str, records: Sequence[EvidenceRecord]) -> None:
             record.kind.replace("_", " "),
             "\n".join(line for line in lines if line),
         )
-    console.print(table)
+    print_table(table)
 
 
 def _print_report(report: AuditReport) -> None:

@@ -11,19 +11,38 @@ import numpy as np
 import typer
 from rich.markup import escape
 
-from service.cli.calibrate_intrinsics import image_files
-from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
-from service.compute.calibration.board import Board, Pattern
+from service.cli.board_options import (
+    DEFAULT_DICTIONARY,
+    BoardOption,
+    DictionaryOption,
+    LegacyOption,
+    MarkerOption,
+    PatternOption,
+    SquareOption,
+    described_board,
+    require_board,
+)
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable,
+)
 from service.compute.calibration.board_images import find_boards, usable_views
 from service.compute.calibration.board_plan import SuggestedPose, suggest_board_poses
 from service.compute.calibration.board_plan_plot import draw_board_plan
 from service.compute.calibration.hand_eye import HandEyeResult, Method, calibrate_hand_eye
 from service.compute.calibration.hand_eye_record import board_corners, hand_eye_record
+from service.compute.calibration.hand_eye_setup import Setup
 from service.compute.calibration.intrinsics import locate_view
 from service.compute.calibration.joint_file import read_joints_csv
-from service.compute.calibration.kinematics import ArmModel, arm_model, matching_arm, solve_joints
-from service.compute.poses.pose_files import read_camera_json, read_poses
-from service.core.errors import ConfigurationError, DataError
+from service.compute.calibration.kinematics import ARM_MODELS, ArmModel, arm_model, matching_arm, solve_joints
+from service.compute.image_folder import image_folder
+from service.compute.poses.pose_files import posed_images, read_camera_json
+from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
 
 
@@ -33,29 +52,49 @@ def hand_eye_command(
         Path, typer.Option("--robot-poses", help="CSV image,x,y,z,qx,qy,qz,qw: T_base_flange in metres.")
     ],
     camera: Annotated[Path, typer.Option("--camera", help="camera.json of a calibrated camera.")],
-    board: Annotated[str, typer.Option("--board", metavar="COLSxROWS", help="Inner corners of the board.")],
-    square_mm: Annotated[float, typer.Option("--square-mm", help="Side of a square.")],
+    board: BoardOption,
+    square_mm: SquareOption,
     out: Annotated[Path, typer.Option("--out", help="The hand_eye.json to write.")],
-    pattern: Annotated[Pattern, typer.Option("--pattern", help="What is printed.")] = "checkerboard",
+    pattern: PatternOption = "checkerboard",
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = DEFAULT_DICTIONARY,
+    legacy: LegacyOption = False,
+    setup: Annotated[
+        Setup,
+        typer.Option("--setup", help="eye-to-hand: the camera stands beside the robot, the board is on its flange."),
+    ] = "eye-in-hand",
     method: Annotated[Method, typer.Option("--method", help="Which one gives the answer.")] = "weighted",
     joints: Annotated[
         Path | None,
         typer.Option("--joints", help="CSV image,q1,…,q6 in radians: the arm's own error is then estimated too."),
     ] = None,
     arm: Annotated[
-        str | None, typer.Option("--arm", help="Model, such as UR10e; without: found from the joints.")
+        str | None, typer.Option("--arm", help=f"Model: {', '.join(ARM_MODELS)}; without: found from the joints.")
     ] = (None),
     suggest: Annotated[int, typer.Option("--suggest", help="How many next board poses to suggest.", min=0)] = 6,
     preview: Annotated[
         Path | None, typer.Option("--preview", help="PNG of the suggested poses beside those taken.")
     ] = None,
+    strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
     """Calibrate the camera's place on the robot's flange, and say how far to trust it."""
     with reporting_errors(json):
-        target = Board(*_counts(board), square_mm * 1e-3, pattern)
+        target = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
+        if setup == "eye-to-hand" and (joints is not None or arm is not None):
+            raise typer.BadParameter("--joints and --arm are for a camera on the flange, not for --setup eye-to-hand")
+        if setup == "eye-to-hand" and preview is not None:
+            raise typer.BadParameter("--preview shows suggested places of a camera that the robot moves")
+        if arm is not None:
+            arm_model(arm)  # an unknown one is refused before images are searched
         model = read_camera_json(camera)
-        files = image_files(images)
+        folder = image_folder(images, size=(model.width, model.height), strict=strict)
+        known, folder = posed_images(robot_poses, folder, images, strict=strict)
+        files = folder.files
+        for file in (out, preview):
+            if file is not None:
+                require_writable(file)
+        require_board(files, target)
         with progress_bar(quiet=json) as progress:
             found = find_boards(
                 files,
@@ -64,16 +103,8 @@ def hand_eye_command(
                 progress=lambda done, total: progress("board images", done, total),
             )
         usable = usable_views(found)
-        if usable.size != (model.width, model.height):
-            raise DataError(
-                f"the images are {usable.size[0]} × {usable.size[1]} px, the camera was calibrated at "
-                f"{model.width} × {model.height}",
-                where=str(camera),
-                remedy="Use images of the calibrated size",
-            )
         names = [files[k].name for k in usable.indices]
-        poses = read_poses(robot_poses, names)
-        T_base_flange = np.array([poses[name] for name in names])
+        T_base_flange = np.array([known[name] for name in names])
         joints_rad, kinematics = _arm(joints, arm, names, T_base_flange)
         corners = board_corners(usable.views, target, model)
         result = calibrate_hand_eye(
@@ -84,21 +115,24 @@ def hand_eye_command(
             joints_rad=joints_rad,
             arm=kinematics,
             T_board_turned=target.half_turn(),
+            setup=setup,
         )
         best = result if result.corrected is None else result.corrected
+        # Suggestions are places of the camera: of one that stands still there are none.
         suggested = suggest_board_poses(
             best,
             T_base_flange,
             corners.points_m,
             model,
             corner_sigma_px=result.corner_sigma_px or 0.0,
-            count=suggest,
+            count=suggest if setup == "eye-in-hand" else 0,
             reachable=None
             if kinematics is None or joints_rad is None
             else _Reach(kinematics, joints_rad, T_base_flange),
         )
         record: dict[str, Any] = {
-            **hand_eye_record(result, names),
+            **hand_eye_record(result, names, setup),
+            "left_out": folder.left_out,
             "images_without_board": {files[k].name: reason for k, reason in sorted(usable.excluded.items())},
             "suggested_poses": [_suggestion(pose) for pose in suggested],
             "suggestions_reachable": kinematics is not None,
@@ -110,7 +144,7 @@ def hand_eye_command(
         if json:
             print_json(record)
             return
-        _tell(result, record)
+        _tell(result, record, setup)
         console.print(f"written: {out}")
 
 
@@ -148,13 +182,6 @@ def _arm(
     return values, found
 
 
-def _counts(board: str) -> tuple[int, int]:
-    columns, _, rows = board.lower().replace("×", "x").partition("x")
-    if not (columns.isdigit() and rows.isdigit()):
-        raise typer.BadParameter(f"--board takes COLSxROWS such as 16x23, not {board!r}")
-    return int(columns), int(rows)
-
-
 def _suggestion(pose: SuggestedPose) -> dict[str, Any]:
     return {
         "T_base_flange": pose.T_base_flange.tolist(),
@@ -164,10 +191,11 @@ def _suggestion(pose: SuggestedPose) -> dict[str, Any]:
     }
 
 
-def _tell(result: HandEyeResult, record: dict[str, Any]) -> None:
+def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
     x, y, z = 1e3 * result.T_flange_camera[:3, 3]
+    frame = "flange" if setup == "eye-in-hand" else "robot's base"
     console.print(
-        f"{len(result.held_out_mm)} images: camera at {x:.2f}, {y:.2f}, {z:.2f} mm in the flange frame "
+        f"{len(result.held_out_mm)} images: camera at {x:.2f}, {y:.2f}, {z:.2f} mm in the {frame} frame "
         f"± {result.sigma_mm:.3f} mm, ± {result.sigma_deg:.4f}° ({result.method})"
     )
     held_mm, held_deg = np.median(result.held_out_mm), np.median(result.held_out_deg)
@@ -184,7 +212,7 @@ def _tell(result: HandEyeResult, record: dict[str, Any]) -> None:
         )
     elif len(result.arm_held_out_mm) > 1:
         console.print("estimating the arm's own error gains nothing on held-out images: not used")
-    for name, reason in {**record["excluded"], **record["images_without_board"]}.items():
+    for name, reason in {**record["left_out"], **record["excluded"], **record["images_without_board"]}.items():
         console.print(f"not used: {escape(name)}: {escape(reason)}")
     suggested = record["suggested_poses"]
     if suggested:

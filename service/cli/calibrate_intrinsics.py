@@ -13,13 +13,32 @@ from rich.markup import escape
 
 from drivers.errors import UnreadableFileError
 from drivers.photo_file import read_exif
-from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
+from service.cli.board_options import (
+    DEFAULT_DICTIONARY,
+    BoardOption,
+    DictionaryOption,
+    LegacyOption,
+    MarkerOption,
+    PatternOption,
+    SquareOption,
+    described_board,
+    require_board,
+)
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable,
+    require_writable_folder,
+)
 from service.compute.calibration.adjustment import LensModel
-from service.compute.calibration.board import Board, Pattern
 from service.compute.calibration.board_images import UsableViews, find_boards, usable_views
 from service.compute.calibration.intrinsics import IntrinsicsResult, calibrate_intrinsics
 from service.compute.calibration.intrinsics_record import intrinsics_record
-from service.compute.calibration.optics import Optics, compare_optics, summary
+from service.compute.calibration.optics import Optics, compare_optics, states_focus, summary
 from service.compute.calibration.plots import calibration_plots
 from service.compute.calibration.uncertainty import ProjectionUncertainty, board_distance_m, projection_uncertainty
 from service.compute.calibration.validation import (
@@ -28,35 +47,22 @@ from service.compute.calibration.validation import (
     calibration_warnings,
     cross_validate,
 )
+from service.compute.image_folder import image_folder
+from service.compute.images import image_size
 from service.core.errors import ComputeError, DataError
 
-_IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
+_WITHOUT_EXIF = {".pgm", ".ppm", ".pnm"}
 
 
 def intrinsics_command(
     images: Annotated[Path, typer.Option("--images", help="Folder of the board images.")],
-    board: Annotated[
-        str,
-        typer.Option(
-            "--board",
-            metavar="COLSxROWS",
-            help="Inner corners, where four squares meet: 16x23 for a board of 17 × 24 squares; of a ChArUco board "
-            "too. Of circles: in a row, and rows.",
-        ),
-    ],
-    square_mm: Annotated[
-        float, typer.Option("--square-mm", help="Side of a square; of circles the distance between two rows.")
-    ],
+    board: BoardOption,
+    square_mm: SquareOption,
     out: Annotated[Path, typer.Option("--out", help="The camera.json to write.")],
-    pattern: Annotated[Pattern, typer.Option("--pattern", help="What is printed.")] = "checkerboard",
-    marker_mm: Annotated[
-        float | None,
-        typer.Option("--marker-mm", help="Side of a ChArUco marker; without: ¾ of a square."),
-    ] = None,
-    dictionary: Annotated[str, typer.Option("--dictionary", help="Of the ChArUco markers.")] = "DICT_5X5_1000",
-    legacy: Annotated[
-        bool, typer.Option("--legacy", help="A ChArUco board as OpenCV printed it before version 4.6.")
-    ] = False,
+    pattern: PatternOption = "checkerboard",
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = DEFAULT_DICTIONARY,
+    legacy: LegacyOption = False,
     model: Annotated[
         LensModel,
         typer.Option("--model", help="Distortion: none, k1 k2, + p1 p2, + k3, rational k1 … k6."),
@@ -69,14 +75,18 @@ def intrinsics_command(
         typer.Option("--capture-images", help="Folder of images to be used with this camera: was the lens the same?"),
     ] = None,
     report: Annotated[Path | None, typer.Option("--report", help="Folder for plots (PNG).")] = None,
+    strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
     """Calibrate a camera from images of a flat board, and say how far to trust it."""
     with reporting_errors(json):
-        seen = Board(
-            *_counts(board), square_mm * 1e-3, pattern, None if marker_mm is None else marker_mm * 1e-3, dictionary
-        )
-        files = image_files(images)
+        seen = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
+        folder = image_folder(images, strict=strict)
+        files = folder.files
+        require_writable(out)
+        if report is not None:
+            require_writable_folder(report)
+        require_board(files, seen)
         with progress_bar(quiet=json) as progress:
             found = find_boards(
                 files,
@@ -103,7 +113,7 @@ def intrinsics_command(
                 uncertainty,
                 warnings,
                 [files[k].name for k in used],
-                {files[k].name: excluded[k] for k in sorted(excluded)},
+                folder.left_out | {files[k].name: excluded[k] for k in sorted(excluded)},
             ),
             "optics": optics,
         }
@@ -115,23 +125,6 @@ def intrinsics_command(
             return
         _tell(record, result, validation, uncertainty)
         console.print(f"written: {out}")
-
-
-def image_files(folder: Path) -> list[Path]:
-    """Image files of a folder, by name. Raises DataError when there are none."""
-    if not folder.is_dir():
-        raise DataError("the image folder does not exist", where=str(folder))
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGE_SUFFIXES)
-    if not files:
-        raise DataError("no image in this folder", where=str(folder), remedy="JPEG, PNG or TIFF files are read")
-    return files
-
-
-def _counts(board: str) -> tuple[int, int]:
-    columns, _, rows = board.lower().replace("×", "x").partition("x")
-    if not (columns.isdigit() and rows.isdigit()):
-        raise typer.BadParameter(f"--board takes COLSxROWS such as 16x23, not {board!r}")
-    return int(columns), int(rows)
 
 
 def _with_reasons(error: ComputeError, views: UsableViews, files: Sequence[Path]) -> ComputeError:
@@ -146,8 +139,10 @@ def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[d
     within = compare_optics(calibrated, calibrated)
     record: dict[str, Any] = {"calibration_departures": [str(departure) for departure in within.departures]}
     warnings = [f"the lens changed during the calibration: {line}" for line in summary(within.departures)]
+    if not states_focus(calibrated):
+        warnings.append("the images do not say where the lens was focused: a changed focus would go unseen")
     if capture_folder is not None:
-        comparison = compare_optics(calibrated, [optics_of(file) for file in image_files(capture_folder)])
+        comparison = compare_optics(calibrated, [optics_of(file) for file in image_folder(capture_folder).files])
         record |= {
             "capture_departures": [str(departure) for departure in comparison.departures],
             "capture_images": list(comparison.images),
@@ -167,6 +162,9 @@ def optics_of(file: Path) -> Optics:
     Raises:
         DataError: the file is no picture.
     """
+    if file.suffix.lower() in _WITHOUT_EXIF:
+        width, height = image_size(file)
+        return Optics(image=file.name, width=width, height=height)
     try:
         exif = read_exif(file)
     except UnreadableFileError as error:
@@ -179,6 +177,7 @@ def optics_of(file: Path) -> Optics:
         aperture_f=exif.aperture_f,
         focus_distance_m=exif.focus_distance_m,
         focus_mode=exif.focus_mode,
+        focus_position=exif.focus_position,
         lens=exif.lens,
         lens_serial=exif.lens_serial,
         body=f"{exif.make} {exif.model}".strip(),

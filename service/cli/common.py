@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import json as json_module
+import re
+import tempfile
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
 from typer.models import OptionInfo
 
-from service.core.errors import OrthocaptureError
+from service.core.errors import ConfigurationError, OrthocaptureError
 
 PROGRESS_AFTER_S = 2.0
+_NUMBER = re.compile(r"[-+−±]?\d[\d.,:+−± e%-]*|more|–|-|")
 
 # The streams are looked up at each print, so that a redirected stdout is followed; results there, the rest on stderr.
 console = Console(highlight=False, soft_wrap=True)
@@ -32,9 +37,31 @@ data_option: OptionInfo = typer.Option(
 )
 json_option: OptionInfo = typer.Option("--json", help="Print the result as JSON, for other programs.")
 
+strict_option: OptionInfo = typer.Option(
+    "--strict", help="Refuse odd files (copies, other sizes, images without a pose) instead of leaving them out."
+)
+
 DataOption = Annotated[Path, data_option]
 JsonOption = Annotated[bool, json_option]
+StrictOption = Annotated[bool, strict_option]
 DEFAULT_DATA = Path("runs")
+
+
+def print_table(table: Table, to: Console | None = None) -> None:
+    """Print a table; words wrap at the terminal's edge, but no number is ever cut or broken.
+
+    Where the numbers alone are wider than the terminal, the table is too.
+    """
+    least = 1
+    for column in table.columns:
+        cells = [str(cell) for cell in column.cells]
+        numeric = bool(cells) and all(not cell or _NUMBER.fullmatch(cell) for cell in cells)
+        width = max((cell_len(cell) for cell in cells), default=0) if numeric else 8
+        column.no_wrap, column.overflow = numeric, "fold"
+        column.min_width = width if numeric else None
+        least += width + 3
+    shown = to or console
+    shown.print(table, width=max(shown.width, least), soft_wrap=False, crop=False)
 
 
 def print_json(value: Any) -> None:
@@ -67,6 +94,48 @@ def reporting_errors(json: bool = False) -> Generator[None]:
         yield
     except OrthocaptureError as error:
         raise fail(error, json=json) from error
+
+
+def tell_left_out(left_out: Mapping[str, str]) -> None:
+    """Name the files that took no part, each with its reason."""
+    for name, reason in left_out.items():
+        error_console.print(f"[yellow]left out[/] {escape(name)}: {escape(reason)}")
+
+
+def require_writable(file: Path) -> None:
+    """Raise ConfigurationError unless the file can be written: said before a computation, not after it."""
+    if file.is_dir():
+        raise ConfigurationError("this is a folder, a file is to be written", where=str(file), remedy="Name the file")
+    if not file.parent.is_dir():
+        raise ConfigurationError(
+            "the folder of the file to write does not exist",
+            where=str(file),
+            remedy="Make the folder, or name another",
+        )
+    there = file.exists()
+    try:
+        with file.open("ab"):
+            pass
+    except OSError as error:
+        raise _unwritable(file, error) from error
+    if not there:
+        file.unlink()
+
+
+def require_writable_folder(folder: Path) -> None:
+    """Make the folder if need be, and raise ConfigurationError unless files can be written into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise _unwritable(folder, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> ConfigurationError:
+    return ConfigurationError(
+        f"this cannot be written: {error.strerror}", where=str(path), remedy="Check the path and its permissions"
+    )
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as json_module
 import selectors
+import socket
 import subprocess
 import sys
 import time
@@ -21,10 +22,18 @@ from service.audit.not_in_yet import not_in_yet
 from service.audit.recorded import read_run
 from service.audit.report_content import report_content
 from service.audit.report_html import write_html
-from service.cli.common import JsonOption, console, error_console, print_json, progress_bar, reporting_errors
+from service.cli.common import (
+    JsonOption,
+    console,
+    error_console,
+    print_json,
+    print_table,
+    progress_bar,
+    reporting_errors,
+)
 from service.cli.run import drive
 from service.compute.registration.evaluation import true_error_m
-from service.core.errors import OrthocaptureError
+from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import inverse
 from service.core.protocol import load_protocol
 from service.core.registered import shared_adjustment_note
@@ -36,6 +45,7 @@ from service.steps import params_models
 from service.store.audit import verify
 from service.store.store import Store
 
+_ARM_PORTS = (29999, 30003, 30004)  # of a Universal Robots controller
 _PROTOCOL = Path(__file__).parents[2] / "protocols" / "demo.yaml"
 
 
@@ -45,13 +55,17 @@ def demo_command(
     ),
     scene: Annotated[int, typer.Option("--scene", help="Seed of the simulated scene.")] = 7,
     image_width: Annotated[int, typer.Option("--image-width", help="Width of the simulated photographs.")] = 1280,
+    host: Annotated[
+        str | None,
+        typer.Option("--host", help="Address of the simulated arm, such as 127.0.0.2; without: one with free ports."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Run the demonstration protocol on a simulated rig and show what comes out. Takes a few minutes."""
     started_s = time.monotonic()
     with reporting_errors(json):
         folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
-        with _simulated_rig(folder / "rig", scene, image_width) as ready:
+        with _simulated_rig(folder / "rig", scene, image_width, host or free_address()) as ready:
             rig = load_rig(Path(ready["rig"]))
             loaded = load_protocol(_PROTOCOL, params_models())
             data = folder / "data"
@@ -114,13 +128,40 @@ def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
     return errors
 
 
+def free_address() -> str:
+    """The first address of this machine at which a simulated arm's ports are free; its clients know no other ports.
+
+    Raises:
+        ConfigurationError: none is.
+    """
+    for last in range(1, 255):
+        address = f"127.0.0.{last}"
+        if all(_is_free(address, port) for port in _ARM_PORTS):
+            return address
+    raise ConfigurationError(
+        f"the ports {', '.join(map(str, _ARM_PORTS))} of a simulated arm are in use at every address of this machine",
+        remedy="End the other simulated rigs, or name an address with --host",
+    )
+
+
+def _is_free(address: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((address, port))
+        except OSError:
+            return False
+    return True
+
+
 @contextmanager
-def _simulated_rig(folder: Path, scene: int, image_width: int) -> Generator[dict[str, Any]]:
+def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Generator[dict[str, Any]]:
     """A rig process around one scene; ended with this block."""
     folder.mkdir(parents=True)
     command = [
         sys.executable, "-m", "simulators", "rig", "--scene", str(scene), "--dir", str(folder),
         "--image-width", str(image_width), "--speed-up", "10", "--ct-voxel-mm", "1.0", "--with-parent",
+        "--host", host,
     ]  # fmt: skip
     log = folder / "rig.log"
     with log.open("w") as errors:
@@ -161,7 +202,7 @@ def _print(result: Mapping[str, Any]) -> None:
             f"{row['mean_reprojection_error_px']:.2f}",
             f"{row['true_error_mm']:.3f}",
         )
-    console.print(table)
+    print_table(table)
     if result["table_note"]:
         console.print(escape(result["table_note"]))
     for name in ("run", "database", "artefacts", "dataset", "report"):

@@ -109,6 +109,14 @@ def _clock_words(clock: HostClock) -> str:
     return "is not known to be set" if clock.synchronised is None else "is not set by the network's time"
 
 
+def _offset_words(offset_s: float, clock: str, *, late: bool) -> str:
+    if clock == "uptime":
+        return f"its clock counts from power-on ({offset_s:+.3f} s to this machine's): only its change means anything"
+    way = "ahead of" if offset_s > 0 else "behind"
+    words = f"clock {abs(offset_s):.3f} s {way} this machine's"
+    return f"[yellow]{words}, more than {DEVICE_LIMIT_S:g} s: set it before a run[/]" if late else words
+
+
 def _foresee(data: Path, protocol: Protocol, free_bytes: int, *, simulated: bool) -> Forecast:
     if not database_path(data).is_file():
         return forecast(protocol, None, Usage(), None, free_bytes, simulated=simulated)
@@ -127,16 +135,14 @@ def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
         console.print(f"[bold red]✗ {escape(name)}[/] {escape(str(report))}")
         return
     who = report.identity
-    mark = "[bold green]✓" if not report.problems else "[bold yellow]![/]"
+    late = report.clock == "utc" and abs(report.clock_offset_s or 0.0) > DEVICE_LIMIT_S
+    mark = "[bold yellow]!" if report.problems or late else "[bold green]✓"
     console.print(
         f"{mark} {escape(name)}[/] {escape(who.model)}, serial {escape(who.serial)}, {escape(who.firmware)}"
     )
     console.print(f"    {escape(who.driver)} {escape(who.driver_version)} at {escape(who.address)}")
     if report.clock_offset_s is not None:
-        since = " (counted from power-on: only its change means anything)" if report.clock == "uptime" else ""
-        late = report.clock == "utc" and abs(report.clock_offset_s) > DEVICE_LIMIT_S
-        beyond = f"  [yellow]more than {DEVICE_LIMIT_S:g} s: set it[/]" if late else ""
-        console.print(f"    clock offset {report.clock_offset_s:+.3f} s{since}{beyond}")
+        console.print(f"    {_offset_words(report.clock_offset_s, report.clock, late=late)}")
     if report.free_bytes is not None:
         console.print(f"    {report.free_bytes / 1e9:.1f} GB free")
     if report.battery_fraction is not None:

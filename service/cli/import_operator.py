@@ -12,6 +12,7 @@ from service.core.imported import FileRole, ImportList, PhotographRole
 from service.core.model import OperatorAction
 from service.core.protocol import Protocol
 from service.core.run_state import RunState
+from service.core.terms import term
 from service.runner import Spoken
 
 
@@ -57,4 +58,4 @@ class ImportOperator(TerminalOperator):
 
 
 def _words(part: str) -> str:
-    return {"control_image": "images of the control spheres", "ct": "CT series"}.get(part, part.replace("_", " "))
+    return term(part)

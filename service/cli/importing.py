@@ -19,6 +19,7 @@ from service.cli.common import (
     console,
     error_console,
     print_json,
+    print_table,
     progress_bar,
     reporting_errors,
 )
@@ -210,7 +211,7 @@ def _show(listing: ImportList) -> None:
         name = "DICOM series" if role == "ct" else Path(files[0].path).name
         written = f"written {files[0].modified_utc[:16].replace('T', ' ')}"
         table.add_row(role.replace("_", " "), str(len(files)), escape(name), "", written, megabytes)
-    console.print(table)
+    print_table(table)
     for one in listing.left_out[:_SHOWN]:
         console.print(f"left out: {escape(one.path)}: {escape(one.reason)}")
     if len(listing.left_out) > _SHOWN:
@@ -238,7 +239,7 @@ def _show_result(run_id: str, status: str, deviations: int, rows: Sequence[Mappi
                 f"{row['mean_radial_error_mm']:.3f}",
                 f"{row['mean_reprojection_error_px']:.2f}",
             )
-        console.print(table)
+        print_table(table)
         if note:
             console.print(escape(note))
     console.print(

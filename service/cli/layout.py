@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from drivers.mesh_file import MeshUnit
-from service.cli.common import JsonOption, console, print_json, reporting_errors
+from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors
 from service.cli.spheres import spheres_of
 from service.compute.images import read_image
 from service.compute.markers.detect import detect_spheres
@@ -78,7 +78,7 @@ def _show(report: LayoutReport, centres: Array, radius_m: float) -> None:
     for number, (centre, margin) in enumerate(zip(centres, report.sphere_margins_m, strict=True)):
         shown = f"{1e3 * margin:.2f}" if np.isfinite(margin) else "more"
         table.add_row(str(number), *(f"{1e3 * v:.1f}" for v in centre), shown)
-    console.print(table)
+    print_table(table)
     if report.margin.upper_m > report.margin.lower_m:
         margin = report.margin
         console.print(

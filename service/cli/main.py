@@ -5,10 +5,12 @@ from __future__ import annotations
 import importlib
 import logging
 import os
-from typing import Any
+from difflib import get_close_matches
+from importlib.metadata import version
+from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 # Loaded when asked for: `status` must not wait for the numerics that `register` needs.
 _COMMANDS = {
@@ -49,22 +51,48 @@ class _Commands(TyperGroup):
         """The command of this name, or None."""
         if cmd_name not in _COMMANDS:
             return None
-        module, _, name = _COMMANDS[cmd_name].partition(":")
-        found = getattr(importlib.import_module(module), name)
-        if isinstance(found, typer.Typer):
-            return typer.main.get_group(found)
-        alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-        alone.command(cmd_name, context_settings=_SETTINGS.get(cmd_name))(found)
-        return typer.main.get_command(alone)
+        # The shell asks for names at each press of a key: importing every command for that takes seconds.
+        return TyperCommand(cmd_name, callback=None) if ctx.resilient_parsing else _loaded(cmd_name)
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that was typed, loaded; a near name where there is no such command."""
+        name = args[0]
+        if name in _COMMANDS:
+            return name, _loaded(name), args[1:]
+        near = get_close_matches(name, _COMMANDS, n=1)
+        if near and not ctx.resilient_parsing:
+            ctx.fail(f"No such command {name!r}. Did you mean {near[0]!r}?")
+        return super().resolve_command(ctx, args)
 
 
-app = typer.Typer(
-    name="orthocapture", cls=_Commands, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
-)
+def _loaded(name: str) -> Any:
+    module, _, attribute = _COMMANDS[name].partition(":")
+    found = getattr(importlib.import_module(module), attribute)
+    if isinstance(found, typer.Typer):
+        group = typer.main.get_group(found)
+        group.name = name
+        return group
+    alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    alone.command(name, context_settings=_SETTINGS.get(name))(found)
+    return typer.main.get_command(alone)
+
+
+app = typer.Typer(name="orthocapture", cls=_Commands, no_args_is_help=True, pretty_exceptions_enable=False)
+
+
+def _tell_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"orthocapture {version('orthocapture')}")
+        raise typer.Exit
 
 
 @app.callback()
-def orthocapture() -> None:
+def orthocapture(
+    *,
+    _version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", callback=_tell_version, is_eager=True)
+    ] = False,
+) -> None:
     """Acquire a surgical vision data set that is accurate to a fraction of a millimetre, with the proof."""
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.panel import Panel
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from service.cli.hands import SimulatedHands
 from service.core.acceptance import demanded_role
@@ -184,7 +185,14 @@ class TerminalOperator(_Operator):
         lines.append(f"\nType one of: {', '.join(question.options)} (with a reason where one is needed).")
         if "confirm" in question.options and question.checklist:
             lines.append("By `confirm` you say that every item of the list is done.")
-        self.display.console.print(Panel("\n".join(lines), title=step.title, subtitle=step.why or None))
+        # As text: brackets in an instruction are no markup. Wrapped: at the terminal's edge not a word is lost.
+        title, why = Text(step.title), Text(step.why)
+        panel = Panel(Text("\n".join(lines), overflow="fold"), title=title if len(title) < 60 else None)
+        if len(title) >= 60:
+            self.display.console.print(title, soft_wrap=False)
+        self.display.console.print(panel, soft_wrap=False)
+        if why:
+            self.display.console.print(Text("Why: ") + why, soft_wrap=False)
 
     def _accept(self, accepting: _Accepting, line: str, state: RunState) -> Spoken | None:
         """The name first, then the password, each a line of its own: the run is attended to between them."""

@@ -10,7 +10,15 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    print_json,
+    print_table,
+    reporting_errors,
+)
 from service.cli.run import next_best_views
 from service.core.errors import ConfigurationError
 from service.core.fold import fold
@@ -100,4 +108,4 @@ def next_command(
         table.add_column(heading)
     for view in views:
         table.add_row(view["viewpoint"], f"{view['predicted_error_mm']:.3f}", f"{100 * view['coverage']:.0f} %")
-    console.print(table)
+    print_table(table)

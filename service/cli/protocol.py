@@ -9,20 +9,35 @@ import typer
 from rich.markup import escape
 
 from service.cli.common import JsonOption, console, print_json, reporting_errors
+from service.core.errors import ProtocolError
 from service.core.protocol import load_protocol
 from service.core.protocol_docs import lifecycle_text, schema_text
 from service.core.ways_docs import ways_text
+from service.rig import load_rig
 from service.steps import params_models
+from service.steps.measures import implausible
 
 protocol_app = typer.Typer(name="protocol", help="Check a protocol file before it is used.", no_args_is_help=True)
 
 
 @protocol_app.command("check")
-def check_command(file: Annotated[Path, typer.Argument(help="The protocol file.")], json: JsonOption = False) -> None:
+def check_command(
+    file: Annotated[Path, typer.Argument(help="The protocol file.")],
+    rig: Annotated[Path | None, typer.Option("--rig", help="Check it together with this rig file: stations.")] = None,
+    json: JsonOption = False,
+) -> None:
     """Read a protocol and say everything that is wrong with it, by file, line and field."""
     with reporting_errors(json):
         loaded = load_protocol(file, params_models())
         protocol = loaded.protocol
+        problems = implausible(loaded, None if rig is None else load_rig(rig).section)
+        if problems:
+            listed = "\n".join(f"  {file}:{p.line} {p.field}: {p.message}" for p in problems)
+            raise ProtocolError(
+                f"{len(problems)} of its numbers or names cannot be meant:\n{listed}\n",
+                where=f"{file}:{problems[0].line}",
+                remedy="Correct the measure, its unit or its limit; docs/protocol.schema.json lists the fields",
+            )
         if json:
             steps = [{"id": s.id, "kind": s.kind, "irreversible": s.irreversible} for s in protocol.steps]
             print_json({"id": protocol.id, "version": protocol.version, "sha256": loaded.sha256, "steps": steps})

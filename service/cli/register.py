@@ -12,19 +12,27 @@ import numpy as np
 import typer
 
 from drivers.mesh_file import MeshUnit
-from service.cli.common import JsonOption, console, print_json, progress_bar, reporting_errors
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable,
+    tell_left_out,
+)
 from service.cli.spheres import SeedsOption, spheres_of
+from service.compute.image_folder import image_folder
 from service.compute.locating import DetectFile, LocatedOutlines, detect_all, locate_outlines, searched_whole
 from service.compute.marker_files import detect_file_by_masks, read_boxes
 from service.compute.markers.detectors import options_for
 from service.compute.pipeline import register_images
-from service.compute.poses.pose_files import read_camera_json, read_poses, read_spheres_json
-from service.core.errors import ConfigurationError, DataError
+from service.compute.poses.pose_files import posed_images, read_camera_json, read_spheres_json
+from service.core.errors import ConfigurationError
 from service.core.geometry import Array
 
 DetectorName = Literal["classical", "paper"]
-
-_IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 
 
 def register_command(
@@ -68,15 +76,19 @@ def register_command(
             help="For --detector paper: JSON of another detector, boxes (left, top, right, bottom) by image.",
         ),
     ] = None,
+    strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
     """Register posed images with a scan by the spheres that both show, and say how well it fits."""
     with reporting_errors(json):
-        files = _images(images)
+        require_writable(out)
+        model = read_camera_json(camera)
+        folder = image_folder(images, size=(model.width, model.height), strict=strict)
+        known, folder = posed_images(poses, folder, images, strict=strict)
+        files = list(folder.files)
+        tell_left_out(folder.left_out)
         options = options_for(sphere_colour)
         detect = _file_detector(detector, boxes, [file.name for file in files])
-        model = read_camera_json(camera)
-        known = read_poses(poses, [file.name for file in files])
         registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control, seeds)
         T_world_camera = np.array([known[file.name] for file in files])
         processes = min(len(files), workers or os.cpu_count() or 1)
@@ -117,6 +129,7 @@ def register_command(
             "registration": (registration_m * 1e3).tolist(),
             "control": (control_m * 1e3).tolist(),
         }
+        record["left_out"] = folder.left_out
         record["search"] = _search(located, [file.name for file in files])
         out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
         if json:
@@ -157,15 +170,6 @@ def _search(located: LocatedOutlines, names: list[str]) -> dict[str, object]:
             for sphere, reason in sorted(image.missing.items())
         ],
     }
-
-
-def _images(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise DataError("the image folder does not exist", where=str(folder))
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGE_SUFFIXES)
-    if not files:
-        raise DataError("no image in this folder", where=str(folder), remedy="JPEG, PNG or TIFF files are read")
-    return files
 
 
 def _spheres(

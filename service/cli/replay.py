@@ -22,10 +22,12 @@ from service.cli.common import (
     console,
     fail,
     print_json,
+    print_table,
     progress_bar,
 )
 from service.core.errors import OrthocaptureError
 from service.core.gates import describe
+from service.core.terms import term
 from service.worker.loop import HANDLERS
 
 _COULD_NOT = 2
@@ -130,12 +132,12 @@ def _print(report: ReplayReport) -> None:
         same = sum(artefact.recorded_sha256 == artefact.recomputed_sha256 for artefact in job.artefacts)
         table.add_row(
             job.step,
-            " ".join(filter(None, (job.kind.replace("_", " "), job.label))),
+            " ".join(filter(None, (term(job.kind), job.label))),
             _WORDS[job.verdict],
             f"{same} of {len(job.artefacts)}" if job.artefacts else "",
             f"{job.duration_s:.1f} s",
         )
-    console.print(table)
+    print_table(table)
     for job in report.jobs:
         if job.error or job.differences:
             _print_job(job)

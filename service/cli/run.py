@@ -24,6 +24,7 @@ from service.cli.common import (
     console,
     error_console,
     print_json,
+    print_table,
     reporting_errors,
 )
 from service.cli.hands import SimulatedHands
@@ -239,7 +240,7 @@ def status_command(
         gates = "\n".join(f"{describe(v)}: {_STANDINGS[_standing(v, now)]}" for v in now.verdicts)
         phase = "skipped" if now.skipped else now.phase.replace("_", " ")
         table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), escape(gates))
-    console.print(table)
+    print_table(table)
     live = [job for job in state.step.jobs.values() if job.kind == "live_view" and job.status != "enqueued"]
     for job in live[-3:]:
         console.print(escape(describe_view(job)))

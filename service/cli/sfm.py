@@ -15,9 +15,19 @@ import numpy as np
 import typer
 
 from drivers.mesh_file import MeshUnit, read_mesh_file
-from service.cli.calibrate_intrinsics import image_files
-from service.cli.common import JsonOption, console, error_console, print_json, progress_bar, reporting_errors
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    error_console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable_folder,
+    tell_left_out,
+)
 from service.compute.camera_model import CameraModel
+from service.compute.image_folder import image_folder
 from service.compute.locating import detect_all
 from service.compute.poses.hybrid import HybridPoses, hybrid_poses
 from service.compute.poses.pose_covariance import write_pose_covariance
@@ -79,6 +89,7 @@ def sfm_command(
     workspace: Annotated[
         Path | None, typer.Option("--workspace", help="Keep features and matches here for another mapper.")
     ] = None,
+    strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
     """Estimate camera poses with the calibrated camera held; the model serves register --estimate-scale."""
@@ -90,8 +101,11 @@ def sfm_command(
         refine: Refine = "nothing"
         if refine_principal_point or refine_intrinsics:
             refine = "principal_point" if refine_principal_point else "intrinsics"
-        files = {file.name: file for file in image_files(images)}
+        require_writable_folder(out)
         model = read_camera_json(camera)
+        found = image_folder(images, size=(model.width, model.height), strict=strict)
+        tell_left_out(found.left_out)
+        files = {file.name: file for file in found.files}
         prior = _robot_poses(robot_poses, hand_eye, files)
         station = None if stations is None else read_stations(stations, files)
         options = options_for(effort, model, refine=refine, threads=os.cpu_count() or 1)
@@ -99,7 +113,7 @@ def sfm_command(
         with _workspace(workspace) as folder, progress_bar(quiet=json) as progress:
             solved, off_m = _reconstruct(files, model, folder, mapper, prior, station, options, progress)
             _write_model(out, solved)
-            record = _record(solved, off_m)
+            record = {**_record(solved, off_m), "left_out": found.left_out}
             if known is not None:
                 metric = _hybrid(solved, files, prior, station, *known, progress)
                 write_poses_csv(

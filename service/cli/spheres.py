@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json as json_module
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -13,10 +14,10 @@ from rich.table import Table
 
 from drivers.mesh_file import MeshUnit, read_mesh_file
 from drivers.point_cloud import is_point_cloud, read_point_cloud
-from service.cli.common import JsonOption, console, print_json, reporting_errors
-from service.compute.surfaces.mesh_spheres import MeshSphere, locate_spheres
+from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
+from service.compute.surfaces.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
 from service.compute.surfaces.sphere_records import spheres_document
-from service.core.errors import DataError
+from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 
 SeedsOption = Annotated[
@@ -34,11 +35,37 @@ def spheres_command(
     expect: Annotated[int | None, typer.Option("--expect", help="How many there must be.")] = None,
     seeds: SeedsOption = None,
     mesh_unit: Annotated[MeshUnit, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
+    max_rms_mm: Annotated[
+        float | None,
+        typer.Option("--max-rms-mm", help="Roughness that a sphere may have; without: 2.5 % of the radius.", min=0),
+    ] = None,
+    max_radius_off_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--max-radius-off-mm",
+            help="By how much its own radius may be off; without: 4 % of it, more by noise.",
+            min=0,
+        ),
+    ] = None,
+    max_form_mm: Annotated[
+        float | None,
+        typer.Option("--max-form-mm", help="By how much its form may depart from a sphere's; without: 1 %.", min=0),
+    ] = None,
+    min_cap_deg: Annotated[
+        float | None,
+        typer.Option("--min-cap-deg", help="How wide the seen cap must be at least; without: 50°.", min=0, max=180),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Find every sphere of a radius in a mesh or point cloud, with its covariance and what it was measured on."""
     with reporting_errors(json):
-        found = spheres_of(mesh, radius_mm / 1e3, mesh_unit, expect, seeds)
+        require_writable(out)
+        radius_m = _positive(radius_mm) / 1e3
+        limits = _limits(radius_m, max_rms_mm, max_radius_off_mm, max_form_mm, min_cap_deg)
+        try:
+            found = spheres_of(mesh, radius_m, mesh_unit, expect, seeds, limits)
+        except ComputeError as error:
+            raise _with_limits(error, limits, radius_mm) from error
         document = spheres_document(found, radius_mm / 1e3)
         out.write_text(json_module.dumps(document, indent=1), encoding="utf-8")
         if json:
@@ -54,12 +81,49 @@ def spheres_command(
                 f"{1e3 * sphere.radius_residual_m:+.3f} ± {1e3 * sphere.radius_sigma_m:.3f}",
                 f"{sphere.coverage:.2f}",
             )
-        console.print(table)
+        print_table(table)
         console.print(f"written: {out}")
 
 
+def _positive(radius_mm: float) -> float:
+    if not 0 < radius_mm < float("inf"):
+        raise typer.BadParameter(f"--radius-mm must be a positive number, not {radius_mm:g}")
+    return radius_mm
+
+
+def _limits(
+    radius_m: float,
+    max_rms_mm: float | None,
+    max_radius_off_mm: float | None,
+    max_form_mm: float | None,
+    min_cap_deg: float | None,
+) -> SphereLimits:
+    """The default limits with what was given instead, as parts of the radius."""
+    given = {"max_rms": max_rms_mm, "max_radius_residual": max_radius_off_mm, "max_form": max_form_mm}
+    changed = {name: value / 1e3 / radius_m for name, value in given.items() if value is not None}
+    if min_cap_deg is not None:
+        half = np.radians(min_cap_deg / 2)
+        changed |= {"min_cap_deg": min_cap_deg, "min_coverage": min(0.05, 0.7 * (1 - float(np.cos(half))) / 2)}
+    return dataclasses.replace(SphereLimits(), **changed)
+
+
+def _with_limits(error: ComputeError, limits: SphereLimits, radius_mm: float) -> ComputeError:
+    """The refusal with the limits that it was judged by, and how to change them."""
+    words = (
+        f"Judged by --max-rms-mm {limits.max_rms * radius_mm:.3g}, "
+        f"--max-radius-off-mm {limits.max_radius_residual * radius_mm:.3g}, "
+        f"--max-form-mm {limits.max_form * radius_mm:.3g}, --min-cap-deg {limits.min_cap_deg:g}"
+    )
+    return ComputeError(error.what, where=error.where, remedy=f"{error.remedy}. {words}")
+
+
 def spheres_of(
-    mesh: Path, radius_m: float, unit: MeshUnit, expected: int | None, seeds: str | None
+    mesh: Path,
+    radius_m: float,
+    unit: MeshUnit,
+    expected: int | None,
+    seeds: str | None,
+    limits: SphereLimits | None = None,
 ) -> tuple[MeshSphere, ...]:
     """Spheres of a mesh or point cloud file, metres; in the order of the seeds if given."""
     seeds_m = read_seeds(seeds)
@@ -73,7 +137,7 @@ def spheres_of(
     else:
         scan = read_mesh_file(mesh, unit)
         vertices, faces = scan.mesh.vertices_m, scan.mesh.faces
-    return locate_spheres(vertices, faces, radius_m, expected, normals=normals, seeds_m=seeds_m)
+    return locate_spheres(vertices, faces, radius_m, expected, limits, normals=normals, seeds_m=seeds_m)
 
 
 def read_seeds(text: str | None) -> Array | None:

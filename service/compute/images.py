@@ -70,6 +70,46 @@ def _check_size(width: int, height: int, where: str) -> None:
         )
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image as stored, after a look at whether it is whole; a JPEG is not decoded for it.
+
+    Raises:
+        DataError: as `read_image`.
+    """
+    if path.suffix.lower() in {".jpg", ".jpeg"}:
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise _unreadable(path, error) from error
+        check_jpeg(data, str(path))
+        size = _jpeg_size(data)
+        if size is not None:
+            return size
+    height, width = read_grey(path).shape
+    return width, height
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:
+            at += 1
+            continue
+        if marker in _FRAMES:
+            return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return None
+
+
+def _unreadable(path: Path, error: OSError) -> DataError:
+    return DataError(
+        f"the image cannot be read: {error.strerror}",
+        where=str(path),
+        remedy="Check the path and its permissions",
+    )
+
+
 def read_image(path: Path) -> NDArray[np.uint8]:
     """(H, W, 3) BGR as stored: the orientation tag is ignored, so that the camera model fits.
 
@@ -92,11 +132,7 @@ def _decode(path: Path, how: int) -> NDArray[np.uint8]:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise DataError(
-            f"the image cannot be read: {error.strerror}",
-            where=str(path),
-            remedy="Check the path and its permissions",
-        ) from error
+        raise _unreadable(path, error) from error
     if path.suffix.lower() in {".jpg", ".jpeg"} or data[:2] == b"\xff\xd8":
         check_jpeg(data, str(path))
     elif data.startswith(_PNG):

@@ -254,6 +254,7 @@ def camera_record(image: CapturedImage) -> dict[str, object]:
         "lens_serial": image.lens_serial,
         "body_serial": image.body_serial,
         "focus_distance_m": image.focus_distance_m,
+        "focus_position": image.focus_position,
     }
 
 

@@ -255,13 +255,21 @@ class LiveAnalysis:
                 self.context.tell(describe_view(job))
 
 
+def seen_words(seen: float, expected: float | None) -> str:
+    """`9/10 spheres`; of more than are expected here, `13 spheres (10 expected in this image)`."""
+    if expected is None:
+        return f"{seen:.0f} spheres"
+    if seen > expected:
+        return f"{seen:.0f} spheres ({expected:.0f} expected in this image)"
+    return f"{seen:.0f}/{expected:.0f} spheres"
+
+
 def describe_view(job: JobState) -> str:
     """`v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`: one line on one image."""
     if job.status == "failed":
         return f"{job.arguments['image']['viewpoint']}: could not be looked at: {job.message}"
     m = job.measures
-    expected = f"/{m['spheres_expected']:.0f}" if "spheres_expected" in m else ""
-    parts = [f"{m['spheres_seen']:.0f}{expected} spheres"]
+    parts = [seen_words(m["spheres_seen"], m.get("spheres_expected"))]
     if "outline_rms_px" in m:
         parts.append(f"{m['outline_rms_px']:.2f} px")
     if ERROR in m:

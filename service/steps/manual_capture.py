@@ -18,7 +18,7 @@ from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.exposure import wanted_settings
 from service.steps.held_camera import HeldCamera
 from service.steps.inputs import artefact_of, held_views, result_of
-from service.steps.live import COVERAGE, ERROR, CoverageRule
+from service.steps.live import COVERAGE, ERROR, CoverageRule, seen_words
 from service.steps.optics import departing_images, optics_departures
 
 _KINDS = {"dataset": "image", "control": "control_image", "calibration": "board_image"}
@@ -326,7 +326,7 @@ class _Guide:
         m, result = job.measures, job.result
         parts = [f"{m['images_used']:.0f} used", f"hemisphere {100 * m['hemisphere_coverage']:.0f} %"]
         if "spheres_seen" in m:
-            parts.insert(0, f"{m['spheres_seen']:.0f}/{m['spheres_expected']:.0f} spheres")
+            parts.insert(0, seen_words(m["spheres_seen"], m["spheres_expected"]))
         if "spheres_sigma_mm" in m:  # nobody has measured them: the images tell where they are
             parts.append(f"spheres known to {m['spheres_sigma_mm']:.2f} mm")
         if ERROR in m:

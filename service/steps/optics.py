@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from service.compute.calibration.optics import Optics, OpticsDeparture, compare_optics, summary
 from service.core.model import View
 from service.steps.context import StepContext
 
 _STATED = (
-    "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "lens", "lens_serial",
-    "body_serial",
+    "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "focus_position", "lens",
+    "lens_serial", "body_serial",
 )  # fmt: skip
 
 
@@ -66,4 +67,10 @@ def _calibration_images(context: StepContext) -> tuple[View, ...]:
 
 def _optics(capture: View) -> Optics:
     record = capture.camera
-    return Optics(image=capture.viewpoint, **{name: record[name] for name in _STATED if record.get(name)})
+    return Optics(image=capture.viewpoint, **{name: record[name] for name in _STATED if _stated(name, record)})
+
+
+def _stated(name: str, record: Mapping[str, Any]) -> bool:
+    """Whether the image says it: 0 is a position of the focus motor, and nothing anywhere else."""
+    value = record.get(name)
+    return value is not None if name == "focus_position" else bool(value)

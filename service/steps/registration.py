@@ -14,6 +14,7 @@ from pydantic import field_validator
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.job_keys import arguments_name
 from service.core.model import Record
+from service.core.terms import term
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, hand_eye_of, intrinsics_covariance_of, result_of
 from service.steps.sources import DEFAULT_SOURCES, PLANNED, Source, Wanted, Ways, decisive, posed, ways
@@ -123,7 +124,7 @@ def _mounting(context: StepContext, params: Params, images: list[dict[str, Any]]
 
 def _words(found: Ways) -> str:
     working = [task.request.kind for task in found.tasks if task.job and task.job.status == "enqueued"]
-    return ", ".join(kind.replace("_", " ") for kind in dict.fromkeys(working)) or "registration"
+    return ", ".join(map(term, dict.fromkeys(working))) or "registration"
 
 
 def _outcome(found: Ways) -> StepOutcome:

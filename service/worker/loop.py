@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
 from service.core.priorities import Lane
 from service.core.space import LEAST_FREE_BYTES
+from service.core.terms import term
 from service.logs.where import at
 from service.store.errors import LeaseLostError
 from service.store.records import Job
@@ -122,7 +123,7 @@ def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], follo
     at(run=job.run_id, step=job.step, job=job.job_id)
     answer = JobAnswer({})
     attempt = _Attempt(store, job)
-    progress(job.kind.replace("_", " "), 0, 0)
+    progress(term(job.kind), 0, 0)
     with attempt, tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
         answer = HANDLERS[job.kind](JobContext(job.arguments, store, Path(scratch), progress))
     try:

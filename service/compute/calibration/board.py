@@ -195,7 +195,7 @@ def _search_checkerboard(image: Grey, columns: int, rows: int) -> Array:
         if found:
             return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
     raise ComputeError(
-        f"no board of {columns} × {rows} inner corners in the image (searched at widths {sorted(set(tried))})",
+        f"no board of {columns} × {rows} inner corners in the image",
         remedy="the whole board must be visible, sharp and evenly lit; check columns and rows (inner corners)",
     )
 

@@ -12,12 +12,14 @@ from pathlib import Path
 
 import cv2
 
-from service.compute.calibration.board import Board, BoardView, find_board
+from service.compute.calibration.board import Board, BoardView, Grey, find_board
+from service.compute.calibration.board_diagnosis import Diagnosis, diagnose, wrong_board
 from service.compute.images import read_grey
 from service.core.errors import ComputeError, DataError
 
 _MANY_FILES = 24
 _MANY_BYTES = 30e6
+_PROBED = 4  # images, before all are searched
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,18 @@ def find_boards(
     return tuple(found)
 
 
+def probe_board(files: Sequence[Path], board: Board) -> Diagnosis | None:
+    """What is wrong with the board's description, by a few of the images; None where it is seen, or nobody knows."""
+    some = [files[k] for k in sorted({round(k * (len(files) - 1) / (_PROBED - 1)) for k in range(_PROBED)})]
+    greys: list[Grey] = []
+    for file in some:
+        try:
+            greys.append(read_grey(file))
+        except DataError:  # told with the other reasons
+            continue
+    return wrong_board(greys, board)
+
+
 def usable_views(found: Sequence[BoardImage]) -> UsableViews:
     """Views of the size that most images have; the others are excluded with their reasons.
 
@@ -126,4 +140,6 @@ def _find(file: Path, board: Board) -> BoardImage:
     try:
         return BoardImage(size, find_board(grey, board))
     except ComputeError as error:
-        return BoardImage(size, None, error.what)
+        # Of a ChArUco board a part is enough, and trying its markers takes seconds.
+        why = diagnose(grey, board) if board.pattern == "checkerboard" else None
+        return BoardImage(size, None, error.what if why is None else why.words)

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.arm_correction import ArmCorrection
 from service.compute.calibration.closed_form import (
@@ -29,15 +28,16 @@ from service.compute.calibration.hand_eye_fit import (
     arm_noise,
     arm_outliers,
     find_outliers,
-    fit_closed_form,
     fit_method,
     fit_with_arm,
     held_out,
     turned_back,
 )
+from service.compute.calibration.hand_eye_setup import Setup, check_setup, inverted
+from service.compute.calibration.hand_eye_spread import bootstrap_covariance, not_below_held_out
 from service.compute.calibration.kinematics import ArmModel
-from service.compute.calibration.reprojection import BoardCorners, board_covariance, resample_reprojection
-from service.compute.calibration.weighted import Noise, resample
+from service.compute.calibration.reprojection import BoardCorners, board_covariance
+from service.compute.calibration.weighted import Noise
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 
@@ -55,7 +55,6 @@ __all__ = [
 _FOLDS = 5
 _FEW = 24  # up to so many views twice the folds: a fifth less would change the answer
 _WORTH = 0.9  # an arm's correction is used when the held-out error falls below this share
-_MIN_DISTINCT = 4  # views in a bootstrap replicate
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +166,7 @@ def calibrate_hand_eye(
     joints_rad: Array | None = None,
     arm: ArmModel | None = None,
     T_board_turned: Transform | None = None,
+    setup: Setup = "eye-in-hand",
     bootstrap: int = 100,
     seed: int = 0,
 ) -> HandEyeResult:
@@ -185,20 +185,28 @@ def calibrate_hand_eye(
         arm: model of the arm, with `joints_rad`.
         T_board_turned: the half turn of a board that looks the same upside down (`half_turn`); views that were
             numbered from the other end are then turned so that they agree with the robot.
+        setup: eye-to-hand: the camera stands beside the robot and the board hangs on the flange. Then T_flange_camera
+            and T_flange_board change places with T_base_camera and T_base_board: the answer's T_flange_camera is
+            T_base_camera, its T_base_board is T_flange_board. The arm's own error is not estimated then.
         bootstrap: number of resamples.
         seed: of the resampling and of the folds.
 
     Raises:
         DataError: arrays that do not belong together, or are not finite; joints of another arm.
-        ComputeError: too few views, too little rotation, rotation about one axis only, or more than a third of the
-            images in disagreement with the robot.
+        ComputeError: too few views, too little rotation, rotation about one axis only, poses that do not fit the
+            images (`check_setup` says which reading of them does), or more than a third of the images in
+            disagreement with the robot.
     """
     data = _measured(T_base_flange, T_camera_board, corners, joints_rad, arm)
+    if setup == "eye-to-hand":
+        data = dataclasses.replace(data, hands=inverted(data.hands), joints_rad=None, arm=None)
     spread, second, condition = observability(data.hands)
     turned = np.zeros(len(data.hands), dtype=bool)
     if T_board_turned is not None:
         turned = untwist(data.hands, data.boards, T_board_turned)[1]
     straight, sigma_px = _straightened(data, turned, T_board_turned)
+    point = np.zeros(3) if corners is None else corners.points_m.mean(axis=0)
+    check_setup(straight.hands, straight.boards, point, setup)
     rng = np.random.default_rng(seed)
     excluded = find_outliers(straight, rng)
     keep = ~np.isin(np.arange(len(data.hands)), list(excluded))
@@ -213,7 +221,6 @@ def calibrate_hand_eye(
     if not all(np.isfinite(observability(straight.hands[keep]))):
         raise ComputeError("the remaining views do not determine the answer")
 
-    point = np.zeros(3) if corners is None else corners.points_m.mean(axis=0)
     folds = np.random.default_rng(seed).permutation(len(keep)) % min(
         _FOLDS if len(keep) > _FEW else 2 * _FOLDS, len(keep)
     )
@@ -266,7 +273,9 @@ def _quality(
 ) -> dict[str, Any]:
     """The fields of a HandEyeAnswer."""
     residual = deviation(data.placed(answer), answer.T_base_board, point_m)
-    covariance = _bootstrap(good, method, answer, bootstrap, np.random.default_rng(seed))
+    covariance = bootstrap_covariance(good, method, answer, bootstrap, np.random.default_rng(seed))
+    if method in CLOSED_FORMS:
+        covariance = not_below_held_out(covariance, *errors)
     return {
         "T_flange_camera": answer.T_flange_camera,
         "T_base_board": answer.T_base_board,
@@ -348,35 +357,6 @@ def _methods(data: Measured, method: Method, answer: Answer) -> dict[Method, Tra
             except ComputeError:  # a comparison that fails is no reason to lose the answer
                 continue
     return answers
-
-
-def _bootstrap(data: Measured, method: Method, answer: Answer, count: int, rng: np.random.Generator) -> Array:
-    """(6, 6) covariance of T_flange_camera over resamples of whole images.
-
-    It holds for systematic errors that differ from pose to pose too.
-    """
-    n = len(data.hands) if answer.views is None else len(answer.views.T_base_flange)
-    picks = [rng.integers(0, n, n) for _ in range(count)]
-    picks = [pick for pick in picks if len(np.unique(pick)) >= _MIN_DISTINCT]
-    counts = np.array([np.bincount(pick, minlength=n) for pick in picks], dtype=np.float64)
-    X = answer.T_flange_camera
-    if method in CLOSED_FORMS:
-        replicas = [fit_closed_form(_repeat(data, pick), method).T_flange_camera for pick in picks]
-        turns = [Rotation.from_matrix(T[:3, :3] @ X[:3, :3].T).as_rotvec() for T in replicas]
-        steps = np.array([[*(T[:3, 3] - X[:3, 3]), *w] for T, w in zip(replicas, turns, strict=True)])
-    elif method == "reprojection":
-        assert data.corners is not None
-        steps = resample_reprojection(data.hands, data.corners, X, answer.T_base_board, counts)
-    else:
-        assert answer.views is not None
-        assert answer.noise is not None
-        assert answer.fit is not None
-        steps = resample(answer.views, answer.noise, answer.fit, counts)
-    return np.cov(steps[:, :6].T)
-
-
-def _repeat(data: Measured, pick: NDArray[np.int64]) -> Measured:
-    return Measured(data.hands[pick], data.boards[pick], data.covariance[pick], None, None, None)
 
 
 def place_board(T_base_flange: Array, T_camera_board: Array, T_flange_camera: Transform) -> BoardPlacement:

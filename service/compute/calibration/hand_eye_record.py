@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -12,21 +12,28 @@ from service.compute.calibration.arm_correction import ArmCorrection, corrected_
 from service.compute.calibration.board import Board, BoardView
 from service.compute.calibration.closed_form import distance
 from service.compute.calibration.hand_eye import BoardCorners, HandEyeAnswer, HandEyeResult
+from service.compute.calibration.hand_eye_setup import Setup
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
 
+_BESIDE = {"T_flange_camera": "T_base_camera", "T_base_board": "T_flange_board"}
 
-def hand_eye_record(result: HandEyeResult, images: Sequence[str]) -> dict[str, Any]:
+
+def hand_eye_record(result: HandEyeResult, images: Sequence[str], setup: Setup = "eye-in-hand") -> dict[str, Any]:
     """4×4 transforms and covariances in metres and radians, errors in mm and degrees, views by name.
+
+    Of a camera beside the robot (eye-to-hand) the record holds T_base_camera and T_flange_board instead, and nothing
+    that takes T_flange_camera reads it by mistake.
 
     `T_flange_camera` goes with poses as the robot reports them. `arm_correction`, where it is not null, holds the
     correction of the poses and the T_flange_camera that goes with corrected ones (`read_arm_correction`).
     """
     chosen = result.T_flange_camera
     corrected = result.corrected
-    return {
+    record: dict[str, Any] = {
         **_answer(result, images),
+        "setup": setup,
         "method": result.method,
         "methods": {
             name: {
@@ -49,6 +56,14 @@ def hand_eye_record(result: HandEyeResult, images: Sequence[str]) -> dict[str, A
         "arm_correction": None
         if corrected is None
         else {**corrected.correction.as_json(), **_answer(corrected, images), "terms": corrected.terms},
+    }
+    return record if setup == "eye-in-hand" else _renamed(record)
+
+
+def _renamed(record: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        _BESIDE.get(key, key): _renamed(cast("dict[str, Any]", value)) if isinstance(value, dict) else value
+        for key, value in record.items()
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -62,6 +63,10 @@ _ARMS = {
 }
 
 
+#: Names of the arms whose kinematics are known.
+ARM_MODELS = tuple(arm.name for arm in _ARMS.values())
+
+
 def arm_model(name: str) -> ArmModel:
     """The arm of this name, upper or lower case.
 
@@ -71,8 +76,10 @@ def arm_model(name: str) -> ArmModel:
     try:
         return _ARMS[name.lower()]
     except KeyError:
-        known = ", ".join(arm.name for arm in _ARMS.values())
-        raise ConfigurationError(f"no kinematics of an arm {name!r}", remedy=f"known are {known}") from None
+        near = get_close_matches(name.lower(), _ARMS, n=1)
+        hint = f"did you mean {_ARMS[near[0]].name}? " if near else ""
+        known = ", ".join(ARM_MODELS)
+        raise ConfigurationError(f"no kinematics of an arm {name!r}", remedy=f"{hint}known are {known}") from None
 
 
 def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0.02) -> ArmModel | None:

@@ -10,9 +10,10 @@ from service.core.errors import DataError
 
 # Relative steps that are no change: EXIF rounds focal lengths and apertures; focus encoders read in coarse steps.
 _TOLERANCE = {"focal_length_mm": 0.005, "aperture_f": 0.02, "focus_distance_m": 0.02}
+_FOCUS_STEPS = 1  # of a focus motor that stands still, by rounding
 _FIELDS = (
-    "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "lens", "lens_serial",
-    "body", "body_serial",
+    "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "focus_position", "lens",
+    "lens_serial", "body", "body_serial",
 )  # fmt: skip
 _NAMED = 5  # images in a line of the summary
 
@@ -28,6 +29,7 @@ class Optics:
     aperture_f: float | None = None
     focus_distance_m: float | None = None
     focus_mode: str = ""
+    focus_position: int | None = None  # of the focus motor, in its own steps
     lens: str = ""
     lens_serial: str = ""
     body: str = ""
@@ -114,10 +116,17 @@ def compare_optics(calibration: Sequence[Optics], capture: Sequence[Optics]) -> 
 
 
 def _same(field: str, value: object, reference: object) -> bool:
+    if field == "focus_position":
+        return abs(int(str(value)) - int(str(reference))) <= _FOCUS_STEPS
     tolerance = _TOLERANCE.get(field)
     if tolerance is None or not isinstance(value, int | float) or not isinstance(reference, int | float):
         return value == reference
     return abs(value - reference) <= tolerance * abs(reference)
+
+
+def states_focus(optics: Sequence[Optics]) -> bool:
+    """Whether the images would show a focus that was changed: a mode alone does not tell where it is."""
+    return all(one.focus_position is not None or one.focus_distance_m is not None for one in optics)
 
 
 def _text(value: object) -> str:

@@ -30,6 +30,8 @@ _UNIT_RADIUS_PX = 60.0  # radius in samples of the first approach, which average
 _LEAST_PART = 0.19  # of the profiles that must agree
 _START_BLUR_PX, _START_CHROMA_BLUR_PX = 0.7, 1.2
 _ALIKE = 1.5  # radius over the smallest of outlines whose profiles are of one length
+_LEAST_RADIUS = 3.0  # samples; smaller ones have no inside to compare the outside with
+_MOST_CHANGE = 2.0  # of the radius in one fit of sub-pixel edges: such a one extrapolates, to less than nothing even
 _FOCUS = 1.3  # blur over the expected one from which on profiles were too short for it
 
 
@@ -212,6 +214,14 @@ def _measure(
     """Cones near those given, from `n_profiles` each; lengths are in `unit` pixels, whose values are averaged."""
     cones = [s.cone for s in starts]
     radius = np.array([c.half_angle_rad for c in cones]) * camera.fx / unit
+    if not np.all(radius >= _LEAST_RADIUS):
+        large = {i: s for i, s in enumerate(starts) if radius[i] >= _LEAST_RADIUS}
+        found = iter(
+            _measure(image, camera, list(large.values()), n_profiles, step, reach, iterations, unit, options)
+            if large
+            else ()
+        )
+        return [next(found) if i in large else None for i in range(len(starts))]
     typical = float(np.median(radius))
     # Inside, as far as tells the limb's fall from the edge; outside, only what the blurred edge needs.
     blur = max(1.0, float(np.median([s.blur_px for s in starts])))
@@ -237,11 +247,15 @@ def _measure(
         if not fit.good[i] or fit.scale[i] > max(MOST_SIGMA_PX, 0.3 * float(limb.blur[i])):
             out.append(None)
             continue
+        half = cone.half_angle_rad + float(fit.step[i, 2] * angle[i])
+        if not 1 / _MOST_CHANGE < half / cone.half_angle_rad < _MOST_CHANGE:  # a short arc tells no radius
+            out.append(None)
+            continue
         axis = cone.axis + cone.frame()[:, :2] @ fit.step[i, :2] * angle[i]
         systematic = SYSTEMATIC_PER_BLUR * blur_px
         out.append(
             _Measured(
-                cone=Cone(axis / float(np.linalg.norm(axis)), cone.half_angle_rad + float(fit.step[i, 2] * angle[i])),
+                cone=Cone(axis / float(np.linalg.norm(axis)), half),
                 blur_px=blur_px,
                 chroma_blur_px=float(limb.chroma_blur[i]) * unit,
                 coverage=float(fit.coverage[i]),

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.image_folder import ImageFolder, strict_refusal
 from service.compute.poses import colmap_files
 from service.core.errors import DataError
 from service.core.file_text import csv_rows, file_text
@@ -23,8 +24,17 @@ from service.core.json_text import parse_json
 _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # how far a quaternion's length may be from 1: files with four decimals pass
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y up, z backward
-_CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-_MORE_DISTORTION = ("k3", "k4", "k5", "k6")
+_CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
+_DISTORTION = (
+    "k1",
+    "k2",
+    "p1",
+    "p2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+)  # what is not there is zero: a pinhole camera without any
 #: What `calibrate intrinsics` writes beside the camera into the same file.
 _CALIBRATION_KEYS = (
     "model", "board", "n_views", "images", "rms_px", "per_view_rms_px", "excluded", "sigma", "sigma_independent",
@@ -77,7 +87,33 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
     return poses if images is None else _select(poses, images, path)
 
 
+def posed_images(
+    path: Path, images: ImageFolder, folder: Path, *, strict: bool = False
+) -> tuple[dict[str, Transform], ImageFolder]:
+    """T_world_camera of the images that have one, by name, and these images; the others are left out.
+
+    Raises:
+        DataError: as `read_poses`; no image has a pose; or one has none where `strict`.
+    """
+    names = [file.name for file in images.files]
+    chosen, missing = _matched(read_poses(path), names)
+    if not chosen:
+        raise _without_pose(missing, names, path)
+    reasons = dict.fromkeys(missing, f"no pose in {path.name}")
+    if reasons and strict:
+        raise strict_refusal(reasons, folder)
+    return chosen, images.without(reasons)
+
+
 def _select(poses: Mapping[str, Transform], images: Sequence[str], path: Path) -> dict[str, Transform]:
+    chosen, missing = _matched(poses, images)
+    if missing:
+        raise _without_pose(missing, images, path)
+    return chosen
+
+
+def _matched(poses: Mapping[str, Transform], images: Sequence[str]) -> tuple[dict[str, Transform], list[str]]:
+    """Poses by image, and the images without one."""
     by_file_name: dict[str, list[str]] = {}
     for name in poses:
         by_file_name.setdefault(Path(name).name, []).append(name)
@@ -91,13 +127,15 @@ def _select(poses: Mapping[str, Transform], images: Sequence[str], path: Path) -
             chosen[image] = poses[alike[0]]
         else:
             missing.append(image)
-    if missing:
-        raise DataError(
-            f"{len(missing)} of {len(images)} images have no pose: {', '.join(missing[:5])}",
-            where=str(path),
-            remedy="add their poses, or leave the images out",
-        )
-    return chosen
+    return chosen, missing
+
+
+def _without_pose(missing: Sequence[str], images: Sequence[str], path: Path) -> DataError:
+    return DataError(
+        f"{len(missing)} of {len(images)} images have no pose: {', '.join(missing[:5])}",
+        where=str(path),
+        remedy="add their poses, or leave the images out",
+    )
 
 
 # --- CSV ------------------------------------------------------------------------------------------------
@@ -266,7 +304,7 @@ def write_colmap_text(folder: Path, camera: CameraModel, T_world_camera: Mapping
 
 
 def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> CameraModel:
-    """Camera from {"width","height","fx","fy","cx","cy","k1","k2","p1","p2"} (OpenCV conventions), perhaps k3 … k6.
+    """Camera from {"width","height","fx","fy","cx","cy"} and, where not zero, "k1" … "k6", "p1", "p2" (as in OpenCV).
 
     A file that `calibrate intrinsics` wrote holds what it knows of the calibration beside these; any other key is
     refused, since it may change what the numbers mean.
@@ -275,9 +313,9 @@ def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> C
         DataError: a key is missing, unknown or not a number, or the size is not the images' (width, height).
     """
     document = _object(path)
-    _check_keys(document, set(_CAMERA_KEYS), {*_MORE_DISTORTION, *_CALIBRATION_KEYS}, path)
+    _check_keys(document, set(_CAMERA_KEYS), {*_DISTORTION, *_CALIBRATION_KEYS}, path)
     values: dict[str, float] = {}
-    for key in (*_CAMERA_KEYS, *_MORE_DISTORTION):
+    for key in (*_CAMERA_KEYS, *_DISTORTION):
         value = document.get(key, 0.0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise DataError(f"{key} is {value!r}, not a number", where=str(path), remedy=f"correct {key}")
@@ -293,7 +331,7 @@ def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> C
             where=str(path),
             remedy="use images of the calibrated size, or calibrate at theirs",
         )
-    return CameraModel(*size, *(float(values[k]) for k in (*_CAMERA_KEYS, *_MORE_DISTORTION)[2:]))
+    return CameraModel(*size, *(float(values[k]) for k in (*_CAMERA_KEYS, *_DISTORTION)[2:]))
 
 
 def write_camera_json(path: Path, camera: CameraModel) -> None:

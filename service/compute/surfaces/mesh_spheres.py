@@ -23,6 +23,7 @@ _MOST_SAMPLES = 5000  # of one sphere: beyond, neighbours repeat each other's no
 _NEAR_MISSES = 6
 _MIXED = 0.2  # |orientation| below which the normals say nothing
 _MAX_RADIUS_SIGMA = 0.15  # in radii; a radius that is known less is no evidence of a sphere
+_FEWEST_PATCHES = 5  # cells of surface: centre, radius, and one to contradict them
 _ROUGHER = 2.0  # times the rms of the best covered spheres: noise of one mesh is not so different between spheres
 _SEED_REACH = 1.6  # a seed is a rough centre or a point on the surface: the centre is within so many radii
 
@@ -55,12 +56,16 @@ class SphereLimits:
     """What a sphere must satisfy to be accepted; lengths as fractions of the radius.
 
     A cap of half angle a covers (1 - cos a) / 2 of its sphere: 0.067 at 30°, 0.15 at 45°, 0.25 at 60°.
-    The radius may also miss the known one by three of its sigmas: a small cap determines it badly.
+    The radius may also miss the known one by three of its sigmas, up to `most_radius_residual`: a small cap
+    determines it badly, but what fits no better than that is a fillet or an edge.
     """
 
     min_coverage: float = 0.05
+    min_cap_deg: float = 50.0  # opening of the seen cap across its narrow side: 60° of a cap, with its ragged rim
+    min_vertices: int = 20
     max_rms: float = 0.025
     max_radius_residual: float = 0.04
+    most_radius_residual: float = 0.10
     max_flank: float = 0.3
     max_form: float = 0.01
 
@@ -214,6 +219,10 @@ def _shape_reasons(fit: SphereFit, radius: float, limits: SphereLimits) -> list[
     reasons: list[str] = []
     if fit.coverage < limits.min_coverage:
         reasons.append(f"covers {fit.coverage:.3f} of the sphere, {limits.min_coverage:g} is needed")
+    if fit.n < limits.min_vertices or len(fit.patches.unit) < _FEWEST_PATCHES:
+        reasons.append(f"only {fit.n} vertices lie on it, {limits.min_vertices} in several places are needed")
+    elif (cap_deg := _cap_deg(fit)) < limits.min_cap_deg:
+        reasons.append(f"its cap is {cap_deg:.0f}° wide, {limits.min_cap_deg:.0f}° are needed")
     if fit.rms > limits.max_rms * radius:
         reasons.append(f"rms {fit.rms * 1e3:.2f} mm, at most {limits.max_rms * radius * 1e3:.2f}")
     if fit.flank > limits.max_flank:
@@ -223,10 +232,22 @@ def _shape_reasons(fit: SphereFit, radius: float, limits: SphereLimits) -> list[
     return reasons
 
 
+def _cap_deg(fit: SphereFit) -> float:
+    """Opening of the cap that scatters as the inlying surface does across its narrow side: a strip is a small one."""
+    unit, weight = fit.patches.unit, fit.patches.weight / fit.patches.weight.sum()
+    middle = weight @ unit
+    off = unit - middle
+    # In the plane across the middle direction: half the sine of the half angle is the deviation of an even cap.
+    plane = np.linalg.svd(middle[None])[2][1:]
+    across = float(np.sqrt(max(float(np.linalg.eigvalsh(plane @ (off.T @ (off * weight[:, None])) @ plane.T)[0]), 0)))
+    return 2 * float(np.degrees(np.arcsin(min(1.0, 2 * across))))
+
+
 def _radius_reasons(fit: SphereFit, sigma: float, radius: float, limits: SphereLimits) -> list[str]:
     if not np.isfinite(fit.radius_residual) or sigma > _MAX_RADIUS_SIGMA * radius:
         return ["too small a cap for its noise to tell the radius"]
-    if abs(fit.radius_residual) > max(limits.max_radius_residual * radius, 3 * sigma):
+    most = max(limits.max_radius_residual, limits.most_radius_residual)
+    if abs(fit.radius_residual) > max(limits.max_radius_residual * radius, min(3 * sigma, most * radius)):
         return [f"radius {fit.radius_residual * 1e3:+.2f} ± {sigma * 1e3:.2f} mm off"]
     return []
 

@@ -1,0 +1,32 @@
+"""The one list of words for the names that records use: what people read on screens, in terminals and reports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+_WORDS: Mapping[str, str] = {
+    "board_view": "board images",
+    "calibrate": "camera calibration",
+    "coverage_points": "the specimen's surface",
+    "ct_surface": "CT surface",
+    "ct": "CT series",
+    "detect_spheres": "spheres in images",
+    "evaluate": "evaluation",
+    "features": "features of the images",
+    "hand_board": "board images taken by hand",
+    "hand_view": "images taken by hand",
+    "hybrid": "hybrid camera poses",
+    "layout": "layout of the spheres",
+    "live_summary": "summary of the images",
+    "live_view": "images as they arrive",
+    "locate_spheres": "spheres in the mesh",
+    "match": "matches between images",
+    "register": "registration",
+    "structure_from_motion": "camera poses from images",
+    "control_image": "images of the control spheres",
+}
+
+
+def term(name: str) -> str:
+    """Words for a name of the records: ct_surface → CT surface; an unknown one with spaces."""
+    return _WORDS.get(name, name.replace("_", " "))

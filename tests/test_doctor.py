@@ -1,0 +1,55 @@
+"""`orthocapture doctor` tells what each device reports: problems, clocks, and marks that agree with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from drivers.interfaces import DeviceIdentity, DeviceReport
+from service.cli.main import app
+
+
+@dataclass
+class _Devices:
+    """A station whose devices answer with given reports."""
+
+    reports: dict[str, DeviceReport]
+
+    def names(self) -> list[str]:
+        return list(self.reports)
+
+    def device(self, name: str) -> _Devices:
+        return _Devices({"": self.reports[name]})
+
+    def report(self) -> DeviceReport:
+        return self.reports[""]
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("report", "mark", "words"),
+    [
+        ({"problems": ("the card [A] is full: empty it",)}, "!", "the card [A] is full: empty it"),
+        ({"clock_offset_s": -1279.0}, "!", "clock 1279.000 s behind this machine's, more than 5 s: set it"),
+        ({"clock_offset_s": 0.5}, "✓", "clock 0.500 s ahead of this machine's"),
+        ({"clock_offset_s": -1279.0, "clock": "uptime"}, "✓", "counts from power-on (-1279.000 s to"),
+    ],
+)
+def test_doctor_tells_what_a_device_reports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, report: dict[str, Any], mark: str, words: str
+) -> None:
+    who = DeviceIdentity("camera", "model", "serial", "firmware", "driver", "1", "address")
+    devices = _Devices({"camera": DeviceReport(who, **report)})
+    monkeypatch.setattr("service.cli.doctor.Station", lambda _rig: devices)
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("name: bare\ndevices:\n  camera: {driver: gphoto}\n")
+    words_typed = ["doctor", "--rig", str(rig), "--data", str(tmp_path / "data")]
+    result = CliRunner().invoke(app, words_typed, catch_exceptions=False)
+    assert f"{mark} camera model" in result.output
+    assert words in result.output
