@@ -164,7 +164,10 @@ class RobotArm(Device, Protocol):
         ...
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
-        """Samples of the ring buffer (at least the last 10 s) between two host times, oldest first."""
+        """Samples of the ring buffer (at least the last 10 s) between two host times, oldest first.
+
+        Reading them is not looking after the arm: an arm that moves and is only watched in this way is stopped.
+        """
         ...
 
     def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:

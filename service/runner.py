@@ -99,6 +99,10 @@ class Operator(Interface):
         """One line on what happened."""
         ...
 
+    def busy(self, what: str) -> None:
+        """Said before a call that takes its time, in words: what screens show until the next `attend`."""
+        ...
+
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
         """Called several times a second, whatever the runner does: for what screens show."""
         ...
@@ -165,7 +169,7 @@ class Runner:
                     host_clock=host_clock(),
                 )
             )
-            self.devices.watch(self._opened)
+            self.devices.watch(self._opened, lambda name: self.operator.busy(f"connecting the {name}"))
             self._follow_space()
             try:
                 while True:
@@ -316,6 +320,7 @@ class Runner:
             wait=self.wait,
             operator=self.operator.name,
             tell=self.operator.tell,
+            busy=self.operator.busy,
         )
         if (leave := self._log.state.leave) is not None:
             self.devices.let_move(LeaveToMove(leave.seq, leave.by, self._log.leave_not_before_s))
@@ -399,6 +404,7 @@ class Runner:
 
         The end of a run is stamped as well, where an authority is configured: the run has ended already by then.
         """
+        self.operator.busy("signing the record")
         try:
             stamp_end(self.store, self.run_id, self.authority if self._log.state.terminal else None)
         except StoreError as error:

@@ -90,6 +90,10 @@ class _Operator:
         """News."""
         self.display.tell(message)
 
+    def busy(self, what: str) -> None:
+        """For the screens."""
+        self.display.reporter.busy(what)
+
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
         """For the screens."""
         self.display.reporter.attend(doing, state.current, state.step.attempt, pedal_armed=pedal_armed)

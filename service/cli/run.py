@@ -347,6 +347,7 @@ def drive(
         beside = worker_beside(data, error_console.print) if worker else nullcontext()
         with file_log(data, "runner", run=run_id), beside:
             authority, copy = time_stamp_authority(rig), signature_copy(rig)
+            reporter.begin()
             try:
                 state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
             finally:

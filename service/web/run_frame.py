@@ -9,7 +9,7 @@ from service.core.errors import OrthocaptureError
 from service.core.imported import imported_sentence
 from service.core.model import RunStarted
 from service.core.run_state import RunState
-from service.monitor.snapshot import Snapshot, read_snapshot
+from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot
 from service.web.site import Site
 
 Tone = Literal["moving", "standing", "paused", "unknown", "stop"]
@@ -129,7 +129,12 @@ def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner
     if state.terminal:
         return Banner("ended", "standing", "end", "The run has ended.", "It drives no robot any more.")
     if snapshot.doing in ("unknown", "ended"):
-        return _silent(driven=driven)
+        return _silent(snapshot, driven=driven)
+    if snapshot.doing == "starting":
+        text = f"It has moved nothing yet, and asks before it does. {NOT_THE_STOP}"
+        return Banner("starting", "standing", "open", "The program that drives the robot is starting.", text)
+    if snapshot.robot_silent_s > STALE_S and snapshot.robot != "not_connected":
+        return _not_heard_of(snapshot)
     stop = _STOPS.get(snapshot.robot)
     if stop is not None:
         return stop
@@ -137,7 +142,8 @@ def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner
         return _moving(state, snapshot)
     if snapshot.robot == "not_connected":
         title = "Paused. The robot is not connected." if state.paused else "Robot not connected."
-        text = "Nothing has needed it so far. Its own pendant can still move it."
+        now = f" Now: {busy_words(snapshot)}." if busy_words(snapshot) else ""
+        text = f"Nothing has needed it so far.{now} Its own pendant can still move it."
         return Banner("not_connected", "paused" if state.paused else "standing", "open", title, text)
     if state.paused:
         if snapshot.doing == "paused":
@@ -145,16 +151,46 @@ def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner
                 "paused", "paused", "pause", "Paused. The robot stands still.", "It moves only after Resume."
             )
         return Banner("pausing", "paused", "pause", "Pausing…", "The robot may still move. Wait for Paused.")
-    text = "A step is under way: it may move at any moment." if snapshot.doing == "working" else NOT_THE_STOP
+    if snapshot.doing != "working":
+        return Banner("standing", "standing", "standing", "The robot stands still.", NOT_THE_STOP)
+    text = f"{_busy(snapshot)}It may move at any moment."
     return Banner("standing", "standing", "standing", "The robot stands still.", text)
 
 
-def _silent(*, driven: bool) -> Banner:
+def busy_words(snapshot: Snapshot) -> str:
+    """What the program is in the midst of, and for how long; "" where it is quickly done.
+
+    A call of which nothing was said is told by the work that it belongs to: a program that hangs is seen to hang.
+    """
+    if snapshot.lasting:
+        return f"{snapshot.activity}, for {snapshot.activity_s:.0f} s"
+    if snapshot.quiet_s > STALE_S:
+        return f"{snapshot.what or 'something it does not tell of'}, for {snapshot.quiet_s:.0f} s"
+    return ""
+
+
+def _busy(snapshot: Snapshot) -> str:
+    words = busy_words(snapshot)
+    if not words:
+        return "A step is under way. "
+    hangs = " It hears no button before that is done." if snapshot.quiet_s > STALE_S else ""
+    return f"Now: {words}.{hangs} "
+
+
+def _not_heard_of(snapshot: Snapshot) -> Banner:
+    text = (
+        f"It has not been heard of for {snapshot.robot_silent_s:.0f} s, in which the program that drives it is at: "
+        f"{busy_words(snapshot) or 'its work'}. Look at the robot. {NOT_THE_STOP}"
+    )
+    return Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)
+
+
+def _silent(snapshot: Snapshot, *, driven: bool) -> Banner:
     if driven:
-        title, text = (
-            "Robot: unknown.",
-            "The program that drives it has not told anything for 5 s. Look at the robot.",
-        )
+        title = "Robot: unknown."
+        since = f" for {snapshot.age_s():.0f} s" if snapshot.at_utc_s else " yet"
+        last = f" The last word was: {snapshot.activity}." if snapshot.activity else ""
+        text = f"The program that drives it has not told anything{since}.{last} Look at the robot."
     else:
         title, text = "Robot: unknown.", "The program that drives it does not run. Look at the robot."
     return Banner("unknown", "unknown", "unknown", title, f"{text} {NOT_THE_STOP}")
@@ -164,8 +200,9 @@ def _moving(state: RunState, snapshot: Snapshot) -> Banner:
     if state.paused or snapshot.doing in ("pausing", "paused"):
         return Banner("pausing", "paused", "pause", "Pausing…", "The robot still moves. Wait for Paused.")
     speed = "" if snapshot.speed_fraction is None else f" Speed slider {snapshot.speed_fraction:.0%}."
+    now = f" Now: {busy_words(snapshot)}." if busy_words(snapshot) else ""
     return Banner(
-        "moving", "moving", "moving", "The robot moves.", f"Stay outside of its reach.{speed} {NOT_THE_STOP}"
+        "moving", "moving", "moving", "The robot moves.", f"Stay outside of its reach.{speed}{now} {NOT_THE_STOP}"
     )
 
 

@@ -311,7 +311,7 @@ class BenchRig:
     def let_move(self, leave: LeaveToMove) -> None:
         self.arm.let_move(leave.by, leave.not_before_monotonic_s)
 
-    def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
+    def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
         self._on_open = on_open
 
     def reopen(self, device: Device) -> None:
@@ -357,6 +357,7 @@ class ScriptedOperator:
     on_prepare: Callable[[], None] = lambda: None
     asked: list[AskOperator] = field(default_factory=list[AskOperator])
     told: list[str] = field(default_factory=list[str])
+    busy_with: list[str] = field(default_factory=list[str])
     attended: list[tuple[Doing, bool]] = field(default_factory=list[tuple[Doing, bool]])
     prepared: list[tuple[str, int]] = field(default_factory=list[tuple[str, int]])
     mended: list[tuple[str, int, tuple[Mapping[str, Any], ...]]] = field(
@@ -373,6 +374,9 @@ class ScriptedOperator:
 
     def tell(self, message: str) -> None:
         self.told.append(message)
+
+    def busy(self, what: str) -> None:
+        self.busy_with.append(what)
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
         if not self.attended or self.attended[-1] != (doing, pedal_armed):
