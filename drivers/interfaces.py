@@ -391,8 +391,17 @@ class EnvironmentReading:
     monotonic_s: float
 
 
+class TowerLight(Enum):
+    """One light of a signal tower, which is seen across the room."""
+
+    OFF = "OFF"
+    WORKING = "GREEN"
+    WAITING = "YELLOW"  # for a person
+    STOPPED = "RED"
+
+
 class Lightbox(Device, Protocol):
-    """Light level, temperature, shutter relay and foot pedal."""
+    """Light level, temperature, shutter relay, foot pedal and signal tower."""
 
     def read(self) -> EnvironmentReading:
         """Current light level and temperature."""
@@ -404,4 +413,8 @@ class Lightbox(Device, Protocol):
 
     def pedal_presses(self) -> int:
         """Number of pedal presses since the box started; a rise is a new press."""
+        ...
+
+    def show_tower(self, light: TowerLight) -> bool:
+        """Switch the signal tower; False where the box has none, which is no error."""
         ...

@@ -103,7 +103,7 @@ class Operator(Interface):
         """Said before a call that takes its time, in words: what screens show until the next `attend`."""
         ...
 
-    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
         """Called several times a second, whatever the runner does: for what screens show."""
         ...
 
@@ -230,7 +230,7 @@ class Runner:
 
     def _ask(self, question: AskOperator, state: RunState) -> None:
         answer = self._pedal_press(question, state) or self.operator.poll(question, state)
-        self.operator.attend("asking", state, pedal_armed=self._armed_s is not None)
+        self.operator.attend("asking", state, pedal_armed=self._armed_s is not None, asked=question)
         if answer is None:
             self.wait(_POLL_S)
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 
@@ -98,3 +99,50 @@ def test_a_page_that_is_no_runs_keeps_the_robots_in_sight(server: Served, browse
         tablet.page.evaluate("document.querySelector('main').style.paddingBottom = '1500px'")
         tablet.page.evaluate("window.scrollTo(0, 900)")
         assert in_sight(tablet.page, "#robots .robot-banner")
+
+
+HEARD = """() => {
+    window.heard = []; window.noted = [];
+    window.AudioContext = class {
+        currentTime = 0; destination = {};
+        resume() {}
+        createOscillator() {
+            return { frequency: {}, connect: (to) => to, start() { heard.push(this.frequency.value); }, stop() {} };
+        }
+        createGain() {
+            return { gain: { setValueAtTime() {}, linearRampToValueAtTime() {} }, connect: (to) => to };
+        }
+    };
+    window.Notification = class {
+        static permission = "granted";
+        constructor(title, more) { noted.push([title, more.body]); }
+        addEventListener() {}
+    };
+}"""
+
+
+def test_sound_and_notification_are_by_choice(server: Served, browser: Browser) -> None:
+    with at_the_table(server, browser) as (tablet, run_id):
+        page = tablet.page
+        page.add_init_script(f"({HEARD})()")
+        tablet.go(f"/runs/{run_id}")
+        record(server, run_id, skip("fixation"))
+        expect(page.get_by_role("heading", name="Capture", level=1)).to_be_visible(timeout=20_000)
+        expect(page).to_have_title(re.compile("^Waits: Capture: your confirmation is awaited"))
+        assert page.evaluate("heard") == []
+        choice = page.get_by_role("button", name="Alerts")
+        expect(choice).to_have_attribute("aria-pressed", "false")
+        choice.click()
+        expect(choice).to_have_attribute("aria-pressed", "true")
+        assert page.evaluate("heard.length") > 0  # how it sounds
+        page.evaluate("heard.length = 0")
+        failed = StepFailed(step="capture", attempt=1, error="DeviceError", message="no link", recovery="ask")
+        go = OperatorAction(action="confirm", step="capture")
+        record(server, run_id, go, StepStarted(step="capture", attempt=1), failed)
+        expect(page.get_by_role("heading", name="Capture did not work")).to_be_visible(timeout=20_000)
+        assert page.evaluate("heard") == [880, 440, 880, 440]
+        assert page.evaluate("noted") == [["Stopped: Capture: No link → look at the device.", f"Run {run_id}"]]
+        expect(page).to_have_title(re.compile("^Stopped: Capture: No link"))
+        # The choice is the screen's: another page of it tells as well, here that the run has ended.
+        tablet.go("/account")
+        expect(page.get_by_role("button", name="Alerts")).to_have_attribute("aria-pressed", "true")

@@ -17,7 +17,7 @@ from service.monitor.reporter import OpenDevices, Reporter
 from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot, write_snapshot
 from service.store.store import Store
 from service.web.run_frame import Banner, robot_banner
-from tests.support.bench_rig import BenchArm, BenchRig
+from tests.support.bench_rig import BenchArm, BenchLightbox, BenchRig
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.waiting import until
 from tests.support.web import web_site
@@ -202,3 +202,18 @@ def test_the_runner_says_what_it_is_about_to_do(tmp_path: Path) -> None:
     assert taken[1].startswith("taking v002 and fetching it from the camera, ")
     assert taken[1].endswith(" MP")
     assert "signing the record" in said
+
+
+def test_the_signal_tower_shows_how_the_run_stands(tmp_path: Path, arm: BenchArm) -> None:
+    box = BenchLightbox()
+    devices = OpenDevices(robots={"robot": arm}, lightboxes={"box": box})
+    reporter = Reporter(tmp_path, RUN, lambda: devices, BenchRig().camera)
+    reporter.attend("working", "capture", 1)
+    reporter.attend("asking", "capture", 1, asks="recovery", words="Capture: no link")
+    assert read_snapshot(tmp_path, RUN).standing == "stopped"
+    reporter.attend("asking", "spraying", 1, asks="sign", words="Spray: a signature is due")
+    reporter.attend("working", "spraying", 1)
+    arm.safety = SafetyState.PROTECTIVE_STOP
+    reporter.attend("working", "spraying", 2)
+    reporter.end()
+    assert [light.value for light in box.shown] == ["GREEN", "RED", "YELLOW", "GREEN", "RED", "OFF"]

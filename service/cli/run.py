@@ -31,7 +31,7 @@ from service.cli.import_operator import ImportOperator
 from service.cli.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
 from service.cli.waiting import wait_for_results
 from service.core.actions import VERBS, capture_refusal, record_to_sign, refuse
-from service.core.errors import ConfigurationError, IllegalTransitionError
+from service.core.errors import ConfigurationError, IllegalTransitionError, OrthocaptureError
 from service.core.fold import fold
 from service.core.gates import Standing, describe, standing
 from service.core.model import ActionRefused, CaptureAsked, GateVerdict, OperatorAction
@@ -40,6 +40,7 @@ from service.core.run_state import RunState, StepState
 from service.core.ways_on import takes_words, ways_on
 from service.evidence import RunLog, results_to_come
 from service.logs.file_log import file_log
+from service.monitor.alarm import Alarm
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.people import People
 from service.people.proof import Identity, identity_for, who_acts
@@ -325,12 +326,13 @@ def drive(
     protocol, root = recorded_run(store, run_id)
     require_rig_free(store, rig.path, run_id=run_id)
     station = Station(rig)
-    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera)
+    alerts = rig.section.alerts
+    alarm = None if alerts is None else Alarm(alerts, run_id, rig.section.name)
+    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera, alarm)
     display = Display(error_console, reporter)
     hands = SimulatedHands(rig.section.hands if rig.section.simulated else None)
     if auto_confirm:
         require_simulated(rig)
-    if auto_confirm:
         operator = AutomaticOperator(root.operator, protocol, display, hands)
     elif screens:
         operator = ScreenOperator(root.operator, protocol, display, hands)
@@ -348,10 +350,15 @@ def drive(
         with file_log(data, "runner", run=run_id), beside:
             authority, copy = time_stamp_authority(rig), signature_copy(rig)
             reporter.begin()
+            ended = "its program has ended before the run has"
             try:
                 state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
+                ended = f"it is {state.status}" + (f": {state.stop_reason}" if state.stop_reason else "")
+            except OrthocaptureError as error:
+                ended = f"its program has ended before the run has: {error}"
+                raise
             finally:
-                reporter.end()
+                reporter.end(ended)
                 display.clear()
                 operator.close()
                 station.close()

@@ -14,15 +14,19 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import DeviceError, LeaveNeededError, SafetyStopError
-from drivers.interfaces import Camera, Lightbox, RobotArm, SafetyState
+from drivers.interfaces import Camera, Lightbox, RobotArm, SafetyState, TowerLight
 from service.core.errors import OrthocaptureError
 from service.core.run_state import WAITING_FOR_HAND
+from service.monitor.alarm import Alarm
 from service.monitor.heartbeat import Heartbeat
 from service.monitor.snapshot import (
+    STOPS,
+    Asks,
     Doing,
     Message,
     RobotPhase,
     Snapshot,
+    Standing,
     frames_wanted,
     write_frame,
     write_snapshot,
@@ -42,6 +46,14 @@ _STOPS: Mapping[SafetyState, RobotPhase] = {
     SafetyState.EMERGENCY_STOP: "emergency_stop",
     SafetyState.FAULT: "fault",
     SafetyState.UNKNOWN: "unknown",
+}
+
+
+_TOWER: Mapping[Standing, TowerLight] = {
+    "works": TowerLight.WORKING,
+    "waits": TowerLight.WAITING,
+    "stopped": TowerLight.STOPPED,
+    "ended": TowerLight.OFF,
 }
 
 
@@ -68,6 +80,7 @@ class Reporter:
     run_id: str
     devices: Callable[[], OpenDevices]
     camera: Callable[[], Camera]  # opens it: for the live view, which somebody asked for
+    alarm: Alarm | None = None
     monotonic_s: Callable[[], float] = time.monotonic
     _news: tuple[Message, ...] = ()
     _progress: tuple[str, int, int] = ("", 0, 0)
@@ -105,15 +118,22 @@ class Reporter:
         self._news = (*self._news, news)[-_MESSAGES:]
         self._due_s.pop("snapshot", None)
 
-    def attend(self, doing: Doing, step: str, attempt: int, *, pedal_armed: bool = False) -> None:
-        """The main loop looks up: write how things stand, if it is time again."""
+    def attend(
+        self, doing: Doing, step: str, attempt: int, *, pedal_armed: bool = False, asks: Asks = "", words: str = ""
+    ) -> None:
+        """The main loop looks up: write how things stand, if it is time again.
+
+        Args:
+            asks: what is asked of people now; "" for nothing.
+            words: the question, or what goes on, for people who are elsewhere.
+        """
         self._activity = ("", 0.0)
-        changed = (doing, step, attempt, pedal_armed) != self._known.get("at")
+        changed = (doing, step, attempt, pedal_armed, asks) != self._known.get("at")
         if not changed and not self._due("snapshot", _EVERY_S):
             return
         if changed and self._known.get("at", ("", ""))[1] != step:
             self._progress = ("", 0, 0)
-        self._known["at"] = (doing, step, attempt, pedal_armed)
+        self._known["at"] = (doing, step, attempt, pedal_armed, asks)
         devices = self.devices()
         robot = self._robot(devices)
         if doing == "paused" and robot["robot"] == "moving":
@@ -128,12 +148,17 @@ class Reporter:
             step=step,
             attempt=attempt,
             pedal_armed=pedal_armed,
+            asks=asks,
+            question=words,
             **robot,
             **self._light(devices),
             **self._camera(devices),
             disk_free_bytes=shutil.disk_usage(self.data).free,
         )
         self.beat()
+        self._tower(devices, self._newest.standing)
+        if self.alarm is not None:
+            self.alarm.follow(self._newest.standing, self._elsewhere())
         if doing in ("asking", "paused") or self._progress[0] == WAITING_FOR_HAND:
             self._frame()
 
@@ -174,15 +199,26 @@ class Reporter:
             return
         self._watched = (asked_s, {"robot": "not_connected"})
 
-    def end(self) -> None:
-        """The runner ends, whatever the reason: what is shown from now on does not come from it."""
-        step, attempt = self._known.get("at", ("", "", 0, False))[1:3]
+    def _elsewhere(self) -> str:
+        """How things stand, in few words, for people who are elsewhere."""
+        newest = self._newest
+        if newest.robot in STOPS:
+            return f"the robot reports: {newest.robot.replace('_', ' ')}"
+        return newest.question or ("paused" if newest.doing == "paused" else newest.step)
+
+    def end(self, words: str = "its program has ended") -> None:
+        """The runner ends, for the reason that the words say: what is shown from now on does not come from it."""
+        step, attempt = self._known.get("at", ("", "", 0, False, ""))[1:3]
+        self._tower(self.devices(), "ended")
         with self._writing:
             self._newest = Snapshot(
                 at_utc_s=time.time(), pid=getpid(), doing="ended", step=step, attempt=attempt, messages=self._news
             )
             self._write(lambda: write_snapshot(self.data, self.run_id, self._newest))
         self._heartbeat.end()
+        if self.alarm is not None:
+            self.alarm.follow("ended", words)
+            self.alarm.close()
 
     def _robot(self, devices: OpenDevices) -> dict[str, Any]:
         for name, robot in devices.robots.items():
@@ -197,6 +233,20 @@ class Reporter:
             )
             return {"robot": phase, "robot_name": name, "speed_fraction": state.speed_fraction}
         return {"robot": "not_connected"}
+
+    def _tower(self, devices: OpenDevices, standing: Standing) -> None:
+        """What is seen across the room; a box without a tower, or one that does not answer, is left alone."""
+        light = _TOWER[standing]
+        for box in devices.lightboxes.values():
+            if light == self._known.get("tower") or self.monotonic_s() < self._due_s.get("tower", 0.0):
+                continue
+            try:
+                box.show_tower(light)
+            except DeviceError as error:
+                _log.warning("the signal tower cannot be switched: %s", error)
+                self._due_s["tower"] = self.monotonic_s() + _CAMERA_S
+            else:
+                self._known["tower"] = light
 
     def _light(self, devices: OpenDevices) -> Mapping[str, Any]:
         for box in devices.lightboxes.values():

@@ -17,9 +17,14 @@ STARTING_S = 120.0  # in which a runner that was started has loaded what it need
 LASTING_S = 1.5  # what has gone on for so long is told: shorter, a page would be redrawn for every motion
 _QUIET_STEP_S = 5.0
 Doing = Literal["starting", "asking", "working", "pausing", "paused", "ended", "unknown"]
+Asks = Literal["", "confirm", "sign", "recovery"]
+Standing = Literal["works", "waits", "stopped", "ended"]  # for people who are elsewhere
 RobotPhase = Literal[
     "not_connected", "standing", "moving", "protective_stop", "safeguard_stop", "emergency_stop", "fault", "unknown"
 ]
+
+
+STOPS = frozenset({"protective_stop", "safeguard_stop", "emergency_stop", "fault"})
 
 
 class Message(Record):
@@ -57,6 +62,8 @@ class Snapshot(Record):
     light_lux: float | None = None
     temperature_c: float | None = None
     disk_free_bytes: int | None = None
+    asks: Asks = ""  # of people, now
+    question: str = ""
     pedal_armed: bool = False  # one press given; a second one lets the robot move
 
     def age_s(self) -> float:
@@ -76,6 +83,15 @@ class Snapshot(Record):
     def stale(self) -> bool:
         """Whether it no longer tells how things stand."""
         return self.age_s() > (STARTING_S if self.doing == "starting" else STALE_S)
+
+    @property
+    def standing(self) -> Standing:
+        """Whether the run works, waits for a person, or is stopped, as far as the runner knows."""
+        if self.doing == "ended":
+            return "ended"
+        if self.asks == "recovery" or self.robot in STOPS:
+            return "stopped"
+        return "waits" if self.doing in ("asking", "paused") else "works"
 
     @property
     def quiet_s(self) -> float:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from service.core.decide import AskOperator, decide
 from service.core.errors import OrthocaptureError
 from service.core.imported import imported_sentence
 from service.core.model import RunStarted
+from service.core.protocol import Protocol
 from service.core.run_state import RunState
-from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot
+from service.monitor.snapshot import STALE_S, STOPS, Snapshot, Standing, read_snapshot
+from service.web.run_words import stopped_words
 from service.web.site import Site
 
 Tone = Literal["moving", "standing", "paused", "unknown", "stop"]
@@ -28,6 +31,14 @@ class Banner:
     text: str
     remedy: str = ""  # what a person does at the robot
     assertive: bool = False  # screen readers interrupt for it
+
+
+@dataclass(frozen=True, slots=True)
+class Attention:
+    """What a screen tells by sound and notification, to whoever has chosen so."""
+
+    key: Standing = "works"
+    words: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +63,7 @@ class RunFrame:
     imported: str  # the sentence that says so; "" for a run that captures its photographs itself
     live: bool  # not ended: news may come
     pausable: bool
+    attention: Attention
     banner: Banner
     tabs: tuple[Tab, ...]
 
@@ -62,7 +74,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # site.run has read it the same way
     here = f"/runs/{run_id}"
-    driven = site.launcher.driven(run_id)
+    driven, snapshot = site.launcher.driven(run_id), read_snapshot(site.data, run_id)
     return RunFrame(
         run_id=run_id,
         name=run_id,
@@ -73,7 +85,8 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
         imported=imported_sentence(log.events[0].at_utc, root.operator) if root.origin == "imported" else "",
         live=not log.state.terminal,
         pausable=log.state.status == "active" and driven,
-        banner=robot_banner(log.state, read_snapshot(site.data, run_id), driven=driven),
+        attention=_attention(log.protocol, log.state, snapshot, driven=driven),
+        banner=robot_banner(log.state, snapshot, driven=driven),
         tabs=(
             Tab(here, "Step"),
             Tab(f"{here}/capture", "Capture"),
@@ -82,6 +95,28 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
             Tab(f"/audit/runs/{run_id}", "Audit", below=True),
         ),
     )
+
+
+def _attention(  # noqa: PLR0911 - one return a case
+    protocol: Protocol, state: RunState, snapshot: Snapshot, *, driven: bool
+) -> Attention:
+    """How a run stands, for people who look elsewhere; from the record, so that a dead program is told as well."""
+    if state.terminal:
+        return Attention("ended", f"The run is {state.status}.")
+    if not driven:
+        return Attention("stopped", "The program that drives the robot does not run.")
+    if snapshot.robot in STOPS:
+        return Attention("stopped", f"The robot reports: {snapshot.robot.replace('_', ' ')}.")
+    if state.paused:
+        return Attention("waits", "The run is paused.")
+    question = decide(protocol, state)
+    if not isinstance(question, AskOperator):
+        return Attention()
+    title = protocol.step(question.step).title
+    if question.for_ == "recovery":
+        return Attention("stopped", f"{title}: {stopped_words(protocol, state, question)}.")
+    due = "a signature is due" if question.for_ == "sign" else "your confirmation is awaited"
+    return Attention("waits", f"{title}: {due}.")
 
 
 def driven_frames(site: Site, *, but: str = "") -> list[RunFrame]:
@@ -111,8 +146,9 @@ def _unreadable(run_id: str) -> RunFrame:
     text = f"The record cannot be read now. Look at the robot. {NOT_THE_STOP}"
     banner = Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)
     return RunFrame(
-        run_id, run_id, "", "", "", simulated=False, imported="", live=False, pausable=False, banner=banner, tabs=()
-    )
+        run_id, run_id, "", "", "", simulated=False, imported="", live=False, pausable=False, attention=Attention(),
+        banner=banner, tabs=(),
+    )  # fmt: skip
 
 
 LOST = Banner(

@@ -18,7 +18,7 @@ from service.core.registered import evaluated
 from service.core.run_state import Deviation, RunState
 from service.core.space import Forecast
 from service.core.ways_on import WayOn, takes_words
-from service.monitor.snapshot import Snapshot
+from service.monitor.snapshot import STOPS, Snapshot
 from service.web.run_figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
 from service.web.run_words import (
     count,
@@ -52,9 +52,6 @@ class Recorded(Interface):
     def state(self) -> RunState:
         """Their fold."""
         ...
-
-
-_STOPPED = frozenset({"protective_stop", "safeguard_stop", "emergency_stop", "fault"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,7 +261,7 @@ def run_view(
         steps=tuple(_line(protocol, state, step, shown, stopped=mode == "recover") for step in protocol.steps),
         passed=sum(step.phase == "passed" for step in state.steps.values()),
         shown=_shown(protocol, state, protocol.step(shown), stopped=mode == "recover"),
-        main=_main(protocol, state, decision, mode, stopped=snapshot.robot in _STOPPED),
+        main=_main(protocol, state, decision, mode, stopped=snapshot.robot in STOPS),
         options=_options(decision, state),
         can_pause=mode not in ("ended", "died", "paused") and looker.may_operate,
         asked_anew=needs_leave(protocol, state) and mode in ("ask", "recover"),

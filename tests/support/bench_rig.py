@@ -33,6 +33,7 @@ from drivers.interfaces import (
     Scanner,
     SettleCriteria,
     SettleReport,
+    TowerLight,
 )
 from service.core.decide import AskOperator
 from service.core.errors import ConfigurationError
@@ -243,6 +244,8 @@ class BenchLightbox:
     """A light box with a pedal."""
 
     presses: int = 0
+    tower: bool = True
+    shown: list[TowerLight] = field(default_factory=list[TowerLight])
 
     def open(self) -> DeviceIdentity:
         return self.report().identity
@@ -261,6 +264,10 @@ class BenchLightbox:
 
     def pedal_presses(self) -> int:
         return self.presses
+
+    def show_tower(self, light: TowerLight) -> bool:
+        self.shown.append(light)
+        return self.tower
 
 
 @dataclass
@@ -378,7 +385,7 @@ class ScriptedOperator:
     def busy(self, what: str) -> None:
         self.busy_with.append(what)
 
-    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
         if not self.attended or self.attended[-1] != (doing, pedal_armed):
             self.attended.append((doing, pedal_armed))
         self.on_attend(doing)

@@ -90,6 +90,7 @@
     // A run that waits for a person sends no further news: the page must not miss this one.
     if (outdatedSince) retry = setTimeout(refresh, RETRY_MS);
     announce();
+    document.dispatchEvent(new CustomEvent("page-changed"));
     followLock();
     startAtHead();
     if (offline) setControls(true);
@@ -178,6 +179,7 @@
       answeredAt = Date.now();
       mergeChildren(robots, fresh.content);
       announce();
+      document.dispatchEvent(new CustomEvent("page-changed"));
       if (offline && !body.dataset.stream) backOnline();
     } catch {
       if (Date.now() - answeredAt > LOST_AFTER_MS) robotsUnknown();
