@@ -19,6 +19,7 @@ from service.core.run_state import Deviation, RunState
 from service.core.space import Forecast
 from service.core.ways_on import WayOn, takes_words
 from service.monitor.snapshot import STOPS, Snapshot
+from service.web.board_use import unused_count
 from service.web.run_figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
 from service.web.run_words import (
     count,
@@ -111,6 +112,7 @@ class Shown:
     warning: str  # of an irreversible step that has not been done
     requires: tuple[tuple[str, bool], ...]
     captured: int
+    unused: int  # of them, board images without use
     planned: int
     signed_by: str
     skipped: bool
@@ -260,7 +262,13 @@ def run_view(
         attempt=state.step.attempt,
         steps=tuple(_line(protocol, state, step, shown, stopped=mode == "recover") for step in protocol.steps),
         passed=sum(step.phase == "passed" for step in state.steps.values()),
-        shown=_shown(protocol, state, protocol.step(shown), stopped=mode == "recover"),
+        shown=_shown(
+            protocol,
+            state,
+            protocol.step(shown),
+            stopped=mode == "recover",
+            unused=unused_count(state, log.events, shown),
+        ),
         main=_main(protocol, state, decision, mode, stopped=snapshot.robot in STOPS),
         options=_options(decision, state),
         can_pause=mode not in ("ended", "died", "paused") and looker.may_operate,
@@ -321,7 +329,7 @@ def _line(protocol: Protocol, state: RunState, step: Step, shown: str, *, stoppe
     return StepLine(step.id, step.title, word, tone, icon, step.id == shown, there.phase != "pending")
 
 
-def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool) -> Shown:
+def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, unused: int) -> Shown:
     now = state.steps[step.id]
     checks = tuple(Check(item, item in now.ticked) for item in step.checklist)
     undone = step.irreversible and now.phase != "passed"
@@ -344,6 +352,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool) ->
         warning=irreversible_warning(protocol, step) if undone else "",
         requires=tuple((protocol.step(name).title, state.steps[name].passed_its_gates) for name in step.requires),
         captured=len(now.captured),
+        unused=unused,
         planned=planned_views(step),
         signed_by=now.signed_by,
         skipped=now.skipped,
