@@ -34,7 +34,7 @@ from service.core.actions import VERBS, capture_refusal, record_to_sign, refuse
 from service.core.errors import ConfigurationError, IllegalTransitionError, OrthocaptureError
 from service.core.fold import fold
 from service.core.gates import Standing, describe, standing
-from service.core.model import ActionRefused, CaptureAsked, GateVerdict, OperatorAction
+from service.core.model import CaptureAsked, GateVerdict, OperatorAction
 from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState, StepState
 from service.core.ways_on import takes_words, ways_on
@@ -47,6 +47,7 @@ from service.people.proof import Identity, identity_for, who_acts
 from service.rig import Rig, load_rig
 from service.runner import Runner
 from service.runs import (
+    record_refusal,
     recorded_rig,
     recorded_run,
     require_rig_free,
@@ -175,8 +176,7 @@ def act_command(
         )
         refusal = refuse(protocol, state, action, name)
         if refusal is not None:
-            record = ActionRefused(action=action.action, step=action.step, why=str(refusal))
-            store.record(run_id, [record], actor=name)
+            record_refusal(store, run_id, state, action, refusal, name)
             raise refusal
         store.record(run_id, [action], actor=name)
         _report_recorded(run_id, verb, action.step, name, json=json)

@@ -481,6 +481,16 @@ class TimeStampKept(Record):
     token_sha256: str  # of the token's text
 
 
+class ActionAfterEnd(Record):
+    """Somebody wanted something of a run that had ended; without effect, and no part of the run, which is sealed."""
+
+    kind: Literal["action_after_end"] = "action_after_end"
+    run: str
+    action: OperatorVerb
+    step: str | None
+    why: str
+
+
 class DataRestored(Record):
     """This data folder was made from a backup: what was recorded after it, in the folder of then, is not here."""
 
@@ -546,6 +556,7 @@ Payload = Annotated[
     | RunSigned
     | TimeStampKept
     | LeftoversRemoved
+    | ActionAfterEnd
     | DataRestored,
     Field(discriminator="kind"),
 ]

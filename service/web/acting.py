@@ -31,7 +31,7 @@ from service.people.control import Control
 from service.people.errors import NotAllowedError
 from service.people.proof import identity_for
 from service.rig import load_rig
-from service.runs import require_rig_free, start_run
+from service.runs import record_refusal, require_rig_free, start_run
 from service.steps import params_models
 from service.web.security import Signed, requires
 from service.web.site import Here, Site
@@ -164,8 +164,7 @@ def act(
 def _append(site: Site, log: RunLog, action: OperatorAction, actor: str) -> None:
     refusal = refuse(log.protocol, log.state, action, actor)
     if refusal is not None:
-        record = ActionRefused(action=action.action, step=action.step, why=str(refusal))
-        site.store.record(log.run_id, [record], actor=actor)
+        record_refusal(site.store, log.run_id, log.state, action, refusal, actor)
         raise refusal
     site.store.record(log.run_id, [action], actor=actor)
 
@@ -192,6 +191,7 @@ def _out_of_date(state: RunState) -> IllegalTransitionError:
 @router.post("/runs/{run_id}/control/take", name="take_control", dependencies=[Depends(requires("operate"))])
 def take_control(site: Here, person: Signed, run_id: RunId, reason: Words = "") -> RedirectResponse:
     """Take control of a run that nobody controls; a supervisor takes it from somebody with a reason."""
+    _require_open(site, run_id)
     control = Control(site.store)
     if reason.strip():
         control.take_over(run_id, person, reason)
@@ -203,6 +203,7 @@ def take_control(site: Here, person: Signed, run_id: RunId, reason: Words = "") 
 @router.post("/runs/{run_id}/control/ask", name="ask_for_control", dependencies=[Depends(requires("operate"))])
 def ask_for_control(site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
     """Ask whoever has control to hand it over."""
+    _require_open(site, run_id)
     Control(site.store).ask(run_id, person)
     return _back(run_id)
 
@@ -219,6 +220,12 @@ def release_control(site: Here, person: Signed, run_id: RunId) -> RedirectRespon
     """Give control up; the run goes on and waits at its next question."""
     Control(site.store).release(run_id, person)
     return _back(run_id)
+
+
+def _require_open(site: Site, run_id: str) -> None:
+    state = site.run(run_id).state
+    if state.terminal:
+        raise IllegalTransitionError(f"the run is {state.status}: there is nothing to control any more", where=run_id)
 
 
 def _back(run_id: str, page: str = "") -> RedirectResponse:
