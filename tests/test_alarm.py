@@ -156,7 +156,8 @@ def test_the_reporter_tells_of_the_robots_stop_and_of_the_end(hook: tuple[type[H
     until(lambda: len(kind.taken) == 1, "no alert", 20)
     arm.safety = type(arm.safety).PROTECTIVE_STOP
     reporter.attend("working", "capture", 2)
-    reporter.end("it is aborted: the board slipped")
+    reporter.outcome = "it is aborted: the board slipped"
+    reporter.end()
     assert [(body["standing"], body["words"]) for body in kind.taken] == [
         ("waits", "Capture: a confirmation is awaited"),
         ("stopped", "the robot reports: protective stop"),

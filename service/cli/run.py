@@ -31,7 +31,7 @@ from service.cli.import_operator import ImportOperator
 from service.cli.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
 from service.cli.waiting import wait_for_results
 from service.core.actions import VERBS, capture_refusal, record_to_sign, refuse
-from service.core.errors import ConfigurationError, IllegalTransitionError, OrthocaptureError
+from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.fold import fold
 from service.core.gates import Standing, describe, standing
 from service.core.model import CaptureAsked, GateVerdict, OperatorAction
@@ -40,8 +40,9 @@ from service.core.run_state import RunState, StepState
 from service.core.ways_on import takes_words, ways_on
 from service.evidence import RunLog, results_to_come
 from service.logs.file_log import file_log
-from service.monitor.alarm import Alarm
+from service.monitor.alarm import alarm_of
 from service.monitor.reporter import OpenDevices, Reporter
+from service.people.approvals import approve
 from service.people.people import People
 from service.people.proof import Identity, identity_for, who_acts
 from service.rig import Rig, load_rig
@@ -85,6 +86,10 @@ def run_command(
     auto_confirm: AutoOption = False,
     worker: WorkerOption = True,
     password_stdin: PasswordOption = False,
+    approve_change: Annotated[
+        str,
+        typer.Option("--approve-change", help="Why a content other than the approved one is right."),
+    ] = "",
     json: JsonOption = False,
 ) -> None:
     """Run a protocol step by step. Nothing moves before you have confirmed it."""
@@ -94,6 +99,8 @@ def run_command(
         with Store.open(data) as store:
             name = operator or getpass.getuser()
             who = who_acts(People(store), name, partial(_password, name, from_stdin=password_stdin))
+            if not auto_confirm:  # which is for simulated rigs
+                approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
             run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm)
             state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
         _report_end(run_id, state, json=json)
@@ -326,9 +333,7 @@ def drive(
     protocol, root = recorded_run(store, run_id)
     require_rig_free(store, rig.path, run_id=run_id)
     station = Station(rig)
-    alerts = rig.section.alerts
-    alarm = None if alerts is None else Alarm(alerts, run_id, rig.section.name)
-    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera, alarm)
+    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera, alarm_of(rig, run_id))
     display = Display(error_console, reporter)
     hands = SimulatedHands(rig.section.hands if rig.section.simulated else None)
     if auto_confirm:
@@ -350,15 +355,11 @@ def drive(
         with file_log(data, "runner", run=run_id), beside:
             authority, copy = time_stamp_authority(rig), signature_copy(rig)
             reporter.begin()
-            ended = "its program has ended before the run has"
             try:
                 state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
-                ended = f"it is {state.status}" + (f": {state.stop_reason}" if state.stop_reason else "")
-            except OrthocaptureError as error:
-                ended = f"its program has ended before the run has: {error}"
-                raise
+                reporter.outcome = f"it is {state.status}: {state.stop_reason}".removesuffix(": ")
             finally:
-                reporter.end(ended)
+                reporter.end()
                 display.clear()
                 operator.close()
                 station.close()

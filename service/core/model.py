@@ -491,6 +491,19 @@ class ActionAfterEnd(Record):
     why: str
 
 
+class ProtocolApproved(Record):
+    """A person lets runs be made by a protocol: by these bytes and no others."""
+
+    kind: Literal["protocol_approved"] = "protocol_approved"
+    protocol: str  # its id
+    version: str
+    sha256: str
+    source: str  # the file's text: what another content under the same id and version is held against
+    instead_of: str = ""  # SHA-256 of such a content, approved before, whose place it takes
+    reason: str = ""  # needed for that
+    identified: Literal["", "claimed", "password"] = ""
+
+
 class DataRestored(Record):
     """This data folder was made from a backup: what was recorded after it, in the folder of then, is not here."""
 
@@ -557,6 +570,7 @@ Payload = Annotated[
     | TimeStampKept
     | LeftoversRemoved
     | ActionAfterEnd
+    | ProtocolApproved
     | DataRestored,
     Field(discriminator="kind"),
 ]

@@ -17,7 +17,7 @@ from email.message import EmailMessage
 
 from service.core.errors import ConfigurationError
 from service.monitor.snapshot import Standing
-from service.rig import AlertsSection, EmailSection, WebhookSection
+from service.rig import AlertsSection, EmailSection, Rig, WebhookSection
 
 _TIMEOUT_S = 10.0
 _TRIES_S = (0.0, 2.0, 10.0)  # pauses before each try
@@ -85,6 +85,12 @@ class Alarm:
         while (alert := self._queue.get()) is not None:
             for name, send in self._senders:
                 _try(name, send, alert)
+
+
+def alarm_of(rig: Rig, run_id: str) -> Alarm | None:
+    """As the rig file configures it; None: nobody elsewhere is told."""
+    section = rig.section.alerts
+    return None if section is None else Alarm(section, run_id, rig.section.name)
 
 
 def _try(name: str, send: Callable[[Alert], None], alert: Alert) -> None:

@@ -81,6 +81,7 @@ class Reporter:
     devices: Callable[[], OpenDevices]
     camera: Callable[[], Camera]  # opens it: for the live view, which somebody asked for
     alarm: Alarm | None = None
+    outcome: str = "its program has ended before the run has"  # what people elsewhere are told in the end
     monotonic_s: Callable[[], float] = time.monotonic
     _news: tuple[Message, ...] = ()
     _progress: tuple[str, int, int] = ("", 0, 0)
@@ -206,8 +207,8 @@ class Reporter:
             return f"the robot reports: {newest.robot.replace('_', ' ')}"
         return newest.question or ("paused" if newest.doing == "paused" else newest.step)
 
-    def end(self, words: str = "its program has ended") -> None:
-        """The runner ends, for the reason that the words say: what is shown from now on does not come from it."""
+    def end(self) -> None:
+        """The runner ends, whatever the reason: what is shown from now on does not come from it."""
         step, attempt = self._known.get("at", ("", "", 0, False, ""))[1:3]
         self._tower(self.devices(), "ended")
         with self._writing:
@@ -217,7 +218,7 @@ class Reporter:
             self._write(lambda: write_snapshot(self.data, self.run_id, self._newest))
         self._heartbeat.end()
         if self.alarm is not None:
-            self.alarm.follow("ended", words)
+            self.alarm.follow("ended", self.outcome)
             self.alarm.close()
 
     def _robot(self, devices: OpenDevices) -> dict[str, Any]:

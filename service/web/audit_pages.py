@@ -23,6 +23,7 @@ from service.steps.time_left import Left
 from service.store.records import SITE
 from service.web.audit_view import Audit, Auditing, audit_frame, close_audit, cut, link
 from service.web.pages import TEMPLATES, render
+from service.web.protocol_identity import protocol_identity
 from service.web.security import Signed, requires
 
 
@@ -114,9 +115,11 @@ def run_page(request: Request, audit: Auditing, run_id: str) -> Response:
         exports = findings.events_of(connection, run_id, "evidence_exported", newest=True)
         signatures = findings.signatures(connection, run_id, known)
     listed = first_page.findings(known) if known else []
+    run = frame.run
     return render(
         request,
         "audit_run.html.j2",
+        identity=protocol_identity(audit.site.store, run_id, run.protocol, run.version),
         audit=frame,
         digest=known,
         progress=digest if isinstance(digest, Progress) else None,

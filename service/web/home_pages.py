@@ -12,6 +12,7 @@ from service.core.decide import AskOperator, decide
 from service.core.errors import OrthocaptureError
 from service.core.protocol import LoadedProtocol, Protocol, load_protocol
 from service.core.run_state import RunState
+from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
 from service.store.records import RunRow
 from service.store.space import forecast_of
@@ -53,6 +54,8 @@ class Startable:
     loaded: LoadedProtocol | None
     fault: str = ""
     space: str = ""  # why the disk will not do for it
+    standing: ProtocolStanding | None = None
+    changes: tuple[str, ...] = ()  # against the approved content of its id and version
 
 
 @router.get("/", name="home", dependencies=[Depends(requires("read"))])
@@ -170,6 +173,9 @@ def _startable(name: str, site: Site) -> Startable:
     try:
         loaded = load_protocol(site.protocols / name, params_models())
         space = forecast_of(site.store, loaded.protocol, simulated=site.rig.section.simulated)
-        return Startable(name, loaded, space="" if space.verdict == "enough" else space.words)
+        standing = standing_of(site.store, loaded)
+        changes = difference(standing.other.payload.source, loaded.source) if standing.other is not None else []
+        words = "" if space.verdict == "enough" else space.words
+        return Startable(name, loaded, "", words, standing, tuple(changes))
     except OrthocaptureError as error:
         return Startable(name, None, str(error))
