@@ -74,7 +74,6 @@ PasswordOption = Annotated[
     bool, typer.Option("--password-stdin", help="Where an action demands a role: read the password from stdin.")
 ]
 WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
-
 _OF_A_CAPTURE = ("release", "finish")
 
 
