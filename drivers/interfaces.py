@@ -164,7 +164,10 @@ class RobotArm(Device, Protocol):
         ...
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
-        """Samples of the ring buffer (at least the last 10 s) between two host times, oldest first."""
+        """Samples of the ring buffer (at least the last 10 s) between two host times, oldest first.
+
+        Reading them is not looking after the arm: an arm that moves and is only watched in this way is stopped.
+        """
         ...
 
     def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
@@ -389,8 +392,17 @@ class EnvironmentReading:
     monotonic_s: float
 
 
+class TowerLight(Enum):
+    """One light of a signal tower, which is seen across the room."""
+
+    OFF = "OFF"
+    WORKING = "GREEN"
+    WAITING = "YELLOW"  # for a person
+    STOPPED = "RED"
+
+
 class Lightbox(Device, Protocol):
-    """Light level, temperature, shutter relay and foot pedal."""
+    """Light level, temperature, shutter relay, foot pedal and signal tower."""
 
     def read(self) -> EnvironmentReading:
         """Current light level and temperature."""
@@ -402,4 +414,8 @@ class Lightbox(Device, Protocol):
 
     def pedal_presses(self) -> int:
         """Number of pedal presses since the box started; a rise is a new press."""
+        ...
+
+    def show_tower(self, light: TowerLight) -> bool:
+        """Switch the signal tower; False where the box has none, which is no error."""
         ...

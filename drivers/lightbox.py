@@ -1,4 +1,4 @@
-r"""The light and environment box: light level, temperature, shutter relay and foot pedal over a serial line.
+r"""The light and environment box: light level, temperature, shutter relay, foot pedal, signal tower; a serial line.
 
 Wire: 115200 baud, 8 data bits, no parity, one stop bit, ASCII lines. The host ends its lines with LF; the box ends
 its own with LF or CR LF. One reply to each request, and each reply begins with the name of what it reports, so that a
@@ -10,6 +10,8 @@ banner, a late reply or noise is recognised and skipped. Lines that begin with #
     SHUTTER?     SHUTTER <0|1>               1: relay closed
     SHUTTER 0|1  SHUTTER <0|1>               the state after switching
     PEDAL?       PEDAL <count>               presses since power-up
+    TOWER OFF|GREEN|YELLOW|RED   TOWER <what is lit>   one light of the signal tower; boxes before firmware 1.3 have
+                                                       none and answer ERR 1
     other        ERR <code> <text>           1 unknown request, 2 wrong argument, 3 sensor fault
 """
 
@@ -29,12 +31,19 @@ from drivers.errors import (
     DeviceTimeoutError,
     DeviceUnavailableError,
 )
-from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading
+from drivers.interfaces import DeviceIdentity, DeviceReport, EnvironmentReading, TowerLight
 from drivers.plugin import DriverConfig, DriverSpec
 
 _LINK_ERRORS = (serial.SerialException, OSError, termios.error)
 _ATTEMPTS = 3
 _MAX_LINE = 256
+
+
+_LIGHTS = tuple(light.value for light in TowerLight)
+
+
+class _UnknownRequestError(DeviceRefusedError):
+    """An older box does not know the request."""
 
 
 class LightboxConfig(DriverConfig):
@@ -52,10 +61,12 @@ class SerialLightbox:
         self._config = config
         self._port: serial.Serial | None = None
         self._pending = b""
+        self._has_tower = True  # until the box says otherwise
 
     def open(self) -> DeviceIdentity:
         """Open the port, skip what the box says unasked, and ask who it is."""
         self.close()
+        self._has_tower = True
         return self._identity()
 
     def close(self) -> None:
@@ -100,6 +111,23 @@ class SerialLightbox:
     def pedal_presses(self) -> int:
         """Presses since the box was powered up."""
         return int(self._number("PEDAL"))
+
+    def show_tower(self, light: TowerLight) -> bool:
+        """One light of the signal tower; False where the box has none."""
+        if not self._has_tower:
+            return False
+        try:
+            lit = self._ask(f"TOWER {light.value}", "TOWER")
+        except _UnknownRequestError:
+            self._has_tower = False
+            return False
+        if lit != light.value:
+            raise DeviceFaultError(
+                f"the signal tower did not switch: it shows {lit}",
+                where=self._config.port,
+                remedy="Check the tower and its supply",
+            )
+        return True
 
     def _identity(self) -> DeviceIdentity:
         fields = [field.strip() for field in self._ask("*IDN?", "*IDN").split(",")]
@@ -184,22 +212,29 @@ class SerialLightbox:
             return None
         word, _, value = line.decode("ascii").partition(" ")
         if word == "ERR":
-            raise DeviceRefusedError(
+            refusal = _UnknownRequestError if value.split(" ")[0] == "1" else DeviceRefusedError
+            raise refusal(
                 f"the light box refuses {request}: {value}",
                 where=self._config.port,
                 remedy="See the box's manual for the error; check its sensors",
             )
-        if word != name or not value.isprintable():
-            return None
-        if name != "*IDN":
+        return value if word == name and value.isprintable() and _usable(name, value) else None
+
+
+def _usable(name: str, value: str) -> bool:
+    """Whether a value is one that its name can have."""
+    match name:
+        case "*IDN":
+            return True
+        case "TOWER":
+            return value in _LIGHTS
+        case "SHUTTER" | "PEDAL":
+            return value.isdigit()
+        case _:
             try:
-                number = float(value)
+                return math.isfinite(float(value))
             except ValueError:
-                return None
-            if name in ("SHUTTER", "PEDAL") and not value.isdigit():
-                return None
-            return value if math.isfinite(number) else None
-        return value
+                return False
 
 
 def _build(config: LightboxConfig) -> SerialLightbox:

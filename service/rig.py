@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from service.core.errors import ConfigurationError, DataError, ProtocolError
 from service.core.imported import ImportList
@@ -89,6 +89,40 @@ class TimestampSection(Record):
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0
 
 
+class WebhookSection(Record):
+    """An address that gets each alert as JSON. The rig file is evidence: a secret address is named, not written."""
+
+    url: Annotated[str, Field(pattern=r"^https?://")] | None = None
+    url_env: str | None = None  # environment variable that holds it
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.url is None) == (self.url_env is None):
+            raise ValueError("give either url or url_env")
+        return self
+
+
+class EmailSection(Record):
+    """A mail server and whom it is to tell."""
+
+    to: Annotated[tuple[str, ...], Field(min_length=1)]
+    sender: str
+    host: str
+    port: Annotated[int, Field(gt=0, lt=65536)] = 587
+    starttls: bool = True
+    user: str = ""
+    password_env: str = ""  # environment variable that holds the password
+
+
+class AlertsSection(Record):
+    """Whom to tell, away from the screen, that a run has stopped, waits or has ended."""
+
+    webhook: WebhookSection | None = None
+    email: EmailSection | None = None
+    on: tuple[Literal["stopped", "waits", "ended"], ...] = ("stopped", "waits", "ended")
+    waits_after_s: Annotated[float, Field(ge=0, le=86400)] = 30.0  # for a person, until that is told
+
+
 class RigSection(Record):
     """The rig file."""
 
@@ -106,6 +140,7 @@ class RigSection(Record):
     signature_copy: str | None = (
         None  # a file elsewhere, on a share say, that gets each line of the log of signatures
     )
+    alerts: AlertsSection | None = None  # None: nobody elsewhere is told
     imported: ImportList | None = None  # of a run that captures nothing: what was captured earlier
 
 

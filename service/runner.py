@@ -99,7 +99,11 @@ class Operator(Interface):
         """One line on what happened."""
         ...
 
-    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
+    def busy(self, what: str) -> None:
+        """Said before a call that takes its time, in words: what screens show until the next `attend`."""
+        ...
+
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
         """Called several times a second, whatever the runner does: for what screens show."""
         ...
 
@@ -165,7 +169,7 @@ class Runner:
                     host_clock=host_clock(),
                 )
             )
-            self.devices.watch(self._opened)
+            self.devices.watch(self._opened, lambda name: self.operator.busy(f"connecting the {name}"))
             self._follow_space()
             try:
                 while True:
@@ -226,7 +230,7 @@ class Runner:
 
     def _ask(self, question: AskOperator, state: RunState) -> None:
         answer = self._pedal_press(question, state) or self.operator.poll(question, state)
-        self.operator.attend("asking", state, pedal_armed=self._armed_s is not None)
+        self.operator.attend("asking", state, pedal_armed=self._armed_s is not None, asked=question)
         if answer is None:
             self.wait(_POLL_S)
             return
@@ -316,6 +320,7 @@ class Runner:
             wait=self.wait,
             operator=self.operator.name,
             tell=self.operator.tell,
+            busy=self.operator.busy,
         )
         if (leave := self._log.state.leave) is not None:
             self.devices.let_move(LeaveToMove(leave.seq, leave.by, self._log.leave_not_before_s))
@@ -399,6 +404,7 @@ class Runner:
 
         The end of a run is stamped as well, where an authority is configured: the run has ended already by then.
         """
+        self.operator.busy("signing the record")
         try:
             stamp_end(self.store, self.run_id, self.authority if self._log.state.terminal else None)
         except StoreError as error:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from ipaddress import ip_address
 from pathlib import Path
 
-from service.core.errors import ConfigurationError
-from service.core.model import RunStarted
+from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.model import ActionAfterEnd, ActionRefused, OperatorAction, RunStarted
 from service.core.protocol import LoadedProtocol, Protocol
+from service.core.run_state import RunState
 from service.evidence import recorded_protocol, recorded_root
 from service.rig import Rig, load_rig, parse_rig
 from service.runner import software_versions
@@ -52,6 +53,18 @@ def start_run(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, 
         origin="imported" if imported else "captured",
     )
     return store.create_run(payload, operator, [NewArtefact(protocol, "runner"), NewArtefact(rig_ref, "runner")])
+
+
+def record_refusal(
+    store: Store, run_id: str, state: RunState, action: OperatorAction, refusal: OrthocaptureError, actor: str
+) -> None:
+    """Write down that an action was refused: in the run, or, where that has ended, in the site's record."""
+    why = str(refusal)
+    if state.terminal:
+        after = ActionAfterEnd(run=run_id, action=action.action, step=action.step, why=why)
+        store.record_site([after], actor=actor, software=software_versions())
+    else:
+        store.record(run_id, [ActionRefused(action=action.action, step=action.step, why=why)], actor=actor)
 
 
 def recorded_run(store: Store, run_id: str) -> tuple[Protocol, RunStarted]:

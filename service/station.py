@@ -59,6 +59,7 @@ class Station:
         self._open: dict[str, Device] = {}
         self._locks: dict[str, DeviceLock] = {}
         self._on_open: Callable[[str, DeviceReport], None] | None = None
+        self._before_open: Callable[[str], None] | None = None
         self._leave: LeaveToMove | None = None
         self._told: dict[str, int] = {}  # arm → seq of the leave that it was given last
 
@@ -81,14 +82,17 @@ class Station:
 
     def opened(self, kind: str) -> dict[str, Device]:
         """Open devices of a kind by name."""
-        return {name: device for name, device in self._open.items() if self.kind_of(name) == kind}
+        # Copied first: a reporter's thread asks while this one opens devices.
+        return {name: device for name, device in tuple(self._open.items()) if self.kind_of(name) == kind}
 
-    def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
-        """Have every device that is opened from now on reported, by its name."""
-        self._on_open = on_open
+    def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
+        """Have every device that is opened from now on reported, by its name, before and after."""
+        self._on_open, self._before_open = on_open, before_open
 
     def _connect(self, name: str, device: Device) -> None:
         """Open a device and make it ready; one that is not ready is not left open."""
+        if self._before_open is not None:
+            self._before_open(name)
         try:
             device.open()
             payload = self.rig.section.payload

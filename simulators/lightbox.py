@@ -20,19 +20,22 @@ from simulators.serve import SimulatorError, Termination, announce
 log = logging.getLogger(__name__)
 
 BANNER = b"# ORTHO-LB1 light and environment box ready\r\n"
-IDENTITY = "orthocapture,ORTHO-LB1 simulated,LB-0001,1.2"
+IDENTITY = "orthocapture,ORTHO-LB1 simulated,LB-0001,1.3"
+OLD_IDENTITY = "orthocapture,ORTHO-LB1 simulated,LB-0001,1.2"  # without a signal tower
+TOWER_LIGHTS = ("OFF", "GREEN", "YELLOW", "RED")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--link", type=Path, metavar="PATH", help="symbolic link to the pseudo-terminal")
+    parser.add_argument("--without-tower", action="store_true", help="a box of firmware 1.2, without a signal tower")
     parser.add_argument("--world", metavar="HOST:PORT", help="control socket of the rig that knows light and pedal")
 
 
 def serve(args: argparse.Namespace) -> None:
     """Serve until SIGTERM; each SIGUSR1 is a press of the pedal."""
     termination = Termination(with_parent=args.with_parent)
-    box = Lightbox(args.faults, World(args.world) if args.world else None, args.link)
+    box = Lightbox(args.faults, World(args.world) if args.world else None, args.link, tower=not args.without_tower)
 
     def press(number: int, frame: FrameType | None) -> None:
         del number, frame
@@ -76,7 +79,7 @@ class World:
 class Lightbox:
     """State of the box and its end of the line."""
 
-    def __init__(self, faults: FaultPlan, world: World | None, link: Path | None) -> None:
+    def __init__(self, faults: FaultPlan, world: World | None, link: Path | None, *, tower: bool = True) -> None:
         self._faults = faults
         self._world = world
         self._link = link
@@ -84,6 +87,7 @@ class Lightbox:
         self._heard = b""
         self._shutter = 0
         self._pressed = 0
+        self._tower = "OFF" if tower else None
 
     def plug_in(self) -> str:
         """Make the pseudo-terminal and its link, say the banner; returns the path of the terminal."""
@@ -170,7 +174,7 @@ class Lightbox:
     def _answer(self, request: str) -> str:
         view = self._world.view() if self._world is not None else {}
         readings = {
-            "*IDN?": f"*IDN {IDENTITY}",
+            "*IDN?": f"*IDN {OLD_IDENTITY if self._tower is None else IDENTITY}",
             "LIGHT?": f"LIGHT {view.get('light_lux', 45_000.0):.1f}",
             "TEMP?": f"TEMP {view.get('temperature_c', 21.5):.2f}",
             "PEDAL?": f"PEDAL {self._pressed + int(view.get('pedal_presses', 0))}",
@@ -179,5 +183,12 @@ class Lightbox:
             self._shutter = int(request[-1])
         if request in ("SHUTTER?", "SHUTTER 0", "SHUTTER 1"):
             return f"SHUTTER {self._shutter}"
+        word, _, light = request.partition(" ")
+        if word in ("TOWER", "TOWER?") and self._tower is not None:
+            if word == "TOWER" and light not in TOWER_LIGHTS:
+                return "ERR 2 wrong argument"
+            self._tower = light or self._tower
+            log.info("the tower shows %s", self._tower)
+            return f"TOWER {self._tower}"
         wrong = "ERR 2 wrong argument" if request.startswith("SHUTTER") else "ERR 1 unknown request"
         return readings.get(request, wrong)

@@ -68,6 +68,7 @@ PAGES: dict[str, tuple[tuple[Role | None, str], ...]] = {
     "/runs/{run_id}/exports": (("supervisor", "/runs/{completed}/exports"),),
     "/audit": (("auditor", "/audit"),),
     "/audit/runs/{run_id}": (("auditor", "/audit/runs/{completed}"), ("supervisor", "/audit/runs/{registered}")),
+    "/audit/runs/{run_id}/gates": (("auditor", "/audit/runs/{completed}/gates"),),
     "/audit/runs/{run_id}/deviations": (("auditor", "/audit/runs/{completed}/deviations"),),
     "/audit/runs/{run_id}/timeline": (("auditor", "/audit/runs/{completed}/timeline"),),
     "/audit/runs/{run_id}/events/{seq}": (("supervisor", "/audit/runs/{completed}/events/8"),),

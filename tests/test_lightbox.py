@@ -14,8 +14,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import serial
 
 from drivers.errors import DeviceFaultError, DeviceRefusedError, DeviceTimeoutError, DeviceUnavailableError
+from drivers.interfaces import TowerLight
 from drivers.lightbox import DRIVER, LightboxConfig, SerialLightbox
 from tests.support.simulator_process import simulator
 
@@ -36,6 +38,40 @@ def opened(port: str | Path, timeout_s: float = 0.4) -> Generator[SerialLightbox
 
 def faults(**fields: object) -> tuple[str, str]:
     return "--faults", json.dumps([{"device": "lightbox", **fields}])
+
+
+def test_the_signal_tower(tmp_path: Path) -> None:
+    link = tmp_path / "lightbox"
+    with simulator("lightbox", "--link", str(link)) as running, opened(link) as driver:
+        assert all(driver.show_tower(light) for light in TowerLight)
+        with serial.Serial(str(link), timeout=1) as other:
+            other.write(b"TOWER?\nTOWER BLUE\n")
+            assert other.read_until(b"\n") + other.read_until(b"\n") == b"TOWER RED\r\nERR 2 wrong argument\r\n"
+        assert running.process.poll() is None
+
+
+def test_a_box_without_a_tower_is_no_error_and_is_asked_once(tmp_path: Path) -> None:
+    link = tmp_path / "lightbox"
+    with simulator("lightbox", "--link", str(link), "--without-tower"), opened(link) as driver:
+        assert driver.open().firmware == "1.2"
+        assert not driver.show_tower(TowerLight.STOPPED)
+        assert driver.read().light_lux == 45_000.0
+    asked: list[bytes] = []
+
+    def old(line: bytes) -> bytes:
+        asked.append(line)
+        return b"*IDN a,b,c,1.0\n" if line.startswith(b"*IDN") else b"ERR 1 unknown request\n"
+
+    with answering(old) as port, opened(port) as driver:
+        assert not driver.show_tower(TowerLight.WORKING)
+        assert not driver.show_tower(TowerLight.STOPPED)
+        assert sum(line.startswith(b"TOWER") for line in asked) == 1
+
+
+def test_a_tower_that_stays_dark_is_a_fault() -> None:
+    dark = answering(lambda line: b"*IDN a,b,c,1.3\n" if line[:1] == b"*" else b"TOWER OFF\n")
+    with dark as port, opened(port) as driver, pytest.raises(DeviceFaultError, match="it shows OFF"):
+        driver.show_tower(TowerLight.STOPPED)
 
 
 @contextmanager
@@ -67,7 +103,7 @@ def test_reads_switches_and_counts(tmp_path: Path) -> None:
     link = tmp_path / "lightbox"
     with simulator("lightbox", "--link", str(link)) as running, opened(link) as driver:
         identity = driver.open()
-        assert (identity.kind, identity.serial, identity.firmware) == ("lightbox", "LB-0001", "1.2")
+        assert (identity.kind, identity.serial, identity.firmware) == ("lightbox", "LB-0001", "1.3")
         reading = driver.read()
         assert (reading.light_lux, reading.temperature_c) == (45_000.0, 21.5)
         assert not reading.shutter_relay_closed

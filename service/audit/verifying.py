@@ -16,7 +16,10 @@ from threading import Lock, Thread
 from pydantic import ValidationError
 
 from service.core.model import Record
+from service.store.audit import AuditReport
 from service.store.seam import Clock, utc_text
+
+LISTED = 500  # faults that a result spells out
 
 
 class VerifiedFault(Record):
@@ -57,6 +60,39 @@ class Verifying:
     problem: str = ""
 
 
+def keep_verification(data: Path, run_id: str, kept: Verification) -> None:
+    """Put a result where the pages find it. Raises OSError."""
+    path = _path(data, run_id)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
+    temporary.write_text(kept.model_dump_json())
+    temporary.replace(path)
+
+
+def verification_of(report: AuditReport, run_id: str, *, by: str, at_utc: str, duration_s: float) -> Verification:
+    """What a report says of one of its runs; its counts are those of all that were verified together."""
+    faults = [fault for fault in report.faults if fault.run_id in (None, run_id)]
+    together = [f"verified together with {len(report.runs) - 1} other runs"] if len(report.runs) > 1 else []
+    return Verification(
+        at_utc=at_utc,
+        by=by,
+        ok=not faults,
+        events=report.events,
+        artefacts=report.artefacts,
+        files=report.files,
+        bytes_hashed=report.bytes_hashed,
+        head_sha256=report.heads.get(run_id, ""),
+        faults=tuple(VerifiedFault(run_id=f.run_id, seq=f.seq, file=f.file, what=f.what) for f in faults[:LISTED]),
+        fault_count=len(faults),
+        notes=(*together, *report.notes)[:LISTED],
+        duration_s=duration_s,
+    )
+
+
+def _path(data: Path, run_id: str) -> Path:
+    return data / "monitor" / f"{run_id}.verification.json"
+
+
 class Verifications:
     """Of one data folder, in one web process."""
 
@@ -70,7 +106,7 @@ class Verifications:
     def last(self, run_id: str) -> Verification | None:
         """The last result; None when there is none that can be read."""
         try:
-            return Verification.model_validate_json(self._path(run_id).read_bytes())
+            return Verification.model_validate_json(_path(self._data, run_id).read_bytes())
         except (OSError, ValidationError):
             return None
 
@@ -128,11 +164,4 @@ class Verifications:
     def _keep(self, run_id: str, begun: Verifying, result: dict[str, object]) -> None:
         fields = {"at_utc": utc_text(self._clock.utc_now()), "by": begun.by, **result}
         kept = Verification.model_validate_json(json.dumps(fields))
-        path = self._path(run_id)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
-        temporary.write_text(kept.model_dump_json())
-        temporary.replace(path)
-
-    def _path(self, run_id: str) -> Path:
-        return self._data / "monitor" / f"{run_id}.verification.json"
+        keep_verification(self._data, run_id, kept)

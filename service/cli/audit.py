@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import base64
 import getpass
+import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +16,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from service.audit.verifying import keep_verification, verification_of
 from service.cli.audit_report import report_command
 from service.cli.common import (
     DEFAULT_DATA,
@@ -27,6 +31,7 @@ from service.cli.common import (
 from service.store import audit
 from service.store.audit import AuditReport, EvidenceRecord
 from service.store.records import Artefact
+from service.store.seam import utc_text
 from service.store.signing import PublicKey, checkpoint, public_keys, rotate_key
 from service.store.store import Store, resolve_run
 
@@ -86,15 +91,26 @@ def verify_command(
     with reporting_errors(json):
         run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
         with progress_bar(quiet=json) as report_progress:
+            begun_s = time.monotonic()
             report = audit.verify(
                 data, run_id, report_progress, certificates=certificates, signatures_copy=signatures
             )
+        _tell_the_pages(data, report, time.monotonic() - begun_s)
     if json:
         print_json(report_json(report))
     else:
         _print_report(report)
     if not report.ok:
         raise typer.Exit(1)
+
+
+def _tell_the_pages(data: Path, report: AuditReport, took_s: float) -> None:
+    """So that the audit's pages know of it. A folder that can only be read is none the worse for it."""
+    by, at_utc = f"{getpass.getuser()} (command line)", utc_text(datetime.now(UTC))
+    for run_id in report.runs:
+        with suppress(OSError):
+            found = verification_of(report, run_id, by=by, at_utc=at_utc, duration_s=took_s)
+            keep_verification(data, run_id, found)
 
 
 @audit_app.command("checkpoint")

@@ -91,9 +91,15 @@ class _Operator:
         """News."""
         self.display.tell(message)
 
-    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
+    def busy(self, what: str) -> None:
         """For the screens."""
-        self.display.reporter.attend(doing, state.current, state.step.attempt, pedal_armed=pedal_armed)
+        self.display.reporter.busy(what)
+
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
+        """For the screens, the signal tower, and people who are elsewhere."""
+        asks, words = (asked.for_, _elsewhere(self.protocol, asked)) if asked is not None else ("", "")
+        attempt = state.step.attempt
+        self.display.reporter.attend(doing, state.current, attempt, pedal_armed=pedal_armed, asks=asks, words=words)
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
         """The whole list: so the terminal says what a confirmation means."""
@@ -260,6 +266,13 @@ class TerminalOperator(_Operator):
                 "identified": self.who.identified if self.who else "",
             }
         )
+
+
+def _elsewhere(protocol: Protocol, asked: AskOperator) -> str:
+    """A question in few words, for people who are elsewhere."""
+    title = protocol.step(asked.step).title
+    due = {"confirm": "a confirmation is awaited", "sign": "a signature is due", "recovery": asked.text}
+    return f"{title}: {due[asked.for_]}"
 
 
 def _ways_lines(question: AskOperator) -> list[str]:

@@ -35,18 +35,21 @@ from service.core.actions import VERBS, capture_refusal, record_to_sign, refuse
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.fold import fold
 from service.core.gates import Standing, describe, standing
-from service.core.model import ActionRefused, CaptureAsked, GateVerdict, OperatorAction
+from service.core.model import CaptureAsked, GateVerdict, OperatorAction
 from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState, StepState
 from service.core.ways_on import takes_words, ways_on
 from service.evidence import RunLog, results_to_come
 from service.logs.file_log import file_log
+from service.monitor.alarm import alarm_of
 from service.monitor.reporter import OpenDevices, Reporter
+from service.people.approvals import approve
 from service.people.people import People
 from service.people.proof import Identity, identity_for, who_acts
 from service.rig import Rig, load_rig
 from service.runner import Runner
 from service.runs import (
+    record_refusal,
     recorded_rig,
     recorded_run,
     require_rig_free,
@@ -72,7 +75,6 @@ PasswordOption = Annotated[
     bool, typer.Option("--password-stdin", help="Where an action demands a role: read the password from stdin.")
 ]
 WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
-
 _OF_A_CAPTURE = ("release", "finish")
 
 
@@ -84,6 +86,10 @@ def run_command(
     auto_confirm: AutoOption = False,
     worker: WorkerOption = True,
     password_stdin: PasswordOption = False,
+    approve_change: Annotated[
+        str,
+        typer.Option("--approve-change", help="Why a content other than the approved one is right."),
+    ] = "",
     json: JsonOption = False,
 ) -> None:
     """Run a protocol step by step. Nothing moves before you have confirmed it."""
@@ -93,6 +99,8 @@ def run_command(
         with Store.open(data) as store:
             name = operator or getpass.getuser()
             who = who_acts(People(store), name, partial(_password, name, from_stdin=password_stdin))
+            if not auto_confirm:  # which is for simulated rigs
+                approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
             run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm)
             state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
         _report_end(run_id, state, json=json)
@@ -175,8 +183,7 @@ def act_command(
         )
         refusal = refuse(protocol, state, action, name)
         if refusal is not None:
-            record = ActionRefused(action=action.action, step=action.step, why=str(refusal))
-            store.record(run_id, [record], actor=name)
+            record_refusal(store, run_id, state, action, refusal, name)
             raise refusal
         store.record(run_id, [action], actor=name)
         _report_recorded(run_id, verb, action.step, name, json=json)
@@ -326,12 +333,11 @@ def drive(
     protocol, root = recorded_run(store, run_id)
     require_rig_free(store, rig.path, run_id=run_id)
     station = Station(rig)
-    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera)
+    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera, alarm_of(rig, run_id))
     display = Display(error_console, reporter)
     hands = SimulatedHands(rig.section.hands if rig.section.simulated else None)
     if auto_confirm:
         require_simulated(rig)
-    if auto_confirm:
         operator = AutomaticOperator(root.operator, protocol, display, hands)
     elif screens:
         operator = ScreenOperator(root.operator, protocol, display, hands)
@@ -348,8 +354,10 @@ def drive(
         beside = worker_beside(data, error_console.print) if worker else nullcontext()
         with file_log(data, "runner", run=run_id), beside:
             authority, copy = time_stamp_authority(rig), signature_copy(rig)
+            reporter.begin()
             try:
                 state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
+                reporter.outcome = f"it is {state.status}: {state.stop_reason}".removesuffix(": ")
             finally:
                 reporter.end()
                 display.clear()

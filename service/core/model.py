@@ -481,6 +481,29 @@ class TimeStampKept(Record):
     token_sha256: str  # of the token's text
 
 
+class ActionAfterEnd(Record):
+    """Somebody wanted something of a run that had ended; without effect, and no part of the run, which is sealed."""
+
+    kind: Literal["action_after_end"] = "action_after_end"
+    run: str
+    action: OperatorVerb
+    step: str | None
+    why: str
+
+
+class ProtocolApproved(Record):
+    """A person lets runs be made by a protocol: by these bytes and no others."""
+
+    kind: Literal["protocol_approved"] = "protocol_approved"
+    protocol: str  # its id
+    version: str
+    sha256: str
+    source: str  # the file's text: what another content under the same id and version is held against
+    instead_of: str = ""  # SHA-256 of such a content, approved before, whose place it takes
+    reason: str = ""  # needed for that
+    identified: Literal["", "claimed", "password"] = ""
+
+
 class DataRestored(Record):
     """This data folder was made from a backup: what was recorded after it, in the folder of then, is not here."""
 
@@ -546,6 +569,8 @@ Payload = Annotated[
     | RunSigned
     | TimeStampKept
     | LeftoversRemoved
+    | ActionAfterEnd
+    | ProtocolApproved
     | DataRestored,
     Field(discriminator="kind"),
 ]

@@ -100,7 +100,7 @@ def _runs(connection: Connection) -> dict[str, int]:
 
 def _driven(connection: Connection, data: Path, run_id: str) -> DrivenRun:
     snapshot = read_snapshot(data, run_id)
-    silent_s = snapshot.age_s() if snapshot.at_utc_s else float("inf")
+    silent_s = snapshot.unattended_s() if snapshot.at_utc_s else float("inf")
     return DrivenRun(run_id, snapshot.doing, snapshot.robot, max(0.0, silent_s), _viewpoint_s(connection, run_id))
 
 

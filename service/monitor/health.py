@@ -16,7 +16,7 @@ from service.monitor.snapshot import read_snapshot
 from service.monitor.worker_sign import living_workers
 from service.store.store import Store
 
-_SILENT_S = 60.0  # for which a runner says nothing; fetching one photograph takes less
+_SILENT_S = 60.0  # for which a runner does not look up from what it does; fetching one photograph takes less
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,5 +64,5 @@ def _worker(data: Path, queued: int) -> str:
 
 def _runners(data: Path, driven: Sequence[str]) -> str:
     snapshots = [read_snapshot(data, run_id) for run_id in driven]
-    silent = [snapshot for snapshot in snapshots if snapshot.at_utc_s and snapshot.age_s() > _SILENT_S]
+    silent = [snapshot for snapshot in snapshots if snapshot.at_utc_s and snapshot.unattended_s() > _SILENT_S]
     return f"{len(silent)} of {len(driven)} runners have said nothing for {_SILENT_S:.0f} s" if silent else ""

@@ -1,11 +1,11 @@
-"""Gathers what the screens show of a run's devices and machine, and writes it down twice a second."""
+"""Gathers what the screens show of a run's devices and machine, and writes it down twice a second, come what may."""
 
 from __future__ import annotations
 
 import logging
 import shutil
+import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -14,14 +14,19 @@ from pathlib import Path
 from typing import Any
 
 from drivers.errors import DeviceError, LeaveNeededError, SafetyStopError
-from drivers.interfaces import Camera, Lightbox, RobotArm, SafetyState
+from drivers.interfaces import Camera, Lightbox, RobotArm, SafetyState, TowerLight
 from service.core.errors import OrthocaptureError
 from service.core.run_state import WAITING_FOR_HAND
+from service.monitor.alarm import Alarm
+from service.monitor.heartbeat import Heartbeat
 from service.monitor.snapshot import (
+    STOPS,
+    Asks,
     Doing,
     Message,
     RobotPhase,
     Snapshot,
+    Standing,
     frames_wanted,
     write_frame,
     write_snapshot,
@@ -33,12 +38,22 @@ _FRAME_S = 0.3
 _LIGHT_S = 3.0
 _CAMERA_S = 30.0  # asking a camera for its battery takes time that exposures want
 _MESSAGES = 12
+_QUIET_S = 1.0  # of the main loop, after which the robot is watched from beside it
+_WATCHED_S = 0.3  # of the arm's stream, by which it is said to move or to stand
 _STOPS: Mapping[SafetyState, RobotPhase] = {
     SafetyState.PROTECTIVE_STOP: "protective_stop",
     SafetyState.SAFEGUARD_STOP: "safeguard_stop",
     SafetyState.EMERGENCY_STOP: "emergency_stop",
     SafetyState.FAULT: "fault",
     SafetyState.UNKNOWN: "unknown",
+}
+
+
+_TOWER: Mapping[Standing, TowerLight] = {
+    "works": TowerLight.WORKING,
+    "waits": TowerLight.WAITING,
+    "stopped": TowerLight.STOPPED,
+    "ended": TowerLight.OFF,
 }
 
 
@@ -53,71 +68,158 @@ class OpenDevices:
 
 @dataclass
 class Reporter:
-    """Called by the runner's own thread, so that no device is spoken to behind its back.
+    """Told by the runner's own thread what goes on; a heartbeat beside it keeps on saying so.
 
-    A device that does not answer becomes "unknown" on the screens; a disk that refuses the file is logged. Neither
-    disturbs the capture.
+    Devices are spoken to by the runner's thread alone, so that nothing happens behind its back, but for one question:
+    while that thread is in a call that takes its time, the pose stream is read, which keeps no watchdog happy
+    (`RobotArm.samples`). A device that does not answer becomes "unknown" on the screens; a disk that refuses the file
+    is logged. Neither disturbs the capture.
     """
 
     data: Path
     run_id: str
     devices: Callable[[], OpenDevices]
     camera: Callable[[], Camera]  # opens it: for the live view, which somebody asked for
+    alarm: Alarm | None = None
+    outcome: str = "its program has ended before the run has"  # what people elsewhere are told in the end
     monotonic_s: Callable[[], float] = time.monotonic
-    _news: deque[Message] = field(default_factory=lambda: deque(maxlen=_MESSAGES))
+    _news: tuple[Message, ...] = ()
     _progress: tuple[str, int, int] = ("", 0, 0)
+    _activity: tuple[str, float] = ("", 0.0)
+    _newest: Snapshot = field(default_factory=lambda: Snapshot(doing="starting"))
+    _watched: tuple[float, dict[str, Any]] = (
+        0.0,
+        {},
+    )  # when, and how the robot stood
+    _writing: threading.Lock = field(default_factory=threading.Lock)
+    _heartbeat: Heartbeat = field(init=False)
     _known: dict[str, Any] = field(default_factory=dict[str, Any])
     _due_s: dict[str, float] = field(default_factory=dict[str, float])
+
+    def __post_init__(self) -> None:
+        self._heartbeat = Heartbeat(self.beat, self.watch)
+
+    def begin(self) -> None:
+        """Tell from now on, twice a second, until `end`."""
+        self._newest = self._newest.model_copy(update={"attended_utc_s": time.time()})
+        self.busy("starting")
+        self._heartbeat.begin()
 
     def show(self, what: str, done: int, total: int) -> None:
         """Progress of the work under way."""
         self._progress = (what, done, total)
 
+    def busy(self, what: str) -> None:
+        """The main loop is about to do this, and will not look up before it is done."""
+        self._activity = (what, time.time())
+
     def tell(self, message: str) -> None:
         """One line of news."""
-        self._news.append(Message(at_utc=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"), text=message))
+        news = Message(at_utc=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"), text=message)
+        self._news = (*self._news, news)[-_MESSAGES:]
         self._due_s.pop("snapshot", None)
 
-    def attend(self, doing: Doing, step: str, attempt: int, *, pedal_armed: bool = False) -> None:
-        """Write how things stand, if it is time again."""
-        changed = (doing, step, attempt, pedal_armed) != self._known.get("at")
+    def attend(
+        self, doing: Doing, step: str, attempt: int, *, pedal_armed: bool = False, asks: Asks = "", words: str = ""
+    ) -> None:
+        """The main loop looks up: write how things stand, if it is time again.
+
+        Args:
+            asks: what is asked of people now; "" for nothing.
+            words: the question, or what goes on, for people who are elsewhere.
+        """
+        self._activity = ("", 0.0)
+        changed = (doing, step, attempt, pedal_armed, asks) != self._known.get("at")
         if not changed and not self._due("snapshot", _EVERY_S):
             return
         if changed and self._known.get("at", ("", ""))[1] != step:
             self._progress = ("", 0, 0)
-        self._known["at"] = (doing, step, attempt, pedal_armed)
+        self._known["at"] = (doing, step, attempt, pedal_armed, asks)
         devices = self.devices()
         robot = self._robot(devices)
         if doing == "paused" and robot["robot"] == "moving":
             doing = "pausing"
-        what, done, total = self._progress
-        snapshot = Snapshot(
-            at_utc_s=time.time(),
+        now_s = time.time()
+        self._newest = Snapshot(
+            at_utc_s=now_s,
+            attended_utc_s=now_s,
+            robot_utc_s=now_s,
             pid=getpid(),
             doing=doing,
             step=step,
             attempt=attempt,
-            what=what,
-            done=done,
-            total=total,
-            messages=tuple(self._news),
             pedal_armed=pedal_armed,
+            asks=asks,
+            question=words,
             **robot,
             **self._light(devices),
             **self._camera(devices),
             disk_free_bytes=shutil.disk_usage(self.data).free,
         )
-        self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
-        if doing in ("asking", "paused") or what == WAITING_FOR_HAND:
+        self.beat()
+        self._tower(devices, self._newest.standing)
+        if self.alarm is not None:
+            self.alarm.follow(self._newest.standing, self._elsewhere())
+        if doing in ("asking", "paused") or self._progress[0] == WAITING_FOR_HAND:
             self._frame()
+
+    def beat(self) -> None:
+        """Write what is known, with the time of now."""
+        (what, done, total), (activity, since_s) = self._progress, self._activity
+        with self._writing:
+            newest, (watched_s, robot) = self._newest, self._watched
+            if newest.doing == "ended":
+                return
+            told: dict[str, Any] = {
+                "at_utc_s": time.time(), "pid": getpid(), "what": what, "done": done, "total": total,
+                "messages": self._news, "activity": activity, "activity_utc_s": since_s,
+            }  # fmt: skip
+            if watched_s > newest.robot_utc_s:
+                told |= {"robot_utc_s": watched_s, **robot}
+            snapshot = newest.model_copy(update=told)
+            self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
+
+    def watch(self) -> None:
+        """Look at the robot from beside the main loop, while that does not look up. May wait for the robot."""
+        newest = self._newest
+        if time.time() - newest.attended_utc_s < _QUIET_S or newest.doing == "ended":
+            return
+        asked_s = time.time()
+        for name, robot in self.devices().robots.items():
+            now_s = self.monotonic_s()
+            try:
+                samples = robot.samples(now_s - _WATCHED_S, now_s)
+            except DeviceError:
+                samples = ()
+            phase: RobotPhase = "unknown"
+            if samples:
+                first, last = samples[0], samples[-1]
+                moves = _turns(last.joint_velocities_rad_s) or _turns(last.joints_rad - first.joints_rad)
+                phase = _STOPS.get(last.safety) or ("moving" if moves else "standing")
+            self._watched = (asked_s, {"robot": phase, "robot_name": name})
+            return
+        self._watched = (asked_s, {"robot": "not_connected"})
+
+    def _elsewhere(self) -> str:
+        """How things stand, in few words, for people who are elsewhere."""
+        newest = self._newest
+        if newest.robot in STOPS:
+            return f"the robot reports: {newest.robot.replace('_', ' ')}"
+        return newest.question or ("paused" if newest.doing == "paused" else newest.step)
 
     def end(self) -> None:
         """The runner ends, whatever the reason: what is shown from now on does not come from it."""
-        step, attempt = self._known.get("at", ("", "", 0, False))[1:3]
-        last = Snapshot(at_utc_s=time.time(), pid=getpid(), doing="ended", step=step, attempt=attempt)
-        self._write(
-            lambda: write_snapshot(self.data, self.run_id, last.model_copy(update={"messages": tuple(self._news)}))
-        )
+        step, attempt = self._known.get("at", ("", "", 0, False, ""))[1:3]
+        self._tower(self.devices(), "ended")
+        with self._writing:
+            self._newest = Snapshot(
+                at_utc_s=time.time(), pid=getpid(), doing="ended", step=step, attempt=attempt, messages=self._news
+            )
+            self._write(lambda: write_snapshot(self.data, self.run_id, self._newest))
+        self._heartbeat.end()
+        if self.alarm is not None:
+            self.alarm.follow("ended", self.outcome)
+            self.alarm.close()
 
     def _robot(self, devices: OpenDevices) -> dict[str, Any]:
         for name, robot in devices.robots.items():
@@ -132,6 +234,20 @@ class Reporter:
             )
             return {"robot": phase, "robot_name": name, "speed_fraction": state.speed_fraction}
         return {"robot": "not_connected"}
+
+    def _tower(self, devices: OpenDevices, standing: Standing) -> None:
+        """What is seen across the room; a box without a tower, or one that does not answer, is left alone."""
+        light = _TOWER[standing]
+        for box in devices.lightboxes.values():
+            if light == self._known.get("tower") or self.monotonic_s() < self._due_s.get("tower", 0.0):
+                continue
+            try:
+                box.show_tower(light)
+            except DeviceError as error:
+                _log.warning("the signal tower cannot be switched: %s", error)
+                self._due_s["tower"] = self.monotonic_s() + _CAMERA_S
+            else:
+                self._known["tower"] = light
 
     def _light(self, devices: OpenDevices) -> Mapping[str, Any]:
         for box in devices.lightboxes.values():

@@ -6,17 +6,25 @@ import math
 import os
 import time
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import ValidationError
 
 from service.core.model import Record
 
 STALE_S = 5.0
-Doing = Literal["asking", "working", "pausing", "paused", "ended", "unknown"]
+STARTING_S = 120.0  # in which a runner that was started has loaded what it needs, on a busy machine too
+LASTING_S = 1.5  # what has gone on for so long is told: shorter, a page would be redrawn for every motion
+_QUIET_STEP_S = 5.0
+Doing = Literal["starting", "asking", "working", "pausing", "paused", "ended", "unknown"]
+Asks = Literal["", "confirm", "sign", "recovery"]
+Standing = Literal["works", "waits", "stopped", "ended"]  # for people who are elsewhere
 RobotPhase = Literal[
     "not_connected", "standing", "moving", "protective_stop", "safeguard_stop", "emergency_stop", "fault", "unknown"
 ]
+
+
+STOPS = frozenset({"protective_stop", "safeguard_stop", "emergency_stop", "fault"})
 
 
 class Message(Record):
@@ -27,9 +35,17 @@ class Message(Record):
 
 
 class Snapshot(Record):
-    """What a runner says of itself, its devices and its machine. What cannot be told is None, or "unknown"."""
+    """What a runner says of itself, its devices and its machine. What cannot be told is None, or "unknown".
+
+    It comes from a thread of its own (`at_utc_s`), which also tells since when the main loop has not looked up from
+    what it does (`attended_utc_s`), what that is, and when the robot was last heard of.
+    """
 
     at_utc_s: float = 0.0
+    attended_utc_s: float = 0.0  # 0: as at_utc_s
+    robot_utc_s: float = 0.0  # 0: as attended_utc_s
+    activity: str = ""  # a call of the main loop that takes its time, in words
+    activity_utc_s: float = 0.0  # when it began
     pid: int = 0
     doing: Doing = "unknown"
     step: str = ""
@@ -46,6 +62,8 @@ class Snapshot(Record):
     light_lux: float | None = None
     temperature_c: float | None = None
     disk_free_bytes: int | None = None
+    asks: Asks = ""  # of people, now
+    question: str = ""
     pedal_armed: bool = False  # one press given; a second one lets the robot move
 
     def age_s(self) -> float:
@@ -55,7 +73,8 @@ class Snapshot(Record):
     def shown(self) -> tuple[object, ...]:
         """What a screen would show differently, in steps that people see: without this, noise redraws every page."""
         steps = {"light_lux": 0.05, "temperature_c": 0.2, "disk_free_bytes": 1e9, "camera_free_bytes": 1e9}
-        seen = dict(self) | {"at_utc_s": 0.0}
+        seen: dict[str, Any] = dict(self) | {"at_utc_s": 0.0, "activity_utc_s": 0.0, "activity": self.lasting}
+        seen |= {"attended_utc_s": self.quiet_s // _QUIET_STEP_S, "robot_utc_s": self.robot_silent_s > STALE_S}
         if self.light_lux:
             seen["light_lux"] = math.log(self.light_lux)
         return tuple(round(value / steps[name]) if name in steps and value else value for name, value in seen.items())
@@ -63,7 +82,40 @@ class Snapshot(Record):
     @property
     def stale(self) -> bool:
         """Whether it no longer tells how things stand."""
-        return self.age_s() > STALE_S
+        return self.age_s() > (STARTING_S if self.doing == "starting" else STALE_S)
+
+    @property
+    def standing(self) -> Standing:
+        """Whether the run works, waits for a person, or is stopped, as far as the runner knows."""
+        if self.doing == "ended":
+            return "ended"
+        if self.asks == "recovery" or self.robot in STOPS:
+            return "stopped"
+        return "waits" if self.doing in ("asking", "paused") else "works"
+
+    @property
+    def quiet_s(self) -> float:
+        """Seconds for which the main loop had not looked up from what it does when this was written."""
+        return max(0.0, self.at_utc_s - self.attended_utc_s) if self.attended_utc_s else 0.0
+
+    def unattended_s(self) -> float:
+        """Seconds since the main loop last looked up, by now."""
+        return time.time() - (self.attended_utc_s or self.at_utc_s)
+
+    @property
+    def robot_silent_s(self) -> float:
+        """Seconds for which the robot had not been heard of when this was written."""
+        return max(0.0, self.at_utc_s - self.robot_utc_s) if self.robot_utc_s else self.quiet_s
+
+    @property
+    def lasting(self) -> str:
+        """The activity, once it has lasted long enough to be told."""
+        return self.activity if self.activity_s >= LASTING_S else ""
+
+    @property
+    def activity_s(self) -> float:
+        """Seconds that the activity had taken when this was written."""
+        return max(0.0, self.at_utc_s - self.activity_utc_s) if self.activity else 0.0
 
 
 def _path(data: Path, run_id: str, suffix: str) -> Path:

@@ -152,6 +152,7 @@ class BoardCapture:
     ) -> tuple[Viewpoint, ...]:
         """Plan, record and tell; none where the arm can take no further pose that holds the board."""
         self.context.progress("planning board poses", 0, 1)
+        self.context.busy("planning board poses")
         known = self._knowledge(looks)
         planner = self.planner(known, coverage=1.0 if why == "mend" else self.wanted.coverage)
         taken = self._taken(looks, known, planner)

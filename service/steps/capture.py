@@ -122,6 +122,7 @@ class _CaptureLoop:
     given_up: set[str] = field(init=False)
     _taken: set[str] = field(init=False, default_factory=set[str])  # in this execution, successful or not
     _held: Shot | None = field(init=False, default=None)
+    _size: str = field(init=False, default="")  # of an image, in words, once one is there
     _targets: dict[str, Array] = field(init=False, default_factory=dict[str, Array])  # joints (6,) asked ahead
 
     def __post_init__(self) -> None:
@@ -154,6 +155,8 @@ class _CaptureLoop:
         """Record the image that is held, if there is one."""
         shot, self._held = self._held, None
         if shot is not None:
+            self._size = f", {shot.image.width * shot.image.height / 1e6:.0f} MP"
+            self.context.busy(f"storing {shot.viewpoint.name}{self._size}")
             record_shot(self.context, shot)
             self.on_captured()
 
@@ -189,6 +192,7 @@ class _CaptureLoop:
                 settled = self._go_to(robot, viewpoint)
                 arrived = True
                 environment = self._dwell(robot, later)
+                context.busy(f"taking {viewpoint.name} and fetching it from the camera{self._size}")
                 return expose(
                     context, self.camera, robot, viewpoint, settled, environment, self.wanted, self.image_kind
                 )
@@ -200,6 +204,7 @@ class _CaptureLoop:
                 context.checkpoint()
                 if arrived:
                     context.devices.reopen(self.camera)
+                    context.busy("setting the camera")
                     self.camera.apply(self.wanted)
                 if not arrived or not _streams(robot):
                     context.devices.reopen(robot)
@@ -268,6 +273,7 @@ def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, fol
         inside.mkdir()
         try:
             _apply(context, camera, wanted)
+            context.busy("taking a photograph and fetching it from the camera")
             return expose_when_free(context, camera, inside)
         except WORTH_ANOTHER_TRY as error:
             if tries_left == 0:
@@ -280,6 +286,7 @@ def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, fol
 
 def _apply(context: StepContext, camera: Camera, wanted: CameraSettings) -> None:
     """Set the camera, which may have dropped its link since it was last used."""
+    context.busy("setting the camera")
     try:
         camera.apply(wanted)
     except WORTH_ANOTHER_TRY:

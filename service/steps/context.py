@@ -94,8 +94,8 @@ class Devices(Protocol):
         """What was captured earlier, in a run that imports it; None in one that captures."""
         ...
 
-    def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
-        """Have every device that is opened from now on reported, by its name in rig.yaml."""
+    def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
+        """Have every device that is opened from now on reported, by its name in rig.yaml, before and after."""
         ...
 
     def let_move(self, leave: LeaveToMove) -> None:
@@ -193,6 +193,7 @@ class StepContext:
     wait: Callable[[float], None]
     operator: str
     tell: Callable[[str], None]  # one line of news for the operator
+    busy: Callable[[str], None] = lambda _what: None  # said before a call that takes its time, until the checkpoint
 
     @property
     def state(self) -> StepState:

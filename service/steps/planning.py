@@ -68,6 +68,7 @@ def plan_step(
             continue
         start = robot.state().sample.joints_rad
         layout = context.devices.layout(station)
+        context.busy("planning the motions of the arm")
         plans.append(
             plan_station(
                 mine, T_flange_camera, layout, model, collision, optics, context.protocol.motion, start, order,

@@ -27,11 +27,12 @@ from service.core.model import (
 from service.core.protocol import load_protocol
 from service.core.run_state import RunState
 from service.evidence import RunLog
+from service.people.approvals import approve, standing_of
 from service.people.control import Control
 from service.people.errors import NotAllowedError
 from service.people.proof import identity_for
 from service.rig import load_rig
-from service.runs import require_rig_free, start_run
+from service.runs import record_refusal, require_rig_free, start_run
 from service.steps import params_models
 from service.web.security import Signed, requires
 from service.web.site import Here, Site
@@ -41,6 +42,7 @@ router = APIRouter(tags=["acting"])
 RunId = Annotated[str, Path(max_length=64)]
 Short = Annotated[str, Form(max_length=200)]
 Words = Annotated[str, Form(max_length=2000)]
+Secret = Annotated[str, Form(max_length=1000)]
 Number = Annotated[int, Form(ge=0, le=2**31)]
 # Events that change nothing of what the person was looking at when deciding.
 _HARMLESS = (
@@ -59,8 +61,12 @@ _HARMLESS = (
 
 
 @router.post("/runs", name="start_run", dependencies=[Depends(requires("operate"))])
-def start(site: Here, person: Signed, protocol: Short) -> RedirectResponse:
-    """Begin a run of one of the protocol files; nothing moves before somebody confirms."""
+def start(site: Here, person: Signed, protocol: Short, reason: Words = "", password: Secret = "") -> RedirectResponse:
+    """Begin a run of one of the protocol files; nothing moves before somebody confirms.
+
+    Whoever is the first to begin one approves its content. A content that is not the approved one of its id and
+    version needs a reason, and the password of somebody who may sign.
+    """
     known = {path.name: path for path in site.protocol_files()}
     if protocol not in known:
         raise ConfigurationError(
@@ -68,6 +74,13 @@ def start(site: Here, person: Signed, protocol: Short) -> RedirectResponse:
         )
     loaded = load_protocol(known[protocol], params_models())
     require_rig_free(site.store, site.rig.path)
+    changed = standing_of(site.store, loaded).changed
+    if changed:
+        if not person.may("sign"):
+            raise NotAllowedError(f"the role {person.role} may not approve a changed protocol", where=protocol)
+        if reason.strip():
+            site.people.check_password(person.account, password)
+    approve(site.store, loaded, person.account, reason=reason, identified="password" if changed else "")
     run_id = start_run(site.store, loaded, load_rig(site.rig.path), operator=person.account, auto_confirm=False)
     Control(site.store).take(run_id, person)
     site.launcher.start(run_id)
@@ -124,7 +137,7 @@ def act(
     viewpoint: Short = "",
     reason: Words = "",
     meaning: Words = "",
-    password: Annotated[str, Form(max_length=1000)] = "",
+    password: Secret = "",
     account: Short = "",
     signed_sha256: Short = "",
     seen_seq: Number = 0,
@@ -164,8 +177,7 @@ def act(
 def _append(site: Site, log: RunLog, action: OperatorAction, actor: str) -> None:
     refusal = refuse(log.protocol, log.state, action, actor)
     if refusal is not None:
-        record = ActionRefused(action=action.action, step=action.step, why=str(refusal))
-        site.store.record(log.run_id, [record], actor=actor)
+        record_refusal(site.store, log.run_id, log.state, action, refusal, actor)
         raise refusal
     site.store.record(log.run_id, [action], actor=actor)
 
@@ -192,6 +204,7 @@ def _out_of_date(state: RunState) -> IllegalTransitionError:
 @router.post("/runs/{run_id}/control/take", name="take_control", dependencies=[Depends(requires("operate"))])
 def take_control(site: Here, person: Signed, run_id: RunId, reason: Words = "") -> RedirectResponse:
     """Take control of a run that nobody controls; a supervisor takes it from somebody with a reason."""
+    _require_open(site, run_id)
     control = Control(site.store)
     if reason.strip():
         control.take_over(run_id, person, reason)
@@ -203,6 +216,7 @@ def take_control(site: Here, person: Signed, run_id: RunId, reason: Words = "") 
 @router.post("/runs/{run_id}/control/ask", name="ask_for_control", dependencies=[Depends(requires("operate"))])
 def ask_for_control(site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
     """Ask whoever has control to hand it over."""
+    _require_open(site, run_id)
     Control(site.store).ask(run_id, person)
     return _back(run_id)
 
@@ -219,6 +233,12 @@ def release_control(site: Here, person: Signed, run_id: RunId) -> RedirectRespon
     """Give control up; the run goes on and waits at its next question."""
     Control(site.store).release(run_id, person)
     return _back(run_id)
+
+
+def _require_open(site: Site, run_id: str) -> None:
+    state = site.run(run_id).state
+    if state.terminal:
+        raise IllegalTransitionError(f"the run is {state.status}: there is nothing to control any more", where=run_id)
 
 
 def _back(run_id: str, page: str = "") -> RedirectResponse:

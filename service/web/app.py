@@ -14,6 +14,7 @@ from service.web import (
     calibration_pages,
     capture_pages,
     export_pages,
+    gates_pages,
     health_pages,
     held_pages,
     home_pages,
@@ -38,6 +39,7 @@ _PAGES = (
     scene_pages,
     calibration_pages,
     audit_pages,
+    gates_pages,
     export_pages,
     health_pages,
 )

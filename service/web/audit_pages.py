@@ -22,7 +22,9 @@ from service.evidence import results_to_come
 from service.steps.time_left import Left
 from service.store.records import SITE
 from service.web.audit_view import Audit, Auditing, audit_frame, close_audit, cut, link
+from service.web.gates_pages import accuracy_of
 from service.web.pages import TEMPLATES, render
+from service.web.protocol_identity import protocol_identity
 from service.web.security import Signed, requires
 
 
@@ -114,9 +116,11 @@ def run_page(request: Request, audit: Auditing, run_id: str) -> Response:
         exports = findings.events_of(connection, run_id, "evidence_exported", newest=True)
         signatures = findings.signatures(connection, run_id, known)
     listed = first_page.findings(known) if known else []
+    run = frame.run
     return render(
         request,
         "audit_run.html.j2",
+        identity=protocol_identity(audit.site.store, run_id, run.protocol, run.version),
         audit=frame,
         digest=known,
         progress=digest if isinstance(digest, Progress) else None,
@@ -124,6 +128,8 @@ def run_page(request: Request, audit: Auditing, run_id: str) -> Response:
         groups=GROUPS,
         listed=listed[:_FIRST],
         more=len(listed) - _FIRST,
+        accuracy=accuracy_of(known),
+        dataset_exported=any(row.payload.get("what") == "dataset" for row in exports),
         root=root[0] if root else None,
         corrected=corrected,
         devices={row.payload.get("device"): row for row in devices},

@@ -24,7 +24,8 @@ from service.web.site import Here, Site
 LONGEST = 200  # characters of a filter; more is cut
 _LOCK = Lock()
 _TABS = (
-    ("", "First page"),
+    ("", "Overview"),
+    ("/gates", "Gates"),
     ("/timeline", "Timeline"),
     ("/artefacts", "Artefacts"),
     ("/provenance", "Provenance"),

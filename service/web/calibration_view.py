@@ -11,6 +11,7 @@ from service.core.model import ArtefactRef, DeviceOpened, OperatorAction, View
 from service.core.protocol import Step
 from service.core.run_state import StepState
 from service.evidence import RunLog
+from service.web.board_use import BoardUse, board_use
 from service.web.charts import Dots, HeatMap, VectorField, dots, heat_map, vector_field
 from service.web.viewpoints import captures_of
 
@@ -27,7 +28,9 @@ class ImageRow:
     residual_deg: float | None
     held_out_mm: float | None
     held_out_deg: float | None
-    excluded: str  # why, "" for not
+    sha256: str  # of the photograph
+    step: str
+    use: BoardUse
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +45,7 @@ class Calibration:
         best: the answer that the registration uses: the arm's correction where there is one, else `hand_eye`.
         captures: the board images, of the step whose images were used.
         artefact: calibration.json of the last step.
+        states: of all steps of the run.
     """
 
     steps: tuple[tuple[Step, StepState], ...]
@@ -52,6 +56,7 @@ class Calibration:
     captures: tuple[View, ...]
     artefact: ArtefactRef | None
     robots: tuple[str, ...]
+    states: Mapping[str, StepState]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +97,9 @@ def calibration_of(log: RunLog) -> Calibration | None:
     best = None if hand_eye is None else hand_eye["arm_correction"] or hand_eye
     files = [ref for ref in solved[-1][1].artefacts if ref.kind == "calibration"]
     return Calibration(
-        tuple(solved), camera, intrinsics, hand_eye, best, tuple(captures), files[-1] if files else None, robots
-    )
+        tuple(solved), camera, intrinsics, hand_eye, best, tuple(captures), files[-1] if files else None, robots,
+        log.state.steps,
+    )  # fmt: skip
 
 
 def charts_of(calibration: Calibration) -> Charts | None:
@@ -152,7 +158,7 @@ def hand_eye_chart(calibration: Calibration) -> Dots | None:
 
 
 def image_rows(calibration: Calibration) -> list[ImageRow]:
-    """Every board image, with its residuals."""
+    """Every board image, with its residuals; those that are not used first."""
     record, best = calibration.intrinsics or {}, calibration.best or {}
     names: list[str] = record.get("images", [])
     validation: Mapping[str, Any] = record.get("cross_validation") or {}
@@ -163,19 +169,21 @@ def image_rows(calibration: Calibration) -> list[ImageRow]:
     rms = by_image(record.get("per_view_rms_px"))
     five, one = by_image(validation.get("five_fold_view_px")), by_image(validation.get("leave_one_out_view_px"))
     left: Mapping[str, Mapping[str, float]] = best.get("residuals", {})
-    why = {entry["image"]: entry["reason"] for entry in record.get("excluded", ())}
-    why |= {} if calibration.hand_eye is None else calibration.hand_eye.get("excluded", {})
-    return [
+    rows = [
         ImageRow(
             name,
             rms.get(name),
             five.get(name),
             one.get(name),
             *(left.get(key, {}).get(name) for key in ("mm", "deg", "held_out_mm", "held_out_deg")),
-            excluded=str(why.get(name, "")),
+            sha256=capture.artefacts[0].sha256,
+            step=capture.step,
+            use=board_use(calibration.states[capture.step], capture),
         )
-        for name in (capture.viewpoint for capture in calibration.captures)
+        for capture in calibration.captures
+        for name in (capture.viewpoint,)
     ]
+    return sorted(rows, key=lambda row: row.use.used is not False)  # stable: what is not used first
 
 
 def held_out_mm(calibration: Calibration) -> tuple[float, float] | None:

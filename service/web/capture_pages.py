@@ -9,11 +9,12 @@ from fastapi.responses import HTMLResponse
 
 from service.people.control import Control
 from service.people.person import Person
+from service.web.board_use import BoardUse, board_uses
 from service.web.pages import part_names, render
 from service.web.run_frame import run_frame
 from service.web.security import Signed, requires
 from service.web.site import Here, Site
-from service.web.viewpoints import captures_of
+from service.web.viewpoints import Capture, captures_of
 
 router = APIRouter(tags=["capture"])
 
@@ -99,7 +100,8 @@ def _shown(
         chosen = (named or ([] if viewpoint else valid) or [None])[-1]
     name = viewpoint or ("" if chosen is None else chosen.payload.viewpoint)
     view = next((v for v in views if v.name == name), None)
-    listed = everything if replaced else valid
+    uses = board_uses(log.state, log.events, step.id)
+    listed = sorted(everything if replaced else valid, key=lambda c: _is_problem(c, uses.get(c.sha256)))  # stable
     pages = max(1, -(-len(listed) // SHEET))
     page = min(page, pages)
     stations = list(dict.fromkeys(v.station for v in views if v.station))
@@ -134,6 +136,7 @@ def _shown(
         "sums": [] if chosen is None else capture_view.summary_of(step, chosen),
         "redo": None if view is None else capture_view.redo_of(log, step, view, person.account),
         "in_control": person.may("operate") and holder.screen == person.screen,
+        "uses": uses,
         "captures": listed[::-1][(page - 1) * SHEET : page * SHEET],  # newest first
         "replaced_count": len(everything) - len(valid),
         "page": page,
@@ -151,3 +154,9 @@ def _shown(
             "plain": plain,
         },
     }
+
+
+def _is_problem(capture: Capture, use: BoardUse | None) -> bool:
+    """Whether something is wrong with an image that has not been replaced."""
+    wrong = use.used is False if use is not None else not all(capture.payload.verdicts.values())
+    return wrong and capture.replaced is None

@@ -16,13 +16,15 @@ from service.core.model import OperatorAction, ViewpointCaptured
 from service.core.protocol import Protocol, Step
 from service.core.run_state import StepState
 from service.evidence import RunLog
+from service.web.board_use import board_use, board_uses
 from service.web.planned import Vector, nominal_T_flange_camera, place, planned_viewpoints
 from service.web.viewpoints import Capture, captures_of, last_failures
 
-ViewState = Literal["done", "departs", "next", "open", "again", "failed", "skipped", "left_out"]
+ViewState = Literal["done", "departs", "unused", "next", "open", "again", "failed", "skipped", "left_out"]
 WORDS: Mapping[ViewState, str] = {
     "done": "Done",
     "departs": "Taken, departs",
+    "unused": "Taken, not used",
     "next": "Next",
     "open": "To do",
     "again": "To be redone",
@@ -33,6 +35,7 @@ WORDS: Mapping[ViewState, str] = {
 TONES: Mapping[ViewState, str] = {
     "done": "ok",
     "departs": "attention",
+    "unused": "attention",
     "next": "now",
     "open": "open",
     "again": "now",
@@ -108,6 +111,7 @@ def views_of(log: RunLog, step: Step) -> list[View]:
     failures = last_failures(log, step.id)
     captures = captures_of(log, step.id)
     replaced_of = Counter(c.payload.viewpoint for c in captures if c.replaced is not None)
+    uses = board_uses(log.state, log.events, step.id)
     valid = {c.payload.viewpoint: c for c in captures if state.captured.get(c.payload.viewpoint) == c.seq}
     order = [name for name in _order(state) if name in planned]
     names = list(dict.fromkeys([*order, *planned, *valid, *state.skipped_viewpoints, *state.viewpoint_failures]))
@@ -118,6 +122,9 @@ def views_of(log: RunLog, step: Step) -> list[View]:
         capture = valid.get(name)
         replaced = replaced_of[name]
         now, why = _state(name, state, capture, refused, failures, replaced=replaced > 0)
+        use = None if capture is None else uses.get(capture.sha256)
+        if use is not None and use.used is False:
+            now, why = "unused", use.why
         if now in ("open", "again", "failed") and not next_found:
             next_found = True
             now = "next" if now == "open" else now
@@ -184,25 +191,13 @@ def verdicts_of(log: RunLog, step: Step, capture: Capture, others: Sequence[Capt
 
 def _board(log: RunLog, step: Step, capture: Capture) -> Verdict:
     """Whether the calibration uses an image of the board."""
+    use, name = board_use(log.state.steps[step.id], capture.payload), capture.payload.viewpoint
     details: Any = log.state.steps[step.id].result.get("details", {})
-    intrinsics = details.get("intrinsics", {})
-    why = {entry["image"]: entry["reason"] for entry in intrinsics.get("excluded", ())}
-    why = dict.fromkeys(details.get("views_without_board", ()), "no board was found in it") | why
-    name = capture.payload.viewpoint
-    for note in log.state.steps[step.id].notes:  # why other poses were planned
-        instead_of = note.data.get("instead_of", {})
-        if name in instead_of:
-            why[name] = f"{instead_of[name]} (another pose was taken instead)"
-    for job in log.state.steps[step.id].jobs.values():  # looked at as it arrived
-        unseen = job.kind == "board_view" and job.status == "finished" and not job.result.get("seen")
-        if unseen and job.arguments["image"]["sha256"] == capture.sha256:
-            why[name] = str(job.result.get("reason", "")) + " (another pose was taken instead)"
-    if name in why and name not in intrinsics.get("images", ()):
-        return Verdict("Board", False, "Not used", why[name])
-    if name not in intrinsics.get("images", ()):
-        return Verdict("Board", None, "not looked at yet", "the board is searched for once all images are taken")
-    rms = dict(zip(intrinsics["images"], intrinsics["per_view_rms_px"], strict=True))[name]
-    return Verdict("Board", True, "Found", f"corners {rms:.3f} px rms against the calibration")
+    intrinsics = details.get("intrinsics") or {}
+    if use.used and "per_view_rms_px" in intrinsics:
+        rms = dict(zip(intrinsics["images"], intrinsics["per_view_rms_px"], strict=True))[name]
+        return Verdict("Board", True, "Found", f"corners {rms:.3f} px rms against the calibration")
+    return Verdict("Board", use.used, use.word, use.why)
 
 
 def _found(capture: Capture, others: Sequence[Capture]) -> list[Verdict]:

@@ -8,13 +8,17 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
+from service.core.decide import AskOperator, decide
 from service.core.errors import OrthocaptureError
-from service.core.protocol import LoadedProtocol, load_protocol
+from service.core.protocol import LoadedProtocol, Protocol, load_protocol
+from service.core.run_state import RunState
+from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
 from service.store.records import RunRow
 from service.store.space import forecast_of
 from service.web.pages import render
 from service.web.run_frame import driven_frames, robot_banner
+from service.web.run_words import stopped_words
 from service.web.security import Signed, requires
 from service.web.site import Here, Site
 
@@ -37,6 +41,8 @@ class RunLine:
     steps: int
     deviations: int
     robot: str
+    standing: tuple[str, str] = ("Under way", "now")  # how it stands, and the tone of it
+    why: str = ""  # it is stopped, and what is recommended
     fault: str = ""  # what is wrong with its record
 
 
@@ -48,6 +54,8 @@ class Startable:
     loaded: LoadedProtocol | None
     fault: str = ""
     space: str = ""  # why the disk will not do for it
+    standing: ProtocolStanding | None = None
+    changes: tuple[str, ...] = ()  # against the approved content of its id and version
 
 
 @router.get("/", name="home", dependencies=[Depends(requires("read"))])
@@ -108,16 +116,28 @@ def _line(site: Site, row: RunRow) -> RunLine:
         log = site.run(row.run_id)
     except OrthocaptureError as error:
         return RunLine(
-            row.run_id, row.run_id, row.created_utc, "", row.simulated, "unreadable", "", 0, 0, 0, "", str(error)
+            row.run_id,
+            row.run_id,
+            row.created_utc,
+            "",
+            row.simulated,
+            "unreadable",
+            "",
+            0,
+            0,
+            0,
+            "",
+            fault=str(error),
         )
     state = log.state
     # Imported here: one small file a run is read for those under way only.
     from service.monitor.snapshot import read_snapshot  # noqa: PLC0415
 
-    robot = ""
+    robot, standing, why = "", ("", ""), ""
     if not state.terminal:
-        snapshot = read_snapshot(site.data, row.run_id)
-        robot = robot_banner(state, snapshot, driven=site.launcher.driven(row.run_id)).title
+        snapshot, driven = read_snapshot(site.data, row.run_id), site.launcher.driven(row.run_id)
+        robot = robot_banner(state, snapshot, driven=driven).title
+        standing, why = _standing(log.protocol, state, driven=driven)
     return RunLine(
         run_id=row.run_id,
         title=log.protocol.title,
@@ -130,13 +150,32 @@ def _line(site: Site, row: RunRow) -> RunLine:
         steps=len(log.protocol.steps),
         deviations=state.deviation_count,
         robot=robot,
+        standing=standing,
+        why=why,
     )
+
+
+def _standing(protocol: Protocol, state: RunState, *, driven: bool) -> tuple[tuple[str, str], str]:
+    """How a run that has not ended stands: word and tone; and why, where it is stopped."""
+    if not driven:
+        return ("Stopped", "stop"), "the program that drives it does not run → open it and go on"
+    if state.paused:
+        return ("Paused", "attention"), ""
+    question = decide(protocol, state)
+    if not isinstance(question, AskOperator):
+        return ("Under way", "now"), ""
+    if question.for_ == "recovery":
+        return ("Stopped", "stop"), stopped_words(protocol, state, question)
+    return ("Waits for a signature" if question.for_ == "sign" else "Waits for a confirmation", "attention"), ""
 
 
 def _startable(name: str, site: Site) -> Startable:
     try:
         loaded = load_protocol(site.protocols / name, params_models())
         space = forecast_of(site.store, loaded.protocol, simulated=site.rig.section.simulated)
-        return Startable(name, loaded, space="" if space.verdict == "enough" else space.words)
+        standing = standing_of(site.store, loaded)
+        changes = difference(standing.other.payload.source, loaded.source) if standing.other is not None else []
+        words = "" if space.verdict == "enough" else space.words
+        return Startable(name, loaded, "", words, standing, tuple(changes))
     except OrthocaptureError as error:
         return Startable(name, None, str(error))

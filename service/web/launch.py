@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
 
 from service.core.errors import ConfigurationError
-from service.monitor.snapshot import log_path
+from service.monitor.snapshot import Snapshot, log_path, write_snapshot
 from service.runs import recorded_run, require_rig_free
 from service.store.store import Store
 
@@ -61,3 +63,7 @@ class Launcher:
             ) from error
         with self._lock:
             self._children[run_id] = child
+        now_s = time.time()
+        first = Snapshot(at_utc_s=now_s, pid=child.pid, doing="starting", activity="starting", activity_utc_s=now_s)
+        with contextlib.suppress(OSError):  # the runner tells of itself soon
+            write_snapshot(self.data, run_id, first)

@@ -94,7 +94,7 @@ def _processes(figures: Figures) -> Iterable[Metric]:
     yield _gauge("driven_runs", "Runs that a process drives now.", (), {(): len(figures.driven)})
     yield _gauge(
         "runner_silent_seconds",
-        "Since a runner last said anything.",
+        "Since the main loop of a runner last looked up from what it does.",
         ("run",),
         {(run.run_id,): run.silent_s for run in figures.driven if math.isfinite(run.silent_s)},
     )

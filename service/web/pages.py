@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from datetime import datetime
 from functools import partial
-from typing import Any
+from itertools import takewhile
+from typing import TYPE_CHECKING, Any
 
 from fastapi import Path, Request
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+if TYPE_CHECKING:
+    from service.audit.queries import EventRow
 
 from service.web.run_frame import LOST, driven_frames
 
@@ -18,6 +24,28 @@ TEMPLATES = Environment(
     trim_blocks=True,
     lstrip_blocks=True,
 )
+
+
+def local_time(at_utc: str) -> str:
+    """A recorded time on the clock of this machine and its site: `10:12:03 CET`; "" where that is UTC itself."""
+    try:
+        there = datetime.fromisoformat(at_utc).astimezone()
+    except ValueError:
+        return ""
+    if not there.utcoffset():
+        return ""
+    day = f"{there:%Y-%m-%d} " if f"{there:%Y-%m-%d}" != at_utc[:10] else ""
+    return f"{day}{there:%H:%M:%S} {there.tzname()}"
+
+
+def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
+    """How many events from `start` on keep files for the same step."""
+    first = rows[start]
+    return sum(1 for _ in takewhile(lambda row: (row.kind, row.step) == (first.kind, first.step), rows[start:]))
+
+
+TEMPLATES.globals.update({"kept_in_a_row": kept_in_a_row})
+TEMPLATES.filters["local_time"] = local_time
 
 
 def part_names(*names: str) -> Any:

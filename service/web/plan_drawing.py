@@ -17,7 +17,7 @@ _MOST_LABELS = 40
 _MOST_SYMBOLS = 400  # of more, those that would lie on one another are drawn as one
 _CELL = 6.0  # edge of the square in which they do
 # Which of them is drawn: what a person has to look at comes first.
-_FIRST: Sequence[ViewState] = ("failed", "again", "departs", "left_out", "skipped", "open", "done", "next")
+_FIRST: Sequence[ViewState] = ("failed", "again", "unused", "departs", "left_out", "skipped", "open", "done", "next")
 
 
 @dataclass(frozen=True, slots=True)

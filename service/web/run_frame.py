@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from service.core.decide import AskOperator, decide
 from service.core.errors import OrthocaptureError
 from service.core.imported import imported_sentence
 from service.core.model import RunStarted
+from service.core.protocol import Protocol
 from service.core.run_state import RunState
-from service.monitor.snapshot import Snapshot, read_snapshot
+from service.monitor.snapshot import STALE_S, STOPS, Snapshot, Standing, read_snapshot
+from service.web.run_words import stopped_words
 from service.web.site import Site
 
 Tone = Literal["moving", "standing", "paused", "unknown", "stop"]
@@ -28,6 +31,14 @@ class Banner:
     text: str
     remedy: str = ""  # what a person does at the robot
     assertive: bool = False  # screen readers interrupt for it
+
+
+@dataclass(frozen=True, slots=True)
+class Attention:
+    """What a screen tells by sound and notification, to whoever has chosen so."""
+
+    key: Standing = "works"
+    words: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +63,7 @@ class RunFrame:
     imported: str  # the sentence that says so; "" for a run that captures its photographs itself
     live: bool  # not ended: news may come
     pausable: bool
+    attention: Attention
     banner: Banner
     tabs: tuple[Tab, ...]
 
@@ -62,7 +74,7 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # site.run has read it the same way
     here = f"/runs/{run_id}"
-    driven = site.launcher.driven(run_id)
+    driven, snapshot = site.launcher.driven(run_id), read_snapshot(site.data, run_id)
     return RunFrame(
         run_id=run_id,
         name=run_id,
@@ -73,7 +85,8 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
         imported=imported_sentence(log.events[0].at_utc, root.operator) if root.origin == "imported" else "",
         live=not log.state.terminal,
         pausable=log.state.status == "active" and driven,
-        banner=robot_banner(log.state, read_snapshot(site.data, run_id), driven=driven),
+        attention=_attention(log.protocol, log.state, snapshot, driven=driven),
+        banner=robot_banner(log.state, snapshot, driven=driven),
         tabs=(
             Tab(here, "Step"),
             Tab(f"{here}/capture", "Capture"),
@@ -82,6 +95,28 @@ def run_frame(site: Site, run_id: str) -> RunFrame:
             Tab(f"/audit/runs/{run_id}", "Audit", below=True),
         ),
     )
+
+
+def _attention(  # noqa: PLR0911 - one return a case
+    protocol: Protocol, state: RunState, snapshot: Snapshot, *, driven: bool
+) -> Attention:
+    """How a run stands, for people who look elsewhere; from the record, so that a dead program is told as well."""
+    if state.terminal:
+        return Attention("ended", f"The run is {state.status}.")
+    if not driven:
+        return Attention("stopped", "The program that drives the robot does not run.")
+    if snapshot.robot in STOPS:
+        return Attention("stopped", f"The robot reports: {snapshot.robot.replace('_', ' ')}.")
+    if state.paused:
+        return Attention("waits", "The run is paused.")
+    question = decide(protocol, state)
+    if not isinstance(question, AskOperator):
+        return Attention()
+    title = protocol.step(question.step).title
+    if question.for_ == "recovery":
+        return Attention("stopped", f"{title}: {stopped_words(protocol, state, question)}.")
+    due = "a signature is due" if question.for_ == "sign" else "your confirmation is awaited"
+    return Attention("waits", f"{title}: {due}.")
 
 
 def driven_frames(site: Site, *, but: str = "") -> list[RunFrame]:
@@ -111,8 +146,9 @@ def _unreadable(run_id: str) -> RunFrame:
     text = f"The record cannot be read now. Look at the robot. {NOT_THE_STOP}"
     banner = Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)
     return RunFrame(
-        run_id, run_id, "", "", "", simulated=False, imported="", live=False, pausable=False, banner=banner, tabs=()
-    )
+        run_id, run_id, "", "", "", simulated=False, imported="", live=False, pausable=False, attention=Attention(),
+        banner=banner, tabs=(),
+    )  # fmt: skip
 
 
 LOST = Banner(
@@ -129,7 +165,12 @@ def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner
     if state.terminal:
         return Banner("ended", "standing", "end", "The run has ended.", "It drives no robot any more.")
     if snapshot.doing in ("unknown", "ended"):
-        return _silent(driven=driven)
+        return _silent(snapshot, driven=driven)
+    if snapshot.doing == "starting":
+        text = f"It has moved nothing yet, and asks before it does. {NOT_THE_STOP}"
+        return Banner("starting", "standing", "open", "The program that drives the robot is starting.", text)
+    if snapshot.robot_silent_s > STALE_S and snapshot.robot != "not_connected":
+        return _not_heard_of(snapshot)
     stop = _STOPS.get(snapshot.robot)
     if stop is not None:
         return stop
@@ -137,7 +178,8 @@ def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner
         return _moving(state, snapshot)
     if snapshot.robot == "not_connected":
         title = "Paused. The robot is not connected." if state.paused else "Robot not connected."
-        text = "Nothing has needed it so far. Its own pendant can still move it."
+        now = f" Now: {busy_words(snapshot)}." if busy_words(snapshot) else ""
+        text = f"Nothing has needed it so far.{now} Its own pendant can still move it."
         return Banner("not_connected", "paused" if state.paused else "standing", "open", title, text)
     if state.paused:
         if snapshot.doing == "paused":
@@ -145,16 +187,46 @@ def robot_banner(state: RunState, snapshot: Snapshot, *, driven: bool) -> Banner
                 "paused", "paused", "pause", "Paused. The robot stands still.", "It moves only after Resume."
             )
         return Banner("pausing", "paused", "pause", "Pausing…", "The robot may still move. Wait for Paused.")
-    text = "A step is under way: it may move at any moment." if snapshot.doing == "working" else NOT_THE_STOP
+    if snapshot.doing != "working":
+        return Banner("standing", "standing", "standing", "The robot stands still.", NOT_THE_STOP)
+    text = f"{_busy(snapshot)}It may move at any moment."
     return Banner("standing", "standing", "standing", "The robot stands still.", text)
 
 
-def _silent(*, driven: bool) -> Banner:
+def busy_words(snapshot: Snapshot) -> str:
+    """What the program is in the midst of, and for how long; "" where it is quickly done.
+
+    A call of which nothing was said is told by the work that it belongs to: a program that hangs is seen to hang.
+    """
+    if snapshot.lasting:
+        return f"{snapshot.activity}, for {snapshot.activity_s:.0f} s"
+    if snapshot.quiet_s > STALE_S:
+        return f"{snapshot.what or 'something it does not tell of'}, for {snapshot.quiet_s:.0f} s"
+    return ""
+
+
+def _busy(snapshot: Snapshot) -> str:
+    words = busy_words(snapshot)
+    if not words:
+        return "A step is under way. "
+    hangs = " It hears no button before that is done." if snapshot.quiet_s > STALE_S else ""
+    return f"Now: {words}.{hangs} "
+
+
+def _not_heard_of(snapshot: Snapshot) -> Banner:
+    text = (
+        f"It has not been heard of for {snapshot.robot_silent_s:.0f} s, in which the program that drives it is at: "
+        f"{busy_words(snapshot) or 'its work'}. Look at the robot. {NOT_THE_STOP}"
+    )
+    return Banner("unknown", "unknown", "unknown", "Robot: unknown.", text)
+
+
+def _silent(snapshot: Snapshot, *, driven: bool) -> Banner:
     if driven:
-        title, text = (
-            "Robot: unknown.",
-            "The program that drives it has not told anything for 5 s. Look at the robot.",
-        )
+        title = "Robot: unknown."
+        since = f" for {snapshot.age_s():.0f} s" if snapshot.at_utc_s else " yet"
+        last = f" The last word was: {snapshot.activity}." if snapshot.activity else ""
+        text = f"The program that drives it has not told anything{since}.{last} Look at the robot."
     else:
         title, text = "Robot: unknown.", "The program that drives it does not run. Look at the robot."
     return Banner("unknown", "unknown", "unknown", title, f"{text} {NOT_THE_STOP}")
@@ -164,8 +236,9 @@ def _moving(state: RunState, snapshot: Snapshot) -> Banner:
     if state.paused or snapshot.doing in ("pausing", "paused"):
         return Banner("pausing", "paused", "pause", "Pausing…", "The robot still moves. Wait for Paused.")
     speed = "" if snapshot.speed_fraction is None else f" Speed slider {snapshot.speed_fraction:.0%}."
+    now = f" Now: {busy_words(snapshot)}." if busy_words(snapshot) else ""
     return Banner(
-        "moving", "moving", "moving", "The robot moves.", f"Stay outside of its reach.{speed} {NOT_THE_STOP}"
+        "moving", "moving", "moving", "The robot moves.", f"Stay outside of its reach.{speed}{now} {NOT_THE_STOP}"
     )
 
 

@@ -18,7 +18,8 @@ from service.core.registered import evaluated
 from service.core.run_state import Deviation, RunState
 from service.core.space import Forecast
 from service.core.ways_on import WayOn, takes_words
-from service.monitor.snapshot import Snapshot
+from service.monitor.snapshot import STOPS, Snapshot
+from service.web.board_use import unused_count
 from service.web.run_figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
 from service.web.run_words import (
     count,
@@ -29,6 +30,8 @@ from service.web.run_words import (
     planned_views,
     sentence,
     station_of,
+    stopped_words,
+    way_words,
     will_happen,
 )
 
@@ -50,9 +53,6 @@ class Recorded(Interface):
     def state(self) -> RunState:
         """Their fold."""
         ...
-
-
-_STOPPED = frozenset({"protective_stop", "safeguard_stop", "emergency_stop", "fault"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +112,7 @@ class Shown:
     warning: str  # of an irreversible step that has not been done
     requires: tuple[tuple[str, bool], ...]
     captured: int
+    unused: int  # of them, board images without use
     planned: int
     signed_by: str
     skipped: bool
@@ -170,6 +171,7 @@ class Trouble:
     """A step that needs a decision."""
 
     title: str
+    short: str  # why it is stopped, and what is recommended
     what: str
     safe: str
     advice: str
@@ -255,13 +257,19 @@ def run_view(
         seq=state.seq,
         status=state.status,
         mode=mode,
-        headline=_headline(protocol, state, mode),
+        headline=_headline(protocol, state, mode, decision),
         current=state.current,
         attempt=state.step.attempt,
-        steps=tuple(_line(protocol, state, step, shown) for step in protocol.steps),
+        steps=tuple(_line(protocol, state, step, shown, stopped=mode == "recover") for step in protocol.steps),
         passed=sum(step.phase == "passed" for step in state.steps.values()),
-        shown=_shown(protocol, state, protocol.step(shown)),
-        main=_main(protocol, state, decision, mode, stopped=snapshot.robot in _STOPPED),
+        shown=_shown(
+            protocol,
+            state,
+            protocol.step(shown),
+            stopped=mode == "recover",
+            unused=unused_count(state, log.events, shown),
+        ),
+        main=_main(protocol, state, decision, mode, stopped=snapshot.robot in STOPS),
         options=_options(decision, state),
         can_pause=mode not in ("ended", "died", "paused") and looker.may_operate,
         asked_anew=needs_leave(protocol, state) and mode in ("ask", "recover"),
@@ -298,29 +306,30 @@ def _mode(state: RunState, decision: object, *, driven: bool) -> str:
     return "work"
 
 
-def _headline(protocol: Protocol, state: RunState, mode: str) -> str:
+def _headline(protocol: Protocol, state: RunState, mode: str, decision: object) -> str:
     title = protocol.step(state.current).title
+    if mode == "recover" and isinstance(decision, AskOperator):
+        return f"{title}. Stopped: {stopped_words(protocol, state, decision)}."
     return {
         "ended": f"The run is {state.status}.",
         "died": "The program that drives the robot has stopped. Everything captured is safe.",
         "paused": f"Paused at: {title}.",
         "ask": f"Now: {title}. Your confirmation is awaited.",
         "sign": f"{title}: a signature is due.",
-        "recover": f"{title}: a decision is needed.",
         "work": f"Working: {title}.",
     }[mode]
 
 
-def _line(protocol: Protocol, state: RunState, step: Step, shown: str) -> StepLine:
+def _line(protocol: Protocol, state: RunState, step: Step, shown: str, *, stopped: bool) -> StepLine:
     there = state.steps[step.id]
-    word, tone, icon = phase_words(state, there)
+    word, tone, icon = phase_words(state, there, stopped=stopped)
     again = any(past.step == step.id and past.viewpoint is None for past in state.superseded)
     if again and tone in ("passed", "current"):
         word = f"{word}, attempt {there.attempt}"
     return StepLine(step.id, step.title, word, tone, icon, step.id == shown, there.phase != "pending")
 
 
-def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
+def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, unused: int) -> Shown:
     now = state.steps[step.id]
     checks = tuple(Check(item, item in now.ticked) for item in step.checklist)
     undone = step.irreversible and now.phase != "passed"
@@ -335,7 +344,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
         drawing=drawing_of(step),
         picture=next((ref.sha256 for ref in reversed(now.artefacts) if ref.kind == "layout_overlay"), ""),
         station=station_of(step),
-        status=phase_words(state, now)[0],
+        status=phase_words(state, now, stopped=stopped)[0],
         current=step.id == state.current and not state.terminal,
         checklist=checks,
         open_items=sum(not check.ticked for check in checks),
@@ -343,6 +352,7 @@ def _shown(protocol: Protocol, state: RunState, step: Step) -> Shown:
         warning=irreversible_warning(protocol, step) if undone else "",
         requires=tuple((protocol.step(name).title, state.steps[name].passed_its_gates) for name in step.requires),
         captured=len(now.captured),
+        unused=unused,
         planned=planned_views(step),
         signed_by=now.signed_by,
         skipped=now.skipped,
@@ -379,7 +389,10 @@ def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) ->
         return Main("sign", f"Sign: {step.title[:1].lower()}{step.title[1:]}", "Your password is asked for.")
     if mode == "recover" and isinstance(decision, AskOperator) and "confirm" in decision.options:
         note = "What was captured is kept; only what is missing is done."
-        return Main("confirm", "Try again", note + (" The robot moves." if moves else ""), hold=moves)
+        first = next((way for way in decision.ways if way.available), None)
+        mends = first is not None and first.verb == "confirm" and state.step.mend
+        text = f"Try again: {way_words(state, first)}" if mends and first is not None else "Try again"
+        return Main("confirm", text, note + (" The robot moves." if moves else ""), hold=moves)
     return None
 
 
@@ -398,14 +411,15 @@ def _trouble(protocol: Protocol, state: RunState, decision: object) -> Trouble |
     images = sum(len(there.captured) for there in state.steps.values())
     safe = f"Yes. {count(images, 'image is', 'images are')} recorded, and every result so far."
     advice = str(now.mend.get("advice", ""))
+    short = stopped_words(protocol, state, decision)
     if now.failure is not None:
-        return Trouble(f"{step.title} did not work", sentence(now.failure.message), safe, advice)
+        return Trouble(f"{step.title} did not work", short, sentence(now.failure.message), safe, advice)
     failed = [figure_line(verdict) for verdict in now.verdicts if not verdict.passed]
     if failed:
         undecided = all(verdict.passed or verdict.undecided for verdict in now.verdicts)
         found = "not decided yet" if undecided else "outside its limits"
-        return Trouble(f"{step.title}: {found}", "; ".join(failed), safe, advice)
-    return Trouble(f"{step.title} cannot begin yet", decision.text, safe, advice)
+        return Trouble(f"{step.title}: {found}", short, "; ".join(failed), safe, advice)
+    return Trouble(f"{step.title} cannot begin yet", short, decision.text, safe, advice)
 
 
 _BUTTONS: Mapping[OperatorVerb, str] = {

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from service.core.decide import AskOperator
 from service.core.gates import Standing, figure, standing
 from service.core.model import GateVerdict
 from service.core.protocol import Protocol, Step
 from service.core.run_state import RunState, StepState
-from service.core.ways_on import planned_sets, planned_views
+from service.core.ways_on import WayOn, planned_sets, planned_views
 
 _DRAWINGS_BY_ID = {
     "fixation": "fixation",
@@ -113,6 +114,34 @@ def figure_line(verdict: GateVerdict) -> str:
     return f"{measure_name(verdict.measure)} {figure(verdict)} ({allowed}{undecided})"
 
 
+def needs(verdict: GateVerdict) -> str:
+    """What a gate lacks: `Coverage 0.896, needs at least 0.9`."""
+    allowed = limit(verdict.minimum, verdict.maximum, verdict.unit)
+    undecided = ", not decided" if verdict.undecided else ""
+    return f"{measure_name(verdict.measure)} {figure(verdict)}, needs {allowed}{undecided}"
+
+
+def stopped_words(protocol: Protocol, state: RunState, question: AskOperator) -> str:
+    """Why a run is stopped and what is recommended: `Coverage 0.896, needs at least 0.9 → take these 6 views`."""
+    now = state.step
+    failed = [needs(verdict) for verdict in now.verdicts if not verdict.passed]
+    if now.failure is not None:
+        why = sentence(now.failure.message).rstrip(".")
+    else:
+        why = "; ".join(failed) or sentence(question.text).rstrip(".")
+    way = next((way for way in question.ways if way.available), None)
+    return f"{why} → {way_words(state, way)}" if way is not None else why
+
+
+def way_words(state: RunState, way: WayOn) -> str:
+    """A way on in few words, with a small letter: the views that mend are counted, an advice is cut at its end."""
+    views = len(state.step.mend.get("viewpoints", ()))
+    if way.verb == "confirm" and views:
+        return f"take {'this view' if views == 1 else f'these {views} views'}"
+    words = way.words.split(";")[0].split(". ")[0].rstrip(".")
+    return words[:1].lower() + words[1:]
+
+
 _STANDINGS: dict[Standing, tuple[str, str]] = {
     "within": ("Within", "ok"),
     "not_decided": ("Not decided", "attention"),
@@ -126,8 +155,8 @@ def gate_word(verdict: GateVerdict, *, accepted: bool = False) -> tuple[str, str
     return _STANDINGS[standing(verdict, accepted=accepted)]
 
 
-def phase_words(state: RunState, step: StepState) -> tuple[str, str, str]:
-    """A step's status in the list of steps: word, tone, icon."""
+def phase_words(state: RunState, step: StepState, *, stopped: bool = False) -> tuple[str, str, str]:
+    """A step's status in the list of steps: word, tone, icon. `stopped`: the current one needs a decision."""
     if step.skipped:
         return "skipped", "skipped", "skip"
     if step.phase == "passed" and step.accepted is not None:
@@ -135,7 +164,7 @@ def phase_words(state: RunState, step: StepState) -> tuple[str, str, str]:
     if step.phase == "passed":
         return "passed", "passed", "ok"
     if step.step == state.current and not state.terminal:
-        return "now", "current", "now"
+        return ("stopped", "stopped", "fail") if stopped else ("now", "current", "now")
     if state.terminal and step.step == state.current:
         return "stopped here", "current", "fail"
     return "to come", "pending", "open"

@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Path, Request
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from service.monitor.snapshot import read_snapshot
+from service.monitor.snapshot import STALE_S, read_snapshot
 from service.people.person import Person
 from service.web.security import Signed, requires, token_of
 from service.web.site import Here, Site
@@ -75,4 +75,5 @@ def _signed_in(site: Site, token: str) -> Person | None:
 def _newest(site: Site, run_id: str) -> tuple[int, int]:
     """The last event, and a number that changes with what the runner tells; its falling silent is news as well."""
     snapshot = read_snapshot(site.data, run_id)
-    return site.store.head(run_id), hash((snapshot.stale, *snapshot.shown()))
+    silent = snapshot.age_s() // STALE_S if snapshot.stale else 0
+    return site.store.head(run_id), hash((silent, *snapshot.shown()))

@@ -40,11 +40,18 @@ def board_view(context: JobContext) -> JobAnswer:
         view = find_board(grey, board_of(context.arguments))
     except ComputeError as error:
         bright = float(np.percentile(grey, 1)) > _WHITE
-        result["reason"] = "the image is black" if quality.black else "the image is white" if bright else error.what
+        result["reason"] = (
+            "the image is black" if quality.black else "the image is white" if bright else plain_reason(error)
+        )
         return JobAnswer(measures, (), result)
     record = {"size": size, "indices": view.indices.tolist(), "corners": np.round(view.corners, 4).tolist()}
     ref = context.keep_json(record, kind="board_corners", name=f"{image['viewpoint']}.corners.json")
     return JobAnswer(measures | {"corners": float(len(view.indices))}, (ref,), result | {"seen": True})
+
+
+def plain_reason(error: ComputeError) -> str:
+    """Why no board was found, without what only tells how it was searched."""
+    return error.what.partition(" (searched")[0]
 
 
 def read_corners(record: Mapping[str, Any]) -> BoardImage:

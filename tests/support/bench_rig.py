@@ -33,6 +33,7 @@ from drivers.interfaces import (
     Scanner,
     SettleCriteria,
     SettleReport,
+    TowerLight,
 )
 from service.core.decide import AskOperator
 from service.core.errors import ConfigurationError
@@ -243,6 +244,8 @@ class BenchLightbox:
     """A light box with a pedal."""
 
     presses: int = 0
+    tower: bool = True
+    shown: list[TowerLight] = field(default_factory=list[TowerLight])
 
     def open(self) -> DeviceIdentity:
         return self.report().identity
@@ -261,6 +264,10 @@ class BenchLightbox:
 
     def pedal_presses(self) -> int:
         return self.presses
+
+    def show_tower(self, light: TowerLight) -> bool:
+        self.shown.append(light)
+        return self.tower
 
 
 @dataclass
@@ -311,7 +318,7 @@ class BenchRig:
     def let_move(self, leave: LeaveToMove) -> None:
         self.arm.let_move(leave.by, leave.not_before_monotonic_s)
 
-    def watch(self, on_open: Callable[[str, DeviceReport], None]) -> None:
+    def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
         self._on_open = on_open
 
     def reopen(self, device: Device) -> None:
@@ -357,6 +364,7 @@ class ScriptedOperator:
     on_prepare: Callable[[], None] = lambda: None
     asked: list[AskOperator] = field(default_factory=list[AskOperator])
     told: list[str] = field(default_factory=list[str])
+    busy_with: list[str] = field(default_factory=list[str])
     attended: list[tuple[Doing, bool]] = field(default_factory=list[tuple[Doing, bool]])
     prepared: list[tuple[str, int]] = field(default_factory=list[tuple[str, int]])
     mended: list[tuple[str, int, tuple[Mapping[str, Any], ...]]] = field(
@@ -374,7 +382,10 @@ class ScriptedOperator:
     def tell(self, message: str) -> None:
         self.told.append(message)
 
-    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool) -> None:
+    def busy(self, what: str) -> None:
+        self.busy_with.append(what)
+
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
         if not self.attended or self.attended[-1] != (doing, pedal_armed):
             self.attended.append((doing, pedal_armed))
         self.on_attend(doing)

@@ -47,8 +47,9 @@ def main() -> None:
             arm.move_joints(target, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2)
             said = None
             say(moves_to=target[0])
-            if hangs:
-                time.sleep(3600)
+            while hangs:  # its main loop; a screen's thread goes on watching the arm
+                arm.samples(time.monotonic() - 0.3, time.monotonic())
+                time.sleep(0.1)
             while arm.is_moving():
                 time.sleep(0.02)
             say(arrived=target[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import floor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +114,8 @@ def calibration_warnings(
     if result.rms_px > _RMS_PX:
         found.append(f"{result.rms_px:.2f} px rms, more than {_RMS_PX} px: blur, motion, bent board, wrong model")
     if result.coverage < _COVERAGE:
-        found.append(f"corners in {result.coverage:.0%} of the image, below {_COVERAGE:.0%}: show the board there")
+        share = f"{floor(1000 * result.coverage) / 10:g} %"  # never rounded up to its limit
+        found.append(f"corners in {share} of the image, less than {_COVERAGE:.0%}: show the board there")
     if result.tilt_deg.max() < _TILT_DEG:
         found.append(f"largest tilt {result.tilt_deg.max():.0f}°, less than {_TILT_DEG:.0f}°: focal length is weak")
     if result.inflation > _INFLATION:

@@ -90,8 +90,21 @@
     // A run that waits for a person sends no further news: the page must not miss this one.
     if (outdatedSince) retry = setTimeout(refresh, RETRY_MS);
     announce();
+    document.dispatchEvent(new CustomEvent("page-changed"));
     followLock();
+    startAtHead();
     if (offline) setControls(true);
+  }
+
+  // A step that has just come up, or has just stopped, is read from its title on.
+  const headOf = () => document.querySelector("[data-head]")?.dataset.head;
+  let head = headOf();
+  function startAtHead() {
+    const now = headOf();
+    if (now === head || document.querySelector("dialog[open]")) return;
+    head = now;
+    window.scrollTo({ top: 0, behavior: "instant" });
+    document.querySelector("[data-head] h1")?.focus({ preventScroll: true });
   }
   function gathered() { // the parts of one address are asked for together and tell of one moment
     const groups = new Map();
@@ -166,6 +179,7 @@
       answeredAt = Date.now();
       mergeChildren(robots, fresh.content);
       announce();
+      document.dispatchEvent(new CustomEvent("page-changed"));
       if (offline && !body.dataset.stream) backOnline();
     } catch {
       if (Date.now() - answeredAt > LOST_AFTER_MS) robotsUnknown();

@@ -1,0 +1,166 @@
+"""Tells people who are elsewhere that a run has stopped, waits or has ended: by webhook and by e-mail."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import queue
+import smtplib
+import ssl
+import threading
+import time
+import urllib.request
+from collections.abc import Callable
+from dataclasses import dataclass
+from email.message import EmailMessage
+
+from service.core.errors import ConfigurationError
+from service.monitor.snapshot import Standing
+from service.rig import AlertsSection, EmailSection, Rig, WebhookSection
+
+_TIMEOUT_S = 10.0
+_TRIES_S = (0.0, 2.0, 10.0)  # pauses before each try
+_CLOSE_S = 15.0
+_log = logging.getLogger(__name__)
+_SUBJECT = {"waits": "waits for you", "stopped": "has stopped", "ended": "has ended"}
+
+
+@dataclass(frozen=True, slots=True)
+class Alert:
+    """What is sent. Names no person."""
+
+    standing: Standing
+    run_id: str
+    rig: str
+    words: str
+    at_utc_s: float
+
+    @property
+    def subject(self) -> str:
+        """One line."""
+        return f"Run {self.run_id} {_SUBJECT[self.standing]}"
+
+    @property
+    def text(self) -> str:
+        """The whole message."""
+        return f"{self.subject}: {self.words} (rig {self.rig})"
+
+
+class Alarm:
+    """Follows how a run stands, and sends what is due in a thread of its own: no capture waits for a mail server."""
+
+    def __init__(
+        self, section: AlertsSection, run_id: str, rig: str, *, monotonic_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Raises ConfigurationError where a secret that the rig file names is not in the environment."""
+        self._section, self._run_id, self._rig, self._monotonic_s = section, run_id, rig, monotonic_s
+        self._senders = _senders(section)
+        self._since: tuple[tuple[str, str], float] = (("", ""), 0.0)
+        self._told: tuple[str, str] = ("", "")
+        self._queue: queue.SimpleQueue[Alert | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._send_all, name="alarm", daemon=True)
+        self._thread.start()
+
+    def follow(self, standing: Standing, words: str) -> None:
+        """How the run stands now; called again and again. Waiting is told when it has lasted, the rest at once."""
+        now = (standing, words)
+        if now != self._since[0]:
+            self._since = (now, self._monotonic_s())
+        if standing == "works":
+            self._told = ("", "")  # the same stop once more is news
+        lasted_s = self._monotonic_s() - self._since[1]
+        due_s = self._section.waits_after_s if standing == "waits" else 0.0
+        if standing not in self._section.on or now == self._told or lasted_s < due_s:
+            return
+        self._told = now
+        self._queue.put(Alert(standing, self._run_id, self._rig, words, time.time()))
+
+    def close(self) -> None:
+        """Send what is still to be sent, for some seconds at most."""
+        self._queue.put(None)
+        self._thread.join(_CLOSE_S)
+
+    def _send_all(self) -> None:
+        while (alert := self._queue.get()) is not None:
+            for name, send in self._senders:
+                _try(name, send, alert)
+
+
+def alarm_of(rig: Rig, run_id: str) -> Alarm | None:
+    """As the rig file configures it; None: nobody elsewhere is told."""
+    section = rig.section.alerts
+    return None if section is None else Alarm(section, run_id, rig.section.name)
+
+
+def _try(name: str, send: Callable[[Alert], None], alert: Alert) -> None:
+    for pause_s in _TRIES_S:
+        time.sleep(pause_s)
+        try:
+            send(alert)
+        except (OSError, smtplib.SMTPException) as error:
+            _log.warning("the alert was not taken by the %s: %s", name, error)
+        else:
+            return
+
+
+def _senders(section: AlertsSection) -> list[tuple[str, Callable[[Alert], None]]]:
+    senders: list[tuple[str, Callable[[Alert], None]]] = []
+    if section.webhook is not None:
+        senders.append(("webhook", _webhook(section.webhook)))
+    if section.email is not None:
+        senders.append(("mail server", _email(section.email)))
+    return senders
+
+
+def _webhook(section: WebhookSection) -> Callable[[Alert], None]:
+    url = section.url or _secret(section.url_env or "")
+    if not url.startswith(("http://", "https://")):
+        raise ConfigurationError(
+            f"{section.url_env} holds no address of a webhook",
+            where="rig.yaml: alerts",
+            remedy="It begins with http:// or https://",
+        )
+
+    def send(alert: Alert) -> None:
+        body = {
+            "text": alert.text,  # what chat services show
+            "run": alert.run_id, "rig": alert.rig, "standing": alert.standing, "words": alert.words,
+            "at_utc_s": round(alert.at_utc_s, 3),
+        }  # fmt: skip
+        request = urllib.request.Request(
+            url, json.dumps(body).encode(), {"Content-Type": "application/json"}, method="POST"
+        )
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
+            answer.read(1 << 16)
+
+    return send
+
+
+def _email(section: EmailSection) -> Callable[[Alert], None]:
+    password = _secret(section.password_env) if section.password_env else ""
+
+    def send(alert: Alert) -> None:
+        message = EmailMessage()
+        message["Subject"], message["From"] = alert.subject, section.sender
+        message["To"] = ", ".join(section.to)
+        message.set_content(alert.text + "\n")
+        with smtplib.SMTP(section.host, section.port, timeout=_TIMEOUT_S) as server:
+            if section.starttls:
+                server.starttls(context=ssl.create_default_context())
+            if section.user:
+                server.login(section.user, password)
+            server.send_message(message)
+
+    return send
+
+
+def _secret(name: str) -> str:
+    value = os.environ.get(name, "")
+    if not value:
+        raise ConfigurationError(
+            f"the environment has no {name}, which the rig file names for alerts",
+            where="rig.yaml: alerts",
+            remedy=f"Set {name} where the server and the runs are started, or take it out of the rig file",
+        )
+    return value

@@ -1,0 +1,87 @@
+"""Whether each board image of a calibration step is used, and why not: one answer for every page that shows it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from service.core.model import Event, View
+from service.core.run_state import RunState, StepState
+
+BOARD_IMAGE = "board_image"
+_INSTEAD = "another pose was taken instead"
+_SEARCH = re.compile(r" ?\(searched at widths [^)]*\)")  # what the detector once told developers
+
+
+@dataclass(frozen=True, slots=True)
+class BoardUse:
+    """What became of one board image. `used` is None while that is not known."""
+
+    used: bool | None
+    word: str
+    why: str = ""
+
+    @property
+    def tone(self) -> str:
+        """Of its word."""
+        return {True: "ok", False: "attention", None: "open"}[self.used]
+
+
+def board_uses(run: RunState, events: Sequence[Event], step: str) -> Mapping[str, BoardUse]:
+    """By SHA-256, for the valid board images of a step; from the looks as they arrive, then from the calibration."""
+    state = run.steps[step]
+    images = {
+        payload.artefacts[0].sha256: payload
+        for seq in state.captured.values()
+        if isinstance(payload := events[seq - 1].payload, View) and payload.artefacts[0].kind == BOARD_IMAGE
+    }
+    return {sha256: board_use(state, view) for sha256, view in images.items()}
+
+
+def board_use(state: StepState, view: View) -> BoardUse:
+    """What became of one image of a step."""
+    sha256, name = view.artefacts[0].sha256, view.viewpoint
+    looks = [job for job in state.jobs.values() if job.kind == "board_view"]
+    look = next((job for job in looks if job.arguments["image"]["sha256"] == sha256), None)
+    details: Any = state.result.get("details", {})
+    intrinsics = details.get("intrinsics") or {}
+    solved, why = set(intrinsics.get("images", ())), _reasons(state, details)
+    excluded = {entry["image"] for entry in intrinsics.get("excluded", ())}
+    if name in solved and name not in excluded:
+        return BoardUse(True, "Used", why.get(name, ""))
+    unseen = look is not None and look.status == "finished" and not look.result.get("seen")
+    departs = [key for key, passed in view.verdicts.items() if not passed]
+    reason = why.get(name) or (_plain(str(look.result.get("reason", ""))) if unseen and look is not None else "")
+    if not reason and departs:
+        reason = f"{' and '.join(departs)} not as wanted"
+    if not reason and look is not None and look.status == "failed":
+        reason = f"it could not be looked at: {look.message}"
+    if reason or unseen:
+        return BoardUse(False, "Not used", reason or "no board was found in it")
+    if solved:
+        return BoardUse(False, "Not used", "the calibration does without it")
+    if look is not None and look.status == "finished":
+        return BoardUse(None, "Board found", "it is used once all images are there")
+    return BoardUse(None, "Being looked at" if look is not None else "Not looked at yet")
+
+
+def unused_count(run: RunState, events: Sequence[Event], step: str) -> int:
+    """How many valid board images of a step are known not to be used."""
+    return sum(use.used is False for use in board_uses(run, events, step).values())
+
+
+def _reasons(state: StepState, details: Mapping[str, Any]) -> dict[str, str]:
+    """By viewpoint, what the record says against it."""
+    intrinsics, hand_eye = details.get("intrinsics") or {}, state.result.get("hand_eye") or {}
+    why = dict.fromkeys(map(str, details.get("views_without_board", ())), "no board was found in it")
+    why |= {str(entry["image"]): str(entry["reason"]) for entry in intrinsics.get("excluded", ())}
+    why |= {str(name): str(reason) for name, reason in hand_eye.get("excluded", {}).items()}
+    for note in state.notes:  # why other poses were planned
+        why |= {str(n): f"{r} ({_INSTEAD})" for n, r in note.data.get("instead_of", {}).items()}
+    return {name: _plain(reason) for name, reason in why.items()}
+
+
+def _plain(reason: str) -> str:
+    return _SEARCH.sub("", reason).strip()
