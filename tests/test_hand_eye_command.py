@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -51,9 +52,8 @@ def test_poses_that_fit_give_the_mount(photographs: BoardFolder, tmp_path: Path)
     ],
 )
 def test_poses_that_are_read_wrongly_are_refused_and_the_mistake_is_named(
-    photographs: BoardFolder, tmp_path: Path, change: object, words: str, remedy: str
+    photographs: BoardFolder, tmp_path: Path, change: Callable[[Array], Array], words: str, remedy: str
 ) -> None:
-    assert callable(change)
     poses = photographs.poses(tmp_path / "poses.csv", [change(T) for T in photographs.T_base_flange.values()])
     out = tmp_path / "hand_eye.json"
     for method in ("weighted", "park"):

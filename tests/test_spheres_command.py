@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
@@ -75,7 +76,7 @@ def test_an_unwritable_output_is_told_before_the_mesh_is_read(tmp_path: Path) ->
     assert "folder of the file to write does not exist" in done.output
 
 
-def _fillet(radius: float) -> tuple[Array, Array]:
+def _fillet(radius: float) -> tuple[Array, NDArray[np.int64]]:
     """A narrow strip of a sphere, as a fillet between two surfaces has one, with surfaces that go on as planes."""
     along, across = np.meshgrid(np.linspace(-1.2, 1.2, 40), np.linspace(-0.16, 0.16, 8))
     points = radius * np.stack(

@@ -63,7 +63,7 @@ def test_no_word_of_an_instruction_is_lost(columns: int) -> None:
         )  # fmt: skip
         shown.truncate(0)
         shown.seek(0)
-        operator._print(question)  # what the poll shows, without a terminal to poll
+        operator.print_question(question)  # what the poll shows, without a terminal to poll
         assert max(map(len, shown.getvalue().splitlines())) <= columns
         words = _plain(shown.getvalue())
         for text in (step.title, step.why, question.text, *step.checklist):

@@ -156,7 +156,7 @@ class TerminalOperator(_Operator):
         if question != self._asked:
             self._asked = question
             self._stop_accepting()
-            self._print(question)
+            self.print_question(question)
         line = self._line()
         if line is None:
             return None
@@ -180,7 +180,8 @@ class TerminalOperator(_Operator):
         line, _, self._typed = self._typed.partition(b"\n")
         return line.decode(errors="replace")
 
-    def _print(self, question: AskOperator) -> None:
+    def print_question(self, question: AskOperator) -> None:
+        """Show what is asked, with what can be answered."""
         self.display.clear()
         step = self.protocol.step(question.step)
         lines = [question.text, *(f"  ☐ {item}" for item in question.checklist)]

@@ -44,7 +44,8 @@ def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
     return sum(1 for _ in takewhile(lambda row: (row.kind, row.step) == (first.kind, first.step), rows[start:]))
 
 
-TEMPLATES.globals.update({"kept_in_a_row": kept_in_a_row})
+_globals: dict[str, Any] = TEMPLATES.globals
+_globals["kept_in_a_row"] = kept_in_a_row
 TEMPLATES.filters["local_time"] = local_time
 
 

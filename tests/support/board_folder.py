@@ -18,8 +18,12 @@ from service.core.geometry import Array, inverse, transform
 from tests.support.board_images import Shade, checkerboard, photograph, printed
 
 CAMERA = CameraModel(900, 600, 1260, 1261, 452.0, 301.0, -0.045, 0.03, 4e-4, -5e-4)
-T_FLANGE_CAMERA = transform(Rotation.from_euler("xyz", [4, -7, 31], degrees=True).as_matrix(), [0.03, -0.05, 0.11])
-T_BASE_BOARD = transform(Rotation.from_euler("xyz", [178, 3, 40], degrees=True).as_matrix(), [0.6, -0.1, 0.02])
+T_FLANGE_CAMERA = transform(
+    Rotation.from_euler("xyz", [4, -7, 31], degrees=True).as_matrix(), np.array([0.03, -0.05, 0.11])
+)
+T_BASE_BOARD = transform(
+    Rotation.from_euler("xyz", [178, 3, 40], degrees=True).as_matrix(), np.array([0.6, -0.1, 0.02])
+)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from service.core.decide import AskOperator
 from service.core.model import OperatorAction
 from service.core.run_state import RunState
+from service.monitor.snapshot import Doing
 from service.runner import Spoken
 from tests.support.bench_rig import ScriptedOperator, agree, answer
 from tests.support.ur_rtde_protocol import RtdeClient
@@ -53,9 +54,9 @@ class Person(ScriptedOperator):
             return answer(question, "confirm")
         return OperatorAction(action=way.verb, step=way.step, reason="as the screen says")
 
-    def attend(self, doing: object, state: RunState, *, pedal_armed: bool) -> None:
+    def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
         """See service.runner.Operator."""
-        del doing, pedal_armed
+        del doing, pedal_armed, asked
         self.look(state)
 
 

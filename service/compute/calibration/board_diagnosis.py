@@ -203,7 +203,7 @@ def _corners(image: Grey, board: Board) -> int:
         return 0
     if identifiers is None or len(identifiers) < 4:  # pyright: ignore[reportUnnecessaryComparison]
         return 0
-    points = board.points()[np.asarray(identifiers).ravel(), :2]
+    points = board.points()[np.asarray(identifiers, dtype=np.int64).ravel(), :2]
     pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2)
     _, inlier = cv2.findHomography(points, pixels, cv2.RANSAC, 3.0)
     return 0 if inlier is None else int(np.count_nonzero(inlier))  # pyright: ignore[reportUnnecessaryComparison]
