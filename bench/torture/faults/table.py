@@ -27,6 +27,7 @@ the run is resumed later. Where nothing is done, the case does no harm: what com
 
 """
 _COLUMNS = "| case | what goes wrong | what is done | how it ends | errors | words on the screen |"
+_LONGEST = 140  # of a command in the results; the whole is in the JSON
 _RULE = "|---|---|---|---|---|---|"
 
 
@@ -114,6 +115,7 @@ def report(about: Mapping[str, Any], new: Sequence[Verdict], stem: Path) -> None
         groups["/".join(verdict.name.split("/")[:2])].append(verdict)
     broken = [verdict for verdict in verdicts if verdict.broken]
     commands = [" ".join(["python -m bench.torture.faults", *sweep["options"]]) for sweep in sweeps]
+    commands = [words if len(words) < _LONGEST else f"{words[:_LONGEST]} …" for words in commands]
     lines = [
         "# Fault matrix",
         "",
