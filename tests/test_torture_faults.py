@@ -21,16 +21,14 @@ from service.store.store import Store
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.rig import REPOSITORY
 
-# Of each device one on its wire and one of its own that end the same way on any machine.
+# Of each device one that ends the same way on any machine, of the robot one of its own as well.
 CHOSEN = (
     "robot/rtde/inputs/reject",
     "robot/itself/protective_stop",
     "camera/ptpip/file/drop",
-    "camera/itself/wrong_exif",
     "lightbox/serial/light/corrupt",
     "scanner/export/half_written",
     "store/disk_full/commit_02",
-    "store/database/gone",
 )
 SILENT = """
 import sys
@@ -54,7 +52,7 @@ def sweep(folder: Path, *words: str, code: str = "") -> tuple[int, str, list[dic
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(400)
 def test_a_few_cases_of_each_device_go_as_the_table_says(tmp_path: Path) -> None:
     status, said, verdicts = sweep(tmp_path, "--only", *CHOSEN)
     assert [one["name"] for one in verdicts if one["broken"]] == [], said
