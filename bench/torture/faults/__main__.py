@@ -149,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         }
         DOCUMENT.write_text(table(list(cases().values()), verdicts, read_table(DOCUMENT)), encoding="utf-8")
         stem = RESULTS / f"torture_faults-{about['date']}"
-        report(about, verdicts, stem)
+        report(about, cases(), verdicts, stem)
     if not broken:
         shutil.rmtree(folder, ignore_errors=True)
     return 1 if broken or (differing and not options.record) else 0

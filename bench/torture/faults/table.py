@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -97,11 +97,11 @@ def table(cases: Sequence[Case], verdicts: Sequence[Verdict], before: Mapping[st
     return _HEAD + "\n".join(sections)
 
 
-def report(about: Mapping[str, Any], new: Sequence[Verdict], stem: Path) -> None:
+def report(about: Mapping[str, Any], known: Container[str], new: Sequence[Verdict], stem: Path) -> None:
     """The results as JSON and Markdown; those of the same day that were not tried again stay."""
     path = stem.with_suffix(".json")
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"sweeps": [], "verdicts": []}
-    rows = {row["name"]: row for row in before["verdicts"]}
+    rows = {row["name"]: row for row in before["verdicts"] if row["name"] in known}
     rows |= {verdict.name: {**verdict.told(), "commit": about["commit"]} for verdict in new}
     now: dict[str, Any] = {key: about[key] for key in ("options", "commit", "seconds")}
     sweeps: list[dict[str, Any]] = [*before["sweeps"], now | {"tried": len(new)}]
