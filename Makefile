@@ -62,7 +62,7 @@ torture-crash: $(TOOLS)
 torture-faults: $(TOOLS)
 	$(strip $(BIN)/python -m bench.torture.faults $(if $(ONLY),--only '$(ONLY)') $(if $(MINUTES),--minutes $(MINUTES)))
 
-# Long and large (docs/soak.md): an hour of captures, a run of 10,000 viewpoints, many on one file, speed. Two hours.
+# Long and large (docs/soak.md): an hour of captures, a run of 10,000 viewpoints, many on one file, speed. Hours.
 soak: $(TOOLS)
 	$(BIN)/python -m bench.soak
 
