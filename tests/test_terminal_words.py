@@ -70,14 +70,20 @@ def test_no_word_of_an_instruction_is_lost(columns: int) -> None:
             assert " ".join(text.split()) in words
 
 
-def test_a_table_never_cuts_a_number() -> None:
+def _shown_table(*, terminal: bool) -> str:
     shown = io.StringIO()
     table = Table("", "x mm", "y mm", "z mm", "sigma mm", "what")
     table.add_row("0", "-5895.842", "-12345.678", "99999.123", "0.0001", "a long word on where this lies in the hall")
-    print_table(table, Console(file=shown, width=40, soft_wrap=True, highlight=False))
-    for number in ("-5895.842", "-12345.678", "99999.123", "0.0001"):
-        assert number in shown.getvalue()
-    assert "…" not in shown.getvalue()
+    print_table(table, Console(file=shown, width=40, soft_wrap=True, highlight=False, force_terminal=terminal))
+    return shown.getvalue()
+
+
+def test_a_table_never_cuts_a_number() -> None:
+    for terminal in (True, False):
+        for number in ("-5895.842", "-12345.678", "99999.123", "0.0001"):
+            assert number in _shown_table(terminal=terminal)
+        assert "…" not in _shown_table(terminal=terminal)
+    assert "a long word on where this lies in the hall" in _shown_table(terminal=False)
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("registr", "register"), ("stat", "status"), ("calibate", "calibrate")])
