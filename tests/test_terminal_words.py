@@ -54,8 +54,9 @@ def test_no_word_of_an_instruction_is_lost(columns: int) -> None:
     protocol = load_protocol(ROOT / "protocols" / "exvivo_spine.yaml", params_models()).protocol
     shown = io.StringIO()
     console = Console(file=shown, width=columns, soft_wrap=True, highlight=False)
-    display = Display(console, cast(Any, None))
-    operator = TerminalOperator("A. Tester", protocol, display, SimulatedHands(None))
+    nobody_types, _ = os.pipe()
+    reporter = cast(Any, None)
+    operator = TerminalOperator("A. Tester", protocol, Display(console, reporter), SimulatedHands(None), nobody_types)
     for step in protocol.steps:
         question = AskOperator(
             step=step.id, for_="confirm", text=f"{step.instructions} [bold] 90° [/] it", options=("confirm",),
