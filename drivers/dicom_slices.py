@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import struct
 import warnings
 import zlib
@@ -16,6 +17,8 @@ import numpy as np
 import pydicom
 from pydicom.dataset import FileDataset
 from pydicom.errors import BytesLengthException, InvalidDicomError
+from pydicom.pixels import get_decoder
+from pydicom.uid import UID
 
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import Array, Transform
@@ -208,11 +211,28 @@ def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
     ):
         if bad:
             problems.append(f"{text}: {_named(bad)}")
+    problems += [
+        f"images compressed as {UID(syntax).name}, for which no decoder is installed (pip install python-gdcm): "
+        + _named([h for h in headers if h.transfer_syntax == syntax])
+        for syntax in sorted({h.transfer_syntax for h in headers})
+        if _undecodable(syntax)
+    ]
     images = [header for header in headers if header.rows * header.columns > 0]
     placed = [header for header in images if _placed(header) and "LOCALIZER" not in header.image_type]
     if placed:
         problems += _shape_problems(placed) or _position_problems(placed)
     return tuple(problems)
+
+
+def _undecodable(syntax: str) -> bool:
+    """Whether pixels of a known transfer syntax cannot be decoded here; an unknown one is tried when it is read."""
+    uid = UID(syntax) if re.fullmatch(r"[0-9.]+", syntax) else None
+    if uid is None or not uid.is_transfer_syntax or not uid.is_compressed or uid.is_deflated:
+        return False
+    try:
+        return not get_decoder(uid).is_available
+    except NotImplementedError:
+        return True
 
 
 def _placed(header: SliceHeader) -> bool:

@@ -12,7 +12,17 @@ import pydicom.data
 import pytest
 import trimesh
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
-from pydicom.uid import UID, CTImageStorage, ExplicitVRLittleEndian, ImplicitVRLittleEndian, RLELossless, generate_uid
+from pydicom.encaps import encapsulate
+from pydicom.pixels import get_decoder
+from pydicom.uid import (
+    UID,
+    CTImageStorage,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+    JPEGLosslessSV1,
+    RLELossless,
+    generate_uid,
+)
 from scipy.spatial.transform import Rotation
 
 from drivers.dicom_folder import DRIVER, DicomFolder, DicomFolderConfig
@@ -313,3 +323,18 @@ def test_a_length_of_four_gigabytes_asks_for_no_more_than_the_file_holds(tmp_pat
         assert source(tmp_path).series() == ()
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def test_a_compression_that_nothing_here_decodes_is_told_before_the_series_is_read(tmp_path: Path) -> None:
+    def compressed(ds: Dataset, _k: int) -> None:
+        ds.PixelData = encapsulate([bytes(ds.PixelData)])
+        ds["PixelData"].is_undefined_length = True
+
+    write_series(tmp_path / "lossless", syntax=JPEGLosslessSV1, change=compressed)
+    (series,) = source(tmp_path / "lossless").series()
+    if get_decoder(JPEGLosslessSV1).is_available:  # with the extra package the same series is read
+        assert not series.problems
+        return
+    (problem,) = series.problems
+    assert "compressed as JPEG Lossless" in problem
+    assert "pip install python-gdcm" in problem

@@ -293,3 +293,17 @@ def test_an_arc_that_fills_the_image_is_no_outline_and_no_fault() -> None:
                 cone = Cone(ray / float(np.linalg.norm(ray)), float(np.arctan(radius_px / 400)))
                 for found in approach_outlines(image, lens, [cone]):
                     assert found is None or 0 < found.cone.half_angle_rad < np.pi / 2
+
+
+def test_a_sphere_of_any_size_is_found_where_its_size_is_told() -> None:
+    width, height, radius = 1024, 700, 300.0
+    lens = CameraModel(width, height, 1228, 1228, 511.5, 349.5)
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    off = np.hypot(x - 522, y - 342)
+    shade = 0.35 + 0.65 * np.sqrt(np.clip(1 - (off / radius) ** 2, 0, 1))[..., None]
+    shown = cv2.GaussianBlur(np.where((off < radius)[..., None], shade * [40, 120, 230], [60.0, 80, 70]), (0, 0), 1.0)
+    noise = np.random.default_rng(0).normal(0, 2, shown.shape)
+    image = np.clip(shown + noise, 0, 255).astype(np.uint8)
+    assert not detect_spheres(image, lens, options_for(None))
+    (found,) = detect_spheres(image, lens, options_for(None, 0.45))
+    assert max(found.semi_axes_px) == pytest.approx(radius, abs=1.5)

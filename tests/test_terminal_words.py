@@ -54,8 +54,9 @@ def test_no_word_of_an_instruction_is_lost(columns: int) -> None:
     protocol = load_protocol(ROOT / "protocols" / "exvivo_spine.yaml", params_models()).protocol
     shown = io.StringIO()
     console = Console(file=shown, width=columns, soft_wrap=True, highlight=False)
-    display = Display(console, cast(Any, None))
-    operator = TerminalOperator("A. Tester", protocol, display, SimulatedHands(None))
+    nobody_types, _ = os.pipe()
+    reporter = cast(Any, None)
+    operator = TerminalOperator("A. Tester", protocol, Display(console, reporter), SimulatedHands(None), nobody_types)
     for step in protocol.steps:
         question = AskOperator(
             step=step.id, for_="confirm", text=f"{step.instructions} [bold] 90° [/] it", options=("confirm",),
@@ -70,14 +71,20 @@ def test_no_word_of_an_instruction_is_lost(columns: int) -> None:
             assert " ".join(text.split()) in words
 
 
-def test_a_table_never_cuts_a_number() -> None:
+def _shown_table(*, terminal: bool) -> str:
     shown = io.StringIO()
     table = Table("", "x mm", "y mm", "z mm", "sigma mm", "what")
     table.add_row("0", "-5895.842", "-12345.678", "99999.123", "0.0001", "a long word on where this lies in the hall")
-    print_table(table, Console(file=shown, width=40, soft_wrap=True, highlight=False))
-    for number in ("-5895.842", "-12345.678", "99999.123", "0.0001"):
-        assert number in shown.getvalue()
-    assert "…" not in shown.getvalue()
+    print_table(table, Console(file=shown, width=40, soft_wrap=True, highlight=False, force_terminal=terminal))
+    return shown.getvalue()
+
+
+def test_a_table_never_cuts_a_number() -> None:
+    for terminal in (True, False):
+        for number in ("-5895.842", "-12345.678", "99999.123", "0.0001"):
+            assert number in _shown_table(terminal=terminal)
+        assert "…" not in _shown_table(terminal=terminal)
+    assert "a long word on where this lies in the hall" in _shown_table(terminal=False)
 
 
 @pytest.mark.parametrize(("typed", "meant"), [("registr", "register"), ("stat", "status"), ("calibate", "calibrate")])

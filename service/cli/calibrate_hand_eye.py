@@ -40,6 +40,7 @@ from service.compute.calibration.hand_eye_setup import Setup
 from service.compute.calibration.intrinsics import locate_view
 from service.compute.calibration.joint_file import read_joints_csv
 from service.compute.calibration.kinematics import ARM_MODELS, ArmModel, arm_model, matching_arm, solve_joints
+from service.compute.camera_covariance import read_camera_covariance
 from service.compute.image_folder import image_folder
 from service.compute.poses.pose_files import posed_images, read_camera_json
 from service.core.errors import ConfigurationError
@@ -116,6 +117,7 @@ def hand_eye_command(
             arm=kinematics,
             T_board_turned=target.half_turn(),
             setup=setup,
+            camera_covariance=read_camera_covariance(camera),
         )
         best = result if result.corrected is None else result.corrected
         # Suggestions are places of the camera: of one that stands still there are none.
@@ -203,6 +205,11 @@ def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
         f"held-out images: {held_mm:.3f} mm, {held_deg:.4f}° (median); "
         f"other methods up to {result.spread_mm:.3f} mm away; condition {result.condition:.1f}"
     )
+    camera_mm, camera_deg = record["sigma"]["camera_mm"], record["sigma"]["camera_deg"]
+    if camera_mm:
+        console.print(f"of that ± {camera_mm:.3f} mm, ± {camera_deg:.4f}° from what is not known of the camera")
+    else:
+        console.print("camera.json states no covariance: the camera counts as exactly known")
     if result.robot_noise_mm is not None and result.robot_noise_deg is not None:
         console.print(f"robot noise for each axis: {result.robot_noise_mm:.3f} mm, {result.robot_noise_deg:.4f}°")
     if result.corrected is not None:

@@ -15,6 +15,7 @@ import typer
 from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from typer.models import OptionInfo
@@ -56,12 +57,16 @@ def print_table(table: Table, to: Console | None = None) -> None:
     for column in table.columns:
         cells = [str(cell) for cell in column.cells]
         numeric = bool(cells) and all(not cell or _NUMBER.fullmatch(cell) for cell in cells)
-        width = max((cell_len(cell) for cell in cells), default=0) if numeric else 8
+        width = max((cell_len(cell) for cell in (*cells, str(column.header))), default=0) if numeric else 8
         column.no_wrap, column.overflow = numeric, "fold"
-        column.min_width = width if numeric else None
+        column.min_width = width if numeric else min(8, max((cell_len(cell) for cell in cells), default=1))
         least += width + 3
     shown = to or console
-    shown.print(table, width=max(shown.width, least), soft_wrap=False, crop=False)
+    # Into a file or another program nothing is wrapped: `grep` finds what stands in a cell.
+    whole = 0 if shown.is_terminal else Measurement.get(shown, shown.options.update(max_width=10_000), table).maximum
+    if max(least, whole) > shown.width:
+        table.width = max(least, whole)
+    shown.print(table, soft_wrap=False, crop=False)
 
 
 def print_json(value: Any) -> None:

@@ -66,6 +66,15 @@ def register_command(
             "--sphere-colour", help="white, grey, green, orange or #rrggbb; learnt in each image by default."
         ),
     ] = None,
+    largest_sphere: Annotated[
+        float | None,
+        typer.Option(
+            "--largest-sphere",
+            help="Radius of the largest sphere looked for, over the image's width; without: 0.13.",
+            min=0.02,
+            max=0.7,
+        ),
+    ] = None,
     detector: Annotated[
         DetectorName, typer.Option("--detector", help="paper: the published chain, for comparison; searches whole.")
     ] = "classical",
@@ -87,7 +96,7 @@ def register_command(
         known, folder = posed_images(poses, folder, images, strict=strict)
         files = list(folder.files)
         tell_left_out(folder.left_out)
-        options = options_for(sphere_colour)
+        options = options_for(sphere_colour, largest_sphere)
         detect = _file_detector(detector, boxes, [file.name for file in files])
         registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control, seeds)
         T_world_camera = np.array([known[file.name] for file in files])

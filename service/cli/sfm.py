@@ -26,6 +26,7 @@ from service.cli.common import (
     require_writable_folder,
     tell_left_out,
 )
+from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.camera_model import CameraModel
 from service.compute.image_folder import image_folder
 from service.compute.locating import detect_all
@@ -112,7 +113,7 @@ def sfm_command(
         known = _spheres(mesh, spheres, radius_mm, mesh_unit) if hybrid else None
         with _workspace(workspace) as folder, progress_bar(quiet=json) as progress:
             solved, off_m = _reconstruct(files, model, folder, mapper, prior, station, options, progress)
-            _write_model(out, solved)
+            _write_model(out, solved, read_camera_covariance(camera) if refine == "nothing" else None)
             record = {**_record(solved, off_m), "left_out": found.left_out}
             if known is not None:
                 metric = _hybrid(solved, files, prior, station, *known, progress)
@@ -224,13 +225,13 @@ def _disagreement(
     return float(np.sqrt(np.mean(squares))), float(np.sqrt(np.mean(spread)))
 
 
-def _write_model(out: Path, solved: SfmModel) -> None:
+def _write_model(out: Path, solved: SfmModel, known: CameraCovariance | None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     for file in solved.folder.iterdir():
         shutil.copyfile(file, out / file.name)
     write_camera_json(out / "camera.json", solved.camera)
     write_pose_covariance(
-        out / "pose_covariance.json", list(solved.T_world_camera), solved.pose_covariance(), "model"
+        out / "pose_covariance.json", list(solved.T_world_camera), solved.pose_covariance(known), "model"
     )
 
 

@@ -145,6 +145,7 @@ def _answer(record: Mapping[str, Any]) -> HandEyeAnswer:
         sigma_mm=record["sigma"]["mm"],
         sigma_deg=record["sigma"]["deg"],
         covariance=np.array(record["sigma"]["covariance"]),
+        camera_share=np.zeros((6, 6)),  # is in the covariance; nothing here asks for it alone
         formal_covariance=None,
         robot_noise_mm=record["robot_noise"]["mm"],
         robot_noise_deg=record["robot_noise"]["deg"],

@@ -34,10 +34,11 @@ from service.compute.calibration.hand_eye_fit import (
     turned_back,
 )
 from service.compute.calibration.hand_eye_setup import Setup, check_setup, inverted
-from service.compute.calibration.hand_eye_spread import bootstrap_covariance, not_below_held_out
+from service.compute.calibration.hand_eye_spread import bootstrap_covariance, camera_share, not_below_held_out
 from service.compute.calibration.kinematics import ArmModel
 from service.compute.calibration.reprojection import BoardCorners, board_covariance
 from service.compute.calibration.weighted import Noise
+from service.compute.camera_covariance import CameraCovariance
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
 
@@ -66,7 +67,9 @@ class HandEyeAnswer:
         T_base_board: where the board lay.
         sigma_mm: bootstrap standard deviation of the translation (root of the summed variances), over images.
         sigma_deg: bootstrap standard deviation of the rotation.
-        covariance: (6, 6) of T_flange_camera by the bootstrap: (d in metres, w in radians) in the flange's axes.
+        covariance: (6, 6) of T_flange_camera by the bootstrap: (d in metres, w in radians) in the flange's axes; with
+            the camera's share.
+        camera_share: (6, 6) of it, from what is not known of the camera: no number of images makes it smaller.
         formal_covariance: (6, 6) as the fit's own noise model predicts it; None unless the method is weighted.
         robot_noise_mm: standard deviation for each axis of what is left of the robot's position error; None
             unless the method is weighted, as the next.
@@ -82,6 +85,7 @@ class HandEyeAnswer:
     sigma_mm: float
     sigma_deg: float
     covariance: Array
+    camera_share: Array
     formal_covariance: Array | None
     robot_noise_mm: float | None
     robot_noise_deg: float | None
@@ -167,6 +171,7 @@ def calibrate_hand_eye(
     arm: ArmModel | None = None,
     T_board_turned: Transform | None = None,
     setup: Setup = "eye-in-hand",
+    camera_covariance: CameraCovariance | None = None,
     bootstrap: int = 100,
     seed: int = 0,
 ) -> HandEyeResult:
@@ -188,6 +193,7 @@ def calibrate_hand_eye(
         setup: eye-to-hand: the camera stands beside the robot and the board hangs on the flange. Then T_flange_camera
             and T_flange_board change places with T_base_camera and T_base_board: the answer's T_flange_camera is
             T_base_camera, its T_base_board is T_flange_board. The arm's own error is not estimated then.
+        camera_covariance: how well the camera of the corners is known; added to the answer's, with `corners`.
         bootstrap: number of resamples.
         seed: of the resampling and of the folds.
 
@@ -237,15 +243,18 @@ def calibrate_hand_eye(
     best = min(rms, key=lambda terms: rms[terms])
     corrected: CorrectedHandEye | None = None
     good = straight.take(keep)
+    share = np.zeros((6, 6))
+    if camera_covariance is not None and corners is not None:
+        share = camera_share(good, camera_covariance)
     if rms[best] < _WORTH * rms["none"]:
         answer, *errors = outcomes[best]
         assert answer.correction is not None
-        quality = _quality(straight, good, method, answer, (errors[0], errors[1]), point, bootstrap, seed)
+        quality = _quality(straight, good, method, answer, (errors[0], errors[1]), point, share, bootstrap, seed)
         corrected = CorrectedHandEye(**quality, correction=answer.correction, terms=best)
     methods = _methods(good, method, plain)
     distances = [distance(T, plain.T_flange_camera) for T in methods.values()]
     return HandEyeResult(
-        **_quality(straight, good, method, plain, outcomes["none"][1:], point, bootstrap, seed),
+        **_quality(straight, good, method, plain, outcomes["none"][1:], point, share, bootstrap, seed),
         method=method,
         methods=methods,
         spread_mm=max(mm for mm, _ in distances),
@@ -268,6 +277,7 @@ def _quality(
     answer: Answer,
     errors: tuple[Array, Array],
     point_m: Array,
+    share: Array,
     bootstrap: int,
     seed: int,
 ) -> dict[str, Any]:
@@ -276,12 +286,14 @@ def _quality(
     covariance = bootstrap_covariance(good, method, answer, bootstrap, np.random.default_rng(seed))
     if method in CLOSED_FORMS:
         covariance = not_below_held_out(covariance, *errors)
+    covariance = covariance + share
     return {
         "T_flange_camera": answer.T_flange_camera,
         "T_base_board": answer.T_base_board,
         "sigma_mm": 1e3 * float(np.sqrt(np.trace(covariance[:3, :3]))),
         "sigma_deg": float(np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))),
         "covariance": covariance,
+        "camera_share": share,
         "formal_covariance": None if answer.fit is None else answer.fit.covariance[:6, :6],
         "robot_noise_mm": None if answer.noise is None else 1e3 * answer.noise.robot_m,
         "robot_noise_deg": None if answer.noise is None else float(np.degrees(answer.noise.robot_rad)),

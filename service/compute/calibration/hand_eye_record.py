@@ -76,6 +76,8 @@ def _answer(answer: HandEyeAnswer, images: Sequence[str]) -> dict[str, Any]:
             "mm": answer.sigma_mm,
             "deg": answer.sigma_deg,
             "covariance": answer.covariance.tolist(),
+            "camera_mm": 1e3 * float(np.sqrt(np.trace(answer.camera_share[:3, :3]))),
+            "camera_deg": float(np.degrees(np.sqrt(np.trace(answer.camera_share[3:, 3:])))),
             "formal_covariance": None if formal is None else formal.tolist(),
         },
         "robot_noise": {"mm": answer.robot_noise_mm, "deg": answer.robot_noise_deg},

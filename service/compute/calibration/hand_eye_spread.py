@@ -6,11 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.closed_form import CLOSED_FORMS
+from service.compute.calibration.adjustment import fit_pose, pose_matrix
+from service.compute.calibration.board import BoardView
+from service.compute.calibration.closed_form import CLOSED_FORMS, solve_closed_form
 from service.compute.calibration.hand_eye_fit import Answer, Measured, Method, fit_closed_form
-from service.compute.calibration.reprojection import resample_reprojection
+from service.compute.calibration.reprojection import BoardCorners, resample_reprojection
 from service.compute.calibration.weighted import resample
-from service.core.geometry import Array
+from service.compute.camera_covariance import CameraCovariance
+from service.compute.camera_model import CameraModel
+from service.core.geometry import Array, Transform
 
 _MIN_DISTINCT = 4  # views in a bootstrap replicate
 
@@ -40,6 +44,35 @@ def bootstrap_covariance(
         assert answer.fit is not None
         steps = resample(answer.views, answer.noise, answer.fit, counts)
     return np.cov(steps[:, :6].T)
+
+
+def camera_share(data: Measured, known: CameraCovariance) -> Array:
+    """(6, 6) covariance of T_flange_camera from what is not known of the camera, which is the same in every image.
+
+    The board's place in each image and then the mount are found again with cameras one standard deviation off; by
+    Park's closed form, whose answer the camera's error moves as it moves the others'.
+    """
+    corners = data.corners
+    assert corners is not None
+    total = np.zeros((6, 6))
+    before = solve_closed_form(data.hands, data.boards, "park")
+    for camera in known.deviations(corners.camera):
+        boards = np.array(
+            [_located(corners, k, T, camera) for k, T in enumerate(data.boards)],
+        )
+        X = solve_closed_form(data.hands, boards, "park")
+        turn = Rotation.from_matrix(X[:3, :3] @ before[:3, :3].T).as_rotvec()
+        step = np.concatenate([X[:3, 3] - before[:3, 3], turn])
+        total += np.outer(step, step)
+    return total
+
+
+def _located(corners: BoardCorners, index: int, T: Transform, camera: CameraModel) -> Transform:
+    """T_camera_board of one view through another camera, starting from where it was."""
+    seen = np.flatnonzero(np.isfinite(corners.corners_px[index]).all(axis=1))
+    view = BoardView(seen, corners.corners_px[index][seen])
+    start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
+    return pose_matrix(fit_pose(view, corners.points_m, camera, start)[0])
 
 
 def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Array) -> Array:

@@ -26,16 +26,21 @@ class Detector(Protocol):
         ...
 
 
-def options_for(colour: str | None) -> DetectionOptions:
+def options_for(colour: str | None, largest: float | None = None) -> DetectionOptions:
     """The default options with the spheres' colour, by name or as #rrggbb; None: it is learnt.
+
+    Args:
+        colour: of the spheres.
+        largest: radius of the largest sphere looked for, over the image's width; None: the default.
 
     Raises:
         ConfigurationError: no such colour.
     """
+    options = DEFAULTS if largest is None else replace(DEFAULTS, max_radius=largest)
     if colour is None:
-        return DEFAULTS
+        return options
     colour_bgr, tolerance = colour_of(colour)
-    return replace(DEFAULTS, colour_bgr=colour_bgr, colour_tolerance=tolerance)
+    return replace(options, colour_bgr=colour_bgr, colour_tolerance=tolerance)
 
 
 DETECTORS: Mapping[str, Detector] = {"classical": detect_spheres, "paper": detect_by_masks}

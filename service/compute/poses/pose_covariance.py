@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.poses.adjustment import clustered_information, first_guess, robust_rows
-from service.compute.poses.bundle import Data, Sigmas, State
+from service.compute.poses.bundle import Data, Rows, Sigmas, State, linearise, normal_equations
 from service.compute.poses.tracks import Tracks
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 
-def similarity_covariance(T_world_camera: Array, tracks: Tracks, camera: CameraModel) -> Array:
+def similarity_covariance(
+    T_world_camera: Array, tracks: Tracks, camera: CameraModel, known: CameraCovariance | None = None
+) -> Array:
     """Joint covariance (6 N, 6 N) of poses at the solution of a bundle adjustment, the camera held.
 
     From the normal equations with the points eliminated, robust weights, and errors that are common to a track
@@ -27,6 +31,8 @@ def similarity_covariance(T_world_camera: Array, tracks: Tracks, camera: CameraM
         T_world_camera: (N, 4, 4), any unit.
         tracks: of the same images, in the same frame.
         camera: intrinsics.
+        known: how well they are known, where they were held: their error moves all poses together, whatever the
+            number of images. None: as if exactly.
 
     Returns:
         (6 N, 6 N) of increments (d in the model's unit, w in radians) of exp(w) R, t + d in the model's axes.
@@ -60,7 +66,27 @@ def similarity_covariance(T_world_camera: Array, tracks: Tracks, camera: CameraM
     E = fixed.reshape(6 * n, 7)
     S = np.eye(6 * n) - G @ np.linalg.solve(E.T @ G, E.T)
     half = S @ inverse
-    return half @ meat @ half.T
+    covariance = half @ meat @ half.T
+    for pull in _pulls(state, data, rows["tracks"], bread, known) if known is not None else ():
+        moved = half @ pull
+        covariance = covariance + np.outer(moved, moved)
+    return covariance
+
+
+def _pulls(state: State, data: Data, tracks: Rows, bread: Array, known: CameraCovariance) -> Iterator[Array]:
+    """(6 N,) what each deviation of the camera adds to the gradient of the poses, the points free to follow."""
+    plain = linearise(state, data, Sigmas())["tracks"]
+    # The square roots of the robust weights, and of the sigma that they were found with.
+    root = np.sqrt(_row_squares(tracks) / np.maximum(_row_squares(plain), 1e-300))
+    for camera in known.deviations(state.camera):
+        off = linearise(dataclasses.replace(state, camera=camera), data, Sigmas())["tracks"].residual - plain.residual
+        normal = normal_equations([dataclasses.replace(tracks, residual=root * off)])
+        n = len(bread)
+        yield normal.gradient[:n] * float(np.trace(bread) / np.trace(normal.schur[:n, :n]))
+
+
+def _row_squares(rows: Rows) -> Array:
+    return np.asarray(rows.frame.multiply(rows.frame).sum(axis=1), dtype=np.float64).ravel()
 
 
 def blocks(covariance: Array) -> Array:

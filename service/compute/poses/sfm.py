@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.poses.colmap_process import ColmapProcess
 from service.compute.poses.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
@@ -66,16 +67,17 @@ class SfmModel:
         """(P, 3) triangulated points."""
         return self.tracks.points
 
-    def joint_pose_covariance(self) -> Array:
+    def joint_pose_covariance(self, known: CameraCovariance | None = None) -> Array:
         """(6 N, 6 N) of the poses after the positions were laid over the true ones by a similarity; the model's unit.
 
-        Increments (d, w) of exp(w) R, t + d in the model's axes. Takes a second or so.
+        Increments (d, w) of exp(w) R, t + d in the model's axes. `known` is how well the camera was, where it was
+        held. Takes a second or so.
         """
-        return similarity_covariance(np.array(list(self.T_world_camera.values())), self.tracks, self.camera)
+        return similarity_covariance(np.array(list(self.T_world_camera.values())), self.tracks, self.camera, known)
 
-    def pose_covariance(self) -> Array:
+    def pose_covariance(self, known: CameraCovariance | None = None) -> Array:
         """(N, 6, 6) the same of each pose alone."""
-        return blocks(self.joint_pose_covariance())
+        return blocks(self.joint_pose_covariance(known))
 
 
 def reconstruct(

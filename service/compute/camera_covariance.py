@@ -1,0 +1,64 @@
+"""How well a calibrated camera is known, for what is computed with it: its error is common to all images."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from service.compute.camera_model import CameraModel
+from service.core.errors import DataError
+from service.core.file_text import file_text
+from service.core.geometry import Array
+from service.core.json_text import parse_json
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCovariance:
+    """Covariance (P, P) of parameters of a CameraModel, by name, in their units (px and 1)."""
+
+    parameters: tuple[str, ...]
+    matrix: Array
+
+    def deviations(self, camera: CameraModel) -> Iterator[CameraModel]:
+        """Cameras one standard deviation off along each principal axis of what is not known.
+
+        What they change in a result, squared and summed, is the camera's share of that result's covariance.
+        """
+        scale = np.sqrt(np.maximum(np.diag(self.matrix), 1e-300))
+        values, axes = np.linalg.eigh(self.matrix / np.outer(scale, scale))
+        for step in (axes * np.sqrt(np.maximum(values, 0.0))).T:
+            change = dict(zip(self.parameters, step * scale, strict=True))
+            yield dataclasses.replace(
+                camera, **{name: getattr(camera, name) + float(d) for name, d in change.items()}
+            )
+
+
+def read_camera_covariance(path: Path) -> CameraCovariance | None:
+    """What `calibrate intrinsics` wrote of it into camera.json; None where the file says nothing.
+
+    Raises:
+        DataError: the file holds no JSON, or no covariance where it says that it does.
+    """
+    document = parse_json(file_text(path), name=str(path))
+    stated: Any = cast("dict[str, Any]", document).get("covariance") if isinstance(document, dict) else None
+    if stated is None:
+        return None
+    wrong = DataError(
+        "the covariance of the camera is no square matrix of its parameters",
+        where=f"{path}: covariance",
+        remedy="Calibrate again, or take the key out: the camera then counts as exactly known",
+    )
+    try:
+        parameters = tuple(str(name) for name in stated["parameters"])
+        matrix = np.array(stated["matrix"], dtype=np.float64)
+    except (TypeError, KeyError, ValueError, OverflowError) as error:
+        raise wrong from error
+    known = {field.name for field in dataclasses.fields(CameraModel)} - {"width", "height"}
+    if not set(parameters) <= known or matrix.shape != (len(parameters),) * 2 or not np.isfinite(matrix).all():
+        raise wrong
+    return CameraCovariance(parameters, matrix)
