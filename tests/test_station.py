@@ -37,7 +37,7 @@ def station_of(folder: Path, text: str = RIG) -> Generator[tuple[Station, list[s
     def note(name: str, report: DeviceReport) -> None:
         opened.append(f"{name}: {report.identity.kind}")
 
-    station.watch(note)
+    station.watch(note, lambda _name: None)
     try:
         yield station, opened
     finally:
