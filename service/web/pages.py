@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from functools import partial
 from itertools import takewhile
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from fastapi import Path, Request
 from fastapi.responses import HTMLResponse
@@ -44,8 +44,7 @@ def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
     return sum(1 for _ in takewhile(lambda row: (row.kind, row.step) == (first.kind, first.step), rows[start:]))
 
 
-_globals: dict[str, Any] = TEMPLATES.globals
-_globals["kept_in_a_row"] = kept_in_a_row
+cast("dict[str, Any]", TEMPLATES.globals)["kept_in_a_row"] = kept_in_a_row  # its type names its own names only
 TEMPLATES.filters["local_time"] = local_time
 
 
