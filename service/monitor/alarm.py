@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import json
 import logging
 import os
@@ -98,7 +99,7 @@ def _try(name: str, send: Callable[[Alert], None], alert: Alert) -> None:
         time.sleep(pause_s)
         try:
             send(alert)
-        except (OSError, smtplib.SMTPException) as error:
+        except (OSError, http.client.HTTPException, smtplib.SMTPException) as error:
             _log.warning("the alert was not taken by the %s: %s", name, error)
         else:
             return
