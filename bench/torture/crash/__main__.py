@@ -61,6 +61,8 @@ def sweep_points(folder: Path, options: argparse.Namespace, rng: Random) -> dict
         verdicts.append(verdict)
         for fault in verdict.faults:
             print(f"{_named(case)}: {fault}", flush=True)
+        if verdict.faults and options.first_fault:
+            break
         if number % 50 == 0:
             print(f"{number} of {len(cases)}, {time.monotonic() - began_s:.0f} s", flush=True)
     return {
@@ -155,6 +157,7 @@ def main() -> None:
     parser.add_argument("--sample", type=int, help="so many cases of the systematic sweep; all of them without it")
     parser.add_argument("--kinds", action="store_true", help="one case for each process and effect, of either death")
     parser.add_argument("--ways", nargs="+", choices=_WAYS, default=_WAYS, help="how the processes die")
+    parser.add_argument("--first-fault", action="store_true", help="end the systematic sweep with it")
     parser.add_argument("--minutes", type=float, default=0, help="end the systematic sweep after this; 0: never")
     parser.add_argument("--random-runs", type=int, default=6, help="runs over the real wires; 0: none")
     parser.add_argument("--kills", type=int, default=4, help="in each of these")
