@@ -309,7 +309,8 @@ def test_recovery_can_abort_the_run(log: Log) -> None:
     [
         ("DeviceUnavailableError", 1, "ask", "retry"),
         ("DeviceTimeoutError", 2, "abort", "retry"),
-        ("DeviceBusyError", 3, "ask", "ask"),
+        ("DeviceTimeoutError", 3, "ask", "ask"),
+        ("DeviceBusyError", 1, "ask", "ask"),
         ("DeviceBusyError", 3, "abort", "abort"),
         ("SafetyStopError", 1, "abort", "ask"),
         ("DeviceStorageFullError", 1, "abort", "ask"),

@@ -9,8 +9,8 @@ from service.core.protocol import Recovery
 Policy = Literal["retry", "ask", "abort"]
 
 # Names, not classes: core does not know the drivers, and the events hold names.
-# Passing troubles: the same call may succeed in a moment.
-PASSING = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "DeviceBusyError", "StaleImageError"})
+# Passing troubles: the same call may succeed in a moment. (A camera that stays busy has been waited for already.)
+PASSING = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "StaleImageError"})
 # Only a person at the table can put these right, whatever the protocol says.
 # (a damaged file of the evidence is put back from a copy; what is read again is checked against its hash again).
 NEEDS_A_PERSON = frozenset(

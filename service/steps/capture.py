@@ -186,6 +186,7 @@ class _CaptureLoop:
         context = self.context
         at(viewpoint=viewpoint.name)
         robot = context.devices.robot(viewpoint.station)
+        was_busy = False
         for tries_left in range(context.step.recovery.retries, -1, -1):
             arrived = False
             try:
@@ -194,9 +195,11 @@ class _CaptureLoop:
                 environment = self._dwell(robot, later)
                 context.busy(f"taking {viewpoint.name} and fetching it from the camera{self._size}")
                 return expose(
-                    context, self.camera, robot, viewpoint, settled, environment, self.wanted, self.image_kind
-                )
+                    context, self.camera, robot, viewpoint, settled, environment, self.wanted, self.image_kind,
+                    was_busy=was_busy,
+                )  # fmt: skip
             except WORTH_ANOTHER_TRY as error:
+                was_busy = isinstance(error, DeviceBusyError)
                 self.keep()
                 self._record_failure(viewpoint, error, skipped=False)
                 if tries_left == 0:
@@ -268,14 +271,16 @@ def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, fol
 
     Raises DeviceError when it fails for good, StepInterruptedError on pause.
     """
+    was_busy = False
     for tries_left in range(context.step.recovery.retries, -1, -1):
         inside = folder / str(tries_left)  # what an earlier try has left behind is not in the way
         inside.mkdir()
         try:
             _apply(context, camera, wanted)
             context.busy("taking a photograph and fetching it from the camera")
-            return expose_when_free(context, camera, inside)
+            return expose_when_free(context, camera, inside, was_busy=was_busy)
         except WORTH_ANOTHER_TRY as error:
+            was_busy = isinstance(error, DeviceBusyError)
             if tries_left == 0:
                 raise
             context.note("photograph_repeated", why=str(error))

@@ -24,6 +24,7 @@ from service.store.records import NewArtefact
 
 #: How long a busy camera is left alone before the next try: nearly a minute in all.
 _BUSY_PAUSES_S = (0.5, 1.0, 2.0, 4.0, *(8.0,) * 6)
+_BUSY_AGAIN_PAUSES_S = _BUSY_PAUSES_S[:3]  # of a camera that was opened again because it stayed busy
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +51,8 @@ def expose(
     environment: dict[str, float],
     wanted: CameraSettings,
     image_kind: str,
+    *,
+    was_busy: bool = False,
 ) -> Shot:
     """Take the picture and judge it. Nothing is recorded yet: `record_shot` does that while the arm moves on.
 
@@ -57,7 +60,7 @@ def expose(
     """
     folder = tempfile.TemporaryDirectory(prefix="orthocapture-")
     try:
-        image = expose_when_free(context, camera, Path(folder.name))
+        image = expose_when_free(context, camera, Path(folder.name), was_busy=was_busy)
         window = robot.samples(image.trigger_monotonic_s, image.trigger_monotonic_s + wanted.exposure_s + 0.3)
         pose = _mean_pose(window, settled)
     except BaseException:
@@ -123,9 +126,13 @@ def record_shot(context: StepContext, shot: Shot) -> None:
     )
 
 
-def expose_when_free(context: StepContext, camera: Camera, folder: Path) -> CapturedImage:
-    """Release the shutter, and wait for a camera that is still busy with what came before."""
-    for pause_s in _BUSY_PAUSES_S:
+def expose_when_free(context: StepContext, camera: Camera, folder: Path, *, was_busy: bool = False) -> CapturedImage:
+    """Release the shutter, and wait up to a minute for a camera that is still busy with what came before.
+
+    Args:
+        was_busy: that minute has passed before; it is waited for a few seconds only.
+    """
+    for pause_s in _BUSY_AGAIN_PAUSES_S if was_busy else _BUSY_PAUSES_S:
         try:
             return camera.capture(folder)
         except DeviceBusyError:

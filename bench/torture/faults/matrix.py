@@ -128,8 +128,8 @@ def _camera_itself() -> Iterator[Case]:
         ("raw_only", "a RAW comes without its JPEG", plan("raw_only", "image", 2)),
     ):
         yield Case(f"{own}/{name}", "camera", what, faults=faults)
-    busy = plan("busy", "shutter", 2, 999)  # a minute for each try of a view, of which there are four
-    yield Case(f"{own}/busy_on", "camera", "the camera is busy and stays so", faults=busy, patience=0, longer_s=120)
+    busy = plan("busy", "shutter", 2, 999)
+    yield Case(f"{own}/busy_on", "camera", "the camera is busy and stays so", faults=busy, patience=0)
     yield Case(f"{own}/battery_low", "camera", "the battery is at 5 %", options=("--battery", "5"), act="nothing")
     yield Case(f"{own}/switched_off", "camera", "the camera is switched off", after=1, act="camera_off")
 
