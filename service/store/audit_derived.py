@@ -27,9 +27,10 @@ FROM (SELECT run_id, seq, position, position AS place,
              lag(seq) OVER (PARTITION BY run_id ORDER BY position) AS before FROM event_index)
 ORDER BY position
 """
+# A cross join: SQLite looks up the event of each job. Left to choose, it goes through all jobs for each event.
 _QUEUE = """
 SELECT j.run_id, j.enqueued_seq, j.job_id, j.position, row_number() OVER (ORDER BY i.position) AS place
-FROM jobs AS j JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
+FROM jobs AS j CROSS JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
 """
 _STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # what ANALYZE makes, by anybody's hand
 _NUMBERS = ("user_version", "application_id")  # of the database; this software sets none of them
