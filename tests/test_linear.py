@@ -1,4 +1,4 @@
-"""What is asked of a run takes as long as the run is large, no longer: counted in instructions, not seconds."""
+"""What is asked of a run takes as long as the run is large, no longer: counted in lines executed, not seconds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from service.evidence import RunLog, StepEvidence
 from service.runs import recorded_run
 from service.store.audit import show
 from service.web.capture_view import views_of
-from tests.support.counting import instructions_of
+from tests.support.counting import lines_of
 
 SMALL, LARGE = 100, 200
 MOST = 2.3  # times as much for twice as many viewpoints
@@ -62,7 +62,7 @@ def held_already(record: LargeRecord) -> Callable[[], object]:
 def test_twice_as_many_viewpoints_are_twice_the_work(
     records: tuple[LargeRecord, LargeRecord], asked: Callable[[LargeRecord], Callable[[], object]]
 ) -> None:
-    small, large = (instructions_of(asked(record), "/service/") for record in records)
+    small, large = (lines_of(asked(record), "/service/") for record in records)
     assert small > SMALL, "nothing was counted"
     assert large < MOST * small
 
@@ -71,11 +71,11 @@ def test_a_page_that_follows_a_run_does_not_plan_it_anew(records: tuple[LargeRec
     _, record = records
     capture_page(record)()
     record.store.record(record.run_id, [StepNote(step=STEP, attempt=1, note="seen")], actor="runner")
-    assert instructions_of(capture_page(record), "/service/core/geometry.py") == 0
+    assert lines_of(capture_page(record), "/service/core/geometry.py") == 0
 
 
 def test_whether_a_photograph_is_there_already_is_asked_without_reading_them_all(
     records: tuple[LargeRecord, LargeRecord],
 ) -> None:
-    small, large = (instructions_of(held_already(record), "/service/") for record in records)
+    small, large = (lines_of(held_already(record), "/service/") for record in records)
     assert large == small

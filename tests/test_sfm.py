@@ -17,7 +17,7 @@ from service.compute.poses.sfm import SfmModel, reconstruct, reconstruct_from
 from service.compute.poses.sfm_options import SfmOptions
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Transform, align_points, apply, inverse, transform
-from tests.support.counting import instructions_of
+from tests.support.counting import lines_of
 from tests.support.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
 OPTIONS = SfmOptions(max_features=1500, neighbours=4)
@@ -229,7 +229,7 @@ def test_twice_as_many_images_are_twice_the_work() -> None:
     def work(count: int) -> int:
         names = [f"v{k:03d}" for k in range(count)]
         prior = dict(zip(names, ring_of_poses(count), strict=True))
-        return instructions_of(lambda: choose_pairs(names, prior, 6, 60.0), "/service/")
+        return lines_of(lambda: choose_pairs(names, prior, 6, 60.0), "/service/")
 
     assert work(120) < 2.3 * work(60)
 
