@@ -335,6 +335,7 @@ _TELLING = (
     "error",
     "message",
     "note",
+    "text",
     "why",
     "reason",
     "meaning",

@@ -19,8 +19,10 @@ from service.web import (
     held_pages,
     home_pages,
     media,
+    note_pages,
     run_pages,
     scene_pages,
+    start_pages,
     stream,
 )
 from service.web.seal import sealed
@@ -30,8 +32,10 @@ from service.web.site import Site
 _PAGES = (
     account_pages,
     home_pages,
+    start_pages,
     run_pages,
     acting,
+    note_pages,
     stream,
     capture_pages,
     held_pages,
