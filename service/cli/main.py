@@ -23,6 +23,8 @@ _COMMANDS = {
     "note": "service.cli.act:note_command",
     "status": "service.cli.run:status_command",
     "runs": "service.cli.runs:runs_command",
+    "compare": "service.cli.runs:compare_command",
+    "history": "service.cli.runs:history_command",
     "worker": "service.cli.worker:worker_command",
     "doctor": "service.cli.doctor:doctor_command",
     "calibrate": "service.cli.calibrate:calibrate_app",

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from datetime import date
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
+from service.audit.history import history, history_csv
+from service.audit.run_comparison import ComparedRun, RunComparison, compare_runs
 from service.audit.run_search import RESULT_WORDS, RESULTS, FoundRun, RunWanted, find_runs
 from service.cli.common import (
     DEFAULT_DATA,
@@ -19,7 +22,10 @@ from service.cli.common import (
     print_json,
     print_table,
     reporting_errors,
+    require_writable,
 )
+from service.evidence import RunLog
+from service.runs import recorded_run
 from service.store.store import Store
 
 
@@ -89,3 +95,80 @@ def _day(given: str, option: str) -> str:
         return date.fromisoformat(given).isoformat() if given else ""
     except ValueError as error:
         raise typer.BadParameter(f"{given!r} is no day such as 2026-11-21", param_hint=option) from error
+
+
+def compare_command(
+    first: Annotated[str, typer.Argument(help="A run: its name, its first characters, or `latest`.")],
+    second: Annotated[str, typer.Argument(help="The run to hold against it.")],
+    everything: Annotated[bool, typer.Option("--all", help="Also what is the same in both.")] = False,
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """Hold two runs side by side: protocol, gates, figures, accuracy, calibration, durations, deviations."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        comparison = compare_runs(_compared(store, first), _compared(store, second))
+    if json:
+        print_json(_comparison_record(comparison))
+        return
+    one, other = comparison.first.run_id, comparison.second.run_id
+    if comparison.same_protocol:
+        console.print(f"The same protocol, SHA-256 {comparison.first.root.protocol_sha256}")
+    else:
+        console.print(f"{len(comparison.protocol_changes)} lines of the protocol differ (− {one}, + {other}):")
+        for line in comparison.protocol_changes:
+            console.print(f"  {escape(line)}")
+    for part in _PARTS:
+        rows = [row for row in getattr(comparison, part) if everything or row.differs]
+        if not rows:
+            continue
+        table = Table(title=part.capitalize(), title_justify="left", box=None, pad_edge=False)
+        for heading in ("", one, other, "change"):
+            table.add_column(heading)
+        for row in rows:
+            name = " ".join(filter(None, (row.step, row.name))).replace("_", " ")
+            table.add_row(*map(escape, (name, row.first, row.second, row.change)))
+        print_table(table)
+    for run_id, lines in zip((one, other), comparison.deviations, strict=True):
+        console.print(f"Deviations of {run_id}: {len(lines) or 'none'}")
+        for line in lines:
+            console.print(f"  {escape(line)}")
+
+
+_PARTS = ("about", "accuracy", "gates", "calibration", "durations", "measures")
+
+
+def _compared(store: Store, name: str) -> ComparedRun:
+    run_id = store.find_run(name)
+    protocol, root = recorded_run(store, run_id)
+    source = store.artefact_path(root.protocol.sha256, verify=True).read_text("utf-8")
+    log = RunLog(store, run_id, protocol)
+    return ComparedRun(run_id, root, protocol, source, log.events, log.state)
+
+
+def _comparison_record(comparison: RunComparison) -> dict[str, object]:
+    parts = {part: [asdict(row) for row in getattr(comparison, part)] for part in _PARTS}
+    return {
+        "first": comparison.first.run_id,
+        "second": comparison.second.run_id,
+        "same_protocol": comparison.same_protocol,
+        "protocol_changes": list(comparison.protocol_changes),
+        **parts,
+        "deviations": [list(lines) for lines in comparison.deviations],
+    }
+
+
+def history_command(
+    out: Annotated[Path | None, typer.Option("--out", help="Write into this file.", dir_okay=False)] = None,
+    data: DataOption = DEFAULT_DATA,
+) -> None:
+    """Calibration and accuracy over time for each camera, lens and arm, as CSV."""
+    with reporting_errors(), Store.open(data, create=False) as store:
+        if out is not None:
+            require_writable(out)
+        rows = history(store)
+        content = history_csv(rows)
+    if out is None:
+        typer.echo(content, nl=False)
+        return
+    out.write_text(content, encoding="utf-8", newline="")
+    console.print(f"{len(rows)} runs with figures: {escape(str(out))}")
