@@ -60,7 +60,7 @@ def test_two_runs_stand_side_by_side_on_a_page(two: Two) -> None:
     assert "rms px 0.03 px 0.03 px" in page
     assert "Camera fx 2033.77 px 2033.77 px" in page
     assert "Whole run" in page
-    assert "redo: capture done again: the cable was loose (grace)" in page or "the cable was loose" in page
+    assert page.count("the cable was loose") == 2
     assert "State completed active differs" in page
 
 
@@ -168,11 +168,10 @@ def test_a_chart_places_points_by_time_and_value() -> None:
     assert chart is not None
     first, middle, last = chart.marks
     assert abs(middle.x - (first.x + last.x) / 2) < 0.2
-    assert first.y > middle.y > chart.limit > last.y if chart.limit is not None else False
-    assert len(chart.lines) == 1  # real ones; a single simulated point has none
-    assert [tick.text for tick in chart.x_ticks] == ["2026-11-02", "2026-11-03", "2026-11-04", "2026-11-05"] or all(
-        tick.text.startswith("2026-11-0") for tick in chart.x_ticks
-    )
+    assert chart.limit is not None
+    assert first.y > middle.y > chart.limit > last.y
+    assert len(chart.lines) == 1  # of real rigs; a single simulated value has none
+    assert [tick.text for tick in chart.x_ticks] == ["2026-11-02", "2026-11-03", "2026-11-04", "2026-11-05"]
     focal = time_chart(points[:1], title="Focal length", unit="px", from_zero=False)
     assert focal is not None
     assert focal.marks[0].x == pytest.approx((focal.left + focal.right) / 2, abs=0.2)

@@ -207,7 +207,8 @@ def _calibration(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
         turned = here[:3, :3].T @ there[:3, :3]
         turned_deg = math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(turned)) - 1) / 2))))
         where = [f"{1e3 * T[0, 3]:.2f}, {1e3 * T[1, 3]:.2f}, {1e3 * T[2, 3]:.2f} mm" for T in (here, there)]
-        yield _row("Camera on the flange", *where, change=f"{moved_mm:.3f} mm, {turned_deg:.4f}°")
+        change = f"{moved_mm:.3f} mm, {turned_deg:.4f}°" if not np.array_equal(here, there) else ""
+        yield _row("Camera on the flange", *where, change=change)
 
 
 def _calibrated(run: ComparedRun) -> tuple[Mapping[str, float], Any, Mapping[str, float]]:
@@ -254,7 +255,7 @@ def _took(seconds: float | None) -> str:
 
 
 def _longer(first: float | None, second: float | None) -> str:
-    if first is None or second is None or first == second:
+    if first is None or second is None or _took(first) == _took(second):
         return ""
     return ("+" if second > first else "−") + _took(second - first)
 
