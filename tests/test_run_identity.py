@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import zipfile
 from collections.abc import Generator
 from html import unescape
 from pathlib import Path
@@ -14,6 +15,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from service.audit import verifier
+from service.audit.bundle import export_bundle
 from service.audit.recorded import read_run
 from service.audit.report_content import report_content
 from service.audit.report_html import render_html
@@ -22,6 +25,7 @@ from service.cli.main import app
 from service.core.entered import NoteTaken
 from service.core.model import PAYLOAD, RunAborted, RunStarted
 from service.store.audit import verify
+from service.store.signing import checkpoint
 from tests.support.web import Browser, WebSite, web_site
 
 ENTERED = {
@@ -311,3 +315,25 @@ def test_a_note_from_the_command_line(web: WebSite, tmp_path: Path) -> None:
     assert refused.exit_code == 1
     assert "neither a JPEG nor a PNG" in refused.stderr
     assert verify(web.site.data, run_id).ok
+
+
+def test_a_bundle_with_notes_verifies_elsewhere_and_an_altered_note_does_not(web: WebSite, tmp_path: Path) -> None:
+    browser = web.browser("technician")
+    run_id = start(browser)
+    note(browser, run_id, "the wire slipped", jpeg())
+    web.store.record(run_id, [RunAborted(reason="enough")], actor="runner")
+    checkpoint(web.store, run_id)
+    made = export_bundle(web.store, run_id, tmp_path / "bundle.zip", actor="ada")
+    with zipfile.ZipFile(made.path) as archive:
+        archive.extractall(tmp_path / "bundle")
+    whole = verifier.Check()
+    whole.run(tmp_path / "bundle", None, None)
+    assert whole.faults == []
+    (taken,) = notes(web, run_id)
+    assert taken.photograph is not None
+    assert list((tmp_path / "bundle").rglob(f"*{taken.photograph.sha256}*"))
+    record = next((tmp_path / "bundle").rglob("events.jsonl"))
+    record.write_text(record.read_text().replace("the wire slipped", "the wire held"))
+    altered = verifier.Check()
+    altered.run(tmp_path / "bundle", None, None)
+    assert altered.faults
