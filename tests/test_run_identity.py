@@ -20,6 +20,7 @@ from service.audit.bundle import export_bundle
 from service.audit.recorded import read_run
 from service.audit.report_content import report_content
 from service.audit.report_html import render_html
+from service.audit.report_pdf import write_pdf
 from service.audit.run_search import RunWanted, find_runs
 from service.cli.main import app
 from service.core.entered import NoteTaken
@@ -169,6 +170,15 @@ def test_a_note_with_a_photograph_is_evidence_and_shown_everywhere(web: WebSite)
     assert "Spine 7, L1–L5" in report
     bare = render_html(report_content(recorded, verify(web.site.data, run_id), with_pictures=False))
     assert report.count("data:image/jpeg") == bare.count("data:image/jpeg") + 1
+
+
+def test_the_longest_texts_fit_into_a_printed_report(web: WebSite, tmp_path: Path) -> None:
+    browser = web.browser("technician")
+    run_id = start(browser, specimen="W" * 200, text="WWWWW MMM " * 400)
+    for text in ("W" * 4000, "W MMMMM " * 500, "x\n" * 1999):
+        assert note(browser, run_id, text).status_code == 303
+    write_pdf(report_content(read_run(web.site.data, run_id), verify(web.site.data, run_id)), tmp_path / "report.pdf")
+    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_a_photograph_that_is_altered_afterwards_is_found(web: WebSite) -> None:
