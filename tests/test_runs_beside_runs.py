@@ -171,7 +171,7 @@ def test_a_chart_places_points_by_time_and_value() -> None:
     assert chart.limit is not None
     assert first.y > middle.y > chart.limit > last.y
     assert len(chart.lines) == 1  # of real rigs; a single simulated value has none
-    assert [tick.text for tick in chart.x_ticks] == ["2026-11-02", "2026-11-03", "2026-11-04", "2026-11-05"]
+    assert [tick.text for tick in chart.x_ticks] == ["2026-11-03", "2026-11-05"]
     focal = time_chart(points[:1], title="Focal length", unit="px", from_zero=False)
     assert focal is not None
     assert focal.marks[0].x == pytest.approx((focal.left + focal.right) / 2, abs=0.2)

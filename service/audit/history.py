@@ -132,8 +132,9 @@ def _calibrations(connection: Connection) -> dict[str, tuple[_Calibration, ...]]
             "SELECT e.run_id, e.at_utc, json_extract(e.payload, '$.step') AS step, "
             "json_extract(e.payload, '$.measures') AS measures, "
             "json_extract(e.payload, '$.result.camera') AS camera, "
-            "json_extract(e.payload, '$.result.robots') AS robots FROM event_index AS i JOIN events AS e "
-            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE i.kind = 'step_measured' AND json_valid(e.payload) "
+            "json_extract(e.payload, '$.result.robots') AS robots FROM runs AS r CROSS JOIN event_index AS i "
+            "ON i.run_id = r.run_id AND i.kind = 'step_measured' CROSS JOIN events AS e "
+            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE json_valid(e.payload) "
             "AND json_type(e.payload, '$.result.camera') = 'object' ORDER BY e.run_id, e.seq"
         )
     )
@@ -153,8 +154,9 @@ def _devices(connection: Connection) -> dict[str, dict[str, Mapping[str, Any]]]:
     rows = connection.execute(
         text(
             "SELECT e.run_id, json_extract(e.payload, '$.device') AS device, "
-            "json_extract(e.payload, '$.report.identity') AS identity FROM event_index AS i JOIN events AS e "
-            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE i.kind = 'device_opened' AND json_valid(e.payload) "
+            "json_extract(e.payload, '$.report.identity') AS identity FROM runs AS r CROSS JOIN event_index AS i "
+            "ON i.run_id = r.run_id AND i.kind = 'device_opened' CROSS JOIN events AS e "
+            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE json_valid(e.payload) "
             "AND json_type(e.payload, '$.report.identity') = 'object' ORDER BY e.run_id, e.seq"
         )
     )
@@ -168,10 +170,9 @@ def _optics(connection: Connection) -> dict[str, Mapping[str, Any]]:
     """By run: what the first photograph says of camera and lens."""
     rows = connection.execute(
         text(
-            "SELECT e.run_id, json_extract(e.payload, '$.camera') AS camera FROM events AS e JOIN "
-            "(SELECT run_id, min(seq) AS seq FROM event_index "
-            "WHERE kind IN ('viewpoint_captured', 'view_held', 'view_imported') GROUP BY run_id) AS f "
-            "ON e.run_id = f.run_id AND e.seq = f.seq WHERE json_valid(e.payload)"
+            "SELECT e.run_id, json_extract(e.payload, '$.camera') AS camera FROM runs AS r CROSS JOIN events AS e "
+            "ON e.run_id = r.run_id AND e.seq = (SELECT min(i.seq) FROM event_index AS i WHERE i.run_id = r.run_id "
+            "AND i.kind IN ('viewpoint_captured', 'view_held', 'view_imported')) WHERE json_valid(e.payload)"
         )
     )
     return {row.run_id: json.loads(row.camera) for row in rows if row.camera}
