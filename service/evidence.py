@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from threading import Lock
 from typing import Literal
 
 from service.core.decide import advance, fold
@@ -55,6 +56,8 @@ class RunLog:
     state: RunState = field(init=False)
     leave_not_before_s: float = field(init=False, default=-math.inf)
     _looked_s: float = field(init=False, default=-math.inf)
+    # The web has one log of a run for all its threads: an event that two of them read must be taken once.
+    _refreshing: Lock = field(init=False, default_factory=Lock, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         self.state = fold(self.protocol, [])
@@ -62,14 +65,15 @@ class RunLog:
 
     def refresh(self) -> RunState:
         """Read what other processes (worker, command line, web) have appended meanwhile."""
-        leave, looked_s = self.state.leave, time.monotonic()
-        for event in self.store.events(self.run_id, after_seq=len(self.events)):
-            self.events.append(event)
-            self.state = advance(self.protocol, self.state, event)
-        if self.state.leave != leave:
-            self.leave_not_before_s = self._looked_s
-        self._looked_s = looked_s
-        return self.state
+        with self._refreshing:
+            leave, looked_s = self.state.leave, time.monotonic()
+            for event in self.store.events(self.run_id, after_seq=len(self.events)):
+                self.events.append(event)
+                self.state = advance(self.protocol, self.state, event)
+            if self.state.leave != leave:
+                self.leave_not_before_s = self._looked_s
+            self._looked_s = looked_s
+            return self.state
 
     def captures(self, step_id: str) -> tuple[View, ...]:
         """The valid captures of a step's current attempt, in order."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from ipaddress import ip_address
 from pathlib import Path
 
+from service.core.entered import RunAbout
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.model import ActionAfterEnd, ActionRefused, OperatorAction, RunStarted
 from service.core.protocol import LoadedProtocol, Protocol
@@ -20,8 +21,16 @@ from service.store.timestamping import Authority
 _SCHEMES = ("ptpip:", "socket://")
 
 
-def start_run(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, auto_confirm: bool) -> str:
-    """Record the root of a new run's chain; its name.
+def start_run(
+    store: Store,
+    loaded: LoadedProtocol,
+    rig: Rig,
+    *,
+    operator: str,
+    auto_confirm: bool,
+    about: RunAbout | None = None,
+) -> str:
+    """Record the root of a new run's chain, with what was entered of it; its name.
 
     Raises ConfigurationError when automatic confirmation is asked for on anything but a simulated rig, and
     SpaceShortError on a disk on which nothing could be captured.
@@ -51,6 +60,7 @@ def start_run(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, 
         operator=operator,
         software=software_versions(),
         origin="imported" if imported else "captured",
+        about=about if about != RunAbout() else None,
     )
     return store.create_run(payload, operator, [NewArtefact(protocol, "runner"), NewArtefact(rig_ref, "runner")])
 

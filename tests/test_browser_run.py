@@ -102,6 +102,7 @@ def start(tablet: Screen) -> str:
     """A run of the short protocol; its name."""
     tablet.go("/")
     tablet.page.get_by_role("button", name="Start A short protocol").click()
+    tablet.page.get_by_role("button", name="Start the run").click()
     expect(tablet.page.get_by_role("heading", name="Fix the specimen and place the spheres")).to_be_visible(
         timeout=LONG_MS
     )

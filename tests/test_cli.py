@@ -23,7 +23,10 @@ from tests.support.bench_run import PROTOCOL, record_runs
 
 ROOT = Path(__file__).parents[1]
 COMMAND = Path(sys.executable).with_name("orthocapture")
-COMMANDS = ("demo", "run", "resume", "act", "status", "worker", "doctor", "register", "simulate", "audit", "protocol")
+COMMANDS = (
+    "demo", "run", "resume", "act", "note", "status", "runs", "compare", "history", "worker", "doctor", "register",
+    "simulate", "audit", "protocol",
+)  # fmt: skip
 
 
 def invoke(*arguments: object) -> Result:

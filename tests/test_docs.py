@@ -158,6 +158,9 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture status latest --data runs": succeeds,
     "orthocapture plan next latest --data runs": succeeds,
     "orthocapture act pause --run latest --data runs": succeeds,
+    'orthocapture note "a wire slipped" --run latest --data runs': succeeds,
+    "orthocapture runs --search spine --data runs": succeeds,
+    "orthocapture history --out history.csv --data runs": succeeds,
     "orthocapture worker --data runs": serves_until_terminated,
     "orthocapture serve --rig rig.yaml --data runs": serves_pages,
     "orthocapture audit report latest --pdf report.pdf --data runs": succeeds,
@@ -174,6 +177,9 @@ RUN_HERE: dict[str, Check] = {
 }
 # Commands that take minutes or a whole rig: the test of the suite that runs them.
 RUN_ELSEWHERE = {
+    "orthocapture compare RUN OTHER --data runs": (
+        "tests/test_runs_beside_runs.py::test_two_runs_side_by_side_in_the_terminal"
+    ),
     "orthocapture replay latest --data runs": "tests/test_replay.py::test_command_says_equal_with_status_0",
     "orthocapture calibrate intrinsics --images DIR --board 16x23 --square-mm 15 --out camera.json": (
         "tests/test_intrinsics_command.py::test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads"

@@ -156,8 +156,8 @@ def test_the_first_page_lists_runs_and_starts_protocols(web: WebSite, run_id: st
     assert page.index(run_id) < page.index(ended)
     assert "A small procedure" in page
     assert "Cannot be started" in page
-    assert 'value="bench.yaml"' in page
-    assert 'value="bench.yaml"' not in web.browser("auditor").get("/").text
+    assert 'href="/start?protocol=bench.yaml"' in page
+    assert 'href="/start?protocol=bench.yaml"' not in web.browser("auditor").get("/").text
 
 
 def test_the_theme_is_remembered_and_leads_nowhere_else(web: WebSite) -> None:

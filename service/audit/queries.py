@@ -320,25 +320,12 @@ def _event_row(row: Any, *, whole: bool) -> EventRow:
     )
 
 
+# fmt: off
 _TELLING = (
-    "viewpoint",
-    "station",
-    "action",
-    "item",
-    "device",
-    "job_kind",
-    "what",
-    "account",
-    "outcome",
-    "field",
-    "measure",
-    "error",
-    "message",
-    "note",
-    "why",
-    "reason",
-    "meaning",
-)  # fmt: skip - one line of names reads better
+    "viewpoint", "station", "action", "item", "device", "job_kind", "what", "account", "outcome", "field", "measure",
+    "error", "message", "note", "text", "why", "reason", "meaning",
+)
+# fmt: on
 
 
 def headline(payload: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ from service.audit.report_accuracy import accuracy_section, budget_section, late
 from service.audit.report_blocks import Cell, Facts, Paragraph, Report, Section
 from service.audit.report_certificates import certificate_sections
 from service.audit.report_course import deviations, deviations_section, people_section, steps_section
+from service.audit.report_notes import about_facts, notes_section
 from service.audit.report_origin import devices_section, pictures_section, software_section
 from service.audit.report_verification import verification_section
 from service.audit.report_words import duration, utc
@@ -48,6 +49,7 @@ def report_content(
         budget_section(summary),
         steps_section(run),
         people_section(run),
+        notes_section(run, with_pictures=with_pictures),
         *certificate_sections(run),
         devices_section(run),
         pictures_section(run, with_scene=with_scene)
@@ -116,6 +118,7 @@ def _facts(run: RecordedRun) -> Facts:
     return Facts(
         (
             ("Run", run.run_id),
+            *about_facts(run),
             ("Begun", utc(events[0].at_utc)),
             ("Last record", f"{utc(events[-1].at_utc)}, after {duration(events[0].at_utc, events[-1].at_utc)}"),
             (

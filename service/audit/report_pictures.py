@@ -15,13 +15,16 @@ THUMBNAIL_PX = 300
 LARGE_PX = 1400
 
 
-def picture(run: RecordedRun, sha256: str, caption: str, width_px: int) -> Picture:
-    """A JPEG copy no wider than this, without the camera's own data; empty where the file is missing or altered."""
+def picture(run: RecordedRun, sha256: str, caption: str, width_px: int, *, upright: bool = False) -> Picture:
+    """A JPEG copy no wider than this, without the camera's own data; empty where the file is missing or altered.
+
+    `upright`: turned as its orientation tag says, which what is measured in never is.
+    """
     try:
         path = run.files.artefact_path(sha256, verify=True)
     except IntegrityError:
         return Picture(f"{caption}: the file is missing or was altered", None)
-    pixels = _read(path, width_px)
+    pixels = _read(path, width_px, 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         return Picture(f"{caption}: the file cannot be read as a picture", None)
     height, width = pixels.shape[:2]
@@ -32,11 +35,11 @@ def picture(run: RecordedRun, sha256: str, caption: str, width_px: int) -> Pictu
     return Picture(caption, jpeg, pixels.shape[1], pixels.shape[0])
 
 
-def _read(path: Path, width_px: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None:
+def _read(path: Path, width_px: int, how: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]] | None:
     """Thumbnails are decoded at an eighth where the photograph is large enough: 60 MP take long otherwise."""
     if width_px <= THUMBNAIL_PX:
-        small = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_4 | cv2.IMREAD_IGNORE_ORIENTATION)
+        small = cv2.imread(str(path), cv2.IMREAD_REDUCED_COLOR_4 | how)
         if small is not None and small.shape[1] >= width_px:
             return np.asarray(small, dtype=np.uint8)
-    found = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    found = cv2.imread(str(path), cv2.IMREAD_COLOR | how)
     return None if found is None else np.asarray(found, dtype=np.uint8)

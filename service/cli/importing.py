@@ -12,6 +12,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
+from service.cli.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -25,6 +26,7 @@ from service.cli.common import (
 )
 from service.cli.import_operator import part_of
 from service.cli.run import OperatorOption, WorkerOption, drive
+from service.core.entered import RunAbout, about_run
 from service.core.errors import ConfigurationError
 from service.core.imported import FileRole, ImportedView, ImportList, PhotographRole
 from service.core.protocol import LoadedProtocol, Protocol, load_protocol
@@ -71,6 +73,10 @@ def import_command(
     data: DataOption = DEFAULT_DATA,
     operator: OperatorOption = "",
     worker: WorkerOption = True,
+    specimen: SpecimenOption = "",
+    purpose: PurposeOption = "",
+    site: SiteOption = "",
+    remarks: RemarksOption = "",
     json: JsonOption = False,
 ) -> None:
     """Import photographs, scan and CT that were captured earlier; register and evaluate them as a run.
@@ -86,6 +92,7 @@ def import_command(
         "ct": ct,
     }
     with reporting_errors(json):
+        about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
         loaded = load_protocol(protocol, params_models())
         with progress_bar(quiet=json) as progress:
             parts: set[PhotographRole | FileRole] = set()
@@ -103,7 +110,8 @@ def import_command(
             return
         rig = import_rig(listing, simulated=simulated)
         with Store.open(data) as store:
-            run_id = _run_of(store, loaded, rig, operator=operator or getpass.getuser(), again=again)
+            name = operator or getpass.getuser()
+            run_id = _run_of(store, loaded, rig, operator=name, again=again, about=about)
             state = drive(store, run_id, rig, data=data, auto_confirm=False, worker=worker)
             summary = summarise(store, run_id, loaded.protocol)
             table, note = summary.table(), shared_adjustment_note(loaded.protocol, summary.state)
@@ -129,7 +137,7 @@ def _require_wanted(protocol: Protocol, listing: ImportList) -> None:
             )
 
 
-def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, again: bool) -> str:
+def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, again: bool, about: RunAbout) -> str:
     """The run of this very list that has not ended, or a new one.
 
     Raises ConfigurationError when the list was imported before, or when its files come from a simulated run.
@@ -155,7 +163,7 @@ def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, ag
                 where=str(rig.path.parent),
                 remedy="Import them with --simulated, which marks the run",
             )
-    return start_run(store, loaded, rig, operator=operator, auto_confirm=False)
+    return start_run(store, loaded, rig, operator=operator, auto_confirm=False, about=about)
 
 
 # --- what is shown ----------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""`orthocapture run`, `resume`, `act` and `status`: a protocol from its first step to its last."""
+"""`orthocapture run`, `resume` and `status`: a protocol from its first step to its last."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from drivers.interfaces import Camera, Lightbox, RobotArm
+from service.cli.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
 from service.cli.beside import worker_beside
 from service.cli.common import (
     DEFAULT_DATA,
@@ -31,11 +32,11 @@ from service.cli.hands import SimulatedHands
 from service.cli.import_operator import ImportOperator
 from service.cli.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
 from service.cli.waiting import wait_for_results
-from service.core.actions import VERBS, capture_refusal, record_to_sign, refuse
-from service.core.errors import ConfigurationError, IllegalTransitionError
+from service.core.entered import about_rows, about_run
+from service.core.errors import ConfigurationError
 from service.core.fold import fold
 from service.core.gates import Standing, describe, standing
-from service.core.model import CaptureAsked, GateVerdict, OperatorAction
+from service.core.model import GateVerdict
 from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState, StepState
 from service.core.ways_on import takes_words, ways_on
@@ -45,11 +46,10 @@ from service.monitor.alarm import alarm_of
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.approvals import approve
 from service.people.people import People
-from service.people.proof import Identity, identity_for, who_acts
+from service.people.proof import Identity, who_acts
 from service.rig import Rig, load_rig
 from service.runner import Runner
 from service.runs import (
-    record_refusal,
     recorded_rig,
     recorded_run,
     require_rig_free,
@@ -75,7 +75,6 @@ PasswordOption = Annotated[
     bool, typer.Option("--password-stdin", help="Where an action demands a role: read the password from stdin.")
 ]
 WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
-_OF_A_CAPTURE = ("release", "finish")
 
 
 def run_command(
@@ -90,18 +89,23 @@ def run_command(
         str,
         typer.Option("--approve-change", help="Why a content other than the approved one is right."),
     ] = "",
+    specimen: SpecimenOption = "",
+    purpose: PurposeOption = "",
+    site: SiteOption = "",
+    remarks: RemarksOption = "",
     json: JsonOption = False,
 ) -> None:
     """Run a protocol step by step. Nothing moves before you have confirmed it."""
     with reporting_errors(json):
+        about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
         loaded = load_protocol(protocol, params_models())
         rig_file = load_rig(rig)
         with Store.open(data) as store:
             name = operator or getpass.getuser()
-            who = who_acts(People(store), name, partial(_password, name, from_stdin=password_stdin))
+            who = who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin))
             if not auto_confirm:  # which is for simulated rigs
                 approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
-            run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm)
+            run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm, about=about)
             state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
         _report_end(run_id, state, json=json)
 
@@ -125,97 +129,8 @@ def resume_command(
         _report_end(run_id, state, json=json)
 
 
-def act_command(
-    verb: Annotated[
-        str,
-        typer.Argument(
-            help="confirm, sign, redo, skip, accept, pause, resume or abort; of a capture by hand: release or finish."
-        ),
-    ],
-    run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
-    step: Annotated[str | None, typer.Option("--step", help="The step, if it is not the current one.")] = None,
-    viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo this viewpoint alone.")] = None,
-    reason: Annotated[str, typer.Option("--reason", help="Why; needed for redo, skip, accept and abort.")] = "",
-    meaning: Annotated[str, typer.Option("--meaning", help="What a signature says.")] = "",
-    operator: OperatorOption = "",
-    password_stdin: PasswordOption = False,
-    data: DataOption = DEFAULT_DATA,
-    json: JsonOption = False,
-) -> None:
-    """Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist."""
-    if verb not in (*VERBS, *_OF_A_CAPTURE):
-        raise typer.BadParameter(f"{verb!r} is none of {', '.join((*VERBS, *_OF_A_CAPTURE))}", param_hint="VERB")
-    with reporting_errors(json), Store.open(data, create=False) as store:
-        run_id = store.find_run(run)
-        protocol, _ = recorded_run(store, run_id)
-        state = fold(protocol, store.events(run_id))
-        name = operator or getpass.getuser()
-        if verb in _OF_A_CAPTURE:
-            name = who_acts(People(store), name, partial(_password, name, from_stdin=password_stdin)).name
-            asked = step or state.current
-            _ask_capture(
-                store,
-                run_id,
-                protocol,
-                state,
-                CaptureAsked.model_validate({"step": asked, "attempt": state.step.attempt, "what": verb}),
-                name,
-            )
-            _report_recorded(run_id, verb, asked, name, json=json)
-            return
-        identity = identity_for(
-            People(store), protocol, state, verb, name, partial(_password, name, from_stdin=password_stdin)
-        )
-        if identity is None and verb == "pause":  # the safe direction: nobody is kept from it
-            identity = Identity(name, "", "claimed")
-        identity = identity or who_acts(People(store), name, partial(_password, name, from_stdin=password_stdin))
-        name = identity.name
-        action = OperatorAction(
-            action=verb,
-            step=step or state.current,
-            viewpoint=viewpoint,
-            reason=reason,
-            checklist=protocol.step(state.current).checklist if verb == "confirm" else (),
-            meaning=meaning,
-            signed_sha256=signed_by_verb(verb, protocol, state),
-            role=identity.role,
-            identified=identity.identified,
-        )
-        refusal = refuse(protocol, state, action, name)
-        if refusal is not None:
-            record_refusal(store, run_id, state, action, refusal, name)
-            raise refusal
-        store.record(run_id, [action], actor=name)
-        _report_recorded(run_id, verb, action.step, name, json=json)
-
-
-def _ask_capture(
-    store: Store, run_id: str, protocol: Protocol, state: RunState, asked: CaptureAsked, name: str
-) -> None:
-    """Ask a capture by hand for a release of the shutter, or to end with what it has."""
-    if asked.step not in protocol.step_ids:
-        raise IllegalTransitionError(f"there is no step {asked.step!r}", where=asked.what)
-    refusal = capture_refusal(protocol, state, asked.step, asked.attempt)
-    if refusal is not None:
-        raise refusal
-    store.record(run_id, [asked], actor=name)
-
-
-def _report_recorded(run_id: str, verb: str, step: str | None, name: str, *, json: bool) -> None:
-    if json:
-        print_json({"run": run_id, "recorded": verb, "step": step})
-    else:
-        console.print(f"Recorded: {verb} of {step} by {escape(name)}")
-
-
-def signed_by_verb(verb: str, protocol: Protocol, state: RunState) -> str:
-    """SHA-256 of the event that an action binds; "" for one that is no signature."""
-    if verb == "accept":
-        return state.step.gates_sha256
-    return record_to_sign(protocol, state) if verb == "sign" else ""
-
-
-def _password(name: str, *, from_stdin: bool) -> str:
+def typed_password(name: str, *, from_stdin: bool) -> str:
+    """A password from the keyboard, or the next line of stdin. Raises ConfigurationError where none is given."""
     if from_stdin:
         return sys.stdin.readline().rstrip("\n")
     try:
@@ -232,12 +147,13 @@ def status_command(
     """Show how far a run is: steps, gates, deviations."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
-        protocol, _ = recorded_run(store, run_id)
+        protocol, root = recorded_run(store, run_id)
         log = RunLog(store, run_id, protocol)
         state, missing = log.state, [left.text for left in results_to_come(log)]
     if json:
         ways = [asdict(way) for way in ways_on(protocol, state)]
-        print_json(status_record(run_id, state) | {"still_to_come": missing, "ways_on": ways})
+        about = None if root.about is None else root.about.model_dump()
+        print_json(status_record(run_id, state) | {"about": about, "still_to_come": missing, "ways_on": ways})
         return
     table = Table(title=f"Run {run_id}: {state.status}", title_justify="left")
     for heading in ("step", "state", "attempt", "views", "gates"):
@@ -248,6 +164,8 @@ def status_command(
         phase = "skipped" if now.skipped else now.phase.replace("_", " ")
         table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), escape(gates))
     print_table(table)
+    for name, entered in about_rows(root.about):
+        console.print(f"{name}: {escape(entered)}")
     live = [job for job in state.step.jobs.values() if job.kind == "live_view" and job.status != "enqueued"]
     for job in live[-3:]:
         console.print(escape(describe_view(job)))
@@ -346,7 +264,7 @@ def drive(
     else:
         preview = partial(_preview, protocol, rig)
         people = People(store)
-        who = who or who_acts(people, root.operator, partial(_password, root.operator, from_stdin=False))
+        who = who or who_acts(people, root.operator, partial(typed_password, root.operator, from_stdin=False))
         operator = TerminalOperator(who.name, protocol, display, hands, preview=preview, people=people, who=who)
     # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)

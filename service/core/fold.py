@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from service.core.actions import needs_leave, unmet_requirements
+from service.core.entered import NoteTaken
 from service.core.errors import IllegalTransitionError, IntegrityError
 from service.core.gates import evaluate_gates
 from service.core.lifecycle import lifecycle
@@ -185,10 +186,6 @@ def _session_started(protocol: Protocol, state: RunState, event: Event, p: Sessi
     state = replace(state, sessions=state.sessions + 1, restarted=p.resumed, leave=None if p.resumed else state.leave)
     # Who lets the robot move again looks again: what was ticked was true before the program ended.
     return change(state, state.current, ticked=()) if needs_leave(protocol, state) else state
-
-
-def _device_opened(protocol: Protocol, state: RunState, event: Event, p: DeviceOpened) -> RunState:
-    return state
 
 
 def _device_trouble(protocol: Protocol, state: RunState, event: Event, p: DeviceTrouble) -> RunState:
@@ -426,14 +423,14 @@ def _run_released(protocol: Protocol, state: RunState, event: Event, p: RunRelea
     return replace(state, released_by=event.actor)
 
 
-def _evidence_exported(protocol: Protocol, state: RunState, event: Event, p: EvidenceExported) -> RunState:
+def _no_effect(protocol: Protocol, state: RunState, event: Event, p: object) -> RunState:
     return state
 
 
 _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunState]] = {
     RunStarted: _run_started,
     SessionStarted: _session_started,
-    DeviceOpened: _device_opened,
+    DeviceOpened: _no_effect,
     DeviceTrouble: _device_trouble,
     StepStarted: _step_started,
     FilesKept: _files_kept,
@@ -455,9 +452,10 @@ _HANDLERS: Mapping[type[Any], Callable[[Protocol, RunState, Event, Any], RunStat
     RunAborted: _run_aborted,
     ActionRefused: _action_refused,
     ItemTicked: _item_ticked,
+    NoteTaken: _no_effect,
     ControlTaken: _control_taken,
     RecordCorrected: _record_corrected,
     RunReleased: _run_released,
-    EvidenceExported: _evidence_exported,
+    EvidenceExported: _no_effect,
     OperatorAction: apply_action,
 }

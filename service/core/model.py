@@ -4,29 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import Field, TypeAdapter
+
+from service.core.entered import NoteTaken, RunAbout
+from service.core.record import ArtefactRef, Record
 
 Matrix4 = tuple[tuple[float, float, float, float], ...]  # T_a_b row-major, metres
-
-
-class Record(BaseModel):
-    """Base of everything that is written down: frozen, no unknown fields."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-# --- artefacts ---------------------------------------------------------------------------------------
-
-
-class ArtefactRef(Record):
-    """A content-addressed file, as events refer to it."""
-
-    sha256: str
-    kind: str  # image, raw, board_image, scan, ct_slice, ct_mesh, pose_log, result, report, protocol, rig …
-    media_type: str
-    size_bytes: int
-    original_name: str
-
 
 # --- operator ------------------------------------------------------------------------------------------
 
@@ -78,6 +61,7 @@ class RunStarted(Record):
     software: dict[str, str]  # distribution → version
     # imported: the photographs were captured earlier, elsewhere; `rig` is then the list of what was imported
     origin: Literal["captured", "imported"] = "captured"
+    about: RunAbout | None = None  # None: nothing was entered
 
 
 class HostClock(Record):
@@ -557,6 +541,7 @@ Payload = Annotated[
     | RunCompleted
     | RunAborted
     | ItemTicked
+    | NoteTaken
     | ControlTaken
     | RecordCorrected
     | RunReleased

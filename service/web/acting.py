@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends, Form, Path
 from fastapi.responses import RedirectResponse
 
 from service.core.actions import needs_leave, refuse
+from service.core.entered import NoteTaken, about_run
 from service.core.errors import ConfigurationError, IllegalTransitionError
 from service.core.model import (
     ActionRefused,
@@ -46,6 +47,7 @@ Secret = Annotated[str, Form(max_length=1000)]
 Number = Annotated[int, Form(ge=0, le=2**31)]
 # Events that change nothing of what the person was looking at when deciding.
 _HARMLESS = (
+    NoteTaken,
     ActionRefused,
     ControlTaken,
     DeviceOpened,
@@ -61,12 +63,24 @@ _HARMLESS = (
 
 
 @router.post("/runs", name="start_run", dependencies=[Depends(requires("operate"))])
-def start(site: Here, person: Signed, protocol: Short, reason: Words = "", password: Secret = "") -> RedirectResponse:
+def start(
+    site: Here,
+    person: Signed,
+    protocol: Short,
+    reason: Words = "",
+    password: Secret = "",
+    specimen: Words = "",
+    purpose: Words = "",
+    place: Annotated[str, Form(alias="site", max_length=2000)] = "",
+    operator: Words = "",
+    text: Annotated[str, Form(max_length=20_000)] = "",
+) -> RedirectResponse:
     """Begin a run of one of the protocol files; nothing moves before somebody confirms.
 
     Whoever is the first to begin one approves its content. A content that is not the approved one of its id and
     version needs a reason, and the password of somebody who may sign.
     """
+    about = about_run(specimen=specimen, purpose=purpose, site=place, operator=operator, text=text)
     known = {path.name: path for path in site.protocol_files()}
     if protocol not in known:
         raise ConfigurationError(
@@ -81,7 +95,8 @@ def start(site: Here, person: Signed, protocol: Short, reason: Words = "", passw
         if reason.strip():
             site.people.check_password(person.account, password)
     approve(site.store, loaded, person.account, reason=reason, identified="password" if changed else "")
-    run_id = start_run(site.store, loaded, load_rig(site.rig.path), operator=person.account, auto_confirm=False)
+    rig = load_rig(site.rig.path)
+    run_id = start_run(site.store, loaded, rig, operator=person.account, auto_confirm=False, about=about)
     Control(site.store).take(run_id, person)
     site.launcher.start(run_id)
     return _back(run_id)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
+from urllib.parse import urlencode
 
 from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
+from service.audit.run_search import RESULT_WORDS, RESULTS, RunWanted, find_runs
 from service.core.decide import AskOperator, decide
+from service.core.entered import RunAbout
 from service.core.errors import OrthocaptureError
+from service.core.model import RunStarted
 from service.core.protocol import LoadedProtocol, Protocol, load_protocol
 from service.core.run_state import RunState
 from service.people.approvals import ProtocolStanding, difference, standing_of
@@ -24,6 +28,7 @@ from service.web.site import Here, Site
 
 router = APIRouter(tags=["home"])
 _PAGE = 12
+Sought = Annotated[str, Query(max_length=200)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +49,7 @@ class RunLine:
     standing: tuple[str, str] = ("Under way", "now")  # how it stands, and the tone of it
     why: str = ""  # it is stopped, and what is recommended
     fault: str = ""  # what is wrong with its record
+    about: RunAbout = field(default_factory=RunAbout)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,25 +66,40 @@ class Startable:
 
 @router.get("/", name="home", dependencies=[Depends(requires("read"))])
 def home(
-    request: Request, site: Here, person: Signed, page: Annotated[int, Query(ge=1, le=100_000)] = 1
+    request: Request,
+    site: Here,
+    person: Signed,
+    page: Annotated[int, Query(ge=1, le=100_000)] = 1,
+    q: Sought = "",
+    since: Sought = "",
+    until: Sought = "",
+    result: Sought = "",
 ) -> HTMLResponse:
     """Runs under way first (those that a process drives before the others), then those that have ended, newest first.
 
-    Only the runs of the page shown are read.
+    Only the runs of the page shown are read whole; where some are sought, those that fit are shown.
     """
     driven = set(site.launcher.driven_runs())
     under_way = site.store.open_runs() | driven
-    newest_first = site.store.runs()[::-1]
+    wanted = RunWanted(q, since, until, result if result in RESULTS else "")
+    found = {run.run_id: run for run in find_runs(site.store, wanted)}
+    newest_first = [row for row in site.store.runs()[::-1] if row.run_id in found]
     rows = sorted(newest_first, key=lambda row: (row.run_id not in driven, row.run_id not in under_way))
     pages = max(1, -(-len(rows) // _PAGE))
     page = min(page, pages)
     lines = [_line(site, row) for row in rows[_PAGE * (page - 1) : _PAGE * page]]
-    startable = [_startable(path.name, site) for path in site.protocol_files()] if person.may("operate") else []
+    asked = person.may("operate") and not wanted.active
+    startable = [startable_of(path.name, site) for path in site.protocol_files()] if asked else []
     return render(
         request,
         "home.html.j2",
         under_way=[line for line in lines if line.status in ("active", "paused")],
         ended=[line for line in lines if line.status not in ("active", "paused")],
+        found=found,
+        count=len(rows),
+        wanted=wanted,
+        results=RESULT_WORDS,
+        query="".join(f"&{urlencode({name: value})}" for name, value in wanted.query().items()),
         page=page,
         pages=pages,
         protocols=startable,
@@ -152,6 +173,7 @@ def _line(site: Site, row: RunRow) -> RunLine:
         robot=robot,
         standing=standing,
         why=why,
+        about=root.about or RunAbout() if isinstance(root := log.events[0].payload, RunStarted) else RunAbout(),
     )
 
 
@@ -169,7 +191,8 @@ def _standing(protocol: Protocol, state: RunState, *, driven: bool) -> tuple[tup
     return ("Waits for a signature" if question.for_ == "sign" else "Waits for a confirmation", "attention"), ""
 
 
-def _startable(name: str, site: Site) -> Startable:
+def startable_of(name: str, site: Site) -> Startable:
+    """A protocol file, and how it stands on the site."""
     try:
         loaded = load_protocol(site.protocols / name, params_models())
         space = forecast_of(site.store, loaded.protocol, simulated=site.rig.section.simulated)

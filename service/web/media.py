@@ -20,6 +20,7 @@ from service.core.errors import OrthocaptureError
 from service.core.model import ArtefactRef
 from service.evidence import RunLog
 from service.monitor.snapshot import ask_for_frames, frame_path
+from service.notes import NOTE_PHOTOGRAPH
 from service.store.artefacts import to_artefact
 from service.store.tables import artefacts
 from service.web.pictures import IMAGE_WIDTHS, PICTURES, cached, nearest_width, reduced_jpeg, safe_name
@@ -192,7 +193,8 @@ def _reduced(
         from service.web.marks import marks_of  # noqa: PLC0415 - as above
 
         marks = marks_of(log, capture) if log is not None and capture is not None and source else ()
-        return reduced_jpeg(site.store.artefact_path(ref.sha256, verify=True), width, marks)
+        path = site.store.artefact_path(ref.sha256, verify=True)
+        return reduced_jpeg(path, width, marks, upright=ref.kind == NOTE_PHOTOGRAPH)
 
     try:
         return cached(site.data, f"{ref.sha256} {width} {source}", ".jpg", make)

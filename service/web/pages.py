@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Any, cast
 from fastapi import Path, Request
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from pydantic import ValidationError
 
 if TYPE_CHECKING:
     from service.audit.queries import EventRow
 
+from service.core.entered import RunAbout, about_rows
 from service.web.run_frame import LOST, driven_frames
 
 TEMPLATES = Environment(
@@ -44,7 +46,16 @@ def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
     return sum(1 for _ in takewhile(lambda row: (row.kind, row.step) == (first.kind, first.step), rows[start:]))
 
 
-cast("dict[str, Any]", TEMPLATES.globals)["kept_in_a_row"] = kept_in_a_row  # its type names its own names only
+def entered_of(root: EventRow) -> list[tuple[str, str]]:
+    """What was entered of a run when it began, from its first event as it is in the database."""
+    try:
+        return about_rows(RunAbout.model_validate(root.payload.get("about") or {}))
+    except ValidationError:  # altered: the verification says so
+        return []
+
+
+# Its type names its own names only.
+cast("dict[str, Any]", TEMPLATES.globals).update(kept_in_a_row=kept_in_a_row, about_rows=entered_of)
 TEMPLATES.filters["local_time"] = local_time
 
 

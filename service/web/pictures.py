@@ -78,8 +78,10 @@ def cached(folder: Path, key: str, suffix: str, make: Callable[[], bytes]) -> Pa
     return path
 
 
-def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = ()) -> bytes:
+def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = (), *, upright: bool = False) -> bytes:
     """A JPEG of this width, or of the picture's own where that is smaller, with outlines drawn over it.
+
+    `upright`: turned as its orientation tag says, for people to look at; without it as stored, for measuring.
 
     A photograph is decoded at an eighth, a quarter or half of its size, never in full when that is wider than needed.
 
@@ -108,7 +110,7 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = ()) -> bytes:
             break
     with _DECODING:
         try:
-            image = cv2.imdecode(data, how | cv2.IMREAD_IGNORE_ORIENTATION)
+            image = cv2.imdecode(data, how if upright else how | cv2.IMREAD_IGNORE_ORIENTATION)
         except cv2.error as error:
             raise DataError("the picture cannot be decoded", where=path.name, remedy=_REMEDY) from error
         if image is None:

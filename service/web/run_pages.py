@@ -12,12 +12,15 @@ from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
 from service.core.dependence import accepted_gates
+from service.core.entered import about_rows
+from service.core.model import RunStarted
 from service.core.registered import evaluated, shared_adjustment_note
 from service.evidence import RunLog, results_to_come
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Person
 from service.store.space import forecast_of
+from service.web.note_pages import notes_of
 from service.web.pages import part_names, render
 from service.web.run_frame import run_frame
 from service.web.run_view import Looker, run_view
@@ -62,10 +65,13 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         to_come=[left.text for left in results_to_come(log)],
         space=None if log.state.terminal else forecast_of(site.store, log.protocol, log.state),
     )
+    looking_back = bool(step) and view.shown.id != view.current
     return {
         "view": view,
-        "looking_back": bool(step) and view.shown.id != view.current,
+        "looking_back": looking_back,
         "dialog": dialog,
+        "notes": notes_of(log.events, "" if view.mode == "ended" and not looking_back else view.shown.id),
+        "about": _about(log),
         "drawing": drawing(view.shown.drawing),
         "board_plan": _board_plan(log, view.shown.id),
         "now_utc": datetime.now(UTC).isoformat(),
@@ -73,6 +79,12 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         "result_table": evaluated(log.protocol, log.state),
         "result_note": shared_adjustment_note(log.protocol, log.state),
     }
+
+
+def _about(log: RunLog) -> list[tuple[str, str]]:
+    """What was entered of the run when it began."""
+    root = log.events[0].payload
+    return about_rows(root.about) if isinstance(root, RunStarted) else []
 
 
 def _board_plan(log: RunLog, step: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Iterable
@@ -16,6 +17,8 @@ from service.people.errors import TooManyTriesError
 from service.store.seam import Clock
 
 BODY_LIMIT_BYTES = 1_000_000
+PHOTOGRAPH_LIMIT_BYTES = 16_200_000  # of a note with its photograph; read only for people who are signed in
+_WITH_PHOTOGRAPH = re.compile(r"/runs/[^/]{1,64}/notes")
 TRIES_WINDOW_S = 300.0  # over which failed tries of an address are counted
 CONTENT_SECURITY_POLICY = "; ".join(
     (
@@ -67,7 +70,8 @@ class Shield:
                 add_safety_headers(MutableHeaders(scope=message), scope["path"])
             await send(message)
 
-        refusal = self._refusal(scope["method"], headers)
+        limit = PHOTOGRAPH_LIMIT_BYTES if _WITH_PHOTOGRAPH.fullmatch(scope["path"]) else BODY_LIMIT_BYTES
+        refusal = self._refusal(scope["method"], headers, limit)
         if refusal is not None:
             await _plain(send_with_headers, *refusal)
             return
@@ -77,19 +81,19 @@ class Shield:
             nonlocal received
             message = await receive()
             received += len(message.get("body", b""))
-            if received > BODY_LIMIT_BYTES:
+            if received > limit:
                 raise HTTPException(413, "the request is too large")
             return message
 
         await self._app(scope, receive_limited, send_with_headers)
 
-    def _refusal(self, method: str, headers: Headers) -> tuple[int, str] | None:
+    def _refusal(self, method: str, headers: Headers, limit: int) -> tuple[int, str] | None:
         host = headers.get("host", "")
         if not self._answers_to(_host_name(host)):
             # A name that somebody else's DNS points here would make their pages this site's own.
             return 421, "This site does not answer to that name. Use the address that `orthocapture serve` printed."
         size = headers.get("content-length", "0")
-        if not size.isdecimal() or int(size) > BODY_LIMIT_BYTES:
+        if not size.isdecimal() or int(size) > limit:
             return 413, "The request is too large; nothing was done."
         if method not in _SAFE_METHODS and not _is_from_own_page(headers, host):
             return 403, "The request came from another site; nothing was done."

@@ -282,7 +282,8 @@
     send(form, button);
   });
   async function send(form, button) {
-    const fields = new URLSearchParams(new FormData(form, button));
+    const entered = new FormData(form, button);
+    const fields = form.enctype === "multipart/form-data" ? entered : new URLSearchParams(entered); // with a file, or none
     const action = new URL(button?.getAttribute("formaction") || form.getAttribute("action") || location.href, location.href);
     if (action.pathname === "/theme") document.documentElement.dataset.theme = fields.get("theme");
     form.dataset.busy = "yes";

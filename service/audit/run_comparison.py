@@ -1,0 +1,268 @@
+"""Two runs held against one another: protocol, figures and gates, accuracy, calibration, durations, deviations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+
+from service.core.entered import ABOUT, RunAbout
+from service.core.errors import IntegrityError
+from service.core.gates import figure, limits, quantity, standing
+from service.core.model import Event, GateVerdict, RunStarted
+from service.core.protocol import Protocol
+from service.core.registered import evaluated
+from service.core.run_state import RunState, StepState
+from service.people.approvals import difference
+
+_UNITS = {"_px": "px", "_mm": "mm", "_deg": "°", "_min": "min"}  # by the end of a measure's name
+_STANDINGS = {
+    "within": "within",
+    "not_decided": "not decided",
+    "accepted": "accepted outside",
+    "outside": "outside",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedRun:
+    """One of the two."""
+
+    run_id: str
+    root: RunStarted
+    protocol: Protocol
+    source: str  # of the protocol, as it is in the evidence
+    events: Sequence[Event]
+    state: RunState
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One thing in both runs, in words; `change` from the first to the second, "" where there is none to tell."""
+
+    name: str
+    first: str
+    second: str
+    change: str = ""
+    differs: bool = False
+    step: str = ""  # title of the step that it belongs to
+
+
+@dataclass(frozen=True, slots=True)
+class RunComparison:
+    """What is the same and what is not."""
+
+    first: ComparedRun
+    second: ComparedRun
+    about: tuple[Row, ...]
+    same_protocol: bool
+    protocol_changes: tuple[str, ...]  # − of the first, + of the second
+    gates: tuple[Row, ...]
+    measures: tuple[Row, ...]
+    accuracy: tuple[Row, ...]
+    calibration: tuple[Row, ...]
+    durations: tuple[Row, ...]
+    deviations: tuple[tuple[str, ...], tuple[str, ...]]
+
+
+def compare_runs(first: ComparedRun, second: ComparedRun) -> RunComparison:
+    """Hold two runs against one another. What only one of them has is told as such."""
+    same = first.root.protocol_sha256 == second.root.protocol_sha256
+    return RunComparison(
+        first=first,
+        second=second,
+        about=tuple(_about(first, second)),
+        same_protocol=same,
+        protocol_changes=() if same else tuple(difference(first.source, second.source)),
+        gates=tuple(_gates(first, second)),
+        measures=tuple(_measures(first, second)),
+        accuracy=tuple(_accuracy(first, second)),
+        calibration=tuple(_calibration(first, second)),
+        durations=tuple(_durations(first, second)),
+        deviations=(_deviations(first), _deviations(second)),
+    )
+
+
+def root_of(events: Sequence[Event]) -> RunStarted:
+    """The root of a run's chain. Raises IntegrityError where it is of another kind."""
+    root = events[0].payload if events else None
+    if not isinstance(root, RunStarted):
+        raise IntegrityError("the run's first event is not run_started", where=events[0].run_id if events else "")
+    return root
+
+
+def _row(name: str, first: str, second: str, *, change: str = "", step: str = "") -> Row:
+    return Row(name, first or "–", second or "–", change, first != second, step)
+
+
+def _about(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+    said = [run.root.about or RunAbout() for run in (first, second)]
+    for field, name in ABOUT.items():
+        pair = [str(getattr(about, field)) for about in said]
+        if any(pair):
+            yield _row(name, *pair)
+    yield _row("Begun (UTC)", *(run.events[0].at_utc[:19].replace("T", " ") for run in (first, second)))
+    yield _row("Begun by", first.root.operator, second.root.operator)
+    yield _row("Protocol", *(f"{run.protocol.id} {run.protocol.version}" for run in (first, second)))
+    yield _row("State", first.state.status, second.state.status)
+    yield _row("Rig", *("simulated" if run.root.simulated else "real" for run in (first, second)))
+
+
+def _steps(first: ComparedRun, second: ComparedRun) -> list[tuple[str, str]]:
+    """Identifier and title, in the order of the first run; what the second has alone at the end."""
+    titles = {step.id: step.title for run in (second, first) for step in run.protocol.steps}
+    return [(name, titles[name]) for name in dict.fromkeys([*first.protocol.step_ids, *second.protocol.step_ids])]
+
+
+def _state(run: ComparedRun, step: str) -> StepState:
+    return run.state.steps.get(step) or StepState(step)
+
+
+def _gates(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+    for step, title in _steps(first, second):
+        states = _state(first, step), _state(second, step)
+        verdicts = [{v.measure: v for v in state.verdicts} for state in states]
+        for measure in dict.fromkeys([*verdicts[0], *verdicts[1]]):
+            judged = [there.get(measure) for there in verdicts]
+            texts = [_judged(v, state) for v, state in zip(judged, states, strict=True)]
+            values = [None if v is None else v.value for v in judged]
+            unit = next((v.unit for v in judged if v is not None), "")
+            yield _row(measure, *texts, change=_change(values, unit), step=title)
+
+
+def _judged(verdict: GateVerdict | None, state: StepState) -> str:
+    if verdict is None:
+        return ""
+    how = _STANDINGS[standing(verdict, accepted=state.accepted is not None)]
+    return f"{figure(verdict)} ({limits(verdict.minimum, verdict.maximum)}): {how}"
+
+
+def _measures(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+    for step, title in _steps(first, second):
+        numbers = _state(first, step).measures, _state(second, step).measures
+        for measure in dict.fromkeys([*numbers[0], *numbers[1]]):
+            values = [there.get(measure) for there in numbers]
+            unit = _unit(measure)
+            texts = ["" if value is None else quantity(value, unit) for value in values]
+            yield _row(measure, *texts, change=_change(values, unit), step=title)
+
+
+def _unit(name: str) -> str:
+    return next((unit for ending, unit in _UNITS.items() if name.endswith(ending)), "")
+
+
+def _change(values: Sequence[float | None], unit: str = "") -> str:
+    """`+0.012 mm`; "" where one of the two is missing or they are the same."""
+    first, second = values
+    if first is None or second is None or not math.isfinite(apart := second - first) or apart == 0:
+        return ""
+    return f"{apart:+.4g} {unit}".rstrip().replace("-", "−", 1)
+
+
+def _accuracy(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+    tables = [{str(row["poses"]): row for row in evaluated(run.protocol, run.state)} for run in (first, second)]
+    for poses in dict.fromkeys([*tables[0], *tables[1]]):
+        rows = [table.get(poses, {}) for table in tables]
+        for field, name, unit in (
+            ("mean_radial_error_mm", "mean radial error", "mm"),
+            ("predicted_error_mm", "predicted error", "mm"),
+            ("mean_reprojection_error_px", "reprojection", "px"),
+        ):
+            values = [row.get(field) for row in rows]
+            if any(value is not None for value in values):
+                texts = ["" if value is None else f"{value:.3f} {unit}" for value in values]
+                yield _row(name, *texts, change=_change(values, unit), step=poses)
+
+
+# Of the camera; those of the hand-eye transform come from the measures.
+_CAMERA = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+_OF_CALIBRATION = (
+    "rms_px", "five_fold_rms_px", "coverage", "uncertainty_mm", "hand_eye_sigma_mm", "hand_eye_sigma_deg",
+    "hand_eye_held_out_mm", "hand_eye_held_out_deg", "robot_noise_mm", "robot_noise_deg",
+)  # fmt: skip
+
+
+def _calibration(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+    found = [_calibrated(run) for run in (first, second)]
+    cameras = [camera for camera, *_ in found]
+    for name in _CAMERA:
+        values = [camera.get(name) for camera in cameras]
+        if any(value is not None for value in values):
+            unit = "px" if name in ("fx", "fy", "cx", "cy") else ""
+            texts = ["" if value is None else f"{value:.6g} {unit}".rstrip() for value in values]
+            yield _row(f"Camera {name}", *texts, change=_change(values, unit))
+    for name in _OF_CALIBRATION:
+        values = [measures.get(name) for _, _, measures in found]
+        if any(value is not None for value in values):
+            unit = _unit(name)
+            texts = ["" if value is None else quantity(value, unit) for value in values]
+            yield _row(name, *texts, change=_change(values, unit))
+    here, there = (T for _, T, _ in found)
+    if here is not None and there is not None:
+        moved_mm = 1e3 * float(np.linalg.norm(there[:3, 3] - here[:3, 3]))
+        turned = here[:3, :3].T @ there[:3, :3]
+        turned_deg = math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(turned)) - 1) / 2))))
+        where = [f"{1e3 * T[0, 3]:.2f}, {1e3 * T[1, 3]:.2f}, {1e3 * T[2, 3]:.2f} mm" for T in (here, there)]
+        change = f"{moved_mm:.3f} mm, {turned_deg:.4f}°" if not np.array_equal(here, there) else ""
+        yield _row("Camera on the flange", *where, change=change)
+
+
+def _calibrated(run: ComparedRun) -> tuple[Mapping[str, float], Any, Mapping[str, float]]:
+    """The camera, T_flange_camera (4, 4) or None, and the measures of all calibration steps together."""
+    camera: Mapping[str, float] = {}
+    T_flange_camera = None
+    measures: dict[str, float] = {}
+    for step in run.protocol.steps:
+        state = run.state.steps[step.id]
+        if step.kind == "calibration" and state.result:
+            camera = state.result.get("camera") or camera
+            if state.result.get("T_flange_camera") is not None:
+                T_flange_camera = np.array(state.result["T_flange_camera"], dtype=np.float64)
+            measures |= state.measures
+    return camera, T_flange_camera, measures
+
+
+def _durations(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
+    for step, title in _steps(first, second):
+        seconds = [
+            _between(state.started_utc, state.ended_utc) for state in (_state(first, step), _state(second, step))
+        ]
+        if any(value is not None for value in seconds):
+            yield _row(title, *map(_took, seconds), change=_longer(*seconds))
+    whole = [_between(run.events[0].at_utc, run.state.ended_utc) for run in (first, second)]
+    if any(value is not None for value in whole):
+        yield _row("Whole run", *map(_took, whole), change=_longer(*whole))
+
+
+def _between(begun: str, ended: str) -> float | None:
+    if not begun or not ended:
+        return None
+    return (datetime.fromisoformat(ended) - datetime.fromisoformat(begun)).total_seconds()
+
+
+def _took(seconds: float | None) -> str:
+    if seconds is None:
+        return ""
+    minutes, rest = divmod(abs(seconds), 60)
+    hours, minutes = divmod(int(minutes), 60)
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {rest:02.0f} s" if minutes else f"{rest:.1f} s"
+
+
+def _longer(first: float | None, second: float | None) -> str:
+    if first is None or second is None or _took(first) == _took(second):
+        return ""
+    return ("+" if second > first else "−") + _took(second - first)
+
+
+def _deviations(run: ComparedRun) -> tuple[str, ...]:
+    return tuple(
+        f"{d.kind.replace('_', ' ')}: {d.text}" + (f" ({d.actor})" if d.actor else "")
+        for d in run.state.deviations
+        if not d.is_note
+    )

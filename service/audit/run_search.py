@@ -1,0 +1,179 @@
+"""The runs of a data folder, found by what people said of them, by when they were and by how they came out."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+from pydantic import ValidationError
+from sqlalchemy import Connection, text
+
+from service.core.entered import RunAbout
+from service.store.records import SITE
+from service.store.store import Store, read_open_runs
+
+Result = Literal["open", "completed", "aborted", "within", "outside", "released"]
+RESULTS: tuple[Result, ...] = get_args(Result)
+RESULT_WORDS: Mapping[Result, str] = {
+    "open": "not ended",
+    "completed": "completed",
+    "aborted": "ended early",
+    "within": "accuracy within its limit",
+    "outside": "accuracy outside its limit",
+    "released": "released",
+}
+_ERROR = "mean_radial_error_mm"  # the measure of an evaluation that says how accurate the run came out
+
+
+@dataclass(frozen=True, slots=True)
+class RunWanted:
+    """Which runs are wanted; an empty field wants all."""
+
+    q: str = ""  # words, all of which are found somewhere in what people said of the run
+    since: str = ""  # 2026-11-21, in UTC
+    until: str = ""
+    result: str = ""  # one of RESULTS
+
+    @property
+    def active(self) -> bool:
+        """Whether anything is sought."""
+        return any((self.q.strip(), self.since, self.until, self.result))
+
+    def query(self) -> dict[str, str]:
+        """For a link that keeps it."""
+        fields = {"q": self.q, "since": self.since, "until": self.until, "result": self.result}
+        return {name: value for name, value in fields.items() if value}
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """The mean radial error on the control spheres as it was judged last."""
+
+    error_mm: float
+    most_mm: float | None
+    within: bool | None  # None: its uncertainty leaves that open
+
+    @property
+    def words(self) -> str:
+        """`0.213 mm (within)`."""
+        how = {True: "within", False: "outside", None: "not decided"}[self.within]
+        return f"{self.error_mm:.3f} mm ({how})"
+
+
+@dataclass(frozen=True, slots=True)
+class FoundRun:
+    """A run in a list."""
+
+    run_id: str
+    created_utc: str
+    simulated: bool
+    protocol: str
+    version: str
+    begun_by: str
+    about: RunAbout
+    notes: tuple[str, ...]
+    status: Literal["open", "completed", "aborted"]
+    released: bool
+    accuracy: Accuracy | None
+
+    def has(self, result: str) -> bool:
+        """Whether it came out so: one of RESULTS."""
+        if result == "released":
+            return self.released
+        if result in ("within", "outside"):
+            return self.accuracy is not None and self.accuracy.within is (result == "within")
+        return self.status == result
+
+    @property
+    def words(self) -> str:
+        """All in which a search looks, in small letters."""
+        said = (value for value in self.about.model_dump().values())
+        parts = (self.run_id, self.protocol, self.version, self.begun_by, *said, *self.notes)
+        return "\n".join(map(str, parts)).casefold()
+
+
+def find_runs(store: Store, wanted: RunWanted) -> list[FoundRun]:
+    """The runs that are wanted, newest first. A root that cannot be read leaves its fields empty."""
+    with store.database.reading() as connection:
+        every = _every(connection)
+    terms = wanted.q.casefold().split()
+    return [
+        run
+        for run in every
+        if (not wanted.since or wanted.since <= run.created_utc[:10])
+        and (not wanted.until or run.created_utc[:10] <= wanted.until)
+        and (not wanted.result or run.has(wanted.result))
+        and (not terms or all(term in run.words for term in terms))
+    ]
+
+
+def _every(connection: Connection) -> list[FoundRun]:
+    roots = connection.execute(
+        text(
+            "SELECT r.run_id, r.created_utc, r.simulated, json_extract(e.payload, '$.protocol_id') AS protocol, "
+            "json_extract(e.payload, '$.protocol_version') AS version, "
+            "json_extract(e.payload, '$.operator') AS operator, json_extract(e.payload, '$.about') AS about "
+            "FROM runs AS r LEFT JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 AND json_valid(e.payload) "
+            "WHERE r.run_id <> :site ORDER BY r.created_utc DESC, r.run_id DESC"
+        ),
+        {"site": SITE},
+    ).all()
+    still_open = read_open_runs(connection)
+    ended = {run for run, _ in _of_kind(connection, "run_completed", "'x'")}
+    released = {run for run, _ in _of_kind(connection, "run_released", "'x'")}
+    notes: dict[str, list[str]] = defaultdict(list)
+    for run, said in _of_kind(connection, "note_taken", "json_extract(e.payload, '$.text')"):
+        notes[run].append(said)
+    judged = dict(
+        _of_kind(connection, "gates_evaluated", f"CASE WHEN e.payload LIKE '%{_ERROR}%' THEN e.payload END")
+    )
+    return [
+        FoundRun(
+            run_id=row.run_id,
+            created_utc=row.created_utc,
+            simulated=bool(row.simulated),
+            protocol=str(row.protocol or ""),
+            version=str(row.version or ""),
+            begun_by=str(row.operator or ""),
+            about=_about(row.about),
+            notes=tuple(notes.get(row.run_id, ())),
+            status="open" if row.run_id in still_open else "completed" if row.run_id in ended else "aborted",
+            released=row.run_id in released,
+            accuracy=_accuracy(judged.get(row.run_id, "")),
+        )
+        for row in roots
+    ]
+
+
+def _of_kind(connection: Connection, kind: str, shown: str) -> Sequence[tuple[str, str]]:
+    """Run and text of each event of a kind, in order; those without text are left out."""
+    rows = connection.execute(
+        text(
+            # Run by run, as the index goes: not through every event of the folder.
+            f"SELECT i.run_id, {shown} AS shown FROM runs AS r CROSS JOIN event_index AS i "
+            "ON i.run_id = r.run_id AND i.kind = :kind CROSS JOIN events AS e "
+            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE json_valid(e.payload) ORDER BY i.run_id, i.seq"
+        ),
+        {"kind": kind},
+    )
+    return [(str(row.run_id), str(row.shown)) for row in rows if row.shown]
+
+
+def _about(content: str | None) -> RunAbout:
+    try:
+        return RunAbout.model_validate_json(content) if content else RunAbout()
+    except ValidationError:  # for the verification to find
+        return RunAbout()
+
+
+def _accuracy(payload: str) -> Accuracy | None:
+    verdicts: list[dict[str, Any]] = json.loads(payload).get("verdicts", []) if payload else []
+    mine = [v for v in verdicts if str(v.get("measure", "")).endswith(_ERROR) and v.get("value") is not None]
+    if not mine:
+        return None
+    judged = mine[0]
+    within = None if judged.get("undecided") else bool(judged.get("passed"))
+    return Accuracy(float(judged["value"]), judged.get("maximum"), within)

@@ -1,0 +1,21 @@
+"""What every record is made of: the frozen base, and a reference to a content-addressed file."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+
+class Record(BaseModel):
+    """Base of everything that is written down: frozen, no unknown fields."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ArtefactRef(Record):
+    """A content-addressed file, as events refer to it."""
+
+    sha256: str
+    kind: str  # image, raw, board_image, scan, ct_slice, ct_mesh, pose_log, result, report, protocol, rig …
+    media_type: str
+    size_bytes: int
+    original_name: str

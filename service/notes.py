@@ -1,0 +1,114 @@
+"""Notes on the steps of a run: text, a photograph or both, checked, bounded and put into the run's chain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from service.core.entered import NoteTaken, paragraphs
+from service.core.errors import DataError, IllegalTransitionError
+from service.core.model import Event
+from service.evidence import RunLog
+from service.store.records import NewArtefact
+
+PHOTOGRAPH_BYTES = 16_000_000
+NOTE_PHOTOGRAPH = "note_photograph"  # kind of the artefact
+_PIXELS = 120_000_000
+_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_REMEDY = "Take the photograph again, as JPEG or PNG"
+
+
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """A photograph as it came, with the name of its file."""
+
+    content: bytes
+    name: str = "photograph"
+
+
+def take_note(
+    log: RunLog,
+    text: str,
+    photograph: Photograph | None,
+    *,
+    step: str,
+    actor: str,
+    via: Literal["web", "cli"],
+) -> Event:
+    """Record a note on a step, the current one where `step` is ""; its event.
+
+    Raises:
+        IllegalTransitionError: the run has ended (its record is sealed), or there is no such step.
+        ConfigurationError: the text is too long.
+        DataError: neither text nor photograph; the photograph is too large, or no JPEG or PNG that can be decoded.
+    """
+    state = log.state
+    step = step or state.current
+    if state.terminal:
+        raise IllegalTransitionError(
+            f"the run is {state.status}, and its record is closed",
+            where=log.run_id,
+            remedy="An auditor's correction, with its reason, can still be added to a value that was recorded",
+        )
+    if step not in state.steps:
+        known = ", ".join(log.protocol.step_ids)
+        raise IllegalTransitionError(f"there is no step {step!r}", where=log.run_id, remedy=f"It has: {known}")
+    said = paragraphs(text, "the note")
+    if not said and photograph is None:
+        raise DataError("the note is empty", where=step, remedy="Write something, or take a photograph")
+    attempt = state.steps[step].attempt
+    ref, artefacts = None, ()
+    if photograph is not None:
+        media_type, suffix = _checked(photograph)
+        name = photograph.name.replace("\\", "/").rpartition("/")[2].strip()[-80:] or "photograph"
+        name = name if "." in name else f"{name}{suffix}"
+        ref = log.store.put_bytes(
+            photograph.content, kind=NOTE_PHOTOGRAPH, media_type=media_type, original_name=_plain(name)
+        )
+        artefacts = (NewArtefact(ref, "note", step, attempt),)
+    note = NoteTaken(step=step, attempt=attempt, text=said, photograph=ref, via=via)
+    (event,) = log.store.record(log.run_id, [note], actor=actor, artefacts=artefacts)
+    return event
+
+
+def require_size(size_bytes: int, name: str) -> None:
+    """Raise DataError for a photograph that is too large: said before it is read."""
+    if size_bytes > PHOTOGRAPH_BYTES:
+        raise DataError(
+            f"the photograph has {size_bytes / 1e6:.1f} MB, and {PHOTOGRAPH_BYTES / 1e6:.0f} MB at most are kept",
+            where=_plain(name),
+            remedy="Take it with fewer pixels",
+        )
+
+
+def _plain(name: str) -> str:
+    return "".join(c if c.isprintable() else "_" for c in name)
+
+
+def _checked(photograph: Photograph) -> tuple[str, str]:
+    """Media type and the ending of its name, once the picture has been decoded."""
+    # The decoder takes its time to load, and a web process starts without it.
+    import cv2  # noqa: PLC0415
+    import numpy as np  # noqa: PLC0415
+
+    from service.compute.images import check_jpeg  # noqa: PLC0415
+
+    content, name = photograph.content, _plain(photograph.name)
+    require_size(len(content), name)
+    if content.startswith(_JPEG):
+        check_jpeg(content, name)
+        kind = "image/jpeg", ".jpg"
+    elif content.startswith(_PNG):
+        kind = "image/png", ".png"
+        width, height = (int.from_bytes(content[at : at + 4], "big") for at in (16, 20))
+        if width * height > _PIXELS:
+            raise DataError(f"the picture claims {width} × {height} pixels", where=name, remedy=_REMEDY)
+    else:
+        raise DataError("the file is neither a JPEG nor a PNG picture", where=name, remedy=_REMEDY)
+    try:
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    except cv2.error as error:
+        raise DataError("the picture cannot be decoded", where=name, remedy=_REMEDY) from error
+    if picture is None:
+        raise DataError("the picture cannot be decoded", where=name, remedy=_REMEDY)
+    return kind
