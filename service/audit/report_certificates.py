@@ -113,7 +113,7 @@ def _hand_eye(result: Mapping[str, Any]) -> Iterator[Block]:
     held: Mapping[str, float] = best["residuals"]["held_out_mm"]
     median_mm, largest_mm = float(np.median(list(held.values()))), max(held.values())
     text = f"Median {median_mm:.3f} mm, largest {largest_mm:.3f} mm; solved by {record['method']}."
-    yield Drawings((bars_drawing("Held-out error of each view", text, held, "mm"),))
+    yield Drawings((bars_drawing("hand_eye_held_out", "Held-out error of each view", text, held, "mm"),))
     if best is not record:
         without = float(np.median(list(record["residuals"]["held_out_mm"].values())))
         yield Paragraph(
