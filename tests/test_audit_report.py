@@ -162,6 +162,49 @@ def test_evidence_that_does_not_verify_is_said_first_and_loudest(folder: Path, t
     assert (tmp_path / "r.pdf").read_bytes().startswith(b"%PDF")
 
 
+def test_a_camera_has_one_serial_number_and_clocks_are_explained(tmp_path: Path) -> None:
+    record_reported_run(tmp_path, serials=("3282933005318008", "05318008"))
+    html = words_of(render_html(report_of(tmp_path / "data")))
+    assert "camera ILCE-7RM5 05318008 3.00" in html
+    assert "body 05318008, FE 50mm" not in html, "the certificate's images are the calibration's own"
+    assert html.count("3282933005318008") == 1
+    assert "which ends with the same digits: it is one and the same body" in html
+    assert "1279.000 s behind this machine's" in html
+    assert "✗ beyond The time written in its files is its own" in html
+    assert "so how far it is from this machine's says nothing" in html
+
+
+def test_counts_are_in_the_singular_where_there_is_one(tmp_path: Path) -> None:
+    record_reported_run(tmp_path)
+    html = words_of(render_html(report_of(tmp_path / "data")))
+    assert "3 photographs taken: 2 count, 1 was replaced by later ones; 1 exposure failed" in html
+    assert not re.findall(
+        r"\b(?<![\d.,])1 (?:deviations|faults|events|views|images|photographs|exposures|jobs)\b", html
+    )
+
+
+def test_the_contents_lead_to_every_section(report: Report) -> None:
+    html = render_html(report)
+    for number, section in enumerate(report.sections, 1):
+        assert f'<li><a href="#section-{number}">{section.title}</a></li>' in html
+        assert f'<h2 id="section-{number}">{number} {section.title}</h2>' in html
+    assert 'content: "Page " counter(page) " of " counter(pages)' in html
+
+
+def test_specimen_and_site_stand_first(report: Report) -> None:
+    assert [name for name, _ in report.facts.rows[:3]] == ["Specimen", "Site", "Run"]
+    assert dict(report.facts.rows)["Site"] == "rig small"
+
+
+def test_originals_are_named_by_their_hash(folder: Path, report: Report) -> None:
+    html = words_of(render_html(report))
+    run = read_run(folder / "data", "latest")
+    originals = [a for a in run.artefacts if a.ref.kind == "image" and a.attempt == 2]
+    assert len(originals) == 2
+    for artefact in originals:
+        assert f"{artefact.seq} {artefact.viewpoint} {artefact.ref.original_name} {artefact.ref.sha256}" in html
+
+
 # --- how it is written -----------------------------------------------------------------------------------
 
 

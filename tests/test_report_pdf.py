@@ -16,7 +16,7 @@ from service.audit.report_blocks import Report
 from service.audit.report_content import report_content
 from service.audit.report_pdf import render_pdf
 from service.store.audit import verify
-from tests.support.pdf_text import pages_of, reader_of, tags_of
+from tests.support.pdf_text import fonts_of, pages_of, reader_of, root_of, tags_of
 from tests.support.reported_run import record_reported_run
 
 AT = datetime(2026, 11, 21, 11, 30, 7, tzinfo=UTC)
@@ -73,7 +73,7 @@ def test_its_contents_lead_to_every_section(report: Report, pdf: bytes) -> None:
 
 def test_it_is_tagged_with_its_language_title_and_true_date(report: Report, pdf: bytes) -> None:
     reader = reader_of(pdf)
-    root = reader.trailer["/Root"]
+    root = root_of(pdf)
     assert root["/MarkInfo"]["/Marked"] is not False
     assert root["/Lang"] == "en"
     assert root["/ViewerPreferences"]["/DisplayDocTitle"] is not False
@@ -116,9 +116,7 @@ def test_greek_and_signs_have_glyphs_without_dejavu(report: Report) -> None:
     whole = " ".join(pages_of(pdf))
     for sign in ("Λ", "σ", "χ", "≤", "↔", "✓"):
         assert sign in whole, sign
-    fonts = {
-        str(font.get_object()["/BaseFont"]) for p in reader_of(pdf).pages for font in p["/Resources"]["/Font"].values()
-    }
+    fonts = fonts_of(pdf)
     assert any("LibertinusSerif" in font for font in fonts)
     assert not any(font.endswith("DejaVuSans") for font in fonts), "else the machine's own DejaVu was found"
     stated = reader_of(pdf).xmp_metadata
@@ -130,7 +128,7 @@ def test_a_sign_that_no_font_has_loses_the_standard_and_not_the_report(tmp_path:
     record_reported_run(tmp_path, person="Ada \U0001f9ff\U000f0000")
     pdf = render_pdf(report_of(tmp_path))
     reader = reader_of(pdf)
-    assert "/StructTreeRoot" in reader.trailer["/Root"]
+    assert "/StructTreeRoot" in root_of(pdf)
     assert reader.xmp_metadata is not None
     assert b"pdfuaid:part" not in reader.xmp_metadata.stream.get_data()
     assert "Begun by Ada" in pages_of(pdf)[0]

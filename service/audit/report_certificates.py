@@ -53,10 +53,11 @@ def _facts(run: RecordedRun, step_id: str, sha256: str) -> Facts:
     intrinsics: Mapping[str, Any] = state.result["details"].get("intrinsics") or {}
     hand_eye: Mapping[str, Any] = state.result.get("hand_eye") or {}
     best = hand_eye.get("arm_correction") or hand_eye
+    body = f"body {camera['body_serial']}" if camera.get("body_serial") else ""
     rows: list[tuple[str, Cell | str]] = [
         ("Certificate number (SHA-256 of calibration.json)", sha256),
         ("Calibrated", utc(state.ended_utc) if state.ended_utc else "not accepted yet"),
-        ("Camera and lens", ", ".join(filter(None, (str(camera.get("body_serial", "")), optics))) or "not recorded"),
+        ("Camera and lens", ", ".join(filter(None, (body, optics))) or "not recorded"),
     ]
     if intrinsics:
         checked, sigma = intrinsics.get("cross_validation"), intrinsics["uncertainty"]

@@ -60,11 +60,10 @@ def deviations(run: RecordedRun) -> list[Departure]:
 def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
     match payload:
         case GatesEvaluated(passed=False):
-            for kind, undecided in (("gate failed", False), ("gate not decided", True)):
-                short = [v for v in payload.verdicts if not v.passed and v.undecided == undecided]
-                if short:
-                    told = "; ".join(describe_judged(verdict) for verdict in short)
-                    yield kind, payload.step, f"attempt {payload.attempt}: {told}"
+            for verdict in payload.verdicts:  # each counts, as on the auditor's pages
+                if not verdict.passed:
+                    kind = "gate not decided" if verdict.undecided else "gate failed"
+                    yield kind, payload.step, f"attempt {payload.attempt}: {describe_judged(verdict)}"
         case StepFailed():
             yield "step failed", payload.step, f"attempt {payload.attempt}: {payload.message}"
         case ViewpointFailed(skipped=False):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,8 @@ import numpy as np
 from service.audit.recorded import RecordedRun
 from service.audit.report_blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
 from service.audit.report_words import clock
+from service.core.bodies import bodies
+from service.core.clocks import clock_of, clock_readings, offset_told
 from service.core.count_words import counted
 from service.core.model import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
 from service.core.terms import term
@@ -21,31 +23,35 @@ def devices_section(run: RecordedRun) -> Section:
     """Every device that answered, its versions and clocks; light and temperature over the captures."""
     columns = (
         Column("device", 0.8),
-        Column("model", 1.7),
-        Column("serial number", 1.4),
+        Column("model", 1.6),
+        Column("serial number", 1.2),
         Column("firmware", 1.1),
-        Column("driver", 2.0),
-        Column("clock against the host (s)", 1.2, "number"),
+        Column("driver", 1.9),
+        Column("its clock when it was opened", 1.7),
         Column("opened (UTC)", 0.9),
     )
+    known = bodies(run.events)
     rows: list[tuple[Cell | str, ...]] = []
     for event in run.events:
         if isinstance(event.payload, DeviceOpened):
             report: Mapping[str, Any] = event.payload.report
             identity: Mapping[str, Any] = report.get("identity") or {}
-            offset = report.get("clock_offset_s")
             rows.append(
                 (
                     event.payload.device,
                     str(identity.get("model", "")),
-                    str(identity.get("serial", "")) or "–",
+                    known.shown(identity) or "–",
                     str(identity.get("firmware", "")) or "–",
                     f"{identity.get('driver', '')}: {identity.get('driver_version', '')}",
-                    "–" if offset is None else f"{offset:.6f}",
+                    offset_told(report.get("clock_offset_s"), clock_of(report)),
                     clock(event.at_utc),
                 )
             )
     blocks: list[Block] = [Table(columns, tuple(rows), small=True)]
+    blocks += [Paragraph(f"{text}.") for text in known.explained]
+    if known.strange:
+        blocks.append(Paragraph(f"{known.strange}.", "stop"))
+    blocks += _clocks(run)
     captures = [view for view in run.summary().captures() if isinstance(view, ViewpointCaptured)]
     if captures:
         offsets = np.array([capture.clock_offset_s for capture in captures])
@@ -58,6 +64,37 @@ def devices_section(run: RecordedRun) -> Section:
         )
         blocks.append(Paragraph(text + _environment(captures)))
     return Section("Devices and clocks", tuple(blocks))
+
+
+def _clocks(run: RecordedRun) -> Iterator[Block]:
+    """Each clock as it was last compared, and what rests on it."""
+    readings = clock_readings(run.events)
+    if not readings:
+        return
+    columns = (
+        Column("clock of", 0.9),
+        Column("against", 1.1),
+        Column("difference", 1.0, "number"),
+        Column("limit", 0.8, "number"),
+        Column("verdict", 0.9),
+        Column("what it means", 3.6),
+    )
+    verdicts = {True: Cell("✓ within", "ok"), False: Cell("✗ beyond", "stop"), None: Cell("? not known", "attention")}
+    yield Heading("Clocks")
+    yield Table(
+        columns,
+        tuple(
+            (
+                reading.name,
+                reading.other,
+                reading.difference,
+                f"± {reading.limit_s:.2f} s",
+                verdicts[reading.within],
+                f"{reading.meaning}{f' ({reading.note})' if reading.note else ''}.",
+            )
+            for reading in readings
+        ),
+    )
 
 
 def _environment(captures: list[ViewpointCaptured]) -> str:

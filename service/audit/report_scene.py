@@ -9,8 +9,6 @@ import base64
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from importlib.resources import files
 
 import cv2
 import numpy as np
@@ -270,7 +268,8 @@ def _numbers(values: Array, digits: int) -> tuple[str, ...]:
 
 
 def _turned(geometry: _Geometry) -> str:
-    """A canvas with its script, which covers the drawing, but for its legend, where a browser can show it."""
+    """A canvas that covers the drawing, but for its legend, where a browser can show it, and what templates/scene.js
+    draws on it."""
     wide = len(geometry.points) > 0xFFFF
     data: Mapping[str, object] = {
         "points": _packed(geometry.points),
@@ -284,15 +283,13 @@ def _turned(geometry: _Geometry) -> str:
         "eye": scene_view.EYE_MM,
     }
     text = json.dumps(data, separators=(",", ":"))
-    script = (files("service.audit") / "templates" / "scene.js").read_text(encoding="utf-8")
     # base64 and numbers, and labels that are escaped: nothing in it ends the element.
     kept = text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-    hint = escape("Drag to turn it; roll the wheel or use + and − to come nearer; arrow keys turn it too.")
+    height = 100 * _HEIGHT / (_HEIGHT + _LEGEND)
     return (
-        f'<div class="turned" style="height: {100 * _HEIGHT / (_HEIGHT + _LEGEND):.3f}%" tabindex="0" '
-        f'role="application" aria-label="The scene, to be turned. {hint}" hidden>'
-        f'<canvas></canvas></div><p class="turned-hint" hidden>{hint}</p>'
-        f'<script type="application/json" id="scene-data">{kept}</script>\n<script>\n{script}</script>'
+        f'<div class="turned" style="height: {height:.3f}%" tabindex="0" role="application" '
+        'aria-label="The scene: arrow keys turn it, + and − come nearer and go back" hidden><canvas></canvas></div>'
+        f'<script type="application/json" id="scene-data">{kept}</script>\n'
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, text
 
+from service.audit.digest import Digest
 from service.audit.queries import plain
 from service.core.count_words import counted
 from service.core.model import Event, ViewpointFailed
@@ -55,6 +56,13 @@ def shots_by_step(protocol: Protocol, state: RunState, failures: Mapping[str, in
         if shots.taken or shots.failed or shots.given_up:
             found.append(shots)
     return found
+
+
+def shots_of(digest: Digest | None, failures: Mapping[str, int]) -> list[Shots]:
+    """The same of a digest; empty while there is none."""
+    if digest is None or digest.protocol is None or digest.state is None:
+        return []
+    return shots_by_step(digest.protocol, digest.state, failures)
 
 
 def together(shots: Sequence[Shots]) -> Shots:

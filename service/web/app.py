@@ -13,6 +13,7 @@ from service.web import (
     audit_pages,
     calibration_pages,
     capture_pages,
+    devices_pages,
     export_pages,
     gates_pages,
     health_pages,
@@ -40,6 +41,7 @@ _PAGES = (
     calibration_pages,
     audit_pages,
     gates_pages,
+    devices_pages,
     export_pages,
     health_pages,
 )

@@ -15,6 +15,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 if TYPE_CHECKING:
     from service.audit.queries import EventRow
 
+from service.core.count_words import counted
 from service.web.run_frame import LOST, driven_frames
 
 TEMPLATES = Environment(
@@ -44,7 +45,8 @@ def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
     return sum(1 for _ in takewhile(lambda row: (row.kind, row.step) == (first.kind, first.step), rows[start:]))
 
 
-cast("dict[str, Any]", TEMPLATES.globals)["kept_in_a_row"] = kept_in_a_row  # its type names its own names only
+# Its type names its own names only.
+cast("dict[str, Any]", TEMPLATES.globals).update(kept_in_a_row=kept_in_a_row, counted=counted)
 TEMPLATES.filters["local_time"] = local_time
 
 

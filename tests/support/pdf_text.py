@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, cast
 
 from pypdf import PdfReader
 
 
 def reader_of(pdf: bytes) -> PdfReader:
     return PdfReader(io.BytesIO(pdf))
+
+
+def root_of(pdf: bytes) -> Mapping[str, Any]:
+    """The document's catalogue."""
+    return cast("Mapping[str, Any]", reader_of(pdf).trailer["/Root"].get_object())
+
+
+def fonts_of(pdf: bytes) -> set[str]:
+    """Names of the fonts that it is set in."""
+    pages = [cast("Mapping[str, Any]", page) for page in reader_of(pdf).pages]
+    return {str(font.get_object()["/BaseFont"]) for page in pages for font in page["/Resources"]["/Font"].values()}
 
 
 def pages_of(pdf: bytes) -> list[str]:
@@ -20,7 +31,7 @@ def pages_of(pdf: bytes) -> list[str]:
 
 def tags_of(pdf: bytes) -> list[tuple[str, str]]:
     """Every tag in reading order with its alternative text, "" where it has none."""
-    return list(_below(reader_of(pdf).trailer["/Root"]["/StructTreeRoot"]))
+    return list(_below(root_of(pdf)["/StructTreeRoot"]))
 
 
 def _below(element: Any) -> Iterator[tuple[str, str]]:

@@ -123,6 +123,6 @@
     e.preventDefault();
   });
   box.hidden = false;
-  document.querySelector(".turned-hint").hidden = false;
+  addEventListener("DOMContentLoaded", () => { document.querySelector(".turned-hint").hidden = false; });
   new ResizeObserver(soon).observe(box);
 })();
