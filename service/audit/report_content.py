@@ -12,7 +12,7 @@ from service.audit.report_certificates import certificate_sections
 from service.audit.report_course import deviations, deviations_section, people_section, steps_section
 from service.audit.report_facts import facts
 from service.audit.report_origin import devices_section, software_section
-from service.audit.report_pictures import pictures_section
+from service.audit.report_photographs import pictures_section
 from service.audit.report_verification import verification_section
 from service.core.count_words import counted
 from service.core.imported import imported_sentence
