@@ -59,7 +59,7 @@
     const back = [Math.cos(up) * Math.cos(around), Math.cos(up) * Math.sin(around), Math.sin(up)];
     const right = [-Math.sin(around), Math.cos(around), 0], top = cross(back, right);
     const eye = [tx + far * back[0], ty + far * back[1], tz + far * back[2]];
-    const near = Math.max(1, far - 1.2 * reach), end = far + 1.2 * reach, f = 2.6;
+    const near = Math.max(1, far - 1.2 * reach), end = far + 1.2 * reach, f = 2.3;  // all is in sight at first
     const x = right.map((v) => v * f * canvas.height / canvas.width), y = top.map((v) => v * f);
     const a = (end + near) / (near - end), b = 2 * end * near / (near - end), z = -dot(back, eye);
     return [
