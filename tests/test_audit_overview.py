@@ -111,3 +111,46 @@ def test_a_time_is_told_on_the_sites_clock_too(monkeypatch: pytest.MonkeyPatch) 
     finally:
         monkeypatch.undo()
         time.tzset()
+
+
+PTP, EXIF = "3282933005318008", "05318008"
+
+
+def test_one_camera_has_one_serial_number(tmp_path: Path) -> None:
+    run_id = record_reported_run(tmp_path, person="grace", serials=(PTP, EXIF))
+    with web_site(tmp_path) as site:
+        overview, devices = read((site, run_id)), read((site, run_id), "/devices")
+        html = words(site.browser("auditor").get(f"/audit/runs/{run_id}/devices").text)
+    assert f"ILCE-7RM5 {EXIF}" in overview
+    assert PTP not in overview
+    assert devices.count(PTP) == 1
+    assert (
+        f"Over its connection it states {PTP}, which ends with the same digits: it is one and the same body" in html
+    )
+
+
+def test_photographs_of_another_body_are_told(tmp_path: Path) -> None:
+    run_id = record_reported_run(tmp_path, person="grace", serials=(PTP, "77"))
+    with web_site(tmp_path) as site:
+        devices = read((site, run_id), "/devices")
+    assert (
+        f"Photographs state the serial number 77, and no camera that was opened does: camera states {PTP}" in devices
+    )
+
+
+def test_photographs_taken_again_and_exposures_that_failed_are_counted(web: tuple[WebSite, str]) -> None:
+    page = read(web)
+    table = page[page.index("Views given up") : page.index("What was taken again")]
+    assert "Capture the specimen 3 2 1 1 0" in table
+    assert "1 Re-do 1 Skipped view 0 Skipped steps" in page
+    assert "1 Correction " in page
+
+
+def test_what_a_clock_offset_means_stands_beside_it(tmp_path: Path) -> None:
+    run_id = record_reported_run(tmp_path, person="grace", serials=(PTP, EXIF))
+    with web_site(tmp_path) as site:
+        page = read((site, run_id), "/devices")
+    assert "counts from when it was switched on: only its change matters" in page
+    assert "1279.000 s behind this machine's" in page
+    assert "Beyond The time written in its files is its own. Order and times of the record do not rest on it." in page
+    assert "a large or negative one is no fault" in page

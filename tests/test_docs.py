@@ -164,6 +164,8 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture worker --data runs": serves_until_terminated,
     "orthocapture serve --rig rig.yaml --data runs": serves_pages,
     "orthocapture audit report latest --pdf report.pdf --data runs": succeeds,
+    "orthocapture audit report latest --pdf report.pdf --html report.html --data runs": succeeds,
+    "orthocapture audit figures latest --out figures --data runs": succeeds,
     "orthocapture audit export latest bundle.zip --data runs": succeeds,
     "orthocapture register --images DIR --camera camera.json --poses poses.csv --mesh scan.ply --radius-mm 15 "
     "--out result.json": registers,

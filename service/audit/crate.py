@@ -7,6 +7,7 @@ from typing import Any
 
 from service.audit.bundle_zip import Listed
 from service.core.acceptance import describe_accepted
+from service.core.bodies import bodies
 from service.core.imported import imported_sentence
 from service.core.model import (
     ArtefactRef,
@@ -172,14 +173,18 @@ def _devices(events: Sequence[Event]) -> Iterable[dict[str, Any]]:
     for event in events:
         if isinstance(event.payload, DeviceOpened):
             opened.setdefault(event.payload.device, event.payload)
+    known = bodies(events)
     for name, payload in opened.items():
         identity: Mapping[str, Any] = payload.report.get("identity", {})
+        wire = str(identity.get("serial") or "")
         yield {
             "@id": _anchor("device", name),
             "@type": "IndividualProduct",
             "name": name,
             "description": " ".join(str(identity.get(key) or "") for key in ("vendor", "model", "firmware")).strip(),
-            "serialNumber": str(identity.get("serial") or ""),
+            "serialNumber": known.shown(identity),
+            # As its connection states it, where photographs state the body's own: one camera.
+            **({"identifier": wire} if known.shown(identity) != wire else {}),
         }
 
 

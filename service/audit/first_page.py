@@ -25,6 +25,26 @@ GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
     "late_results": ("Results that came later", frozenset()),
     "automatic": ("Automatic confirmations", frozenset({"automatic"})),
 }
+# The same of one alone.
+_OF_ONE: Mapping[str, str] = {
+    "accepted": "Gate accepted",
+    "redone": "Re-do",
+    "skipped_views": "Skipped view",
+    "skipped_steps": "Skipped step",
+    "overridden": "Gate overridden",
+    "refused": "Refused action",
+    "failed_gates": "Failed gate",
+    "undecided_gates": "Gate not decided",
+    "late_results": "Result that came later",
+    "automatic": "Automatic confirmation",
+}
+
+
+def group_name(group: str, number: int) -> str:
+    """Name of a group beside how many are in it."""
+    return _OF_ONE[group] if number == 1 else GROUPS[group][0]
+
+
 _NAMES: Mapping[str, str] = {
     "skip": "Step skipped",
     "gate_accepted": "Gate accepted outside its limits",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Literal
 
 Tone = Literal["plain", "ok", "attention", "stop"]
@@ -61,12 +62,16 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A photograph with its caption; None where its file is missing or altered."""
+    """A small copy of a photograph with its caption; None where the file is missing or altered.
+
+    The photograph itself is named by its hash: it lies in the evidence under that name.
+    """
 
     caption: str
     jpeg: bytes | None
     width: int = 0
     height: int = 0
+    sha256: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,14 +118,34 @@ class Label:
 
 
 @dataclass(frozen=True, slots=True)
+class Raster:
+    """A picture within a drawing, as PNG."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    png: bytes = field(repr=False)
+
+
+Shape = Box | Line | Label | Raster
+
+
+@dataclass(frozen=True, slots=True)
 class Drawing:
-    """A chart in its own units, drawn to the width that there is; `text` says the same in words."""
+    """A chart in its own units, drawn to the width that there is; `text` says the same in words.
+
+    `name`: what its file is called, without an ending; `rows`: the figures that it draws, the first row their names
+    with units.
+    """
 
     title: str
     text: str
     width: float
     height: float
-    shapes: tuple[Box | Line | Label, ...]
+    shapes: tuple[Shape, ...]
+    name: str = ""
+    rows: tuple[tuple[str, ...], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,10 +157,10 @@ class Drawings:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The scene in 3D: a div with its own script, for HTML alone."""
+    """The scene: drawn as it is first seen, and to be turned in HTML; `html` is "" where that is not wanted."""
 
-    html: str
-    text: str
+    drawing: Drawing
+    html: str = field(repr=False)
 
 
 Block = Paragraph | Heading | Facts | Table | Pictures | Drawings | Scene
@@ -164,4 +189,4 @@ class Report:
     sections: tuple[Section, ...]
     run_id: str
     head_sha256: str
-    made_utc: str
+    made_at: datetime  # UTC, to the second

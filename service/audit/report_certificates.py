@@ -53,10 +53,11 @@ def _facts(run: RecordedRun, step_id: str, sha256: str) -> Facts:
     intrinsics: Mapping[str, Any] = state.result["details"].get("intrinsics") or {}
     hand_eye: Mapping[str, Any] = state.result.get("hand_eye") or {}
     best = hand_eye.get("arm_correction") or hand_eye
+    body = f"body {camera['body_serial']}" if camera.get("body_serial") else ""
     rows: list[tuple[str, Cell | str]] = [
         ("Certificate number (SHA-256 of calibration.json)", sha256),
         ("Calibrated", utc(state.ended_utc) if state.ended_utc else "not accepted yet"),
-        ("Camera and lens", ", ".join(filter(None, (str(camera.get("body_serial", "")), optics))) or "not recorded"),
+        ("Camera and lens", ", ".join(filter(None, (body, optics))) or "not recorded"),
     ]
     if intrinsics:
         checked, sigma = intrinsics.get("cross_validation"), intrinsics["uncertainty"]
@@ -113,7 +114,7 @@ def _hand_eye(result: Mapping[str, Any]) -> Iterator[Block]:
     held: Mapping[str, float] = best["residuals"]["held_out_mm"]
     median_mm, largest_mm = float(np.median(list(held.values()))), max(held.values())
     text = f"Median {median_mm:.3f} mm, largest {largest_mm:.3f} mm; solved by {record['method']}."
-    yield Drawings((bars_drawing("Held-out error of each view", text, held, "mm"),))
+    yield Drawings((bars_drawing("hand_eye_held_out", "Held-out error of each view", text, held, "mm"),))
     if best is not record:
         without = float(np.median(list(record["residuals"]["held_out_mm"].values())))
         yield Paragraph(

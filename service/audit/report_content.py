@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
 
-from service.audit.not_in_yet import not_in_yet
 from service.audit.recorded import RecordedRun
 from service.audit.report_accuracy import accuracy_section, budget_section, later_section, result_sentence
-from service.audit.report_blocks import Cell, Facts, Paragraph, Report, Section
+from service.audit.report_blocks import Cell, Paragraph, Report, Section
 from service.audit.report_certificates import certificate_sections
 from service.audit.report_course import deviations, deviations_section, people_section, steps_section
-from service.audit.report_notes import about_facts, notes_section
-from service.audit.report_origin import devices_section, pictures_section, software_section
+from service.audit.report_facts import facts
+from service.audit.report_notes import notes_section
+from service.audit.report_origin import devices_section, software_section
+from service.audit.report_photographs import pictures_section
 from service.audit.report_verification import verification_section
-from service.audit.report_words import duration, utc
+from service.core.count_words import counted
 from service.core.imported import imported_sentence
-from service.core.late import late_results
 from service.store.audit import AuditReport
 
 
@@ -36,7 +36,7 @@ def report_content(
         audit: what verifying it gave, before anything else; the first page says so.
         made_at: the time stamp of the report; now unless given. With the same one the same evidence gives the same.
         true_error_mm: by source of poses, on a simulated rig where the truth is known; marked as such.
-        with_scene: the 3D scene as well, which only HTML can show.
+        with_scene: the scene to be turned as well, which only HTML can show; its drawing is there without.
         with_pictures: False leaves out what shows the photographs.
     """
     summary = run.summary()
@@ -52,7 +52,7 @@ def report_content(
         notes_section(run, with_pictures=with_pictures),
         *certificate_sections(run),
         devices_section(run),
-        pictures_section(run, with_scene=with_scene)
+        pictures_section(run, turning=with_scene)
         if with_pictures
         else Section("Pictures", (Paragraph("They were left out: this report goes with hashes alone."),)),
         verification_section(run, audit),
@@ -64,22 +64,23 @@ def report_content(
         origin=_origin(run),
         verification=_verification(audit),
         result=result,
-        deviations=Cell(f"{len(listed)} deviations, listed first", "attention")
+        deviations=Cell(f"{counted(len(listed), 'deviation')}, listed first", "attention")
         if listed
         else Cell("No deviation: every step was done as the protocol says", "ok"),
         release=_release(run),
-        facts=_facts(run),
+        facts=facts(run),
         sections=tuple(section for section in sections if section is not None),
         run_id=run.run_id,
         head_sha256=run.events[-1].sha256,
-        made_utc=utc((made_at or datetime.now(UTC)).isoformat()),
+        made_at=(made_at or datetime.now(UTC)).astimezone(UTC).replace(microsecond=0),
     )
 
 
 def _verification(audit: AuditReport) -> Cell:
     if audit.first_fault is None:
         return Cell("The evidence verifies: every file and every record is as it was recorded", "ok")
-    more = f", and {len(audit.faults) - 1} more faults" if len(audit.faults) > 1 else ""
+    others = len(audit.faults) - 1
+    more = f", and {others} more {'fault' if others == 1 else 'faults'}" if others else ""
     return Cell(
         f"THE EVIDENCE DOES NOT VERIFY: {audit.first_fault}{more}. Nothing in this report can be relied on.", "stop"
     )
@@ -99,49 +100,3 @@ def _release(run: RecordedRun) -> Cell | None:
     if run.state.released_by:
         return Cell(f"Released by a second person: {run.named(run.state.released_by)}", "ok")
     return Cell("NOT RELEASED: the protocol asks that a second person reads and releases this run", "stop")
-
-
-def _later(run: RecordedRun) -> Iterator[tuple[str, Cell]]:
-    late = late_results(run.protocol, run.state)
-    if late:
-        yield "Results that came after the evaluation", Cell(", ".join(one.name for one in late), "attention")
-    missing = not_in_yet(run.protocol, run.state, run.events)
-    if missing:
-        yield "Results not in yet", Cell("; ".join(missing), "attention")
-
-
-def _facts(run: RecordedRun) -> Facts:
-    root, state, events = run.root, run.state, run.events
-    views = sum(len(step.captured) for step in state.steps.values())
-    others = sorted(run.named(person) for person in state.people - {root.operator})
-    status = {"active": "not finished"}.get(state.status, state.status)
-    return Facts(
-        (
-            ("Run", run.run_id),
-            *about_facts(run),
-            ("Begun", utc(events[0].at_utc)),
-            ("Last record", f"{utc(events[-1].at_utc)}, after {duration(events[0].at_utc, events[-1].at_utc)}"),
-            (
-                "State",
-                Cell(
-                    status + (f": {state.stop_reason}" if state.stop_reason else ""),
-                    "ok" if status == "completed" else "attention",
-                ),
-            ),
-            ("Begun by", run.named(root.operator)),
-            ("Others who took part", ", ".join(others) or "none"),
-            ("Released by", run.named(state.released_by) if state.released_by else "nobody"),
-            ("Protocol", f"{root.protocol_id}, version {root.protocol_version}"),
-            ("SHA-256 of the protocol", root.protocol_sha256),
-            (
-                "SHA-256 of the list of imported files"
-                if root.origin == "imported"
-                else "SHA-256 of the rig's description",
-                root.rig.sha256,
-            ),
-            *_later(run),
-            ("Photographs that count", str(views)),
-            ("Records", str(len(events))),
-            ("Chain head", events[-1].sha256),
-        )
-    )

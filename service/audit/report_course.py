@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from service.audit.recorded import RecordedRun
 from service.audit.report_blocks import Block, Cell, Column, Paragraph, Section, Table
 from service.audit.report_words import clock, duration, judged, limit, measured, utc, words
+from service.audit.shots import Shots, failed_exposures, shots_by_step
+from service.core.count_words import counted
 from service.core.gates import BOUNDS_HOLD, describe_judged
 from service.core.model import (
     DeviceTrouble,
@@ -58,11 +60,10 @@ def deviations(run: RecordedRun) -> list[Departure]:
 def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
     match payload:
         case GatesEvaluated(passed=False):
-            for kind, undecided in (("gate failed", False), ("gate not decided", True)):
-                short = [v for v in payload.verdicts if not v.passed and v.undecided == undecided]
-                if short:
-                    told = "; ".join(describe_judged(verdict) for verdict in short)
-                    yield kind, payload.step, f"attempt {payload.attempt}: {told}"
+            for verdict in payload.verdicts:  # each counts, as on the auditor's pages
+                if not verdict.passed:
+                    kind = "gate not decided" if verdict.undecided else "gate failed"
+                    yield kind, payload.step, f"attempt {payload.attempt}: {describe_judged(verdict)}"
         case StepFailed():
             yield "step failed", payload.step, f"attempt {payload.attempt}: {payload.message}"
         case ViewpointFailed(skipped=False):
@@ -97,13 +98,14 @@ def deviations_section(run: RecordedRun, listed: Sequence[Departure]) -> Section
         blocks.append(Paragraph("None: every step was done once, as the protocol says, within its limits.", "ok"))
     automatic = sum(deviation.is_note for deviation in run.state.deviations)
     if automatic:
-        text = f"{automatic} confirmations were given automatically, which only a simulated rig allows."
+        were = "was" if automatic == 1 else "were"
+        text = f"{counted(automatic, 'confirmation')} {were} given automatically, which only a simulated rig allows."
         blocks.append(Paragraph(text, "attention"))
     retaken = [past for past in run.state.superseded if past.viewpoint is not None]
     redone = [past for past in run.state.superseded if past.viewpoint is None]
     if retaken or redone:
-        counted = f"Replaced by later ones: attempts at steps {len(redone)}, single views {len(retaken)}."
-        blocks.append(Paragraph(f"{counted} Their evidence was kept and is part of what was verified."))
+        told = f"Replaced by later ones: attempts at steps {len(redone)}, single views {len(retaken)}."
+        blocks.append(Paragraph(f"{told} Their evidence was kept and is part of what was verified."))
     return Section("Deviations", tuple(blocks))
 
 
@@ -117,10 +119,11 @@ def steps_section(run: RecordedRun) -> Section:
     )
     rows: list[tuple[Cell | str, ...]] = []
     heads: set[int] = set()
+    shots = {one.step: one for one in shots_by_step(run.protocol, run.state, failed_exposures(run.events))}
     for number, step in enumerate(run.protocol.steps, 1):
         state = run.state.steps[step.id]
         heads.add(len(rows))
-        rows.append((_state(run, f"{number}. {step.title}", state), "", "", ""))
+        rows.append((_state(run, f"{number}. {step.title}", state, shots), "", "", ""))
         accepted = state.accepted is not None
         rows += [(*measured(v), limit(v), judged(v, accepted=accepted)) for v in state.verdicts]
     table = Table(columns, tuple(rows), frozenset(heads), frozenset(heads))
@@ -128,7 +131,7 @@ def steps_section(run: RecordedRun) -> Section:
     return Section("Steps and gates", (table, *([Paragraph(f"{BOUNDS_HOLD}.")] if bounded else [])))
 
 
-def _state(run: RecordedRun, title: str, state: StepState) -> Cell:
+def _state(run: RecordedRun, title: str, state: StepState, shots: Mapping[str, Shots]) -> Cell:
     went_on = state.phase == "passed" and not state.skipped
     phase = ("gates overridden" if state.verdicts else "skipped") if state.skipped else words(state.phase)
     parts = [
@@ -140,7 +143,7 @@ def _state(run: RecordedRun, title: str, state: StepState) -> Cell:
         parts.append(f"begun {clock(state.started_utc)}")
     if state.started_utc and state.ended_utc:
         parts.append(f"took {duration(state.started_utc, state.ended_utc)}")
-    parts.append(f"{len(state.captured)} views" if state.captured else "")
+    parts.append(shots[state.step].words if state.step in shots else "")
     parts.append(f"signed by {run.named(state.signed_by)}" if state.signed_by else "")
     within = went_on and state.accepted is None
     return Cell(f"{title}: {', '.join(filter(None, parts))}", "plain" if within else "attention")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from service.audit.report_blocks import Box, Drawing, Label, Line
+from service.audit.report_blocks import Box, Drawing, Label, Line, Shape
 from service.core.geometry import Array
 
 _WIDTH = 480.0
@@ -28,6 +28,8 @@ def coverage_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Drawin
         _WIDTH,
         height,
         tuple(shapes),
+        "coverage",
+        _by_cell(counts, size, "corners", "{:.0f}"),
     )
 
 
@@ -44,6 +46,8 @@ def uncertainty_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Dra
         _WIDTH,
         height,
         tuple(shapes),
+        "projection_uncertainty",
+        _by_cell(field, size, "sigma_mm", "{:.6f}"),
     )
 
 
@@ -58,7 +62,7 @@ def residual_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Drawin
     rows, columns = counts.shape
     height = _WIDTH * size[1] / size[0]
     cell = np.array([_WIDTH / columns, height / rows])
-    shapes: list[Box | Line | Label] = [Box(0, 0, _WIDTH, height, "#f7f9fb")]
+    shapes: list[Shape] = [Box(0, 0, _WIDTH, height, "#f7f9fb")]
     for row, column in np.argwhere(known):
         middle = (np.array([column, row]) + 0.5) * cell
         length = min(2.0, lengths[row, column] / max(usual, 1e-9)) * 0.45 * float(cell.min())
@@ -71,15 +75,23 @@ def residual_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Drawin
         _WIDTH,
         height,
         tuple(shapes),
+        "residuals",
+        (
+            ("row", "column", "centre_x_px", "centre_y_px", "mean_dx_px", "mean_dy_px", "corners"),
+            *(
+                (*_cell(int(row), int(column), counts.shape, size), *(f"{v:.5f}" for v in mean[row, column]), str(n))
+                for (row, column), n in np.ndenumerate(counts)
+            ),
+        ),
     )
 
 
-def bars_drawing(title: str, text: str, values: Mapping[str, float], unit: str) -> Drawing:
-    """One bar a name, with the largest value at the scale."""
+def bars_drawing(name: str, title: str, text: str, values: Mapping[str, float], unit: str) -> Drawing:
+    """One bar a view, with the largest value at the scale; `name` is that of its file."""
     height, base = 190.0, 160.0
     largest = max(values.values(), default=0.0) or 1.0
     step = (_WIDTH - 50) / max(len(values), 1)
-    shapes: list[Box | Line | Label] = [Line(44, base, _WIDTH, base, _LINE)]
+    shapes: list[Shape] = [Line(44, base, _WIDTH, base, _LINE)]
     for share in (0.5, 1.0):
         y = base - 130 * share
         shapes += [
@@ -87,20 +99,36 @@ def bars_drawing(title: str, text: str, values: Mapping[str, float], unit: str) 
             Label(40, y + 3, f"{largest * share:.2g} {unit}", 9, anchor="end"),
         ]
     every = max(1, math.ceil(len(values) / 16))
-    for k, (name, value) in enumerate(values.items()):
+    for k, (view, value) in enumerate(values.items()):
         x = 48 + k * step
         shapes.append(Box(x, base - 130 * value / largest, 0.7 * step, 130 * value / largest, _BLUE))
         if k % every == 0:
-            shapes.append(Label(x + 0.35 * step, base + 14, name, 8))
-    return Drawing(title, text, _WIDTH, height, tuple(shapes))
+            shapes.append(Label(x + 0.35 * step, base + 14, view, 8))
+    rows = (("view", f"error_{unit}"), *((view, f"{value:.6f}") for view, value in values.items()))
+    return Drawing(title, text, _WIDTH, height, tuple(shapes), name, rows)
 
 
-def _cells(values: Array, size: tuple[int, int], text: Any) -> tuple[list[Box | Line | Label], float]:
+def _by_cell(values: Array, size: tuple[int, int], name: str, form: str) -> tuple[tuple[str, ...], ...]:
+    """One row a cell: which, where in the image, and its value."""
+    cells = (
+        (*_cell(int(at[0]), int(at[1]), values.shape, size), form.format(value))
+        for at, value in np.ndenumerate(values)
+    )
+    return (("row", "column", "centre_x_px", "centre_y_px", name), *cells)
+
+
+def _cell(row: int, column: int, shape: tuple[int, ...], size: tuple[int, int]) -> tuple[str, ...]:
+    """Row, column, and the middle of the cell in px; pixel centres at integer coordinates."""
+    x, y = (column + 0.5) * size[0] / shape[1] - 0.5, (row + 0.5) * size[1] / shape[0] - 0.5
+    return str(row), str(column), f"{x:.1f}", f"{y:.1f}"
+
+
+def _cells(values: Array, size: tuple[int, int], text: Any) -> tuple[list[Shape], float]:
     rows, columns = values.shape
     height = _WIDTH * size[1] / size[0]
     width, tall = _WIDTH / columns, height / rows
     low, high = float(values.min()), float(values.max())
-    shapes: list[Box | Line | Label] = []
+    shapes: list[Shape] = []
     for (row, column), value in np.ndenumerate(values):
         share = (float(value) - low) / (high - low) if high > low else 0.0
         shapes.append(Box(column * width, row * tall, width - 1, tall - 1, _mixed(share)))

@@ -9,7 +9,9 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
-from service.audit.report_blocks import Box, Cell, Drawing, Line, Picture, Report
+from service.audit.report_blocks import Cell, Drawing, Picture, Report
+from service.audit.report_svg import drawing_svg
+from service.audit.report_words import moment
 
 
 def write_html(report: Report, path: Path) -> None:
@@ -27,7 +29,7 @@ def render_html(report: Report) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"cell": _cell, "data_url": _data_url, "svg": _svg, "kind": _kind}
+    environment.filters |= {"cell": _cell, "data_url": _data_url, "svg": _svg, "kind": _kind, "moment": moment}
     return environment.get_template("report.html.j2").render(report=report)
 
 
@@ -48,17 +50,4 @@ def _data_url(picture: Picture) -> str:
 
 
 def _svg(drawing: Drawing) -> Markup:
-    parts: list[str] = []
-    for shape in drawing.shapes:
-        if isinstance(shape, Box):
-            place = f'x="{shape.x:.2f}" y="{shape.y:.2f}" width="{shape.width:.2f}" height="{shape.height:.2f}"'
-            parts.append(f'<rect {place} fill="{shape.colour}"/>')
-        elif isinstance(shape, Line):
-            ends = f'x1="{shape.x1:.2f}" y1="{shape.y1:.2f}" x2="{shape.x2:.2f}" y2="{shape.y2:.2f}"'
-            parts.append(f'<line {ends} stroke="{shape.colour}" stroke-width="{shape.width}"/>')
-        else:
-            place = f'x="{shape.x:.2f}" y="{shape.y:.2f}" font-size="{shape.size}" text-anchor="{shape.anchor}"'
-            parts.append(f'<text {place} fill="{shape.colour}">{escape(shape.text)}</text>')
-    label = escape(f"{drawing.title}. {drawing.text}", quote=True)
-    box = f'viewBox="0 0 {drawing.width:.2f} {drawing.height:.2f}"'
-    return Markup(f'<svg {box} role="img" aria-label="{label}">{"".join(parts)}</svg>')
+    return Markup(drawing_svg(drawing))

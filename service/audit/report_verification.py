@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from service.audit.recorded import RecordedRun
 from service.audit.report_blocks import Block, Cell, Column, Facts, Heading, Paragraph, Section, Table
+from service.core.count_words import counted
 from service.store.audit import AuditReport
 
 _FAULTS_SHOWN = 20
@@ -14,10 +15,11 @@ def verification_section(run: RecordedRun, audit: AuditReport) -> Section:
     head = run.events[-1]
     unsigned = audit.unsigned_events.get(run.run_id, 0)
     rows: list[tuple[str, Cell | str]] = [
-        ("Evidence", Cell("verified", "ok") if audit.ok else Cell(f"{len(audit.faults)} faults", "stop")),
+        ("Evidence", Cell("verified", "ok") if audit.ok else Cell(counted(len(audit.faults), "fault"), "stop")),
         (
             "Records walked",
-            f"{audit.events} events, {audit.artefacts} artefact rows, {audit.jobs} jobs",
+            f"{counted(audit.events, 'event')}, {counted(audit.artefacts, 'artefact row')}, "
+            f"{counted(audit.jobs, 'job')}",
         ),
         ("Files hashed again", f"{audit.files}, {audit.bytes_hashed / 1e6:.1f} MB"),
         (f"Chain head (event {head.seq})", head.sha256),

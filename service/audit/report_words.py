@@ -17,6 +17,11 @@ def utc(text: str) -> str:
     return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
+def moment(at: datetime) -> str:
+    """The same of a time."""
+    return utc(at.isoformat())
+
+
 def clock(text: str) -> str:
     """The same without the date."""
     return utc(text).split()[1]

@@ -971,7 +971,7 @@ def report(check: Check) -> str:
         *(f"note: {note}" for note in check.notes),
     ]
     if check.faults:
-        lines.append(f"NOT AS IT WAS RECORDED: {len(check.faults)} differences.")
+        lines.append(f"NOT AS IT WAS RECORDED: {len(check.faults)} difference{'s' * (len(check.faults) != 1)}.")
         lines += [f"  {fault['where']}: {fault['what']}" for fault in check.faults]
     else:
         lines.append("WHOLE AND UNALTERED: every file, record, link and signature is as it was recorded.")

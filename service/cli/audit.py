@@ -17,6 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from service.audit.verifying import keep_verification, verification_of
+from service.cli.audit_figures import figures_command
 from service.cli.audit_report import report_command
 from service.cli.common import (
     DEFAULT_DATA,
@@ -28,6 +29,7 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
+from service.core.count_words import counted
 from service.store import audit
 from service.store.audit import AuditReport, EvidenceRecord
 from service.store.records import Artefact
@@ -239,7 +241,7 @@ def _artefact_json(artefact: Artefact) -> dict[str, Any]:
 
 
 def _print_records(run_id: str, records: Sequence[EvidenceRecord]) -> None:
-    table = Table(title=f"Run {run_id}: {len(records)} events", title_justify="left")
+    table = Table(title=f"Run {run_id}: {counted(len(records), 'event')}", title_justify="left")
     for heading in ("no.", "time (UTC)", "who", "what", "details"):
         table.add_column(heading, overflow="fold")
     for record in records:
@@ -261,9 +263,10 @@ def _print_records(run_id: str, records: Sequence[EvidenceRecord]) -> None:
 
 def _print_report(report: AuditReport) -> None:
     console.print(
-        f"Checked {len(report.runs)} run(s) in {escape(report.data_dir)}: {report.events} events, "
-        f"{report.artefacts} recorded files ({report.bytes_hashed / 1e6:.1f} MB read again), {report.jobs} jobs, "
-        f"{report.checkpoints} signatures."
+        f"Checked {counted(len(report.runs), 'run')} in {escape(report.data_dir)}: "
+        f"{counted(report.events, 'event')}, {counted(report.artefacts, 'recorded file')} "
+        f"({report.bytes_hashed / 1e6:.1f} MB read again), {counted(report.jobs, 'job')}, "
+        f"{counted(report.checkpoints, 'signature')}."
     )
     for run_id, head in report.heads.items():
         console.print(f"  {run_id} ends with {head}")
@@ -281,3 +284,4 @@ def _print_report(report: AuditReport) -> None:
 
 
 audit_app.command("report")(report_command)
+audit_app.command("figures")(figures_command)

@@ -43,6 +43,7 @@ from service.compute.calibration.kinematics import ARM_MODELS, ArmModel, arm_mod
 from service.compute.camera_covariance import read_camera_covariance
 from service.compute.image_folder import image_folder
 from service.compute.poses.pose_files import posed_images, read_camera_json
+from service.core.count_words import counted
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
 
@@ -197,7 +198,7 @@ def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
     x, y, z = 1e3 * result.T_flange_camera[:3, 3]
     frame = "flange" if setup == "eye-in-hand" else "robot's base"
     console.print(
-        f"{len(result.held_out_mm)} images: camera at {x:.2f}, {y:.2f}, {z:.2f} mm in the {frame} frame "
+        f"{counted(len(result.held_out_mm), 'image')}: camera at {x:.2f}, {y:.2f}, {z:.2f} mm in the {frame} frame "
         f"± {result.sigma_mm:.3f} mm, ± {result.sigma_deg:.4f}° ({result.method})"
     )
     held_mm, held_deg = np.median(result.held_out_mm), np.median(result.held_out_deg)

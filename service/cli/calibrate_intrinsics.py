@@ -49,6 +49,7 @@ from service.compute.calibration.validation import (
 )
 from service.compute.image_folder import image_folder
 from service.compute.images import image_size
+from service.core.count_words import counted
 from service.core.errors import ComputeError, DataError
 
 _WITHOUT_EXIF = {".pgm", ".ppm", ".pnm"}
@@ -208,7 +209,7 @@ def _tell(
     uncertainty: ProjectionUncertainty,
 ) -> None:
     held_out = "" if validation is None else f", {validation.five_fold_rms_px:.3f} px held out"
-    console.print(f"{len(result.views)} views, {result.rms_px:.3f} px rms{held_out}")
+    console.print(f"{counted(len(result.views), 'view')}, {result.rms_px:.3f} px rms{held_out}")
     for name in result.parameters:
         console.print(f"  {name:<3} {getattr(result.camera, name):14.6g} ± {result.sigma[name]:.2g}")
     console.print(

@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 
 from drivers.errors import DeviceError
-from drivers.interfaces import DeviceReport
+from drivers.interfaces import DeviceIdentity, DeviceReport
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -24,7 +24,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run import RigOption
-from service.core.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S
+from service.core.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, offset_told
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.model import HostClock
 from service.core.protocol import Protocol, load_protocol
@@ -111,10 +111,17 @@ def _clock_words(clock: HostClock) -> str:
 
 def _offset_words(offset_s: float, clock: str, *, late: bool) -> str:
     if clock == "uptime":
-        return f"its clock counts from power-on ({offset_s:+.3f} s to this machine's): only its change means anything"
-    way = "ahead of" if offset_s > 0 else "behind"
-    words = f"clock {abs(offset_s):.3f} s {way} this machine's"
-    return f"[yellow]{words}, more than {DEVICE_LIMIT_S:g} s: set it before a run[/]" if late else words
+        return (
+            f"its clock counts from when it was switched on, {offset_s:+.3f} s from this machine's count: that is as "
+            "it should be, for only a change during a run matters"
+        )
+    words = f"clock {offset_told(offset_s, clock)}"
+    if not late:
+        return words
+    return (
+        f"[yellow]{words}, more than {DEVICE_LIMIT_S:g} s: set it before a run, or the times in its files are wrong "
+        "by that[/]"
+    )
 
 
 def _foresee(data: Path, protocol: Protocol, free_bytes: int, *, simulated: bool) -> Forecast:
@@ -130,6 +137,12 @@ def _record(report: DeviceReport | OrthocaptureError) -> dict[str, Any]:
     return {"ok": not report.problems, **dataclasses.asdict(report)}
 
 
+def _serial_note(who: DeviceIdentity) -> str:
+    """A camera's number over USB may have digits before that of the body, which its photographs state alone."""
+    known = who.kind == "camera" and who.serial
+    return " (as USB states it; its photographs may state its end alone)" if known else ""
+
+
 def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
     if isinstance(report, OrthocaptureError):
         console.print(f"[bold red]✗ {escape(name)}[/] {escape(str(report))}")
@@ -138,7 +151,8 @@ def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
     late = report.clock == "utc" and abs(report.clock_offset_s or 0.0) > DEVICE_LIMIT_S
     mark = "[bold yellow]!" if report.problems or late else "[bold green]✓"
     console.print(
-        f"{mark} {escape(name)}[/] {escape(who.model)}, serial {escape(who.serial)}, {escape(who.firmware)}"
+        f"{mark} {escape(name)}[/] {escape(who.model)}, serial {escape(who.serial)}{_serial_note(who)}, "
+        f"{escape(who.firmware)}"
     )
     console.print(f"    {escape(who.driver)} {escape(who.driver_version)} at {escape(who.address)}")
     if report.clock_offset_s is not None:

@@ -9,6 +9,7 @@ import typer
 from rich.markup import escape
 
 from service.cli.common import JsonOption, console, print_json, reporting_errors
+from service.core.count_words import counted
 from service.core.errors import ProtocolError
 from service.core.protocol import load_protocol
 from service.core.protocol_docs import lifecycle_text, schema_text
@@ -42,7 +43,9 @@ def check_command(
             steps = [{"id": s.id, "kind": s.kind, "irreversible": s.irreversible} for s in protocol.steps]
             print_json({"id": protocol.id, "version": protocol.version, "sha256": loaded.sha256, "steps": steps})
             return
-        console.print(f"{escape(str(file))} is sound: {protocol.id} {protocol.version}, {len(protocol.steps)} steps")
+        console.print(
+            f"{escape(str(file))} is sound: {protocol.id} {protocol.version}, {counted(len(protocol.steps), 'step')}"
+        )
         for step in protocol.steps:
             marks = ", ".join(m for m, on in (("irreversible", step.irreversible), ("signed", step.sign)) if on)
             console.print(f"  {step.id:<26} {step.kind:<20} {marks}")

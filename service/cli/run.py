@@ -314,6 +314,6 @@ def _report_end(run_id: str, state: RunState, *, json: bool) -> None:
     if json:
         print_json(status_record(run_id, state))
     else:
-        console.print(f"Run {run_id} is {state.status}; {state.deviation_count} deviations. Evidence: audit verify")
+        console.print(f"Run {run_id} is {state.status}; {state.deviations_told}. Evidence: audit verify")
     if state.status != "completed":
         raise typer.Exit(1)

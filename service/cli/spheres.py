@@ -17,6 +17,7 @@ from drivers.point_cloud import is_point_cloud, read_point_cloud
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
 from service.compute.surfaces.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
 from service.compute.surfaces.sphere_records import spheres_document
+from service.core.count_words import counted
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 
@@ -128,7 +129,10 @@ def spheres_of(
     """Spheres of a mesh or point cloud file, metres; in the order of the seeds if given."""
     seeds_m = read_seeds(seeds)
     if expected is not None and seeds_m is not None and len(seeds_m) != expected:
-        raise DataError(f"{len(seeds_m)} seeds are given and {expected} spheres expected", remedy="give one for each")
+        raise DataError(
+            f"{counted(len(seeds_m), 'seed')} given for {counted(expected, 'expected sphere')}",
+            remedy="give one for each",
+        )
     normals: Array | None = None
     faces: NDArray[np.integer] = np.empty((0, 3), dtype=np.int64)
     if mesh.is_file() and is_point_cloud(mesh):

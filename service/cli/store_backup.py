@@ -18,6 +18,7 @@ from service.cli.common import (
     progress_bar,
     reporting_errors,
 )
+from service.core.count_words import counted
 from service.store.backup import BackupReport, back_up
 from service.store.restore import RestoreReport, restore
 
@@ -98,11 +99,11 @@ def _restore_json(made: RestoreReport) -> dict[str, Any]:
 def _print_backup(made: BackupReport) -> None:
     state = made.state
     console.print(
-        f"Backup {made.name} is in {escape(str(made.folder))}: {len(state.heads)} chains, {state.artefacts} files, "
-        f"{state.artefact_bytes / 1e9:.2f} GB."
+        f"Backup {made.name} is in {escape(str(made.folder))}: {counted(len(state.heads), 'chain')}, "
+        f"{counted(state.artefacts, 'file')}, {state.artefact_bytes / 1e9:.2f} GB."
     )
     console.print(
-        f"  Copied this time and read again: {made.copied} files, {made.copied_bytes / 1e9:.2f} GB; "
+        f"  Copied this time and read again: {counted(made.copied, 'file')}, {made.copied_bytes / 1e9:.2f} GB; "
         f"{made.present} were there."
     )
     if not state.with_keys:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from typing import Literal
+from typing import Any, Literal
 
 from service.core.model import DeviceOpened, Event, SessionStarted, ViewpointCaptured
 
@@ -62,6 +62,18 @@ class ClockReading:
         return f"{abs(self.offset_s):.3f} s {'ahead' if self.offset_s > 0 else 'behind'}"
 
     @property
+    def meaning(self) -> str:
+        """What its difference says and what rests on it, for whoever audits a run."""
+        if self.against == "NTP":
+            return "Every time in the record is this machine's: it is true as far as this clock is"
+        if self.against == "host UTC":
+            return "The time written in its files is its own. Order and times of the record do not rest on it"
+        return (
+            "It counts seconds from when the device was switched on, so how far it is from this machine's says "
+            "nothing. Its change matters: by it the pose of the arm is found for the moment of each exposure"
+        )
+
+    @property
     def words(self) -> str:
         """For people, of a clock beyond its limit."""
         ahead = "ahead of" if (self.offset_s or 0.0) > 0 else "behind"
@@ -70,6 +82,21 @@ class ClockReading:
         if self.against == "host since it was opened":
             return f"{what}, counted from the first image: more than {self.limit_s:.2f} s. Look at its controller"
         return f"{what}: more than {self.limit_s:g} s. Set it, for the record's times are compared with it"
+
+
+def offset_told(offset_s: float | None, clock: str) -> str:
+    """A clock offset as a device reported it when it was opened. `clock`: utc, or uptime."""
+    if clock == "uptime":
+        return "counts from when it was switched on: only its change matters"
+    if offset_s is None:
+        return "not told"
+    return f"{abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} this machine's"
+
+
+def clock_of(report: Mapping[str, Any]) -> str:
+    """Which clock a recorded DeviceReport tells of, utc or uptime; an old record does not say: by the device."""
+    kind = str((report.get("identity") or {}).get("kind", ""))
+    return str(report.get("clock") or ("uptime" if kind == "robot" else "utc"))
 
 
 def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
@@ -111,7 +138,7 @@ def _readings(name: str, opened: Event, captures: tuple[Event, Event] | None) ->
     """Of one device, of its last opening and the first and newest image since."""
     assert isinstance(opened.payload, DeviceOpened)
     kind, report = _kind(opened), opened.payload.report
-    if report.get("clock", "uptime" if kind == "robot" else "utc") == "uptime":
+    if clock_of(report) == "uptime":
         return [_drift(name, opened, captures)]
     offset_s, at_utc = report.get("clock_offset_s"), opened.at_utc
     if kind == "camera" and captures is not None:

@@ -14,6 +14,7 @@ BOUNDS_HOLD = (
     "its limits when both bounds are, outside when all between them is, and not decided otherwise"
 )
 _LARGEST_WHOLE = 1e7
+_UNITS_IN_S = ("s", "ms", "µs")  # the others that end with an s are plurals: images, views, spheres
 
 
 def evaluate_gates(
@@ -102,9 +103,11 @@ def uncertain(value: float, lower: float, upper: float, unit: str = "") -> str:
 
 
 def quantity(value: float | None, unit: str = "") -> str:
-    """A number without bounds as people read it, with its unit: `8 images`, `0.7131 px`, `not measured`."""
+    """A number without bounds as people read it, with its unit: `8 images`, `1 image`, `0.71 px`, `not measured`."""
     if value is None:
         return "not measured"
+    if value == 1 and unit.endswith("s") and unit not in _UNITS_IN_S:
+        unit = unit[:-1]
     text = f"{value:.0f}" if value == int(value) and abs(value) < _LARGEST_WHOLE else f"{value:.4g}"
     return f"{text} {unit}".rstrip()
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from service.core.count_words import counted
 from service.core.lifecycle import Phase
 from service.core.model import ArtefactRef, GateVerdict, Uncertainty
 from service.core.priorities import WAITED
@@ -267,3 +268,8 @@ class RunState:
     def deviation_count(self) -> int:
         """Deviations without the notes."""
         return sum(not deviation.is_note for deviation in self.deviations)
+
+    @property
+    def deviations_told(self) -> str:
+        """The same in words: `1 deviation`."""
+        return counted(self.deviation_count, "deviation")

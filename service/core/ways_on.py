@@ -115,7 +115,7 @@ def _again(protocol: Protocol, state: RunState, trouble: Trouble) -> WayOn:
         minutes = left * each_s / 60
     elif now.captured and step.kind in ("viewpoint_capture", "calibration"):
         minutes = _computing(now.worked_s, len(now.captured), each_s)
-    kept = f" The {len(now.captured)} images are kept." if now.captured else ""
+    kept = {0: "", 1: " The image is kept."}.get(len(now.captured), f" The {len(now.captured)} images are kept.")
     return WayOn("confirm", step.id, words, minutes, f"Nothing.{kept}")
 
 

@@ -1,4 +1,4 @@
-"""The scene in 3D as a plotly figure, for report and screen: cameras, spheres, decimated mesh, robot bases."""
+"""The scene in 3D as a plotly figure for the screen: cameras, spheres, decimated mesh, robot bases."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from service.core.geometry import Array, Transform, apply, inverse, transform
 
 FACES_SHOWN = 60_000
 _FRUSTUM_MM = 50.0
-_STYLES = (("#2f86d6", "circle"), ("#d9772b", "diamond"), ("#9a58d1", "square"))  # of cameras, by station
-_KINDS = {"registration": "#2f9e57", "sphere": "#2f9e57", "control": "#d05fa0"}
-_NAMES = {"registration": "registration spheres", "control": "control spheres", "sphere": "spheres"}
-_PROUD = 1.07  # times its radius: a sphere is drawn over the scanned one
-_BAR_MM = 100.0
+STYLES = (("#2f86d6", "circle"), ("#d9772b", "diamond"), ("#9a58d1", "square"))  # of cameras, by station
+KINDS = {"registration": "#2f9e57", "sphere": "#2f9e57", "control": "#d05fa0"}
+KIND_NAMES = {"registration": "registration spheres", "control": "control spheres", "sphere": "spheres"}
+PROUD = 1.07  # times its radius: a sphere is drawn over the scanned one
+BAR_MM = 100.0
 _ROOM_MM = 60.0
-_EYE_MM, _TOWARDS_MM = (280.0, -1150.0, 850.0), (0.0, 0.0, 210.0)  # of the first view
+EYE_MM, TOWARDS_MM = (280.0, -1150.0, 850.0), (0.0, 0.0, 210.0)  # of the first view
 _ROUND, _FLAT = 10, 6  # meridians and parallels of a sphere
 
 
@@ -117,14 +117,14 @@ def scene_figure(scene: Scene) -> dict[str, Any]:
     data: list[dict[str, Any]] = []
     if scene.mesh is not None:
         data.append(_mesh(mm(scene.mesh.points_m), scene.mesh))
-    for kind in _NAMES:
+    for kind in KIND_NAMES:
         mine = [s for s in scene.spheres if s.kind == kind]
         if mine:
             data += _spheres(mm(np.array([s.centre_m for s in mine])), mine, 1e3 * scene.radius_m)
     data.append(_scale_bar(mm(_centre(scene))))
     names = sorted({*scene.stations.values(), *scene.bases})
     for i, station in enumerate(names):
-        colour, symbol = _STYLES[i % len(_STYLES)]
+        colour, symbol = STYLES[i % len(STYLES)]
         data += _cameras(scene, station, to_view, colour, symbol)
         mine = [
             T for name, T in (*scene.cameras.items(), *scene.planned.items()) if scene.stations.get(name) == station
@@ -133,15 +133,6 @@ def scene_figure(scene: Scene) -> dict[str, Any]:
         if station in scene.bases:
             data.append(_base(mm(scene.bases[station][None, :3, 3]), station, colour))
     return {"data": data, "layout": _layout(extent)}
-
-
-def scene_html(scene: Scene) -> str:
-    """HTML (a div with its script, plotly's included) of the scene, for a report."""
-    import plotly.io  # noqa: PLC0415 - half a second, and the screens never need it
-
-    figure = scene_figure(scene)
-    figure["layout"] |= {"height": 620}
-    return str(plotly.io.to_html(figure, full_html=False, include_plotlyjs=True, validate=False, div_id="scene"))
 
 
 def figure_json(figure: Mapping[str, Any]) -> str:
@@ -192,19 +183,19 @@ def _mesh(points: Array, mesh: SceneMesh) -> dict[str, Any]:
 
 
 def _spheres(centres: Array, spheres: Sequence[SceneSphere], radius: float) -> list[dict[str, Any]]:
-    ball, faces = _ball()
-    points = (centres[:, None] + _PROUD * radius * ball[None]).reshape(-1, 3)
+    ball, faces = unit_ball()
+    points = (centres[:, None] + PROUD * radius * ball[None]).reshape(-1, 3)
     triangles = (np.arange(len(centres))[:, None, None] * len(ball) + faces[None]).reshape(-1, 3)
     kind = spheres[0].kind
     # A control sphere is told by its label, C0, C1 …, not by its colour alone.
     return [
         {
             "type": "mesh3d",
-            "name": _NAMES[kind],
+            "name": KIND_NAMES[kind],
             "showlegend": True,
             **_xyz(points),
             **{axis: _packed(triangles[:, k]) for k, axis in enumerate("ijk")},
-            "color": _KINDS[kind],
+            "color": KINDS[kind],
             "hoverinfo": "skip",
             "lighting": {"ambient": 0.6, "diffuse": 0.7},
         },
@@ -233,7 +224,7 @@ def _cameras(scene: Scene, station: str, to_view: Transform, colour: str, symbol
         title = title if station else what
         line = {"color": colour, "width": 3}
         frusta = {"mode": "lines", "name": title, "line": line, "hoverinfo": "skip", "opacity": opacity}
-        out.append({"type": "scatter3d", **frusta, **_xyz(_frusta(list(mine.values())))})
+        out.append({"type": "scatter3d", **frusta, **_xyz(frustum_lines(list(mine.values())))})
         eyes = 1e3 * np.array([T[:3, 3] for T in mine.values()])
         marker = {"size": 5, "color": colour, "symbol": filled}
         points = {"mode": "markers", "text": list(mine), "hoverinfo": "text", "marker": marker, "showlegend": False}
@@ -256,12 +247,12 @@ def _base(at: Array, station: str, colour: str) -> dict[str, Any]:
 
 def _scale_bar(centre: Array) -> dict[str, Any]:
     x, y, z = (float(v) for v in centre[0])
-    ends = [[x - 0.5 * _BAR_MM, y - 300, z - 60], [x + 0.5 * _BAR_MM, y - 300, z - 60]]
+    ends = [[x - 0.5 * BAR_MM, y - 300, z - 60], [x + 0.5 * BAR_MM, y - 300, z - 60]]
     return {
         "type": "scatter3d",
         "mode": "lines+text",
         **_xyz(np.array(ends)),
-        "text": ["", f"  {_BAR_MM:.0f} mm"],
+        "text": ["", f"  {BAR_MM:.0f} mm"],
         "textposition": "middle right",
         "line": {"color": "#8a97a0", "width": 5},
         "hoverinfo": "skip",
@@ -277,7 +268,7 @@ def _layout(extent: _Extent) -> dict[str, Any]:
             "aspectmode": "manual",
             "aspectratio": {a: 1e-3 * (high - low) for a, (low, high) in ranges.items()},
             "dragmode": "turntable",
-            "camera": {"eye": _in_box(ranges, _EYE_MM), "center": _in_box(ranges, _TOWARDS_MM)},
+            "camera": {"eye": _in_box(ranges, EYE_MM), "center": _in_box(ranges, TOWARDS_MM)},
             **axes,
         },
         "margin": {"l": 0, "r": 0, "t": 0, "b": 70},
@@ -290,7 +281,7 @@ def _in_box(ranges: Mapping[str, Sequence[float]], point_mm: Sequence[float]) ->
     return {a: 1e-3 * (p - sum(ends) / 2) for (a, ends), p in zip(ranges.items(), point_mm, strict=True)}
 
 
-def _frusta(cameras: Sequence[Transform]) -> Array:
+def frustum_lines(cameras: Sequence[Transform]) -> Array:
     """Line segments (N, 3) in mm, broken by NaN rows, of a small pyramid for each camera."""
     w, h, z = 0.36 * _FRUSTUM_MM, 0.24 * _FRUSTUM_MM, _FRUSTUM_MM
     o, a, b, c, d = [0, 0, 0], [-w, -h, z], [w, -h, z], [w, h, z], [-w, h, z]
@@ -299,7 +290,7 @@ def _frusta(cameras: Sequence[Transform]) -> Array:
     return np.vstack([np.vstack([1e3 * apply(T, path), gap]) for T in cameras]) if cameras else gap
 
 
-def _ball() -> tuple[Array, NDArray[np.int64]]:
+def unit_ball() -> tuple[Array, NDArray[np.int64]]:
     """A unit sphere: points (V, 3), triangles (F, 3)."""
     polar = np.linspace(0, np.pi, _FLAT + 1)[1:-1]
     around = np.linspace(0, 2 * np.pi, _ROUND, endpoint=False)

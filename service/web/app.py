@@ -14,6 +14,7 @@ from service.web import (
     calibration_pages,
     capture_pages,
     compare_pages,
+    devices_pages,
     export_pages,
     gates_pages,
     health_pages,
@@ -48,6 +49,7 @@ _PAGES = (
     calibration_pages,
     audit_pages,
     gates_pages,
+    devices_pages,
     export_pages,
     health_pages,
 )

@@ -14,10 +14,11 @@ from service.audit.computed import Progress
 from service.audit.correcting import correct, correctable
 from service.audit.digest import Digest
 from service.audit.first_page import GROUPS, ListedRun, RunFilter
+from service.audit.opened import bodies_of_run
 from service.audit.provenance import origin
 from service.audit.provenance_drawing import draw
 from service.audit.queries import EventFilter
-from service.core.clocks import clock_readings
+from service.audit.shots import failed_exposures_of, shots_of, together
 from service.evidence import results_to_come
 from service.steps.time_left import Left
 from service.store.records import SITE
@@ -115,6 +116,8 @@ def run_page(request: Request, audit: Auditing, run_id: str) -> Response:
         sessions = findings.events_of(connection, run_id, "session_started", newest=True)
         exports = findings.events_of(connection, run_id, "evidence_exported", newest=True)
         signatures = findings.signatures(connection, run_id, known)
+        failures = failed_exposures_of(connection, run_id)
+        bodies = bodies_of_run(connection, run_id, devices)
     listed = first_page.findings(known) if known else []
     run = frame.run
     return render(
@@ -126,12 +129,16 @@ def run_page(request: Request, audit: Auditing, run_id: str) -> Response:
         progress=digest if isinstance(digest, Progress) else None,
         counts=first_page.counts(known) if known else {},
         groups=GROUPS,
+        group_name=first_page.group_name,
         listed=listed[:_FIRST],
         more=len(listed) - _FIRST,
         accuracy=accuracy_of(known),
         dataset_exported=any(row.payload.get("what") == "dataset" for row in exports),
         root=root[0] if root else None,
         corrected=corrected,
+        shots=shots_of(known, failures),
+        together=together,
+        bodies=bodies,
         devices={row.payload.get("device"): row for row in devices},
         session=sessions[-1] if sessions else None,
         sessions=len(sessions),
@@ -397,30 +404,6 @@ def signatures_page(request: Request, audit: Auditing, run_id: str) -> Response:
         signatures=found,
         digest=known,
         progress=digest if isinstance(digest, Progress) else None,
-    )
-
-
-@router.get("/audit/runs/{run_id}/devices", name="audit_devices", dependencies=_READ, response_class=HTMLResponse)
-def devices_page(request: Request, audit: Auditing, run_id: str) -> Response:
-    """Devices with versions, clocks, troubles; sessions and software."""
-    frame = audit_frame(audit, run_id, "/devices")
-    with audit.site.store.database.reading() as connection:
-        opened = findings.events_of(connection, run_id, "device_opened", newest=True)
-        sessions = findings.events_of(connection, run_id, "session_started", newest=True)
-        troubles = findings.events_of(connection, run_id, "device_trouble", newest=True)
-        trouble_count = queries.count_of_kind(connection, run_id, "device_trouble")
-        clocks = findings.clock_offsets(connection, run_id)
-    readings = clock_readings(audit.site.run(run_id).events)
-    return render(
-        request,
-        "audit_devices.html.j2",
-        audit=frame,
-        opened=opened,
-        sessions=findings.sessions(sessions),
-        troubles=troubles[-50:],
-        trouble_count=trouble_count,
-        clocks=clocks,
-        readings=readings,
     )
 
 

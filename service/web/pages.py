@@ -16,6 +16,7 @@ from pydantic import ValidationError
 if TYPE_CHECKING:
     from service.audit.queries import EventRow
 
+from service.core.count_words import counted
 from service.core.entered import RunAbout, about_rows
 from service.web.run_frame import LOST, driven_frames
 
@@ -55,7 +56,7 @@ def entered_of(root: EventRow) -> list[tuple[str, str]]:
 
 
 # Its type names its own names only.
-cast("dict[str, Any]", TEMPLATES.globals).update(kept_in_a_row=kept_in_a_row, about_rows=entered_of)
+cast("dict[str, Any]", TEMPLATES.globals).update(kept_in_a_row=kept_in_a_row, about_rows=entered_of, counted=counted)
 TEMPLATES.filters["local_time"] = local_time
 
 

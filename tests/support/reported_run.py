@@ -10,6 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import trimesh
 
 from service.core.gates import evaluate_gates
 from service.core.model import (
@@ -95,10 +96,14 @@ def record_reported_run(
     acceptable: bool = False,
     accepted_by: str = "",
     error_bounds_mm: tuple[float, float] | None = None,
+    serials: tuple[str, str] = ("", ""),
+    photographs: int = 2,
 ) -> str:
     """The run in folder/data; its name. `acceptable`: a figure outside its limit may be; `accepted_by`: and is.
 
-    `error_bounds_mm`: the evaluation's error states its uncertainty, and so does the calibration's.
+    `error_bounds_mm`: the evaluation's error states its uncertainty, and so does the calibration's. `serials`: of the
+    camera, over its connection and in its photographs. `photographs`: of the last attempt; more than two are as large
+    and detailed as real ones are once they are small, with a mesh and overlays to match.
     """
     text = PROTOCOL.replace("steps:", f"release: {release}\nsteps:", 1)
     if registered:
@@ -109,8 +114,15 @@ def record_reported_run(
     loaded = parse_protocol(text.encode(), params_models(), name="reported.yaml")
     with Store.open(folder / "data") as store:
         run_id = start_run(store, loaded, load_rig(folder / "rig.yaml"), operator=person, auto_confirm=False)
-        run = _Writer(store, run_id, loaded.protocol, person)
-        identity = {"model": "UR10e", "serial": "20231", "firmware": "5.12", "driver": "ur", "driver_version": "1"}
+        run = _Writer(store, run_id, loaded.protocol, person, serials[1], large=photographs > 2)
+        identity = {
+            "kind": "robot",
+            "model": "UR10e",
+            "serial": "20231",
+            "firmware": "5.12",
+            "driver": "ur",
+            "driver_version": "1",
+        }
         run.add(DeviceOpened(device="robot", report={"identity": identity, "clock_offset_s": 1.25}))
         data = json.dumps(calibration()).encode()
         ref = run.put(data, "calibration", "application/json", "calibration.json")
@@ -133,7 +145,7 @@ def record_reported_run(
         run.measure("capture", 1, {"viewpoints_captured": 1.0, "optics_departures": 0.0}, {})
         run.act("redo", step="capture", reason="the cable was loose")
         run.add(StepStarted(step="capture", attempt=2))
-        for viewpoint in ("v001", "v002"):
+        for viewpoint in (f"v{number:03d}" for number in range(1, photographs + 1)):
             run.capture(2, viewpoint)
         run.measure("capture", 2, {"viewpoints_captured": 2.0, "optics_departures": 0.0}, {})
         correction = RecordCorrected(
@@ -141,6 +153,11 @@ def record_reported_run(
         )
         run.add(correction, actor=person)
         run.add(StepPassed(step="capture", attempt=2))
+        if serials[0]:
+            camera = {"kind": "camera", "model": "ILCE-7RM5", "serial": serials[0], "firmware": "3.00"}
+            run.add(
+                DeviceOpened(device="camera", report={"identity": camera, "clock": "utc", "clock_offset_s": -1279.0})
+            )
         if registered:
             run.register()
         run.add(StepStarted(step="evaluation", attempt=1))
@@ -148,7 +165,8 @@ def record_reported_run(
         if error_bounds_mm is not None:
             lower, upper = error_bounds_mm
             known = {_ERROR: Uncertainty(sigma=(upper - lower) / 4.65, lower=lower, upper=upper)}
-        judged = run.measure("evaluation", 1, {_ERROR: error_mm}, evaluation(error_mm), known=known)
+        overlays = tuple(run.photograph(f"overlay_{k}.jpg", "overlay") for k in range(6)) if photographs > 2 else ()
+        judged = run.measure("evaluation", 1, {_ERROR: error_mm}, evaluation(error_mm), overlays, known)
         undecided = bool(known) and known[_ERROR].upper > 0.35
         if accepted_by:
             run.accept("evaluation", judged, accepted_by)
@@ -162,7 +180,11 @@ def record_reported_run(
 
 
 class _Writer:
-    def __init__(self, store: Store, run_id: str, protocol: Protocol, person: str) -> None:
+    def __init__(
+        self, store: Store, run_id: str, protocol: Protocol, person: str, body_serial: str, *, large: bool
+    ) -> None:
+        self._large, self._random = large, np.random.default_rng(5)
+        self._stated = {"body_serial": body_serial} if body_serial else {}
         self._store, self._run_id, self._protocol, self._person = store, run_id, protocol, person
 
     def add(self, *payloads: Payload, actor: str = "runner", artefacts: tuple[NewArtefact, ...] = ()) -> str:
@@ -186,11 +208,19 @@ class _Writer:
     def put(self, data: bytes, kind: str, media_type: str, name: str) -> ArtefactRef:
         return self._store.put_bytes(data, kind=kind, media_type=media_type, original_name=name)
 
+    def photograph(self, name: str, kind: str, attempt: int = 1) -> ArtefactRef:
+        """Of one grey with its name; a large one is as full of detail as anatomy is."""
+        if self._large:
+            noise = self._random.normal(0, 70, (800, 1200, 3)).astype(np.float32)
+            pixels = np.clip(110 + cv2.GaussianBlur(noise, (0, 0), 1.5) * 3, 0, 255).astype(np.uint8)
+        else:
+            pixels = np.full((80, 120, 3), 40 * attempt + len(name.removesuffix(".JPG")), np.uint8)
+        text = f"{name.removesuffix('.JPG')} {attempt}"
+        cv2.putText(pixels, text, (4, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255))
+        return self.put(cv2.imencode(".jpg", pixels)[1].tobytes(), kind, "image/jpeg", name)
+
     def capture(self, attempt: int, viewpoint: str) -> None:
-        pixels = np.full((80, 120, 3), 40 * attempt + len(viewpoint), np.uint8)
-        cv2.putText(pixels, f"{viewpoint} {attempt}", (4, 40), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255))
-        jpeg = cv2.imencode(".jpg", pixels)[1].tobytes()
-        ref = self.put(jpeg, "image", "image/jpeg", f"{viewpoint}.JPG")
+        ref = self.photograph(f"{viewpoint}.JPG", "image", attempt)
         payload = ViewpointCaptured(
             step="capture",
             attempt=attempt,
@@ -206,7 +236,7 @@ class _Writer:
             arrival_monotonic_s=2.0,
             controller_time_s=3.0,
             clock_offset_s=1.25 + 0.001 * attempt,
-            camera={"lens": "FE 50mm", "aperture_f": 22, "focus_mode": "Manual"},
+            camera={"lens": "FE 50mm", "aperture_f": 22, "focus_mode": "Manual", **self._stated},
             environment={"light_lux": 800.0, "temperature_c": 21.5},
             verdicts={"still": True},
         )
@@ -216,7 +246,10 @@ class _Writer:
         """The scan of a tetrahedron, and where the cameras are in its frame."""
         buffer = io.BytesIO()
         vertices_m = 0.05 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-        np.savez(buffer, vertices_m=vertices_m, faces=np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+        faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+        body = trimesh.creation.icosphere(subdivisions=6, radius=0.05) if self._large else None
+        mesh_m, triangles = (vertices_m, faces) if body is None else (body.vertices, body.faces)
+        np.savez(buffer, vertices_m=mesh_m, faces=triangles)
         mesh = self.put(buffer.getvalue(), "scan_mesh", "application/x-npz", "scan.npz")
         self.add(StepStarted(step="scan", attempt=1))
         self.measure("scan", 1, {}, {"spheres_m": vertices_m.tolist()}, (mesh,))
