@@ -121,6 +121,8 @@ def test_a_supervisor_accepts_by_badge_on_the_technicians_screen(web: WebSite) -
     assert enrol(web, "grace", BADGE) == 303
     bench, browser = waiting(web, "capture", "recovery", ACCEPTING)
     given = {"account": "emmy", "reason": "enough"}
+    page = browser.get(f"/runs/{bench.run_id}").text
+    assert re.findall(r'<option value="(\w+)">Emmy Noether', page) == ["emmy"], "the name is offered"
     assert act(bench, browser, "accept", "badge", BADGE, **given) == 401, "the technician's own does not do"
     assert act(bench, browser, "accept", "badge", EMMYS_BADGE, **given) == 303
     accepted = bench.state().steps["capture"].accepted

@@ -66,8 +66,11 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         space=None if log.state.terminal else forecast_of(site.store, log.protocol, log.state),
     )
     looking_back = bool(step) and view.shown.id != view.current
+    role = view.acceptance.role if view.acceptance else ""
     return {
         "view": view,
+        # Offered by name, so that nobody types one with gloves.
+        "acceptors": [a for a in site.people.accounts.all() if (a.role, a.state) == (role, "active")] if role else [],
         "looking_back": looking_back,
         "dialog": dialog,
         "notes": notes_of(log.events, "" if view.mode == "ended" and not looking_back else view.shown.id),
