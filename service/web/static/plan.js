@@ -7,17 +7,17 @@
   const FAR_PX = 60; // further away from every viewpoint nothing is meant
   const LARGEST = 16;
   const STEP = 1.6; // of a button
-  // By station: how much larger, and the middle of what is seen, in units of the drawing. Kept while one viewpoint
+  // By step and station: how much larger, and the middle of what is seen, in units of the drawing. Kept while one viewpoint
   // after the other is looked at, each of which is a page of its own.
-  const KEY = `orthocapture-plan ${location.pathname} ${new URLSearchParams(location.search).get("step") || ""}`;
+  const KEY = `orthocapture-plan ${location.pathname}`;
   const looks = new Map(JSON.parse(sessionStorage.getItem(KEY) || "[]"));
   const planOf = (event) => (event.target instanceof Element ? event.target.closest("svg[data-plan]") : null);
-  const stationOf = (plan) => plan.closest("[data-station]").dataset.station;
+  const nameOf = (plan) => `${plan.dataset.plan} ${plan.closest("[data-station]").dataset.station}`;
   const sizeOf = (plan) => [Number(plan.getAttribute("data-width")), Number(plan.getAttribute("data-height"))];
 
   function look(plan) {
     const [width, height] = sizeOf(plan);
-    return looks.get(stationOf(plan)) || { larger: 1, x: width / 2, y: height / 2 };
+    return looks.get(nameOf(plan)) || { larger: 1, x: width / 2, y: height / 2 };
   }
   function show(plan) {
     const { larger, x, y } = look(plan);
@@ -45,7 +45,7 @@
     const now = Math.min(Math.max(larger, 1), LARGEST);
     // The larger, the nearer the middle may come to the rim: what lies there can be looked at as well.
     const within = (at, size) => Math.min(Math.max(at, size / now / now / 2), size - size / now / now / 2);
-    looks.set(stationOf(plan), { larger: now, x: within(x, width), y: within(y, height) });
+    looks.set(nameOf(plan), { larger: now, x: within(x, width), y: within(y, height) });
     sessionStorage.setItem(KEY, JSON.stringify([...looks]));
     show(plan);
   }
