@@ -1,17 +1,19 @@
-"""The guided screen on a tablet, in a real browser: how much of it the step has, and what keeps its place."""
+"""Tablet and paper, in a real browser: how much the step has of the screen, what keeps its place, links, paper."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+import cv2
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, FloatRect, Page, expect
 
 from service.core.model import OperatorAction, StepFailed, StepStarted
 from tests.support.at_the_table import at_the_table, record
-from tests.support.browser import Served, chromium, served
+from tests.support.browser import Served, chromium, screen, served
 from tests.support.shown_site import skip
-from tests.support.web import web_site
+from tests.support.web import password_of, web_site
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -76,3 +78,40 @@ def test_end_run_stays_where_it_is(server: Served, browser: Browser) -> None:
         assert len({tuple(place.values()) for place in places.values()}) == 1, places
         button = page.get_by_role("button", name="End run")
         expect(button).to_be_visible()
+
+
+# --- a link, a checklist -----------------------------------------------------------------------------------------
+
+
+def test_an_invitation_is_scanned_or_copied(server: Served, browser: Browser) -> None:
+    with screen(browser, server.url) as desk:
+        desk.context.grant_permissions(["clipboard-read", "clipboard-write"])
+        desk.sign_in("ada", password_of("ada"))
+        desk.go("/accounts")
+        page = desk.page
+        page.get_by_label("Name, as records").fill("Maria Meyer")
+        page.get_by_label("Account, to sign in").fill("maria")
+        page.get_by_role("button", name="Make a one-time link").click()
+        code = page.get_by_role("img", name="QR code of the link")
+        picture = cv2.imdecode(np.frombuffer(code.screenshot(scale="css"), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
+        assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == page.locator("#one-time-link").inner_text()
+        page.get_by_role("button", name="Copy the link").click()
+        expect(page.get_by_text("Copied.")).to_be_visible()
+        assert page.evaluate("navigator.clipboard.readText()") == page.locator("#one-time-link").inner_text()
+
+
+def test_a_checklist_is_printed_without_what_belongs_to_the_screen(server: Served, browser: Browser) -> None:
+    with screen(browser, server.url) as desk:
+        desk.sign_in("grace", password_of("grace"))
+        page = desk.page
+        page.get_by_role("link", name="Checklist to print of A small procedure").click()
+        expect(page.get_by_role("heading", name="A small procedure")).to_be_visible()
+        page.evaluate("window.print = () => { window.printed = true; }")
+        page.get_by_role("button", name="Print").click()
+        assert page.evaluate("window.printed")
+        page.emulate_media(media="print")
+        for gone in (".masthead", ".in-sight", "[data-print]", "[data-shortcuts]"):
+            expect(page.locator(gone)).to_be_hidden()
+        expect(page.get_by_text("wires hold")).to_be_visible()
+        assert page.pdf(format="A4").startswith(b"%PDF")

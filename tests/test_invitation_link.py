@@ -1,4 +1,4 @@
-"""The page of a one-time link. That its code can be read is seen in a browser: tests/test_browser_gloves.py."""
+"""The page of a one-time link. That its code can be read is seen in a browser: tests/test_browser_tablet.py."""
 
 from __future__ import annotations
 
