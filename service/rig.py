@@ -123,6 +123,13 @@ class AlertsSection(Record):
     waits_after_s: Annotated[float, Field(ge=0, le=86400)] = 30.0  # for a person, until that is told
 
 
+class SigningSection(Record):
+    """What may stand for the password where a step is signed or figures are accepted; the password always may."""
+
+    pin: bool = False
+    badge: bool = False  # of a reader that types what it reads, and Enter
+
+
 class RigSection(Record):
     """The rig file."""
 
@@ -141,6 +148,7 @@ class RigSection(Record):
         None  # a file elsewhere, on a share say, that gets each line of the log of signatures
     )
     alerts: AlertsSection | None = None  # None: nobody elsewhere is told
+    signing: SigningSection = SigningSection()
     imported: ImportList | None = None  # of a run that captures nothing: what was captured earlier
 
 

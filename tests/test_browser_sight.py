@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from service.core.model import OperatorAction, StepFailed, StepStarted
-from service.store.store import Store
-from tests.support.attended import attended
-from tests.support.browser import TABLET, Screen, Served, chromium, screen, served
+from tests.support.at_the_table import at_the_table, record
+from tests.support.browser import Served, chromium, served
 from tests.support.shown_site import skip
-from tests.support.web import password_of, web_site
+from tests.support.web import web_site
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
-STANDING = {"doing": "asking", "robot": "standing", "robot_name": "robot"}
 
 
 @pytest.fixture(scope="module")
@@ -33,24 +30,6 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         pass
     with served(folder / "rig.yaml", folder / "data", "--protocols", str(folder / "protocols")) as running:
         yield running
-
-
-@contextmanager
-def at_the_table(server: Served, browser: Browser, size: tuple[int, int] = TABLET) -> Generator[tuple[Screen, str]]:
-    """A technician before a run of her own that has begun and is driven, and that she controls."""
-    with web_site(server.data.parent) as web:
-        run_id = web.begin_run().run_id
-    with attended(server.data, {run_id: STANDING}), screen(browser, server.url, size) as tablet:
-        tablet.sign_in("grace", password_of("grace"))
-        tablet.go(f"/runs/{run_id}")
-        tablet.page.get_by_role("button", name="Take control").click()
-        expect(tablet.page.get_by_role("button", name="Confirm: all of this is done")).to_be_visible()
-        yield tablet, run_id
-
-
-def record(server: Served, run_id: str, *payloads: object) -> None:
-    with Store.open(server.data) as store:
-        store.record(run_id, list(payloads), actor="grace")  # type: ignore[arg-type]
 
 
 def in_sight(page: Page, selector: str) -> bool:

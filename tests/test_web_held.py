@@ -118,13 +118,13 @@ def test_a_camera_without_a_cable_has_no_release_and_no_live_view_on_the_page(
 ) -> None:
     _, browser, bench = shown
     page = f"/runs/{bench.run_id}/held"
-    assert "Live view" in browser.get(page).text
+    assert "Start live view" in browser.get(page).text
     watch = PhotoWatch(PhotoWatchConfig(folder=bench.data / "card"))
     watch.open()
     opened = DeviceOpened(device="camera", report=dataclasses.asdict(watch.report()))
     bench.store.record(bench.run_id, [opened], actor="runner")
     shown_now = browser.get(page).text
     assert "Release the shutter" not in shown_now
-    assert "Live view" not in shown_now
+    assert "Start live view" not in shown_now
     assert "That is enough" in shown_now
     assert f"as soon as their files are in {bench.data / 'card'}" in words(shown_now)

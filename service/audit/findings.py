@@ -38,6 +38,7 @@ class Signature:
     unaltered: bool  # the bound event's content gives this hash today
     stands: bool | None  # it is the record on which the step stands now; None: cannot be told yet
     refused: bool  # it had no effect
+    known_by: str  # password, pin, badge, claimed; "" where the record does not tell
 
 
 def signatures(connection: Connection, run_id: str, digest: Digest | None) -> list[Signature]:
@@ -74,6 +75,7 @@ def _signature(connection: Connection, run_id: str, row: EventRow, digest: Diges
         unaltered=bound is not None and _is_unaltered(run_id, bound, signed),
         stands=None if digest is None or digest.state is None else _stands(digest, row, signed) and not refused,
         refused=refused,
+        known_by=str(row.payload.get("identified", "")),
     )
 
 

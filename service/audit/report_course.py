@@ -161,6 +161,7 @@ def people_section(run: RecordedRun) -> Section:
             counts[payload.action] = counts.get(payload.action, 0) + 1
             if payload.action in ("sign", "accept"):
                 how = "automatic" if payload.automatic else payload.via
+                how += {"pin": ", by PIN", "badge": ", by badge"}.get(payload.identified, "")
                 said = (
                     f"accepted outside its limits, {payload.reason}"
                     if payload.action == "accept"

@@ -89,5 +89,5 @@ def acceptor_refusal(
 def describe_accepted(accepted: Accepted) -> str:
     """`coverage 0.896, allowed ≥ 0.9; accepted by Emmy (supervisor): the corners are not used`: for every reader."""
     figures = "; ".join(describe_judged(verdict) for verdict in accepted.verdicts)
-    how = ", by claim" if accepted.identified == "claimed" else ""
+    how = {"claimed": ", by claim", "pin": ", by PIN", "badge": ", by badge"}.get(accepted.identified, "")
     return f"{figures}; accepted by {accepted.by} ({accepted.role}{how}): {accepted.reason}"

@@ -28,8 +28,8 @@ class OperatorAction(Record):
     meaning: str = ""  # of a signature
     signed_sha256: str = ""  # hash of the event that was signed
     role: str = ""  # of the person, where the action demands one
-    # How the program knows: the account's password was asked, or it is a claim (a site without accounts).
-    identified: Literal["", "claimed", "password"] = ""
+    # How the program knows: a secret of the account was asked, or it is a claim (a site without accounts).
+    identified: Literal["", "claimed", "password", "pin", "badge"] = ""
     via: Literal["cli", "web", "pedal", "auto"] = "cli"
     automatic: bool = False
 
@@ -408,12 +408,12 @@ class AccountChanged(Record):
 
     kind: Literal["account_changed"] = "account_changed"
     account: str
-    field: str  # created, role, state, password, pin, lock_out, link
+    field: str  # created, role, state, password, pin, badge, lock_out, link
     old: str
     new: str
     reason: str = ""
     full_name: str = ""  # of an account that is made
-    # password_hash, pin_hash, token_sha256 → SHA-256 of what is stored: a secret put in past the software shows.
+    # password_hash, pin_hash, badge_hash, token_sha256 → SHA-256 of it: a secret put in past the software shows.
     stored: dict[str, str] = Field(default_factory=dict)
 
 

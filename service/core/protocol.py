@@ -27,6 +27,7 @@ from service.core.errors import ProtocolError
 from service.core.lifecycle import RESERVED_STEP_IDS
 from service.core.model import Record
 from service.core.protocol_rules import rule_violations
+from service.core.reasons import Reasons
 from service.core.yaml_tree import FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
 
 ParamsT = TypeVar("ParamsT", bound=BaseModel)
@@ -211,6 +212,7 @@ class ProtocolFields(Record):
     settle: Settle = Settle()
     # Whether a person who took no part in the run must release it before anything of it is exported.
     release: Literal["none", "second_person"] = "none"
+    reasons: Reasons = Reasons()  # offered where a redo, a skip or an acceptance asks for one
 
 
 class Protocol(ProtocolFields):

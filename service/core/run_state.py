@@ -80,7 +80,7 @@ class Accepted:
     seq: int  # of the action
     by: str
     role: str
-    identified: Literal["", "claimed", "password"]
+    identified: Literal["", "claimed", "password", "pin", "badge"]
     reason: str
     verdicts: tuple[GateVerdict, ...]  # the failed ones
 

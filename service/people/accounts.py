@@ -116,13 +116,13 @@ class Accounts:
             return self._new_link(connection, name, INVITATION_S, actor=by.account)
 
     def reset(self, by: Person, account: str, reason: str) -> str:
-        """Take away password and PIN, end all sign-ins, and make a new link. Raises AccountError."""
+        """Take away password, PIN and badge, end all sign-ins, and make a new link. Raises AccountError."""
         why = require_reason(reason)
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
             if row.state == "active":
                 self._require_another_administrator(connection, row)
-            nothing = {"password_hash": "", "pin_hash": ""}
+            nothing = {"password_hash": "", "pin_hash": "", "badge_hash": ""}
             values = {"state": "invited", "failures": 0, "locked_until_utc_s": 0.0, **nothing}
             connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
             end_sessions(self._store, connection, account, actor=by.account)

@@ -16,6 +16,7 @@ from service.people.errors import AccountError
 PASSWORD_MIN = 10
 PASSWORD_MAX = 256
 _PIN = re.compile(r"[0-9]{4,8}")
+_BADGE = re.compile(r"[0-9A-F]{6,32}")
 
 
 class Passwords:
@@ -67,6 +68,18 @@ def require_pin(pin: str) -> None:
     """Raises AccountError for a PIN that is not 4 to 8 digits."""
     if not _PIN.fullmatch(pin):
         raise AccountError("the PIN is not 4 to 8 digits", where="pin", remedy="Use 4 to 8 digits")
+
+
+def plain_badge(typed: str) -> str:
+    """What a badge reader has typed, as it is hashed. Raises AccountError for what cannot be a badge."""
+    plain = typed.strip().upper()
+    if not _BADGE.fullmatch(plain):
+        raise AccountError(
+            "this is no badge: 6 to 32 digits or letters A to F are",
+            where="badge",
+            remedy="Hold the badge before the reader while the field has the focus",
+        )
+    return plain
 
 
 def new_token() -> str:

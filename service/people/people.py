@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Mapping
 from threading import Lock
-from typing import Any
+from typing import Any, Literal
 
 from argon2 import PasswordHasher
 from sqlalchemy import Connection, Row, delete, insert, select, update
 
 from service.people.accounts import Accounts
+from service.people.badges import Badges
 from service.people.errors import (
     AccountError,
     AccountJustChangedError,
@@ -38,6 +40,10 @@ LONGEST_WAIT_S = 900.0
 _SCREEN_LETTERS = "23456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
+KnownBy = Literal["password", "pin", "badge"]  # of what somebody gives to sign
+NAMES: Mapping[KnownBy, str] = {"password": "password", "pin": "PIN", "badge": "badge"}
+
+
 def wait_after_s(failures: int) -> float:
     """How long an account waits after so many wrong passwords in a row."""
     over = failures - FREE_FAILURES
@@ -54,6 +60,7 @@ class People:
             Lock()
         )  # at a time: no guess overtakes the count of failures, and argon2's memory is bounded
         self.accounts = Accounts(store, self._passwords)
+        self.badges = Badges(store, self._passwords, self.check_password)
 
     def _now_s(self) -> float:
         return self._store.clock.utc_now().timestamp()
@@ -108,18 +115,31 @@ class People:
                     self._require_unchanged(connection, row)
                     self._reset_failures(connection, row, password)
 
+    def check_secret(self, account: str, known_by: KnownBy, secret: str) -> None:
+        """Password, PIN or badge asked again, for a signature. A wrong one counts; raises SignInRefusedError.
+
+        Only the right password begins the count anew: who knows a PIN gains no further guesses at the password.
+        """
+        if known_by == "password":
+            self.check_password(account, secret)
+            return
+        with self._one_guess:
+            self._checked(account, secret.strip().upper(), "", known_by)
+
     def refuse_address(self, address: str) -> None:
         """Record that an address has failed too often and is not listened to for a while."""
         with self._store.database.writing() as connection:
             record_sign_in(self._store, connection, "locked_out", account="", address=address)
 
-    def _checked(self, typed: str, password: str, address: str) -> Row[Any]:
+    def _checked(self, typed: str, secret: str, address: str, known_by: KnownBy = "password") -> Row[Any]:
         name = plain_name(typed)
         with self._store.database.reading() as connection:
             row = find_account(connection, name)
         waits = row is not None and row.locked_until_utc_s > self._now_s()
         usable = row is not None and row.state == "active" and not waits
-        matches = self._passwords.matches(row.password_hash if row is not None and usable else "", password)
+        hashes = {} if row is None else {"password": row.password_hash, "pin": row.pin_hash, "badge": row.badge_hash}
+        stored = str(hashes[known_by]) if usable else ""
+        matches = self._passwords.matches(stored, secret)
         if row is not None and matches:
             return row
         with self._store.database.writing() as connection:
@@ -141,9 +161,9 @@ class People:
                 address=address,
             )
         raise SignInRefusedError(
-            "name and password do not belong together, or the account has to wait",
+            f"name and {NAMES[known_by]} do not belong together, or the account has to wait",
             where="password",
-            remedy=f"Check both. After {FREE_FAILURES} wrong passwords in a row an account waits "
+            remedy=f"Check both. After {FREE_FAILURES} wrong {NAMES[known_by]}s in a row an account waits "
             f"{FIRST_WAIT_S:.0f} s, then longer; an administrator can end the wait",
         )
 

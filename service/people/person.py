@@ -34,6 +34,7 @@ class Account:
     failures: int  # wrong passwords in a row
     locked_until_utc_s: float  # 0 for not locked out
     created_utc: str
+    badge: bool = False  # has one
 
 
 @dataclass(frozen=True, slots=True)

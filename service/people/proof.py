@@ -1,4 +1,4 @@
-"""Who somebody is when an action demands a role: by the password of an account, or by claim where there are none."""
+"""Who somebody is when an action demands a role: by a secret of an account, or by claim where there are none."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from service.core.acceptance import demanded_role
 from service.core.protocol import Protocol
 from service.core.run_state import RunState
 from service.people.errors import NotAllowedError
-from service.people.people import People
+from service.people.people import KnownBy, People
 from service.people.rows import plain_name
 
 
@@ -20,15 +20,21 @@ class Identity:
 
     name: str
     role: str
-    identified: Literal["claimed", "password"]
+    identified: Literal["claimed", "password", "pin", "badge"]
 
 
 def identity_for(
-    people: People, protocol: Protocol, state: RunState, verb: str, typed: str, password: Callable[[], str]
+    people: People,
+    protocol: Protocol,
+    state: RunState,
+    verb: str,
+    typed: str,
+    secret: Callable[[], str],
+    known_by: KnownBy = "password",
 ) -> Identity | None:
     """Who acts, for a verb that demands a role now; None for the others. Raises as `identify` does."""
     role = demanded_role(protocol, state) if verb == "accept" else ""
-    return identify(people, typed, role, password) if role else None
+    return identify(people, typed, role, secret, known_by) if role else None
 
 
 def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identity:
@@ -44,17 +50,20 @@ def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identit
     return Identity(name, account.role, "password")
 
 
-def identify(people: People, typed: str, role: str, password: Callable[[], str]) -> Identity:
+def identify(
+    people: People, typed: str, role: str, secret: Callable[[], str], known_by: KnownBy = "password"
+) -> Identity:
     """The person of this name, in this role.
 
     Args:
         people: accounts of the data folder.
         typed: name as it was typed.
         role: what the action demands.
-        password: asks for it; not called on a site that has no accounts, where a name is a claim.
+        secret: asks for it; not called on a site that has no accounts, where a name is a claim.
+        known_by: what the secret is: the account's password, PIN or badge.
 
     Raises:
-        SignInRefusedError: name and password do not belong together.
+        SignInRefusedError: name and secret do not belong together.
         NotAllowedError: no name was given, or the account has another role.
     """
     if not typed.strip():
@@ -62,8 +71,8 @@ def identify(people: People, typed: str, role: str, password: Callable[[], str])
     if not any(account.state == "active" for account in people.accounts.all()):
         return Identity(typed.strip(), role, "claimed")
     name = plain_name(typed)
-    people.check_password(name, password())
+    people.check_secret(name, known_by, secret())
     account = people.accounts.get(name)
     if account.role != role:
         raise NotAllowedError(f"{name} is {account.role}; this needs a {role}", where="role", remedy=f"Call a {role}")
-    return Identity(name, account.role, "password")
+    return Identity(name, account.role, known_by)

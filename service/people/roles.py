@@ -11,15 +11,16 @@ Permission = Literal[
     "sign",  # sign a step
     "correct",  # correct a recorded value, with reason
     "release",  # release a completed run as second person
+    "enrol",  # give people badges, and take them away
     "export",  # make a bundle, a report or a data set
     "administer",  # accounts, invitations, signing key
 ]
 ROLES: tuple[Role, ...] = ("technician", "supervisor", "auditor", "administrator")
 _GRANTED: dict[Role, frozenset[Permission]] = {
     "technician": frozenset({"read", "operate", "sign"}),
-    "supervisor": frozenset({"read", "operate", "sign", "correct", "release", "export"}),
+    "supervisor": frozenset({"read", "operate", "sign", "correct", "release", "export", "enrol"}),
     "auditor": frozenset({"read"}),
-    "administrator": frozenset({"read", "administer"}),
+    "administrator": frozenset({"read", "administer", "enrol"}),
 }
 
 

@@ -98,6 +98,7 @@ def to_account(row: Row[Any]) -> Account:
         failures=row.failures,
         locked_until_utc_s=row.locked_until_utc_s,
         created_utc=row.created_utc,
+        badge=bool(row.badge_hash),
     )
 
 

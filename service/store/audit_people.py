@@ -147,6 +147,8 @@ def _account_faults(told: _Told, rows: Rows) -> Iterator[Fault]:
             if sha256_text(str(row[column])) != sha256:
                 secret = column.removesuffix("_hash").replace("pin", "PIN")
                 yield _fault(f"the {secret} of the account {name} was set past the software")
+        if row["badge_hash"] and "badge_hash" not in known.stored:
+            yield _fault(f"the badge of the account {name} was set past the software")
         if known.created_utc and (known.created_utc, known.full_name) != (row["created_utc"], row["full_name"]):
             yield _fault(f"the account {name} has another name or beginning than its event tells of")
     for name in told.accounts.keys() - seen:

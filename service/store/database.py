@@ -20,7 +20,7 @@ from service.store.seam import Files
 
 DATABASE_NAME = "orthocapture.sqlite"
 BUSY_TIMEOUT_S = 30.0
-REVISIONS = ("0001", "0002", "0003", "0004")  # of migrations/versions, in order
+REVISIONS = ("0001", "0002", "0003", "0004", "0005")  # of migrations/versions, in order
 RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
 LOOK = "Look at the disk of the data folder: room, cable, permissions; then resume the run. What was recorded is safe"
 _MIGRATIONS = Path(__file__).with_name("migrations")

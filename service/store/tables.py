@@ -200,6 +200,7 @@ accounts = Table(
     Column("failures", Integer, nullable=False),  # in a row
     Column("locked_until_utc_s", REAL, nullable=False),
     Column("created_utc", Text, nullable=False),
+    Column("badge_hash", Text, nullable=False, server_default=""),  # argon2id; "" for none
     CheckConstraint("role IN ('technician', 'supervisor', 'auditor', 'administrator')", name="accounts_role"),
     CheckConstraint("state IN ('invited', 'active', 'disabled')", name="accounts_state"),
     sqlite_strict=True,

@@ -295,6 +295,7 @@ def _own_account(
         "account.html.j2",
         status=status_of(problem) if problem else 200,
         screens=screens,
+        badge=site.people.accounts.get(person.account).badge,
         done=done,
         problem=problem,
         form=form,

@@ -26,11 +26,13 @@ from service.core.model import (
     View,
 )
 from service.core.protocol import load_protocol
+from service.core.reasons import full_reason
 from service.core.run_state import RunState
 from service.evidence import RunLog
 from service.people.approvals import approve, standing_of
 from service.people.control import Control
 from service.people.errors import NotAllowedError
+from service.people.people import NAMES, KnownBy
 from service.people.proof import identity_for
 from service.rig import load_rig
 from service.runs import record_refusal, require_rig_free, start_run
@@ -150,8 +152,10 @@ def act(
     step: Short = "",
     attempt: Number = 0,
     viewpoint: Short = "",
+    preset: Words = "",
     reason: Words = "",
     meaning: Words = "",
+    known_by: Annotated[KnownBy, Form()] = "password",
     password: Secret = "",
     account: Short = "",
     signed_sha256: Short = "",
@@ -160,6 +164,7 @@ def act(
 ) -> RedirectResponse:
     """Append what the person does if it is allowed now; otherwise append the refusal and say why.
 
+    `password` holds what `known_by` names: the password, or the PIN or badge where the site lets them sign.
     Pausing needs neither control of the run nor an unlocked screen: it is the safe direction.
     """
     log = site.run(run_id)
@@ -170,23 +175,36 @@ def act(
     if verb == "sign":
         if not person.may("sign"):
             raise NotAllowedError(f"the role {person.role} may not sign", where=run_id)
-        site.people.check_password(person.account, password)
+        _require_accepted(site, known_by)
+        site.people.check_secret(person.account, known_by, password)
+    if verb == "accept":
+        _require_accepted(site, known_by)
     # A supervisor may accept on the technician's screen, by name and password.
-    who = identity_for(site.people, log.protocol, log.state, verb, account or person.account, lambda: password)
+    who = identity_for(
+        site.people, log.protocol, log.state, verb, account or person.account, lambda: password, known_by
+    )
     action = OperatorAction(
         action=verb,
         step=step or log.state.current,
         viewpoint=viewpoint or None,
-        reason=reason.strip(),
+        reason=full_reason(preset, reason),
         checklist=log.state.step.ticked if verb == "confirm" else (),
         meaning=meaning.strip(),
         signed_sha256=signed_sha256,
         role=who.role if who else "",
-        identified=who.identified if who else "",
+        identified=who.identified if who else known_by if verb == "sign" else "",
         via="web",
     )
     _append(site, log, action, who.name if who else person.account)
     return _back(run_id, back)
+
+
+def _require_accepted(site: Site, known_by: KnownBy) -> None:
+    signing = site.rig.section.signing
+    if known_by != "password" and not (signing.pin if known_by == "pin" else signing.badge):
+        raise NotAllowedError(
+            f"this site takes no {NAMES[known_by]} for a signature", where=known_by, remedy="Give the password"
+        )
 
 
 def _append(site: Site, log: RunLog, action: OperatorAction, actor: str) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Annotated
 
+import segno
 from fastapi import APIRouter, Depends, Form, Path, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from markupsafe import Markup
 
 from service.core.errors import OrthocaptureError
 from service.people.accounts import INVITATION_S
@@ -141,7 +143,19 @@ def _back(account: str) -> RedirectResponse:
 
 def _link(request: Request, whose: str, token: str) -> HTMLResponse:
     address = f"{request.url.scheme}://{request.url.netloc}/set-up/{token}"
-    return render(request, "account_link.html.j2", whose=whose, address=address, hours=round(INVITATION_S / 3600))
+    # A picture in the page itself: the link is a secret, and no other address may give it away.
+    svg = segno.make_qr(address, error="m").svg_inline(
+        omitsize=True, border=4, dark="#000", light="#fff", svgclass="qr"
+    )
+    return render(
+        request,
+        "account_link.html.j2",
+        whose=whose,
+        address=address,
+        qr=Markup(svg),
+        reachable=request.url.hostname not in ("127.0.0.1", "localhost", "::1"),
+        hours=round(INVITATION_S / 3600),
+    )
 
 
 def _refused(request: Request, site: Site, account: str, error: AccountError) -> Response:

@@ -11,8 +11,10 @@ from service.web import (
     account_pages,
     acting,
     audit_pages,
+    badge_pages,
     calibration_pages,
     capture_pages,
+    checklist_pages,
     compare_pages,
     devices_pages,
     export_pages,
@@ -34,6 +36,7 @@ from service.web.site import Site
 
 _PAGES = (
     account_pages,
+    badge_pages,
     home_pages,
     start_pages,
     compare_pages,
@@ -43,6 +46,7 @@ _PAGES = (
     note_pages,
     stream,
     capture_pages,
+    checklist_pages,
     held_pages,
     media,
     scene_pages,

@@ -66,13 +66,20 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
         space=None if log.state.terminal else forecast_of(site.store, log.protocol, log.state),
     )
     looking_back = bool(step) and view.shown.id != view.current
+    role = view.acceptance.role if view.acceptance else ""
     return {
         "view": view,
+        # Offered by name, so that nobody types one with gloves.
+        "acceptors": [a for a in site.people.accounts.all() if (a.role, a.state) == (role, "active")] if role else [],
         "looking_back": looking_back,
         "dialog": dialog,
         "notes": notes_of(log.events, "" if view.mode == "ended" and not looking_back else view.shown.id),
         "about": _about(log),
+        "reasons": log.protocol.reasons,
+        "signing": site.rig.section.signing,
         "drawing": drawing(view.shown.drawing),
+        # Where the camera is set up the lens is focused: the live view belongs there.
+        "lens_step": view.shown.drawing == "camera" and view.shown.current and view.shown.kind == "checklist",
         "board_plan": _board_plan(log, view.shown.id),
         "now_utc": datetime.now(UTC).isoformat(),
         "depends": accepted_gates(log.protocol, log.state),

@@ -386,7 +386,7 @@ def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) ->
         why_not = f"{count(left, 'item is', 'items are')} not ticked yet." if left else ""
         return Main("confirm", text, note, hold=moves, enabled=not left, why_not=why_not)
     if mode == "sign":
-        return Main("sign", f"Sign: {step.title[:1].lower()}{step.title[1:]}", "Your password is asked for.")
+        return Main("sign", f"Sign: {step.title[:1].lower()}{step.title[1:]}", "Your signature is asked for.")
     if mode == "recover" and isinstance(decision, AskOperator) and "confirm" in decision.options:
         note = "What was captured is kept; only what is missing is done."
         first = next((way for way in decision.ways if way.available), None)

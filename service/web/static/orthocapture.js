@@ -354,7 +354,7 @@
     }
     const digit = at?.closest("[data-digit]")?.dataset.digit;
     if (digit) {
-      const pin = at.closest("form").querySelector("[name=pin]");
+      const pin = at.closest("form").querySelector("[name=pin], [name=password]");
       pin.value = digit === "clear" ? "" : pin.value + digit;
     }
   });
