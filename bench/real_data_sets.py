@@ -285,7 +285,8 @@ SETS = (
     ),
     PublicSet(
         "doosan-hand-eye", "Hand-Eye-Calibration-Doosan-A0509-IntelRealSenseA457-ChArUco",
-        "29 images and flange poses of a Doosan A0509; its authors' detector has painted over the markers", "as doosan-charuco", "MIT",
+        "29 images and flange poses of a Doosan A0509; its authors' detector painted over the markers",
+        "as doosan-charuco", "MIT",
         "refused: too few boards can be read", _doosan_hand_eye,
     ),
     PublicSet(

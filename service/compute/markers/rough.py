@@ -22,6 +22,7 @@ _DOUBTFUL_COVERAGE = 0.58
 _DARK = 0.3  # L* over that of the disc's middle, below which its colour does not go on
 _OUTWARD = (1.07, 1.65)  # of the radius: where a larger outline around a disc is looked for
 _LEAST_AROUND = 0.7  # part of it that must be seen
+_LEAST_RINGED_PX = 30.0  # radius of the disc; around smaller ones edges of any texture agree by chance
 _TRIALS = 200  # of RANSAC, on a coarse outline
 LEAST_UNAIDED = 0.5  # coverage below which only a prediction can tell what is outline
 _LEAST_RING = 0.55  # of the ring between two outlines that must have the inner disc's colour
@@ -113,7 +114,7 @@ def outermost(
     A glossy ball mirrors the horizon as a ring on itself, often sharper than its limb.
     """
     inner, radius_px = rough.cone, rough.cone.half_angle_rad * camera.fx
-    if rough.score < CLEAR:
+    if rough.score < CLEAR or radius_px < _LEAST_RINGED_PX:
         return rough
     low, high = _OUTWARD
     middle = 0.5 * (low + high)
