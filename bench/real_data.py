@@ -46,7 +46,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             )
     lines += [
         "",
-        "Not run here, the data being elsewhere:",
+        "Not run on this machine, for want of the data or of time:",
         "",
         "| set | data | expected | where to get it | licence |",
     ]

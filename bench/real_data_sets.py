@@ -23,6 +23,7 @@ from drivers.photo_file import read_exif
 from service.compute.camera_model import CameraModel
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.detectors import options_for
+from service.compute.poses.pose_files import read_poses
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points
 
@@ -181,13 +182,12 @@ def _strecha(folder_name: str, most_mm: float) -> Measure:
         (out / "camera.json").write_text(json.dumps(camera))
         record = command(
             "sfm", "--images", place / "images", "--camera", out / "camera.json", "--out", out / "model",
-            "--effort", "fast",
+            "--effort", "quick",
         )  # fmt: skip
         names = record["registered"]
-        with (out / "model" / "poses.csv").open(encoding="utf-8") as file:
-            found = {row["image"]: np.array([float(row[c]) for c in "xyz"]) for row in csv.DictReader(file)}
+        found = read_poses(out / "model", names)
         theirs = np.array([truth[name] for name in names])
-        ours = np.array([found[name] for name in names])
+        ours = np.array([found[name][:3, 3] for name in names])
         T, scale = align_points(theirs, ours, with_scale=True)
         off = np.linalg.norm(scale * ours @ T[:3, :3].T + T[:3, 3] - theirs, axis=1)
         words = f"{len(names)} of {len(truth)} cameras, centres off by {1e3 * np.mean(off):.1f} mm (mean)"
