@@ -74,6 +74,8 @@ def _described(name: str) -> dict[str, object]:
                 "default": "" if action.default in (None, False, "[]") else str(action.default),
                 "required": action.required,
                 "flag": action.nargs == 0,
+                "many": action.nargs == "+",
+                "number": {int: "int", float: "float"}.get(cast(type, action.type), ""),
                 "choices": [str(choice) for choice in action.choices or ()],
             }
             for action in actions

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+import socket
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+import yaml
 
-from tests.support.rig import RIG_LOCK, orthocapture
+from service.cli.demo import free_address
+from tests.support.rig import RIG_LOCK, command, orthocapture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -112,3 +116,27 @@ def test_every_image_was_looked_at_while_the_specimen_was_there(demo: dict[str, 
 def test_truth_never_enters_the_run(demo: dict[str, Any]) -> None:
     database = Path(demo["database"]).read_bytes()
     assert b"truth" not in database
+
+
+def test_a_taken_port_moves_the_demo_to_another_address(tmp_path: Path) -> None:
+    with RIG_LOCK, socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        first = free_address()
+        taken.bind((first, 30004))
+        taken.listen()
+        with (
+            (tmp_path / "words").open("w") as words,
+            subprocess.Popen(command("demo", "--out", str(tmp_path / "demo")), stdout=words, stderr=words) as demo,
+        ):
+            try:
+                deadline_s = time.monotonic() + 300
+                while not (found := list(tmp_path.glob("demo/*/rig/rig.yaml"))):
+                    assert demo.poll() is None, (tmp_path / "words").read_text()
+                    assert time.monotonic() < deadline_s
+                    time.sleep(0.2)
+                devices = yaml.safe_load(found[0].read_text())["devices"].values()
+            finally:
+                demo.terminate()
+    (host,) = (device["host"] for device in devices if device["driver"] == "ur")
+    assert host != first
+    assert host.startswith("127.0.0.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import resource
 import shutil
 from collections.abc import Callable
@@ -325,15 +326,26 @@ def test_a_length_of_four_gigabytes_asks_for_no_more_than_the_file_holds(tmp_pat
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-def test_a_compression_that_nothing_here_decodes_is_told_before_the_series_is_read(tmp_path: Path) -> None:
-    def compressed(ds: Dataset, _k: int) -> None:
-        ds.PixelData = encapsulate([bytes(ds.PixelData)])
+# The slices of `write_series` as GDCM's encoder writes them, JPEG Lossless of first-order prediction.
+LOSSLESS = [
+    "/9j/wwALEAAGAAgBAREA/8QAFgABAQEAAAAAAAAAAAAAAAAAAQQQ/9oACAEBAAEAAMqq0KqtCqrQqq0KqtCqr//Z",
+    *(
+        f"/9j/wwALEAAGAAgBAREA/8QAFgABAQEAAAAAAAAAAAAAAAAAAQQP/9oACAEBAAEAAMA{first}1VWhVVoVVaFVWhVVoVVf/9k="
+        for first in "LXjv"
+    ),
+]
+
+
+def test_a_lossless_series_is_read_where_a_decoder_is_and_told_of_before_where_none_is(tmp_path: Path) -> None:
+    def compressed(ds: Dataset, k: int) -> None:
+        ds.PixelData = encapsulate([base64.b64decode(LOSSLESS[k])])
         ds["PixelData"].is_undefined_length = True
 
-    write_series(tmp_path / "lossless", syntax=JPEGLosslessSV1, change=compressed)
-    (series,) = source(tmp_path / "lossless").series()
-    if get_decoder(JPEGLosslessSV1).is_available:  # with the extra package the same series is read
+    write_series(tmp_path, syntax=JPEGLosslessSV1, change=compressed)
+    (series,) = source(tmp_path).series()
+    if get_decoder(JPEGLosslessSV1).is_available:  # with the extra package
         assert not series.problems
+        np.testing.assert_array_equal(source(tmp_path).read(series).hounsfield, 2 * pixels() - 1000)
         return
     (problem,) = series.problems
     assert "compressed as JPEG Lossless" in problem

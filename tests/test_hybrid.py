@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from service.compute.camera_covariance import CameraCovariance
 from service.compute.poses.bundle import Data, Sigmas, SphereSightings, State, linearise, moved, width
 from service.compute.poses.hybrid import HybridOptions, HybridPoses, hybrid_poses
 from service.compute.poses.pose_covariance import similarity_covariance
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import align_points, inverse, transform
+from service.core.geometry import Array, align_points, inverse, transform
 from tests.support.sphere_images import RADIUS_M, REGISTRATION_M
 from tests.support.tracked_scene import TrackedScene, pose_errors, tracked_scene
 
@@ -115,6 +116,31 @@ def test_a_wrong_principal_point_is_found_with_the_calibration_as_prior() -> Non
     assert abs(free.camera.cx - (made.camera.cx - 3.0)) < 1.0
     worse, better = (pose_errors(a.T_scan_camera, made.T_scan_camera) for a in (held, free))
     assert np.sqrt(np.mean(better[:, 3:] ** 2)) < 0.5 * np.sqrt(np.mean(worse[:, 3:] ** 2))
+
+
+@pytest.mark.parametrize("robot", [True, False])
+def test_what_is_not_known_of_the_camera_is_in_the_uncertainty(robot: bool) -> None:
+    """Cameras off by their calibration's own sigmas: without its covariance what is stated is far too small."""
+    names, sigmas = ("fx", "fy", "cx", "cy", "k1"), np.array([4.0, 4.0, 2.0, 2.0, 0.004])
+    matrix = np.diag(sigmas**2)
+    matrix[0, 1] = matrix[1, 0] = 0.98 * 16.0  # both focal lengths err alike
+    known = CameraCovariance(names, matrix)
+    rng = np.random.default_rng(11)
+    stated: list[Array] = []
+    without: list[Array] = []
+    for seed in range(8):
+        off = dict(zip(names, rng.multivariate_normal(np.zeros(5), matrix), strict=True))
+        made = tracked_scene(
+            seed, track_px=0.3, outline_px=0.1, robot_m=5e-4, robot_rad=1e-3,
+            camera_errors={name: float(d) for name, d in off.items()},
+        )  # fmt: skip
+        answer = adjust(made, known_camera=known, **({} if robot else {"T_base_camera": None}))
+        error = pose_errors(answer.T_scan_camera, made.T_scan_camera)
+        for ratios, share in ((stated, 0.0), (without, answer.camera_share)):
+            sigma = np.sqrt(np.diag(answer.covariance - share)[: error.size])
+            ratios.append(error.ravel() / sigma)
+    assert np.sqrt(np.mean(np.square(without))) > 3
+    assert 0.5 < np.sqrt(np.mean(np.square(stated))) < 1.5
 
 
 def test_spheres_alone_make_the_poses_metric() -> None:

@@ -307,3 +307,38 @@ def test_a_sphere_of_any_size_is_found_where_its_size_is_told() -> None:
     assert not detect_spheres(image, lens, options_for(None))
     (found,) = detect_spheres(image, lens, options_for(None, 0.45))
     assert max(found.semi_axes_px) == pytest.approx(radius, abs=1.5)
+
+
+@pytest.mark.parametrize("side", [(1.0, 0.1), (-0.3, 1.0), (-0.8, -0.6), (0.2, -1.0)])
+def test_a_large_ball_half_in_shadow_before_a_dark_ground_is_found(side: tuple[float, float]) -> None:
+    # Its dark side passes into the ground without an edge: that was taken for the colour going on.
+    cam = camera(280)
+    centre = np.array([[0.0, -0.001, RADIUS_M * cam.fx / (0.21 * cam.width)]])
+    lamp = ((side[0], side[1], -0.6), 0.8)
+    image = render_look(cam, centre, Look("grey", "black velvet", (lamp,), ambient=0.01, posts=False), seed=1)
+    (found,) = detect_spheres(image, cam, options_for(None, 0.4))
+    axes, radii, _ = errors_px((found,), centre, cam.fx)
+    assert max(axes + [abs(r) for r in radii]) < 0.5
+
+
+@pytest.mark.parametrize(("colour", "mirror"), [("white", 0.45), ("orange", 0.45), ("grey", 0.2)])
+def test_the_limb_of_a_glossy_ball_is_its_outline_not_the_horizon_that_it_mirrors(colour: str, mirror: float) -> None:
+    cam = camera(280)
+    centre = np.array([[0.005, 0.0, 0.12]])
+    look = Look(colour, "table", mirror=mirror, up=(0, 0, -1), posts=False, gloss=0.3)
+    found = detect_spheres(render_look(cam, centre, look, seed=1), cam, options_for(None, 0.4))
+    assert (
+        len(found) == 1 or mirror < 0.3
+    )  # a grey ball hardly stands out from a grey table: refused rather than wrong
+    assert all(abs(off) < 2.0 for off in errors_px(found, centre, cam.fx)[1])  # the ring is 12 px within
+
+
+def test_orange_is_orange_in_a_pale_picture_and_no_other_colour_is() -> None:
+    cam = camera(500)
+    centres = np.array([[-0.08, -0.03, 0.45], [0.08, 0.03, 0.5], [0.0, 0.05, 0.5]])
+    pale = Look("orange", "table", pale=0.35, balance_bgr=(1.0, 0.95, 0.9), posts=False)
+    found = detect_spheres(render_look(cam, centres, pale, seed=3), cam, options_for("orange"))
+    assert sorted(errors_px(found, centres, cam.fx)[2]) == [0, 1, 2]
+    for colour in ("blue", "white", "green"):
+        other = render_look(cam, centres, Look(colour, "table", pale=0.35, posts=False), seed=3)
+        assert detect_spheres(other, cam, options_for("orange")) == ()

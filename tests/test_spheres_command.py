@@ -52,6 +52,17 @@ def test_a_rough_ball_is_refused_with_the_limits_and_accepted_by_option(tmp_path
     assert done.exit_code == 0, done.output
 
 
+@pytest.mark.parametrize(("given", "more"), [("9", ""), ("10.6", ""), ("19.5", "the radius, not the diameter")])
+def test_a_wrong_radius_is_told_with_the_one_that_the_spheres_have(tmp_path: Path, given: str, more: str) -> None:
+    mesh = _balls(tmp_path / "ball.stl", 9.75)
+    refused = _run(mesh, tmp_path / "a.json", "--radius-mm", given, "--mesh-unit", "mm", "--expect", "3")
+    assert refused.exit_code == 1
+    words = " ".join(refused.output.split())
+    assert "There are 3 spheres of radius 9.7" in words
+    assert "give --radius-mm 9.7" in words
+    assert more in words
+
+
 def test_a_ball_of_another_radius_is_accepted_by_option(tmp_path: Path) -> None:
     mesh = _balls(tmp_path / "ball.stl", 9.75)
     words = ("--radius-mm", "9.4", "--mesh-unit", "mm", "--seeds", "0,0,0")

@@ -119,6 +119,25 @@ def test_simulators_explain_themselves_as_every_command_does() -> None:
         assert re.search(rf"│ {name} +[AT]", everything.stdout)
 
 
+@pytest.mark.parametrize(
+    ("typed", "told"),
+    [
+        (["rig", "--scene", "x", "--dir", "d"], "Invalid value for '--scene'"),
+        (["rig", "--scene", "7"], "Missing option '--dir'"),
+        (["rig", "--scen", "7", "--dir", "d"], "No such option: --scen (Possible options: --scene)"),
+        (["rig", "--scene", "7", "--dir", "d", "--arms", "3"], "'3' is not one of '1', '2'"),
+        (["camera", "--image", "a.jpg", "b.jpg", "--bogus"], "No such option: --bogus"),
+        (["lightbocks"], "No such simulator 'lightbocks'. Did you mean 'lightbox'?"),
+        (["--bogus"], "Which one? There are ur, camera, scanner, ct, lightbox, rig."),
+    ],
+)
+def test_a_simulator_refuses_wrong_usage_as_every_command_does(typed: list[str], told: str) -> None:
+    done = _run("simulate", *typed)
+    assert done.returncode == 2
+    assert "╭─ Error" in done.stderr
+    assert told in _plain(done.stderr)
+
+
 def test_a_missing_rig_file_says_what_to_do(tmp_path: Path) -> None:
     status, words = _output("doctor", "--rig", str(tmp_path / "rig.yaml"))
     assert status == 1

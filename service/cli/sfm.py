@@ -113,10 +113,11 @@ def sfm_command(
         known = _spheres(mesh, spheres, radius_mm, mesh_unit) if hybrid else None
         with _workspace(workspace) as folder, progress_bar(quiet=json) as progress:
             solved, off_m = _reconstruct(files, model, folder, mapper, prior, station, options, progress)
-            _write_model(out, solved, read_camera_covariance(camera) if refine == "nothing" else None)
+            well_known = read_camera_covariance(camera) if refine == "nothing" else None
+            _write_model(out, solved, well_known)
             record = {**_record(solved, off_m), "left_out": found.left_out}
             if known is not None:
-                metric = _hybrid(solved, files, prior, station, *known, progress)
+                metric = _hybrid(solved, files, prior, station, *known, well_known, progress)
                 write_poses_csv(
                     out / "poses.csv", dict(zip(solved.T_world_camera, metric.T_world_camera, strict=True))
                 )
@@ -242,6 +243,7 @@ def _hybrid(
     stations: Mapping[str, str] | None,
     centres_m: Array,
     radius_m: float,
+    well_known: CameraCovariance | None,
     progress: Any,
 ) -> HybridPoses:
     names = list(solved.T_world_camera)
@@ -262,6 +264,7 @@ def _hybrid(
         radius_m,
         T_base_camera=None if prior is None else np.array([prior.get(name, nothing) for name in names]),
         groups=[order.index(stations[name]) for name in names] if stations else None,
+        known_camera=well_known,
         names=names,
     )
 

@@ -7,7 +7,8 @@ import json
 import os
 import subprocess
 import sys
-from typing import Annotated, Any
+from difflib import get_close_matches
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -22,16 +23,40 @@ def simulate_command(context: typer.Context) -> None:
     It prints one line of JSON with its addresses when it is ready. `orthocapture simulate rig --help` lists options.
     """
     words = context.args
-    if words and not {"--help", "-h"} & set(words):
-        os.execv(sys.executable, [*_SIMULATORS, *words])
-    chosen = next((word for word in words if not word.startswith("-")), "")
+    chosen = words[0] if words and not words[0].startswith("-") else ""
     described = _described(chosen)
-    name = chosen if "options" in described else "simulate"
-    app = _one(described) if "options" in described else _all(described["simulators"], context.command.help or "")
+    options: list[dict[str, Any]] | None = described.get("options")
+    if chosen and options is None:
+        near = get_close_matches(chosen, described["simulators"], n=1)
+        meant = f"Did you mean {near[0]!r}?" if near else f"There are {', '.join(described['simulators'])}."
+        context.fail(f"No such simulator {chosen!r}. {meant}")
     # In the style of every other command, though a simulator declares its options by itself.
+    app = _all(described["simulators"], context.command.help or "") if options is None else _one(described)
     command = typer.main.get_command(app)
-    with command.make_context(name, ["--help"], parent=context.parent, resilient_parsing=True) as shown:
-        typer.echo(command.get_help(shown), nl=False)
+    if not words or {"--help", "-h"} & set(words):
+        with command.make_context(
+            chosen or "simulate", ["--help"], parent=context.parent, resilient_parsing=True
+        ) as shown:
+            typer.echo(command.get_help(shown), nl=False)
+        return
+    if options is None:
+        context.fail(f"Which one? There are {', '.join(described['simulators'])}.")
+    command.make_context(chosen, _one_at_a_time(words[1:], options), parent=context).close()  # refuses wrong usage
+    os.execv(sys.executable, [*_SIMULATORS, *words])
+
+
+def _one_at_a_time(words: list[str], options: list[dict[str, Any]]) -> list[str]:
+    """The same with `--image A B` as `--image A --image B`, which is how typer knows several values."""
+    many = {flag for option in options if option["many"] for flag in option["flags"]}
+    out: list[str] = []
+    under = ""
+    for word in words:
+        if word.startswith("-"):
+            under = word if word in many else ""
+        elif under and out[-1] != under:
+            out.append(under)
+        out.append(word)
+    return out
 
 
 def _described(name: str) -> dict[str, Any]:
@@ -61,12 +86,13 @@ def _all(simulators: dict[str, str], words: str) -> typer.Typer:
 
 def _option(option: dict[str, Any]) -> inspect.Parameter:
     words = _sentence(option["help"])
-    if option["choices"]:
-        words += f" One of {', '.join(option['choices'])}."
     if option["default"]:
         words += f" Without: {option['default']}."
     flags = option["flags"]
-    kind = bool if option["flag"] else str | None
+    single: Any = {"int": int, "float": float}.get(option["number"], str)
+    if option["choices"]:
+        single = Literal[tuple(option["choices"])]
+    kind: Any = bool if option["flag"] else list[single] if option["many"] else single | None
     declared = typer.Option(*flags, metavar=None if option["flag"] else option["metavar"] or None, help=words)
     return inspect.Parameter(
         flags[-1].lstrip("-").replace("-", "_"),

@@ -16,10 +16,13 @@ from drivers.mesh_file import MeshUnit, read_mesh_file
 from drivers.point_cloud import is_point_cloud, read_point_cloud
 from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors, require_writable
 from service.compute.surfaces.mesh_spheres import MeshSphere, SphereLimits, locate_spheres
+from service.compute.surfaces.other_radii import SeenRadius, seen_radius
 from service.compute.surfaces.sphere_records import spheres_document
 from service.core.count_words import counted
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
+
+_NAMED = 3  # spheres that a refusal names
 
 SeedsOption = Annotated[
     str | None,
@@ -141,7 +144,28 @@ def spheres_of(
     else:
         scan = read_mesh_file(mesh, unit)
         vertices, faces = scan.mesh.vertices_m, scan.mesh.faces
-    return locate_spheres(vertices, faces, radius_m, expected, limits, normals=normals, seeds_m=seeds_m)
+    try:
+        return locate_spheres(vertices, faces, radius_m, expected, limits, normals=normals, seeds_m=seeds_m)
+    except ComputeError as error:
+        seen = seen_radius(vertices, faces, radius_m, limits, normals=normals)
+        # Other balls may lie in a scan, but not more of them than of those that are looked for.
+        if seen is None or (expected is not None and len(seen.spheres) < expected):
+            raise
+        raise _of_another_radius(error, seen, radius_m) from error
+
+
+def _of_another_radius(error: ComputeError, seen: SeenRadius, radius_m: float) -> ComputeError:
+    """The refusal with the radius that the mesh's spheres have."""
+    count = len(seen.spheres)
+    where = ", ".join("({:.1f}, {:.1f}, {:.1f})".format(*(1e3 * s.centre_m)) for s in seen.spheres[:_NAMED])
+    more = ", …" if count > _NAMED else ""
+    return ComputeError(
+        f"{error.what}. There {'is 1 sphere' if count == 1 else f'are {count} spheres'} of radius "
+        f"{1e3 * seen.radius_m:.2f} mm, at {where}{more} mm; the radius given may be off by 4 % at most",
+        where=error.where,
+        remedy=f"Measure a sphere: if these are the ones, give --radius-mm {1e3 * seen.radius_m:.2f}"
+        + (", half of what was given: the radius, not the diameter" if seen.radius_m < 0.55 * radius_m else ""),
+    )
 
 
 def read_seeds(text: str | None) -> Array | None:

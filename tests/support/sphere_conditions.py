@@ -23,7 +23,8 @@ COLOURS_BGR = {
 GROUNDS_BGR = {
     "skin": ((0.28, 0.36, 0.62), (0.16, 0.22, 0.48)), "blood": ((0.03, 0.03, 0.22), (0.10, 0.12, 0.40)),
     "white cloth": ((0.78, 0.78, 0.76), (0.55, 0.56, 0.56)), "green cloth": ((0.20, 0.32, 0.10), (0.13, 0.22, 0.06)),
-    "wood": ((0.16, 0.30, 0.46), (0.09, 0.19, 0.33)),
+    "wood": ((0.16, 0.30, 0.46), (0.09, 0.19, 0.33)), "black velvet": ((0.005, 0.005, 0.006), (0.001, 0.001, 0.001)),
+    "table": ((0.42, 0.44, 0.46), (0.36, 0.38, 0.40)),
 }  # fmt: skip
 
 
@@ -46,6 +47,11 @@ class Look:
     stains: int = 0
     tissue: int = 0  # patches of the ground in front of spheres
     posts: bool = True
+    mirror: float = 0.0  # share of the surroundings' light that is reflected where one looks straight at the sphere
+    up: tuple[float, float, float] = (0.0, -0.2, -0.98)  # of the surroundings: a bright room over the ground
+    room: float = 0.9  # its brightness
+    pale: float = 0.0  # share of white light laid over the picture, as a cheap camera's lens and processing do
+    balance_bgr: tuple[float, float, float] = (1.0, 1.0, 1.0)  # gains of the camera's white balance
 
 
 def _ground(shape: tuple[int, int], kind: str, rng: np.random.Generator) -> Array:
@@ -130,7 +136,7 @@ def picture_of(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int 
         image[mask > 0] = _ground((cam.height, cam.width), look.ground, rng)[mask > 0]
     image = cv2.GaussianBlur(image, (0, 0), look.blur_px)
     image += rng.normal(size=image.shape) * look.noise * np.sqrt(0.15 + np.maximum(image, 0))
-    image = np.clip(image, 0, 1)
+    image = np.clip((look.pale + (1 - look.pale) * image) * look.balance_bgr, 0, 1)
     if look.srgb:
         image = np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055)
     sampling = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420 if look.subsampled else cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
@@ -140,6 +146,22 @@ def picture_of(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int 
     decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert decoded is not None
     return Picture(np.asarray(decoded, dtype=np.uint8), owner)
+
+
+def _reflection(rays: Array, normal: Array, look: Look) -> tuple[Array, Array]:
+    """What the sphere mirrors: the share (N, 1), after Fresnel as Schlick has it, and the light (N, 3) from there.
+
+    The room lies above the horizon, the lit ground below: the horizon is a ring well inside the outline, and beside
+    the outline the sphere mirrors what lies behind it.
+    """
+    facing = np.clip(-np.sum(rays * normal, axis=1), 0, 1)
+    share = look.mirror + (1 - look.mirror) * (1 - facing) ** 5
+    away = rays + 2 * facing[:, None] * normal
+    up = np.array(look.up) / np.linalg.norm(look.up)
+    room = 1 / (1 + np.exp(-(away @ up) / 0.02))
+    ground = np.mean([np.array(c) for c in GROUNDS_BGR[look.ground]], axis=0)
+    ground = ground * (0.35 + 0.65 * sum(s for _, s in look.lamps))
+    return share[:, None], room[:, None] * look.room + (1 - room[:, None]) * ground
 
 
 def _draw_sphere(
@@ -186,6 +208,9 @@ def _draw_sphere(
         albedo[normal @ (spot / np.linalg.norm(spot)) > 0.96] = [0.02, 0.02, 0.2]
     colour = np.zeros((len(hit), 3))
     colour[hit] = albedo * shade[:, None] + shine[:, None]
+    if look.mirror:
+        share, light = _reflection(r, normal, look)
+        colour[hit] = (1 - share) * colour[hit] + share * light
     box = (y1 - y0 + 1, n, x1 - x0 + 1, n)
     cover = hit.reshape(box).mean(axis=(1, 3))[..., None]
     patch = image[y0 : y1 + 1, x0 : x1 + 1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,15 +47,19 @@ def tracked_scene(
     robot_rad: float = 0.0,
     outliers: float = 0.0,
     camera_error_px: float = 0.0,
+    camera_errors: Mapping[str, float] | None = None,
 ) -> TrackedScene:
     """Cameras over spheres and a bumpy scene; structure from motion begins near the truth, in a frame of its own.
 
     With `camera_error_px` the tracks and the outlines come from a camera whose principal point is off by so much from
-    the one that is returned as calibrated.
+    the one that is returned as calibrated; `camera_errors` are added to parameters of it by name.
     """
     rng = np.random.default_rng(seed)
     made = scene(images, 1536, seed)
-    calibrated = dataclasses.replace(made.camera, cx=made.camera.cx + camera_error_px)
+    errors = {"cx": camera_error_px, **(camera_errors or {})}
+    calibrated = dataclasses.replace(
+        made.camera, **{name: getattr(made.camera, name) + d for name, d in errors.items()}
+    )
     T_scan_camera = np.array([inverse(made.T_world_scan) @ T for T in made.T_world_camera])
     X = np.column_stack([rng.uniform(-0.2, 0.2, (points, 2)), rng.uniform(0, 0.1, points)])
     image, point, pixels = [], [], []
@@ -80,7 +85,7 @@ def tracked_scene(
     for i in range(images):
         found = exact_outlines(made, i, REGISTRATION_M, outline_px, seed)[0]
         outlines.append(
-            found if not camera_error_px else tuple(_seen_with(o, made.camera, calibrated) for o in found)
+            found if calibrated == made.camera else tuple(_seen_with(o, made.camera, calibrated) for o in found)
         )
     groups = (np.arange(images) >= images // 2).astype(np.int64)
     bases = np.array([transform(Rotation.random(rng=rng), rng.uniform(-0.6, 0.6, 3)) for _ in range(2)])
@@ -99,10 +104,12 @@ def tracked_scene(
 
 
 def _seen_with(outline: SphereOutline, true: CameraModel, calibrated: CameraModel) -> SphereOutline:
-    """The same outline as who believes the calibrated camera reads it."""
-    plane = calibrated.normalise(true.project(outline.cone.axis[None]))[0]
-    axis = np.append(plane, 1.0)
-    return dataclasses.replace(outline, cone=dataclasses.replace(outline.cone, axis=axis / np.linalg.norm(axis)))
+    """The same outline as who believes the calibrated camera reads its pixels."""
+    rim = outline.cone.rays(np.linspace(0, 2 * np.pi, 24), np.full(24, outline.cone.half_angle_rad))
+    rays = np.column_stack([calibrated.normalise(true.project(np.vstack([outline.cone.axis, rim]))), np.ones(25)])
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    half = float(np.mean(np.arccos(rays[1:] @ rays[0])))
+    return dataclasses.replace(outline, cone=dataclasses.replace(outline.cone, axis=rays[0], half_angle_rad=half))
 
 
 def pose_errors(estimated: Array, true: Array) -> Array:

@@ -182,16 +182,20 @@ def _reduced(image: Grey, target: int) -> tuple[Grey, Array]:
 
 
 def _search_checkerboard(image: Grey, columns: int, rows: int) -> Array:
-    tried: list[int] = []
-    # Reduced first; then larger, for small boards; then with local contrast, for shadows and glare.
-    for target, even in ((_SEARCH_WIDTHS[0], False), (_SEARCH_WIDTHS[1], False), (_SEARCH_WIDTHS[0], True)):
+    tried: list[tuple[int, int]] = []
+    near, far = _SEARCH_WIDTHS
+    stretched = cv2.CALIB_CB_NORMALIZE_IMAGE
+    # Reduced first; as it is, for dark rooms, whose noise a stretched histogram raises to texture; then larger, for
+    # small boards; then with local contrast, for shadows and glare.
+    attempts = ((near, stretched, False), (near, 0, False), (far, stretched, False), (near, stretched, True))
+    for target, flags, even in attempts:
         small, scale = _reduced(image, target)
-        if small.shape[1] in tried and not even:
+        if (small.shape[1], flags) in tried and not even:
             continue
-        tried.append(small.shape[1])
+        tried.append((small.shape[1], flags))
         if even:
             small = np.asarray(cv2.createCLAHE(4.0, (8, 8)).apply(cv2.GaussianBlur(small, (0, 0), 1.0)), np.uint8)
-        found, corners = cv2.findChessboardCornersSB(small, (columns, rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+        found, corners = cv2.findChessboardCornersSB(small, (columns, rows), flags=flags)
         if found:
             return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
     raise ComputeError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ NAMED_BGR: Mapping[str, tuple[Colour, float]] = {
 _HEX_TOLERANCE = 0.18  # the light's colour and the camera's white balance
 _ALIKE = 0.07  # distance of discs of one colour
 _LEARNT_TOLERANCE = (0.1, 0.16)  # least and greatest distance of a pixel from the colour of the clearest spheres
+_PALEST = 0.2  # saturation of a pale picture over that of the colour's name
+_SAME_HUE_RAD = 0.45
 _MEMBERS = 3  # discs of one colour from which it is learnt
 
 
@@ -33,10 +35,27 @@ class ColourModel:
     middle: Array
     tolerance: float
     srgb: bool
+    palest: float = 1.0  # least saturation over that of `middle`; below 1 the hue counts, not the saturation
 
     def distance(self, colours_bgr: Array) -> Array:
         """(N,) of colours (N, 3), in tolerances: up to 1 is a sphere's."""
-        return np.linalg.norm(chromaticity(colours_bgr, srgb=self.srgb) - self.middle, axis=1) / self.tolerance
+        tones = chromaticity(colours_bgr, srgb=self.srgb)
+        if self.palest == 1.0:
+            return np.linalg.norm(tones - self.middle, axis=1) / self.tolerance
+        saturation = float(np.linalg.norm(self.middle))
+        along, across = (tones @ [u, v] / saturation for u, v in _axes(self.middle / saturation))
+        off = np.abs(np.arctan2(across, along)) / _SAME_HUE_RAD
+        return np.asarray(np.where(np.hypot(along, across) < self.palest, 9.0, off), dtype=np.float64)
+
+    def paler(self) -> ColourModel | None:
+        """The same hue as a cheap camera's pale picture has it; None of colours that have hardly any."""
+        pale = float(np.linalg.norm(self.middle)) > 2 * self.tolerance
+        return replace(self, palest=_PALEST) if pale else None
+
+
+def _axes(unit: Array) -> tuple[tuple[float, float], tuple[float, float]]:
+    u, v = (float(x) for x in unit)
+    return (u, v), (-v, u)
 
 
 def colour_of(text: str) -> tuple[Colour, float]:

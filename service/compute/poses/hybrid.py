@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.poses.adjustment import Solution, solve
 from service.compute.poses.bundle import Data, Sigmas, SphereSightings, State, whitening_of
+from service.compute.poses.hybrid_camera import camera_share
 from service.compute.poses.tracks import Tracks
 from service.compute.registration.identity import identify
 from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors
@@ -62,6 +64,7 @@ class HybridPoses:
         T_world_group: base of each group.
         points_scan: (P, 3) scene points that took part.
         covariance: (6 (N + G), 6 (N + G)) joint, of T_scan_camera of every image, then T_scan_base of every group.
+        camera_share: what of it is the camera's own uncertainty; zero where that was not given.
         camera: as given, or refined.
         sigma_track_px: of one observation of a track.
         sphere_factor: of the outlines' residuals over their own sigmas.
@@ -77,6 +80,7 @@ class HybridPoses:
     T_world_group: dict[int, Transform]
     points_scan: Array = field(repr=False)
     covariance: Array = field(repr=False)
+    camera_share: Array = field(repr=False)
     camera: CameraModel
     sigma_track_px: float
     sphere_factor: float
@@ -150,6 +154,7 @@ def hybrid_poses(
     T_base_camera: Array | None = None,
     groups: Sequence[int] | NDArray[np.int64] | None = None,
     lens_covariance: Array | None = None,
+    known_camera: CameraCovariance | None = None,
     sphere_covariance_m2: Array | None = None,
     names: Sequence[str] = (),
     options: HybridOptions | None = None,
@@ -168,6 +173,8 @@ def hybrid_poses(
         groups: (N,) station of each image; None: all one.
         lens_covariance: (4, 4) of fx, fy, cx, cy as calibrated, to refine them with the calibration as a prior; None
             holds the camera.
+        known_camera: how well a camera that is held is known, which the poses' covariance then carries on. None: as
+            if exactly.
         sphere_covariance_m2: (M, 3, 3) of the centres; None: options.sphere_sigma_m.
         names: of the images, for messages.
         options: settings.
@@ -226,10 +233,16 @@ def hybrid_poses(
         lens_covariance=lens_covariance,
     )
     sigmas = Sigmas(settings.track_sigma_px, 1.0, settings.robot_sigma_m, settings.robot_sigma_rad)
-    return _answer(solve(state, data, sigmas), order, len(used.points), start)
+    solution = solve(state, data, sigmas)
+    share = np.zeros_like(solution.covariance)
+    if known_camera is not None and lens_covariance is None:
+        share = camera_share(solution, data, known_camera)
+    return _answer(solution, share, order, len(used.points), start)
 
 
-def _answer(solution: Solution, order: list[int], n_points: int, start: RegistrationResult) -> HybridPoses:
+def _answer(
+    solution: Solution, share: Array, order: list[int], n_points: int, start: RegistrationResult
+) -> HybridPoses:
     state, n = solution.state, len(solution.state.cameras)
     T_world_scan = inverse(state.bases[0]) if order else np.eye(4)
     size = 6 * (n + len(order))
@@ -239,7 +252,8 @@ def _answer(solution: Solution, order: list[int], n_points: int, start: Registra
         T_world_scan=T_world_scan,
         T_world_group={g: T_world_scan @ state.bases[k] for k, g in enumerate(order)},
         points_scan=state.points[:n_points],
-        covariance=solution.covariance[:size, :size],
+        covariance=(solution.covariance + share)[:size, :size],
+        camera_share=share[:size, :size],
         camera=state.camera,
         sigma_track_px=solution.sigmas.track_px,
         sphere_factor=solution.sigmas.sphere,

@@ -1,0 +1,103 @@
+"""The stand-alone commands on public data of others: which sets, where to get them, what to expect, and a table.
+
+`python -m bench.real_data --data DIR` runs every set that lies in DIR under its name and says how to get the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from bench.machine import commit, machine
+from bench.real_data_sets import SETS, PublicSet
+from service.core.errors import OrthocaptureError
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def run(one: PublicSet, data: Path, work: Path) -> dict[str, Any]:
+    """The row of a set: what came out, and whether it is as expected; a refusal is a result too."""
+    row: dict[str, Any] = {"set": one.name, "what": one.what, "licence": one.licence, "expected": one.expected}
+    folder = data / one.folder
+    if one.measure is None or not folder.is_dir():
+        return row | {"ran": False, "figures": "", "as_expected": None}
+    begin = time.monotonic()
+    out = work / one.name
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        figures, good = one.measure(folder, out)
+    except OrthocaptureError as error:
+        figures, good = f"refused: {error.what}", False
+    return row | {"ran": True, "figures": figures, "as_expected": good, "seconds": round(time.monotonic() - begin)}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The rows as Markdown, those that were not run below."""
+    lines = ["| set | data | expected | came out | as expected | s |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        if row["ran"]:
+            good = "yes" if row["as_expected"] else "**no**"
+            lines.append(
+                f"| {row['set']} | {row['what']} | {row['expected']} | {row['figures']} | {good} | {row['seconds']} |"
+            )
+    lines += [
+        "",
+        "Not run on this machine, for want of the data or of time:",
+        "",
+        "| set | data | expected | where to get it | licence |",
+    ]
+    lines.append("|---|---|---|---|---|")
+    ran = {row["set"] for row in rows if row["ran"]}
+    lines += [
+        f"| {one.name} | {one.what} | {one.expected} | {one.where} | {one.licence} |"
+        for one in SETS
+        if one.name not in ran
+    ]
+    lines += ["", "Where those that were run come from:", ""]
+    lines += [f"- {one.name}: {one.where}; {one.licence}" for one in SETS if one.name in ran]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Run what is there, say what is not, write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, help="folder of the sets, each in a folder of its own")
+    parser.add_argument("--only", default="", help="part of a set's name")
+    parser.add_argument("--work", type=Path, default=Path("build/real-data"), help="for what the commands write")
+    parser.add_argument("--out", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    file = options.out / f"real_data-{datetime.now(UTC):%Y-%m-%d}.json"
+    before = {row["set"]: row for row in json.loads(file.read_text())["rows"]} if file.exists() else {}
+    rows: list[dict[str, Any]] = []
+    for one in SETS:
+        row = run(one, options.data, options.work) if options.only in one.name else None
+        if row is not None and row["ran"]:
+            print(
+                f"{one.name}: {row['figures']} ({'as' if row['as_expected'] else 'NOT as'} expected: {one.expected})"
+            )
+        elif row is not None:
+            needed = "" if one.measure is None else f", into {options.data / one.folder}"
+            print(f"{one.name}: not run. {one.where}{needed}")
+        # What ran another day is kept where only a part was asked for.
+        rows.append(
+            row if row is not None and row["ran"] else before.get(one.name, row or run(one, Path("/"), Path()))
+        )
+    here = machine()
+    document = {"machine": here, "commit": commit(), "rows": rows}
+    file.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    text = f"""# Stand-alone commands on data of others
+
+`python -m bench.real_data --data DIR`; {here["processor"]}, {here["cores"]} cores, shared with other work. OpenCV's
+figures are measured beside, on the same images, by its own detectors and solvers (bench/real_data_sets.py).
+
+{table(rows)}
+"""
+    file.with_suffix(".md").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
