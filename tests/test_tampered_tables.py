@@ -290,3 +290,24 @@ def test_whatever_people_do_verifies(tmp_path: Path) -> None:
         person("emmy")  # the sign-ins of the morning have ended
         checkpoint(store, SITE)
     assert faults(tmp_path / "data") == []
+
+
+def rewrite_schema(data: Path, table: str, old: str, new: str) -> None:
+    """What SQLite reads of a table, changed past SQLite, as a flipped bit does."""
+    with closing(sqlite3.connect(database_path(data))) as connection:
+        connection.execute("PRAGMA writable_schema = ON")
+        connection.execute("UPDATE sqlite_master SET sql = replace(sql, ?, ?) WHERE name = ?", (old, new, table))
+        connection.commit()
+
+
+@pytest.mark.parametrize(("table", "column"), [("jobs", "position"), ("event_index", "seq"), ("event_index", "run_id")])
+def test_a_column_with_one_large_letter_is_told(data: Path, table: str, column: str) -> None:
+    rewrite_schema(data, table, f"\t{column} ", f"\t{column[:-1]}{column[-1].upper()} ")
+    assert any(f"the table {table} is not the one that this software makes" in fault for fault in faults(data))
+
+
+def test_a_text_that_became_bytes_is_told_with_its_place(data: Path) -> None:
+    rewrite_schema(data, "sessions", "STRICT", "")
+    tamper(data, "UPDATE sessions SET csrf = CAST(csrf AS BLOB)")
+    rewrite_schema(data, "sessions", ")\n ", ")\n STRICT")
+    assert any("the sign-in of ada on screen" in fault and "not the one" in fault for fault in faults(data))

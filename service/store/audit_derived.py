@@ -10,6 +10,7 @@ from service.store.audit_checks import Fault
 from service.store.database import DATABASE_NAME, fresh_schema, read_schema
 
 # Of an index that says something else than the events, or of events that it does not have.
+# In all of these every column is given its name: one flipped bit in that of the table makes a large letter of a small.
 _INDEX = """
 SELECT coalesce(e.run_id, i.run_id) AS run_id, coalesce(e.seq, i.seq) AS seq,
        e.seq IS NULL AS foreign_row, i.seq IS NULL AS missing_row
@@ -22,14 +23,16 @@ WHERE e.seq IS NULL OR i.seq IS NULL OR i.kind IS NOT e.kind OR i.actor IS NOT e
 
 # Places are given in the order of writing over all runs, one after the other.
 _PLACES = """
-SELECT run_id, seq, place, before, position - row_number() OVER (ORDER BY position) AS gap
+SELECT run_id AS run_id, seq AS seq, place AS place, before AS before,
+       position - row_number() OVER (ORDER BY position) AS gap
 FROM (SELECT run_id, seq, position, position AS place,
              lag(seq) OVER (PARTITION BY run_id ORDER BY position) AS before FROM event_index)
 ORDER BY position
 """
 # A cross join: SQLite looks up the event of each job. Left to choose, it goes through all jobs for each event.
 _QUEUE = """
-SELECT j.run_id, j.enqueued_seq, j.job_id, j.position, row_number() OVER (ORDER BY i.position) AS place
+SELECT j.run_id AS run_id, j.enqueued_seq AS enqueued_seq, j.job_id AS job_id, j.position AS position,
+       row_number() OVER (ORDER BY i.position) AS place
 FROM jobs AS j CROSS JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
 """
 _STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # what ANALYZE makes, by anybody's hand

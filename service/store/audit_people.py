@@ -21,8 +21,9 @@ _LOCKS = {"screen_locked": 1, "screen_unlocked": 0}
 
 
 def session_sha256(row: Mapping[str, Any]) -> str:
-    """Hash of what never changes in a row of sessions."""
-    return sha256_text(canonical({name: row[name] for name in _SESSION}))
+    """Hash of what never changes in a row of sessions; a flipped bit may have made bytes of a text."""
+    values = {name: row[name] for name in _SESSION}
+    return sha256_text(canonical({k: str(v) if isinstance(v, bytes) else v for k, v in values.items()}))
 
 
 @dataclass

@@ -111,7 +111,7 @@ class MortalFiles:
 
     def remove(self, path: Path) -> None:
         """See Files. The file is kept aside: until the folder is synced, a loss of power may bring it back."""
-        aside = self._attic / str(self._calls)
+        aside = self._attic / f"{os.getpid()}-{self._calls}"  # a process that resumed has this journal too
         if path.exists():
             self._attic.mkdir(exist_ok=True)
             os.link(path, aside)
@@ -124,7 +124,7 @@ class MortalFiles:
             before, unchanged = self._log_bytes(), self._checkpointed()
             commit()
             if self._checkpointed() == unchanged:  # else SQLite has synced its log in the middle
-                self._note({"torn": [before, self._log_bytes()]})
+                self._note({"torn": [before, end_of_commit(Path(f"{database_path(self._data)}-wal"), before)]})
 
         self._effect("commit", commit, torn)
 
@@ -163,6 +163,22 @@ class MortalFiles:
 
     def _checkpointed(self) -> int:
         return database_path(self._data).stat().st_mtime_ns
+
+
+def end_of_commit(log: Path, start: int) -> int:
+    """Where the first commit after `start` ends in a write-ahead log, which another process may have added to since.
+
+    https://www.sqlite.org/fileformat2.html#the_write_ahead_log: a frame is a header of 24 bytes and a page; the
+    second word of the header is not 0 in the last frame of a commit.
+    """
+    content = log.read_bytes() if log.exists() else b""
+    if len(content) < 32:
+        return len(content)
+    frame = 24 + int.from_bytes(content[8:12], "big")
+    for at in range(max(start, 32), len(content) - frame + 1, frame):
+        if any(content[at + 4 : at + 8]):
+            return at + frame
+    return len(content)
 
 
 def events_recorded(data: Path) -> int:

@@ -22,7 +22,7 @@ class _Unsynced:
         data: file → as many of its first bytes as are there for certain.
         names: name → the one that the file had before; None for a file or folder that was made.
         removed: name → where its content is kept.
-        torn: sizes of the database's log before and after a commit that did not return.
+        torn: where a commit that did not return begins and ends in the database's log.
     """
 
     data: dict[Path, int] = field(default_factory=dict[Path, int])
@@ -56,7 +56,8 @@ def lose_power(data: Path, journals: Iterable[Path], rng: Random) -> list[str]:
     Path(f"{database_path(data)}-shm").unlink(missing_ok=True)
     if unsynced.torn is not None:
         log, (low, high) = Path(f"{database_path(data)}-wal"), unsynced.torn
-        if log.exists() and high > low:
+        # Where another process has committed since, its sync has brought this commit to the disk too.
+        if log.exists() and log.stat().st_size == high > low:
             os.truncate(log, rng.randint(low, high))
             taken.append("a part of the commit")
     return taken
