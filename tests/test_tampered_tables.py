@@ -300,7 +300,9 @@ def rewrite_schema(data: Path, table: str, old: str, new: str) -> None:
         connection.commit()
 
 
-@pytest.mark.parametrize(("table", "column"), [("jobs", "position"), ("event_index", "seq"), ("event_index", "run_id")])
+@pytest.mark.parametrize(
+    ("table", "column"), [("jobs", "position"), ("event_index", "seq"), ("event_index", "run_id")]
+)
 def test_a_column_with_one_large_letter_is_told(data: Path, table: str, column: str) -> None:
     rewrite_schema(data, table, f"\t{column} ", f"\t{column[:-1]}{column[-1].upper()} ")
     assert any(f"the table {table} is not the one that this software makes" in fault for fault in faults(data))

@@ -10,7 +10,7 @@ from service.store.audit_checks import Fault
 from service.store.database import DATABASE_NAME, fresh_schema, read_schema
 
 # Of an index that says something else than the events, or of events that it does not have.
-# In all of these every column is given its name: one flipped bit in that of the table makes a large letter of a small.
+# Every column is given its name here: one flipped bit makes a large letter of a small one in that of a table.
 _INDEX = """
 SELECT coalesce(e.run_id, i.run_id) AS run_id, coalesce(e.seq, i.seq) AS seq,
        e.seq IS NULL AS foreign_row, i.seq IS NULL AS missing_row
