@@ -14,6 +14,8 @@ Matrix4 = tuple[tuple[float, float, float, float], ...]  # T_a_b row-major, metr
 # --- operator ------------------------------------------------------------------------------------------
 
 OperatorVerb = Literal["confirm", "sign", "redo", "skip", "accept", "pause", "resume", "abort"]
+# How the program knows who acted: a secret of the account was asked, or it is a claim (a site without accounts).
+Identified = Literal["", "claimed", "password", "pin", "badge"]
 
 
 class OperatorAction(Record):
@@ -28,8 +30,7 @@ class OperatorAction(Record):
     meaning: str = ""  # of a signature
     signed_sha256: str = ""  # hash of the event that was signed
     role: str = ""  # of the person, where the action demands one
-    # How the program knows: a secret of the account was asked, or it is a claim (a site without accounts).
-    identified: Literal["", "claimed", "password", "pin", "badge"] = ""
+    identified: Identified = ""
     via: Literal["cli", "web", "pedal", "auto"] = "cli"
     automatic: bool = False
 
@@ -485,7 +486,7 @@ class ProtocolApproved(Record):
     source: str  # the file's text: what another content under the same id and version is held against
     instead_of: str = ""  # SHA-256 of such a content, approved before, whose place it takes
     reason: str = ""  # needed for that
-    identified: Literal["", "claimed", "password"] = ""
+    identified: Identified = ""
 
 
 class DataRestored(Record):

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from service.core.count_words import counted
 from service.core.lifecycle import Phase
-from service.core.model import ArtefactRef, GateVerdict, Uncertainty
+from service.core.model import ArtefactRef, GateVerdict, Identified, Uncertainty
 from service.core.priorities import WAITED
 
 # What a step shows as its progress while a person takes the images: the camera is idle, and shows its live view.
@@ -80,7 +80,7 @@ class Accepted:
     seq: int  # of the action
     by: str
     role: str
-    identified: Literal["", "claimed", "password", "pin", "badge"]
+    identified: Identified
     reason: str
     verdicts: tuple[GateVerdict, ...]  # the failed ones
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from difflib import unified_diff
-from typing import Literal
 
 from sqlalchemy import select
 
 from service.core.errors import ConfigurationError
-from service.core.model import Event, ProtocolApproved
+from service.core.model import Event, Identified, ProtocolApproved
 from service.core.protocol import LoadedProtocol
 from service.store.events import to_event
 from service.store.records import SITE
@@ -81,7 +80,7 @@ def approve(
     by: str,
     *,
     reason: str = "",
-    identified: Literal["", "claimed", "password"] = "",
+    identified: Identified = "",
 ) -> ProtocolStanding:
     """Record that a person approves this content, unless it is approved; how it stands then.
 
