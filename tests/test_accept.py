@@ -384,7 +384,7 @@ def test_the_auditor_reads_it_first(web: WebSite) -> None:
     auditor = web.browser("auditor")
     assert auditor.get(f"/audit/runs/{run_id}").status_code == 200
     page = ""
-    while "Gates accepted" not in page:  # the digest is computed in the background
+    while "Gate accepted" not in page:  # the digest is computed in the background
         page = auditor.get(f"/audit/runs/{run_id}").text
     first = re.search(r'<table class="table deviations">.*?<tbody>\s*<tr>(.*?)</tr>', page, re.DOTALL)
     assert first is not None
