@@ -63,7 +63,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Run what is there, say what is not, write the table."""
+    """Run what is there, say what is not, write the table if anything ran."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of the sets, each in a folder of its own")
     parser.add_argument("--only", default="", help="part of a set's name")
@@ -73,9 +73,11 @@ def main() -> None:
     file = options.out / f"real_data-{datetime.now(UTC):%Y-%m-%d}.json"
     before = {row["set"]: row for row in json.loads(file.read_text())["rows"]} if file.exists() else {}
     rows: list[dict[str, Any]] = []
+    ran = False
     for one in SETS:
         row = run(one, options.data, options.work) if options.only in one.name else None
         if row is not None and row["ran"]:
+            ran = True
             print(
                 f"{one.name}: {row['figures']} ({'as' if row['as_expected'] else 'NOT as'} expected: {one.expected})"
             )
@@ -86,6 +88,8 @@ def main() -> None:
         rows.append(
             row if row is not None and row["ran"] else before.get(one.name, row or run(one, Path("/"), Path()))
         )
+    if not ran:
+        return
     here = machine()
     document = {"machine": here, "commit": commit(), "rows": rows}
     file.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

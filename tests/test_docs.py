@@ -94,6 +94,18 @@ def asks_and_is_aborted(site: Site, command: str) -> None:
     assert "is aborted" in done.stdout
 
 
+def says_how_to_get_the_data(site: Site, command: str) -> None:
+    """With none of the sets there; the committed table stays as it is."""
+    before = sorted(path.name for path in (ROOT / "bench" / "results").glob("real_data*"))
+    words = [sys.executable, *shlex.split(command)[1:-1], str(site.folder)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=110, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) > 10
+    assert all(": not run. " in line for line in lines)
+    assert sorted(path.name for path in (ROOT / "bench" / "results").glob("real_data*")) == before
+
+
 def serves_until_terminated(site: Site, command: str) -> None:
     """The worker takes a job that it has to refuse, and ends when told to."""
     words = shlex.split(command)
@@ -176,6 +188,7 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture audit verify latest --json --data runs": succeeds,
     "orthocapture audit keys --data runs": succeeds,
     "orthocapture store gc --data runs": succeeds,
+    "python -m bench.real_data --data DIR": says_how_to_get_the_data,
 }
 # Commands that take minutes or a whole rig: the test of the suite that runs them.
 RUN_ELSEWHERE = {
