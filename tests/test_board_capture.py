@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service.core.model import GatesEvaluated, StepNote, StepRetried
+from service.core.model import GatesEvaluated, StepMeasured, StepNote, StepRetried
 from service.store.store import Store
 from tests.support.bench_rig import answer
 from tests.support.bench_run import Bench, begin_run
@@ -103,6 +103,39 @@ def test_a_shortfall_is_mended_by_further_poses_and_all_others_are_kept(begin: C
     first, *_, last = bench.payloads(GatesEvaluated)
     assert not first.passed
     assert last.passed
+
+
+LISTED = """viewpoints:
+        - station: station_1
+          prefix: b
+          rolls_deg: [0, 12, -12, 180, 168]
+          aim_offset_m: [0, 0, 0.09]
+          arcs:
+            - {tilt_deg: 8, azimuth_from_deg: -60, azimuth_to_deg: 60, count: 2, distance_m: 0.8}
+            - {tilt_deg: 30, azimuth_from_deg: -75, azimuth_to_deg: 75, count: 4, distance_m: 0.8}"""
+
+
+@pytest.mark.slow
+def test_a_board_seen_in_part_still_counts_when_further_poses_were_added(begin: Callable[[str], Bench]) -> None:
+    listed = PROTOCOL.replace("board_poses: {station: station_1, prefix: b, count: 14, coverage: 1.0}", LISTED)
+    only_views = [line for line in listed.splitlines() if "measure:" not in line or "views" in line]
+    bench = begin("\n".join(only_views).replace("views, min: 14", "views, min: 8"))
+    room = board_room(bench)
+
+    def cover(exposure: int, picture: Picture) -> Picture:
+        if exposure == 4:
+            picture = picture.copy()
+            picture[:, : picture.shape[1] // 2] = 90
+        return picture
+
+    room.spoil = cover
+    bench.script("calibration", "recovery", lambda question, _state: answer(question, "confirm"))
+    state = bench.run()
+    assert state.status == "completed"
+    first, last = bench.payloads(StepMeasured)
+    assert first.measures["views_partial"] == last.measures["views_partial"] == 1
+    assert first.measures["views"] == 7, "six listed, one of them in part, and its replacement"
+    assert last.measures["views"] == 8
 
 
 @pytest.mark.slow

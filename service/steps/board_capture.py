@@ -13,6 +13,7 @@ from service.compute.calibration.board_design import Aims, Prediction, Taken
 from service.compute.calibration.board_knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
 from service.compute.planning.motion_plan import able_postures
+from service.core.count_words import counted
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.steps.board_looks import BoardLooks, Look
@@ -53,7 +54,7 @@ class BoardCapture:
     given: tuple[Viewpoint, ...] = ()  # the protocol's own poses; then nothing is planned but replacements
     camera: Mapping[str, float] | None = None  # calibrated by an earlier step
     earlier: str | None = None  # step whose board images tell where board and mount are
-    known: BoardKnowledge | None = None
+    _known: BoardKnowledge | None = None
     _notes: list[Mapping[str, Any]] = field(default_factory=list[Mapping[str, Any]])
     _replaced: int = 0  # in this attempt
 
@@ -181,9 +182,10 @@ class BoardCapture:
         if why == "replacement":
             data["instead_of"] = {look.capture.viewpoint: look.reason for look in looks if not look.seen}
             self._replaced += len(poses)
-        text = f"{len(poses)} board poses ({_WORDS[why]}): {words}"
+        text = f"{counted(len(poses), 'board pose')} ({_WORDS[why]}): {words}"
         if advise is not None:
-            text = data["advice"] = advise(len(poses), f"{poses[0].name} … {poses[-1].name}", words)
+            names = poses[0].name if len(poses) == 1 else f"{poses[0].name} … {poses[-1].name}"
+            text = data["advice"] = advise(len(poses), names, words)
         self.context.note(NOTE, text=text, **data)
         self.context.tell(text)
         self._notes.append(data)
@@ -229,11 +231,15 @@ class BoardCapture:
 
     # --- what is known ---
 
+    def knowledge(self) -> BoardKnowledge:
+        """Where camera, mount and board are, by all images of the board so far, of earlier attempts too."""
+        return self._knowledge(self.looks())
+
     def _knowledge(self, looks: Sequence[Look]) -> BoardKnowledge:
         """From the images so far; before them from an earlier step's, or as rig file and protocol state it."""
         seen = [look for look in looks if look.seen]
-        if self.known is not None and self.known.measured == len(seen) > 0:
-            return self.known
+        if self._known is not None and self._known.measured == len(seen) > 0:
+            return self._known
         before = [look for look in self._looks.of(self.earlier) if look.seen] if self.earlier is not None else []
         size = next((look.size for look in (*seen, *before)), None)
         if self.camera is None:
@@ -253,7 +259,7 @@ class BoardCapture:
                 known = own if apart > _MOVED_M else both
         elif seen:
             known = _refine(nominal, seen, self.board, lens_known=calibrated)
-        self.known = known
+        self._known = known
         return known
 
     # --- capture and looks ---

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from service.compute.calibration.board_design import Prediction
+from service.core.count_words import counted
 from service.core.gates import describe, evaluate_gates
 from service.core.model import GateVerdict
 from service.steps.board_capture import BoardCapture
@@ -34,8 +35,8 @@ def mend_calibration(context: StepContext, capture: BoardCapture, measures: Mapp
         def advise(found: int, names: str, words: str) -> str:
             first = f"First {' and '.join(again)}. " if again else ""
             return (
-                f"{short}. {first}Confirm to take {found} more images of the board ({names}), all others are kept: "
-                f"predicted then are {words}"
+                f"{short}. {first}Confirm to take {counted(found, 'more image', 'more images')} of the board "
+                f"({names}), all others are kept: predicted then are {words}"
             )
 
         if capture.mend(count, lambda before, after: all(rule(before, after) for rule in rules), advise):

@@ -21,6 +21,8 @@ from service.steps.inputs import captured_images, result_of
 from service.steps.optics import departing_images, optics_departures
 from service.steps.viewpoints import ViewpointSet, plan_viewpoints
 
+_FEWEST_KNOWN = 3  # whole boards, before a part of one may count
+
 
 class Params(MovingParams):
     """Which board images, and what is computed from them."""
@@ -142,8 +144,8 @@ def _solve(
     if capture is not None:
         corners = [looks[image["sha256"]].corners_sha256 if image["sha256"] in looks else None for image in images]
         arguments["corners"] = corners
-        known = capture.known
-        arguments["known"] = known.record() if known is not None and known.measured >= 3 and None in corners else None
+        known = capture.knowledge() if None in corners else None
+        arguments["known"] = None if known is None or known.measured < _FEWEST_KNOWN else known.record()
     (answer,) = context.evidence.run_jobs(JobRequest("calibrate", arguments))
     return answer
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.core.count_words import counted
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.evidence import RunLog
 from service.rig import Rig
@@ -43,7 +44,7 @@ def board_plan_of(log: RunLog, step_id: str, data: Path) -> bytes:
         if notes:
             poses = np.array([pose["T_base_camera"] for note in notes for pose in note.data["poses"]])
             prediction = notes[-1].data["prediction"]
-            text = f"{len(poses)} board poses so far; predicted {describe_prediction(prediction, solve)}"
+            text = f"{counted(len(poses), 'board pose')} so far; predicted {describe_prediction(prediction, solve)}"
             return board_plan_svg(text, prediction["coverage_map"], poses, approach).encode()
         try:
             found = preview_board_poses(log.protocol, step, Rig(recorded_rig(log), Path(), b""), layout)

@@ -138,6 +138,9 @@ def way_words(state: RunState, way: WayOn) -> str:
     views = len(state.step.mend.get("viewpoints", ()))
     if way.verb == "confirm" and views:
         return f"take {'this view' if views == 1 else f'these {views} views'}"
+    boards = len(state.step.mend.get("poses", ()))
+    if way.verb == "confirm" and boards:
+        return f"take {boards} more {'image' if boards == 1 else 'images'} of the board"
     words = way.words.split(";")[0].split(". ")[0].rstrip(".")
     return words[:1].lower() + words[1:]
 
