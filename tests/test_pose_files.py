@@ -85,6 +85,22 @@ def test_colmap_model_written_by_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(T[:3, 2], [0, 0, -1], atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("file", "before", "after", "said"),
+    [
+        ("images.txt", b"view.png", b"vi\xffw.png", "the name of an image is not UTF-8"),
+        ("frames.txt", b"1 1 ", b"1 7 ", "Rig with ID 7 does not exist"),
+    ],
+)
+def test_a_damaged_colmap_model_is_refused_in_words(
+    tmp_path: Path, file: str, before: bytes, after: bytes, said: str
+) -> None:
+    write_colmap_text(tmp_path, CAMERA, {"view.png": np.eye(4)})
+    (tmp_path / file).write_bytes((tmp_path / file).read_bytes().replace(before, after))
+    with pytest.raises(DataError, match=said):
+        read_poses(tmp_path)
+
+
 def test_transforms_json_is_opengl(tmp_path: Path) -> None:
     """The identity there is a camera that looks along -z with y up: ours looks along -z with y down."""
     frame = {"file_path": "./images/v.png", "transform_matrix": np.eye(4).tolist()}

@@ -30,6 +30,7 @@ from service.compute.poses.pose_files import (
 from service.compute.poses.robot_files import read_hand_eye, read_stations
 from service.core.geometry import Transform
 from service.core.imported import ImportedFile, ImportedView, ImportList
+from service.core.json_text import parse_json
 from service.core.protocol import parse_protocol
 from service.importing import import_rig
 from service.rig import load_rig
@@ -161,7 +162,7 @@ def _hand_eyes(_: Path) -> list[bytes]:
 def _hand_eye(data: bytes, folder: Path) -> None:
     path = _put(folder, "hand_eye.json", data)
     _finite(read_hand_eye(path))
-    document = json.loads(data)  # sound as far as that: it was read
+    document = parse_json(data, name="hand_eye.json", remedy="")  # as it was read
     if isinstance(document.get("arm_correction"), dict):
         read_arm_correction(document["arm_correction"])
 

@@ -69,10 +69,12 @@ def _read(folder: str) -> dict[str, Transform] | str:
     colmap.logging.minloglevel = colmap.logging.FATAL.value
     try:
         model = colmap.Reconstruction(folder)
-    except (RuntimeError, ValueError, OSError) as error:  # what pycolmap raises
-        return str(error).strip().splitlines()[-1]
-    images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
-    return {image.name: convention.from_colmap_pose(image.cam_from_world()) for image in images}
+        images = sorted((model.image(k) for k in model.reg_image_ids()), key=lambda image: image.name)
+        return {image.name: convention.from_colmap_pose(image.cam_from_world()) for image in images}
+    except UnicodeDecodeError:
+        return "the name of an image is not UTF-8"
+    except (RuntimeError, ValueError, IndexError, OSError) as error:  # what else pycolmap raises
+        return (str(error).strip().splitlines() or [type(error).__name__])[-1]
 
 
 def _write(folder: str, camera: CameraModel, T_world_camera: dict[str, Transform]) -> str | None:
