@@ -28,9 +28,7 @@ from tests.support.browser import DESKTOP, PASSWORD, TABLET, Screen, add_people,
 
 FOLDER = Path(__file__).parents[1] / "docs" / "screens"
 PEOPLE: tuple[tuple[str, Role], ...] = (("tina", "technician"), ("sam", "supervisor"), ("otto", "auditor"))
-LIMIT_BYTES = 90_000
-USUAL_BYTES = 40_000
-STEPS = ((1.0, 64), (1.0, 32), (1.0, 16), (0.67, 32), (0.67, 16))  # scale and colours
+LIMIT_BYTES, QUALITY = 90_000, 80
 STANDING = {
     "robot": "standing", "robot_name": "robot", "speed_fraction": 0.25, "camera_battery_fraction": 0.82,
     "light_lux": 812.0, "temperature_c": 21.4, "disk_free_bytes": 412_000_000_000,
@@ -40,6 +38,8 @@ SHOTS: tuple[tuple[str, str, str, str], ...] = (
     ("sign-in", "", "/sign-in", "signing in"),
     ("set-up", "", "SET_UP", "an invited person sets up an account by a one-time link"),
     ("home", "tina", "/", "runs, and protocols to start"),
+    ("start", "tina", "/start?protocol=demo.yaml", "what a run is of and for, before it starts"),
+    ("checklist", "tina", "/protocols/demo.yaml/checklist", "a protocol as a checklist to print"),
     ("run", "tina", "/runs/RUN_LIST", "a step with its checklist"),
     ("run-hold", "tina", "/runs/RUN_HOLD", "the robot moves while the button is held"),
     ("run-working", "tina", "/runs/RUN_WORK", "the robot takes the images"),
@@ -54,11 +54,15 @@ SHOTS: tuple[tuple[str, str, str, str], ...] = (
     ("calibration", "otto", "/runs/RUN_DONE/calibration", "coverage, residuals and uncertainty of the calibration"),
     ("certificate", "otto", "/runs/RUN_DONE/calibration/certificate", "the certificate of a calibration"),
     ("exports", "sam", "/runs/RUN_DONE/exports", "release by a second person, and what leaves the system"),
+    ("compare", "sam", "/compare?run=RUN_DONE&run=RUN_WORK", "two runs side by side"),
+    ("history", "sam", "/history", "calibration and accuracy over time"),
+    ("badges", "sam", "/badges", "badges that sign"),
     ("account", "tina", "/account", "one's own account"),
     ("accounts", "ada", "/accounts", "the people of the site, and its signing key"),
     ("account-administration", "ada", "/accounts/tina", "one account, as the administrator sees it"),
     ("audit-runs", "otto", "/audit", "all runs, with filters"),
     ("audit", "otto", "/audit/runs/RUN_DONE", "an auditor's first page of a run"),
+    ("audit-gates", "otto", "/audit/runs/RUN_DONE/gates", "every gate with its limits and its figure"),
     ("audit-deviations", "otto", "/audit/runs/RUN_DONE/deviations", "every deviation with its reason"),
     ("audit-timeline", "otto", "/audit/runs/RUN_DONE/timeline", "every event, filtered and searched"),
     ("audit-event", "otto", "/audit/runs/RUN_DONE/events/300", "one event as it was recorded"),
@@ -75,7 +79,6 @@ SHOTS: tuple[tuple[str, str, str, str], ...] = (
 )  # fmt: skip
 DARK = frozenset({"run-hold", "capture", "audit", "scene"})  # on the tablet
 TABLET_ONLY = frozenset({"run-hold", "run-working", "viewpoint", "sign-dialog", "looking-on", "recovery", "locked"})
-IN_README = frozenset({"capture-tablet.png", "audit-desktop.png"})
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -186,7 +189,7 @@ def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) ->
                     for dark in (False, True) if name in DARK and size == TABLET else (False,):
                         shot.page.emulate_media(color_scheme="dark" if dark else "light")
                         shot.page.wait_for_timeout(300)
-                        target = into / f"{name}-{suffix}{'-dark' if dark else ''}.png"
+                        target = into / f"{name}-{suffix}{'-dark' if dark else ''}.webp"
                         taken.append(write_small(shot.page.screenshot(), target))
                     shot.page.emulate_media(color_scheme="light")
             screens.close()
@@ -224,26 +227,17 @@ def prepare(shot: Screen, path: str) -> None:
 
 
 def write_small(png: bytes, target: Path) -> Path:
-    """With as many colours of a palette as the limit allows."""
+    """As WebP, in full colour; at two thirds of the size where it is a large photograph."""
     whole = Image.open(io.BytesIO(png)).convert("RGB")
-    limit = LIMIT_BYTES if target.name in IN_README else USUAL_BYTES
-    small = png
-    for scale, colours in STEPS:
+    small = b""
+    for scale in (1.0, 0.67):
         size = (round(whole.width * scale), round(whole.height * scale))
         picture = whole if scale == 1.0 else whole.resize(size, Image.Resampling.LANCZOS)
         buffer = io.BytesIO()
-        # Every colour counts, however few its pixels: a photograph would take the accents' places.
-        method = Image.Quantize.MAXCOVERAGE
-        picture.quantize(colours, method, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+        picture.save(buffer, "WEBP", quality=QUALITY, method=6)
         small = buffer.getvalue()
-        if len(small) <= limit:
+        if len(small) <= LIMIT_BYTES:
             break
-    else:  # a large photograph
-        buffer = io.BytesIO()
-        whole.resize((whole.width // 2, whole.height // 2), Image.Resampling.LANCZOS).save(
-            buffer, "JPEG", quality=80, optimize=True
-        )
-        small, target = buffer.getvalue(), target.with_suffix(".jpg")
     target.write_bytes(small)
     return target
 
