@@ -91,7 +91,7 @@ def _checked(photograph: Photograph) -> tuple[str, str]:
     import cv2  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
 
-    from service.compute.images import check_jpeg  # noqa: PLC0415
+    from service.compute.images import check_jpeg, check_png  # noqa: PLC0415
 
     content, name = photograph.content, _plain(photograph.name)
     require_size(len(content), name)
@@ -103,6 +103,7 @@ def _checked(photograph: Photograph) -> tuple[str, str]:
         width, height = (int.from_bytes(content[at : at + 4], "big") for at in (16, 20))
         if width * height > _PIXELS:
             raise DataError(f"the picture claims {width} × {height} pixels", where=name, remedy=_REMEDY)
+        check_png(content, name)
     else:
         raise DataError("the file is neither a JPEG nor a PNG picture", where=name, remedy=_REMEDY)
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import zlib
 from pathlib import Path
 
 import cv2
@@ -59,6 +60,28 @@ def check_jpeg(data: bytes, where: str) -> None:
                 break
             at = end.start()
     raise truncated
+
+
+def check_png(data: bytes, where: str) -> None:
+    """Walk the chunks of a PNG, with their check sums, up to its end.
+
+    Raises:
+        DataError: the file ends before its picture does, or is damaged.
+    """
+    _check_size(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), where)
+    at, kind = len(_PNG), b""
+    while kind != b"IEND":
+        length, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+        end = at + 8 + length
+        if end + 4 > len(data):  # a decoder would make room for what the length claims, up to four gigabytes
+            raise DataError(
+                "the PNG ends before its picture is complete",
+                where=where,
+                remedy="Copy the file again; a half-written image is not used",
+            )
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise DataError("the PNG is damaged", where=where, remedy="Copy the file again")
+        at = end + 4
 
 
 def _check_size(width: int, height: int, where: str) -> None:
@@ -136,8 +159,7 @@ def _decode(path: Path, how: int) -> NDArray[np.uint8]:
     if path.suffix.lower() in {".jpg", ".jpeg"} or data[:2] == b"\xff\xd8":
         check_jpeg(data, str(path))
     elif data.startswith(_PNG):
-        width, height = (int.from_bytes(data[k : k + 4], "big") for k in (16, 20))
-        _check_size(width, height, str(path))
+        check_png(data, str(path))
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), how | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
