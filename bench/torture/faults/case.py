@@ -47,5 +47,7 @@ class Case:
     @property
     def bound_s(self) -> float:
         """No case may take longer."""
-        away_s = AWAY_S.get(self.spoil.column, 0.0) if self.spoil is not None else 0.0
-        return BOUND_S + (away_s or 0.0) + self.longer_s
+        if self.spoil is None:
+            return BOUND_S + self.longer_s
+        garbled_s = 120.0 if self.spoil.column in ("noise", "mutated") else 0.0  # every way on is tried, 60 s each
+        return BOUND_S + (AWAY_S.get(self.spoil.column) or 0.0) + garbled_s + self.longer_s
