@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from service.core.model import Event, JobEnqueued, JobFinished, OperatorAction, Payload, RunStarted, SessionStarted
@@ -10,7 +11,7 @@ from service.core.protocol import parse_protocol
 from service.rig import Rig
 from service.runs import start_run
 from service.steps import params_models
-from service.store.records import NewArtefact, NewJob
+from service.store.records import Job, NewArtefact, NewJob
 from service.store.store import Store
 
 Told = Callable[[Event], bool]
@@ -44,35 +45,61 @@ def retell(
         new = NewArtefact(row.ref, row.device, row.step, row.attempt, row.viewpoint)
         rows.setdefault(row.seq, []).append(new)
     again: dict[str, str] = {}
+    jobs = _Jobs(store, run_id)
     for event in events[1:]:
         if until(event):
             break
-        again[event.sha256] = _tell(store, run_id, person, event, rows.get(event.seq, []), again)
+        again[event.sha256] = _tell(store, run_id, person, event, rows.get(event.seq, []), again, jobs)
         for payload in (more or {}).get(event.seq, ()):
             actor = person if isinstance(payload, OperatorAction) else "runner"
             store.record(run_id, [payload], actor=actor)
     return run_id
 
 
+@dataclass
+class _Jobs:
+    """The jobs of the new run, which a worker ended in an order of its own."""
+
+    store: Store
+    run_id: str
+    keys: dict[str, str] = field(default_factory=dict[str, str])  # job of the source → idempotency key
+    claimed: dict[str, Job] = field(default_factory=dict[str, Job])
+
+    def claim(self, payload: JobFinished) -> Job:
+        """The job that has this end. Raises AssertionError where it was never enqueued."""
+        key = self.keys[payload.job]
+        while key not in self.claimed:
+            job = self.store.claim_job(payload.worker, 3600.0, [payload.job_kind], run_id=self.run_id)
+            assert job is not None, payload.job
+            self.claimed[job.idempotency_key] = job
+        return self.claimed.pop(key)
+
+
 def _tell(
-    store: Store, run_id: str, person: str, event: Event, rows: Sequence[NewArtefact], again: Mapping[str, str]
+    store: Store,
+    run_id: str,
+    person: str,
+    event: Event,
+    rows: Sequence[NewArtefact],
+    again: Mapping[str, str],
+    jobs: _Jobs,
 ) -> str:
     """Record one event again; the hash of the new one."""
     payload = event.payload
     actor = event.actor
     if isinstance(payload, JobEnqueued):
         job = NewJob(payload.job_kind, payload.step, payload.attempt, payload.idempotency_key, payload.arguments)
+        jobs.keys[payload.job] = payload.idempotency_key
         store.enqueue_job(run_id, job, actor=actor)
         return store.events(run_id, store.head(run_id) - 1)[-1].sha256
     if isinstance(payload, JobFinished):
-        claimed = store.claim_job(payload.worker, 60.0, run_id=run_id)
-        assert claimed is not None, payload.job
         finished = store.finish_job(
-            claimed,
+            jobs.claim(payload),
             measures=payload.measures,
             duration_s=payload.duration_s,
             result=payload.result,
             artefacts=rows,
+            late_s=payload.late_s,
         )
         return finished.sha256
     if isinstance(payload, OperatorAction):
