@@ -174,6 +174,11 @@ def test_damaged_pieces_are_refused() -> None:
         ImageFeatures.from_bytes(b"no archive")
     with pytest.raises(DataError, match="matches"):
         unpack_matches(b"no archive")
+    claims_encryption = bytearray(pack_matches([]))
+    claims_encryption[6] |= 1
+    claims_encryption[claims_encryption.index(b"PK\1\2") + 8] |= 1
+    with pytest.raises(DataError, match="matches"):
+        unpack_matches(bytes(claims_encryption))
 
 
 def test_wrong_size_or_broken_image_is_named(

@@ -26,7 +26,7 @@ _MOST_RATIO = 0.8  # of the nearest descriptor's angle and the second nearest's 
 
 
 # What NumPy and the archive below it raise for bytes that are not theirs.
-_DAMAGED = (ValueError, KeyError, TypeError, IndexError, OSError, EOFError, NotImplementedError, zipfile.BadZipFile,
+_DAMAGED = (ValueError, KeyError, TypeError, IndexError, OSError, EOFError, RuntimeError, zipfile.BadZipFile,
             zlib.error)  # fmt: skip
 
 
