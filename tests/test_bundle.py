@@ -302,6 +302,15 @@ def test_every_changed_file_is_named(unpacked: Path) -> None:
     assert check(unpacked) == []
 
 
+def test_a_manifest_of_random_bytes_is_told_in_few_words(unpacked: Path) -> None:
+    (unpacked / "manifest.json").write_bytes(bytes(range(256)) * 40)
+    with pytest.raises(
+        verifier.NotABundleError, match=r"manifest\.json cannot be read: UnicodeDecodeError"
+    ) as refused:
+        check(unpacked)
+    assert len(str(refused.value)) < 250
+
+
 def test_every_missing_file_is_named_and_every_other_too(unpacked: Path) -> None:
     for path in [path for path in sorted(unpacked.rglob("*")) if path.is_file()]:
         name = path.relative_to(unpacked).as_posix()

@@ -153,6 +153,11 @@ def number(value: float) -> str:
     return sign + text
 
 
+def short_words(error: Exception) -> str:
+    """What an error says, without the bytes that some carry along."""
+    return f"{type(error).__name__}: {error}"[:200]
+
+
 def parse(text: bytes) -> Any:
     """JSON without duplicate names, NaN and infinity. Raises ValueError."""
     try:
@@ -355,7 +360,7 @@ class Check:
                 if not isinstance(manifest[name], dict):
                     raise TypeError(f"{name} is no object")  # noqa: TRY301
         except (*UNREADABLE, KeyError, TypeError, OverflowError, AttributeError) as error:
-            raise NotABundleError(f"manifest.json cannot be read: {error!r}") from error
+            raise NotABundleError(f"manifest.json cannot be read: {short_words(error)}") from error
         if len(files) != len(manifest["files"]):
             self.fault(MANIFEST, "it lists a file twice")
         self.manifest = manifest
@@ -625,7 +630,7 @@ class Check:
             graph = parse(bundle.read(name, LARGEST_MANIFEST))["@graph"]
             listed = {str(item["@id"]): str(item.get("sha256", "")) for item in graph if "File" in str(item["@type"])}
         except (*UNREADABLE, KeyError, TypeError, AttributeError) as error:
-            self.fault(name, f"it cannot be read: {error!r}")
+            self.fault(name, f"it cannot be read: {short_words(error)}")
             return
         for path, sha256 in listed.items():
             if path in (MANIFEST, SIGNATURE) or path.startswith("#"):

@@ -183,7 +183,7 @@ def _files() -> Iterator[Case]:
 
 
 # How many calls of each kind a capture makes once its first image is in the record: the disk fails at each of them.
-_CALLS = {"write": 6, "sync_file": 6, "rename": 6, "make_read_only": 4, "sync_directory": 8, "commit": 6, "append": 1}
+_CALLS = {"write": 6, "sync_file": 6, "rename": 5, "make_read_only": 4, "sync_directory": 8, "commit": 6, "append": 1}
 
 
 def _store() -> Iterator[Case]:
