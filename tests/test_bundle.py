@@ -304,9 +304,7 @@ def test_every_changed_file_is_named(unpacked: Path) -> None:
 
 def test_a_manifest_of_random_bytes_is_told_in_few_words(unpacked: Path) -> None:
     (unpacked / "manifest.json").write_bytes(bytes(range(256)) * 40)
-    with pytest.raises(
-        verifier.NotABundleError, match=r"manifest\.json cannot be read: UnicodeDecodeError"
-    ) as refused:
+    with pytest.raises(verifier.NotABundleError, match="cannot be read: UnicodeDecodeError") as refused:
         check(unpacked)
     assert len(str(refused.value)) < 250
 
