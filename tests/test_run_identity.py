@@ -276,6 +276,9 @@ def test_runs_are_found_by_what_people_said_of_them(web: WebSite) -> None:
     assert spine in page.text
     assert done not in page.text
     assert "No run that has ended fits." in browser.get("/", params={"q": "nowhere"}).text
+    listed = web.browser("auditor").get("/audit", params={"q": "knee teaching"}).text
+    assert f"/audit/runs/{knee}" in listed
+    assert f"/audit/runs/{spine}" not in listed
     assert browser.get("/?q=%ED%A0%80%00+%25+_+'&since=yesterday&result=x").status_code == 200
 
 

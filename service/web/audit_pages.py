@@ -18,6 +18,7 @@ from service.audit.opened import bodies_of_run
 from service.audit.provenance import origin
 from service.audit.provenance_drawing import draw
 from service.audit.queries import EventFilter
+from service.audit.run_search import RunWanted, find_runs
 from service.audit.shots import failed_exposures_of, shots_of, together
 from service.evidence import results_to_come
 from service.steps.time_left import Left
@@ -76,8 +77,9 @@ def runs_page(
     )
     with audit.site.store.database.reading() as connection:
         every = queries.runs(connection)
+    said = {run.run_id for run in find_runs(audit.site.store, RunWanted(q=wanted.q))}
     listed = [_listed(audit, basics) for basics in every]
-    found = [run for run in listed if first_page.matches(run, wanted)]
+    found = [run for run in listed if run.basics.run_id in said and first_page.matches(run, wanted)]
     pages = max(1, -(-len(found) // _RUNS_A_PAGE))
     page = min(max(page, 1), pages)
     return render(
