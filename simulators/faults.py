@@ -63,7 +63,7 @@ class FaultPlan:
             return cls(_FAULTS.validate_json(source))
         except ValidationError as error:
             first = error.errors()[0]
-            field = ".".join(str(part) for part in first["loc"])
+            field = ".".join(str(part) for part in first["loc"])[:80]
             raise SimulatorError(f"the fault plan is wrong at {field or 'its start'!a}: {first['msg']}") from error
 
     def to_json(self) -> str:

@@ -11,6 +11,7 @@ import signal
 import socket
 import time
 import tty
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
@@ -95,6 +96,7 @@ class Lightbox:
         # The slave stays open here, so that the terminal lives on while no client holds it.
         tty.setraw(slave)
         name = os.ttyname(slave)
+        os.set_blocking(master, False)
         self._ends, self._heard = (master, slave), b""
         if self._link is not None:
             self._link.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +104,7 @@ class Lightbox:
             temporary.unlink(missing_ok=True)
             temporary.symlink_to(name)
             temporary.replace(self._link)
-        os.write(master, BANNER)
+        self._send(BANNER)
         return name
 
     def unplug(self) -> None:
@@ -142,26 +144,30 @@ class Lightbox:
             if self._spoiled(fault, answer):
                 return
             answer = b"ERR 3 sensor fault\r\n" if fault.kind == "reject" else answer
+        self._send(answer)
+
+    def _send(self, data: bytes) -> None:
+        """What a client does not fetch is lost, as on any line without flow control."""
         if self._ends is not None:
-            os.write(self._ends[0], answer)
+            with suppress(BlockingIOError):
+                os.write(self._ends[0], data)
 
     def _spoiled(self, fault: Fault, answer: bytes) -> bool:
         """Let the fault happen; whether the answer is done with."""
-        assert self._ends is not None
         seconds = float(fault.value) if isinstance(fault.value, (int, float)) else 0.5
         match fault.kind:
             case "drop":
                 return True
             case "truncate":
-                os.write(self._ends[0], answer[: len(answer) // 2])
+                self._send(answer[: len(answer) // 2])
                 return True
             case "corrupt":
-                os.write(self._ends[0], b"\xff\x00\x9e" + answer[3:] + b"\x80\xfe\n")
+                self._send(b"\xff\x00\x9e" + answer[3:] + b"\x80\xfe\n")
                 return True
             case "stall":
                 time.sleep(seconds)
             case "banner":
-                os.write(self._ends[0], BANNER)
+                self._send(BANNER)
             case "unplug":
                 self.unplug()
                 time.sleep(seconds)

@@ -170,6 +170,18 @@ def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
         assert driver.read().light_lux == 45_000.0
 
 
+def test_a_box_goes_on_after_a_client_that_asked_and_never_read(tmp_path: Path) -> None:
+    """Its answers filled the line, and it waited for ever (found by bench/torture/fuzz)."""
+    with simulator("lightbox", "--link", str(tmp_path / "box")):
+        with serial.Serial(str(tmp_path / "box"), timeout=0.5, write_timeout=5) as rude:
+            for _ in range(400):
+                rude.write(b"*IDN?\n" * 10)
+                time.sleep(0.001)
+            rude.reset_input_buffer()
+        with opened(tmp_path / "box", timeout_s=2) as driver:
+            assert driver.read().light_lux == 45_000.0
+
+
 def test_no_such_port() -> None:
     for port in ("/dev/does-not-exist", "socket://127.0.0.1:1", "nonsense://x"):
         driver = DRIVER.build(DRIVER.config.model_validate({"port": port}))

@@ -308,7 +308,11 @@ def _read(connection: Connection, run_id: str | None) -> _Evidence:
     known |= set(connection.execute(select(events.c.run_id).distinct()).scalars())
     known |= set(connection.execute(select(checkpoints.c.run_id).distinct()).scalars())
     if run_id is not None and run_id not in known:
-        raise UnknownRunError(f"there is no run {run_id!r}", remedy="List the runs with `orthocapture status`")
+        raise UnknownRunError(
+            f"there is no run {run_id!r}",
+            where=str(connection.engine.url.database),
+            remedy="List the runs with `orthocapture status`",
+        )
     chosen = tuple(sorted(known)) if run_id is None else (run_id,)
     read = tuple({*chosen, SITE})
 
