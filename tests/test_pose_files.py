@@ -9,6 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -99,6 +100,18 @@ def test_a_damaged_colmap_model_is_refused_in_words(
     (tmp_path / file).write_bytes((tmp_path / file).read_bytes().replace(before, after))
     with pytest.raises(DataError, match=said):
         read_poses(tmp_path)
+
+
+def test_a_colmap_model_that_announces_endless_data_is_given_up(tmp_path: Path) -> None:
+    """The library would count to four thousand million (found by bench/torture/fuzz)."""
+    write_colmap_text(tmp_path, CAMERA, {"view.png": np.eye(4)})
+    binary = tmp_path / "binary"
+    binary.mkdir()
+    pycolmap.Reconstruction(str(tmp_path)).write_binary(str(binary))
+    whole = (binary / "frames.bin").read_bytes()
+    (binary / "frames.bin").write_bytes(whole[:72] + b"\xff\xff\xff\xff")
+    with pytest.raises(DataError, match="took far longer than a sound model takes"):
+        read_poses(binary)
 
 
 def test_transforms_json_is_opengl(tmp_path: Path) -> None:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import resource
+import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from math import ceil
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,6 +20,7 @@ from service.core.errors import DataError
 from service.core.geometry import Transform
 
 _SPARE_BYTES = 1 << 30  # beyond what the library itself takes
+_SPARE_S, _BYTES_PER_S = 3.0, 1e6  # text is read at sixty times that
 _PER_BYTE = 40  # of a model's files, once read: observations are 24 bytes in a file and some 60 in memory
 
 
@@ -38,10 +41,10 @@ def write_model(folder: Path, camera: CameraModel, T_world_camera: dict[str, Tra
 def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> object:
     context = multiprocessing.get_context("spawn")
     try:
-        with ProcessPoolExecutor(1, mp_context=context, initializer=_bound_memory, initargs=(str(folder),)) as pool:
+        with ProcessPoolExecutor(1, mp_context=context, initializer=_bound, initargs=(str(folder),)) as pool:
             outcome = pool.submit(work, *arguments).result()
     except BrokenProcessPool:
-        outcome = "pycolmap crashed on it"
+        outcome = "pycolmap crashed on it, or took far longer than a sound model takes"
     except MemoryError:
         outcome = "it announces more than memory can hold"
     if isinstance(outcome, str):
@@ -53,14 +56,22 @@ def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> obj
     return outcome
 
 
-def _bound_memory(folder: str) -> None:
-    """Counts in a damaged file may ask for any amount: this process gets what a sound model of these files takes."""
+def _bound(folder: str) -> None:
+    """Counts in a damaged file may ask for any amount: this process gets what a sound model of these files takes.
+
+    Of memory and of processor time; beyond that the system ends it.
+    """
     importlib.import_module("pycolmap")
     mapped_bytes = psutil.Process().memory_info().vms
     files_bytes = sum(file.stat().st_size for file in Path(folder).iterdir() if file.is_file())
     limit = mapped_bytes + _SPARE_BYTES + _PER_BYTE * files_bytes
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
+    limit_s = ceil(time.process_time() + _SPARE_S + files_bytes / _BYTES_PER_S)
+    _, most_s = resource.getrlimit(resource.RLIMIT_CPU)
+    resource.setrlimit(
+        resource.RLIMIT_CPU, (limit_s if most_s == resource.RLIM_INFINITY else min(limit_s, most_s), most_s)
+    )
 
 
 def _read(folder: str) -> dict[str, Transform] | str:
