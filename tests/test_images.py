@@ -10,6 +10,7 @@ import pytest
 
 from service.compute.images import read_grey
 from service.core.errors import DataError
+from service.web.images.pictures import reduced_jpeg
 
 PICTURE = np.random.default_rng(3).integers(0, 255, (32, 48), dtype=np.uint8)
 
@@ -47,3 +48,5 @@ def test_a_png_that_claims_gigabytes_is_refused_at_once(tmp_path: Path, png: byt
     (tmp_path / "a.png").write_bytes(claims)
     with pytest.raises(DataError, match="the PNG ends before its picture is complete"):
         read_grey(tmp_path / "a.png")
+    with pytest.raises(DataError, match="the PNG ends before its picture is complete"):
+        reduced_jpeg(tmp_path / "a.png", 40)

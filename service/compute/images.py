@@ -18,6 +18,7 @@ from service.core.errors import DataError
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 _FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # headers that give the size
+_JPEG = b"\xff\xd8"
 _PNG = b"\x89PNG\r\n\x1a\n"
 _MOST_PIXELS = 400_000_000  # the largest cameras take a third; a damaged header may claim four gigabytes more
 _REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
@@ -36,7 +37,7 @@ def check_jpeg(data: bytes, where: str) -> None:
         where=where,
         remedy="Copy the file from the camera again; a half-written image is not used",
     )
-    if data[:2] != b"\xff\xd8":
+    if not data.startswith(_JPEG):
         raise DataError("this is not a JPEG file", where=where, remedy="Use JPEG or PNG images")
     at = 2
     while at + 2 <= len(data):
@@ -82,6 +83,18 @@ def check_png(data: bytes, where: str) -> None:
         if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
             raise DataError("the PNG is damaged", where=where, remedy="Copy the file again")
         at = end + 4
+
+
+def check_image(data: bytes, where: str, *, partly: bool = False) -> None:
+    """What can be told of a JPEG or PNG before it is decoded; of other kinds nothing. `partly`: a cut JPEG will do.
+
+    Raises:
+        DataError: the file ends before its picture does, or is damaged.
+    """
+    if data.startswith(_PNG):
+        check_png(data, where)
+    elif data.startswith(_JPEG) and not partly:
+        check_jpeg(data, where)
 
 
 def _check_size(width: int, height: int, where: str) -> None:
@@ -156,10 +169,10 @@ def _decode(path: Path, how: int) -> NDArray[np.uint8]:
         data = path.read_bytes()
     except OSError as error:
         raise _unreadable(path, error) from error
-    if path.suffix.lower() in {".jpg", ".jpeg"} or data[:2] == b"\xff\xd8":
+    if path.suffix.lower() in {".jpg", ".jpeg"}:
         check_jpeg(data, str(path))
-    elif data.startswith(_PNG):
-        check_png(data, str(path))
+    else:
+        check_image(data, str(path))
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), how | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:

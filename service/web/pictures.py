@@ -91,6 +91,8 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = (), *, upright:
     import cv2  # noqa: PLC0415 - a web process starts without it
     import numpy as np  # noqa: PLC0415
 
+    from service.compute.images import check_image  # noqa: PLC0415
+
     data = np.fromfile(path, np.uint8)
     full = picture_size(data.tobytes())
     if full[0] * full[1] > _MOST_PIXELS:
@@ -99,6 +101,7 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = (), *, upright:
             where=path.name,
             remedy=_REMEDY,
         )
+    check_image(data.tobytes(), path.name, partly=True)
     how = cv2.IMREAD_COLOR
     for flag, k in (
         (cv2.IMREAD_REDUCED_COLOR_8, 8),
