@@ -10,6 +10,7 @@ from service.core.actions import needs_leave, unmet_requirements
 from service.core.entered import NoteTaken
 from service.core.errors import IllegalTransitionError, IntegrityError
 from service.core.gates import evaluate_gates
+from service.core.growing import put
 from service.core.lifecycle import lifecycle
 from service.core.model import (
     ActionRefused,
@@ -256,7 +257,7 @@ def _view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> R
     return change(
         state,
         p.step,
-        captured={**now.captured, p.viewpoint: event.seq},
+        captured=put(now.captured, p.viewpoint, event.seq),
         skipped_viewpoints=tuple(name for name in now.skipped_viewpoints if name != p.viewpoint),
         failures=0,
     )
@@ -265,7 +266,7 @@ def _view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> R
 def _among_the_superseded(state: RunState, event: Event, p: View) -> RunState:
     """The image of an attempt that was replaced while it was on its way is listed with the others of that attempt."""
     listed = [
-        replace(past, captured={**past.captured, p.viewpoint: event.seq})
+        replace(past, captured=put(past.captured, p.viewpoint, event.seq))
         if (past.step, past.attempt, past.viewpoint) == (p.step, p.attempt, None)
         else past
         for past in state.superseded
@@ -278,7 +279,7 @@ def _viewpoint_failed(protocol: Protocol, state: RunState, event: Event, p: View
         return _void(state, event)
     _require_running(state, event)
     now = state.step
-    counts = {**now.viewpoint_failures, p.viewpoint: now.viewpoint_failures.get(p.viewpoint, 0) + 1}
+    counts = put(now.viewpoint_failures, p.viewpoint, now.viewpoint_failures.get(p.viewpoint, 0) + 1)
     given_up = now.skipped_viewpoints
     if p.skipped and p.viewpoint not in given_up:
         given_up = (*given_up, p.viewpoint)
@@ -367,7 +368,7 @@ def _job_enqueued(protocol: Protocol, state: RunState, event: Event, p: JobEnque
         priority=p.priority,
         enqueued_utc=event.at_utc,
     )
-    return change(state, p.step, jobs={**jobs, p.job: job})
+    return change(state, p.step, jobs=put(jobs, p.job, job))
 
 
 def _job_ended(protocol: Protocol, state: RunState, event: Event, p: JobFinished | JobFailed) -> RunState:
@@ -384,7 +385,7 @@ def _job_ended(protocol: Protocol, state: RunState, event: Event, p: JobFinished
     else:
         job = replace(job, status="failed", error=p.error, message=p.message)
     job = replace(job, ended_seq=event.seq, ended_utc=event.at_utc)
-    return change(state, p.step, jobs={**state.steps[p.step].jobs, p.job: job})
+    return change(state, p.step, jobs=put(state.steps[p.step].jobs, p.job, job))
 
 
 # --- operators ------------------------------------------------------------------------------------------------
