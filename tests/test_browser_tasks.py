@@ -44,14 +44,26 @@ class Person:
         self.clicks += 1
 
     def hold(self, button: Locator) -> None:
-        """Press what lets the robot move, until it says that it was held."""
-        expect(button).to_be_enabled(timeout=LONG_MS)
-        button.hover()
-        self.page.mouse.down()
-        self.page.wait_for_timeout(1800)
-        until(lambda: button.locator("xpath=self::*[contains(@class, 'held')]").count() == 0, "it was held")
-        self.page.mouse.up()
+        """Press what lets the robot move, until it says that it was held; again where the page changed meanwhile."""
+        held = button.locator("xpath=self::*[contains(@class, 'held')]")
+        for _ in range(3):
+            expect(button).to_be_enabled(timeout=LONG_MS)
+            button.hover()
+            self.page.mouse.down()
+            self.page.wait_for_timeout(1800)
+            until(lambda: held.count() == 0, "it was held")
+            self.page.mouse.up()
+            if self._taken(button):
+                break
         self.clicks += 1
+
+    def _taken(self, button: Locator) -> bool:
+        """Whether the page goes on, within ten seconds."""
+        for _ in range(50):
+            if button.and_(self.page.locator(":not(:disabled)")).count() == 0:
+                return True
+            self.page.wait_for_timeout(200)
+        return False
 
     def write(self, into: Locator, words: str) -> None:
         """Fill in a field."""
