@@ -8,12 +8,17 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-versions lint format docs bench torture-audit torture-crash torture-faults torture-fuzz soak lock clean
+.PHONY: demo test test-all test-versions lint format docs bench torture-audit torture-crash torture-faults torture-fuzz soak lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
 
+# Units, wires and one short run, in minutes.
 test: $(TOOLS)
+	$(BIN)/pytest -m "not slow"
+
+# The same and all that takes long: whole runs, browsers, the package, sweeps for faults.
+test-all: $(TOOLS)
 	$(BIN)/pytest
 
 # Installs the locks under every supported Python of this machine and runs the fast tests there.

@@ -16,6 +16,7 @@ import trimesh
 import yaml
 
 from service.cli.demo import free_address
+from tests.support.package import installed_package
 from tests.support.rig import RIG_LOCK, command, orthocapture
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -23,10 +24,10 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """One run of the demo, shared by the tests of this file."""
-    out = tmp_path_factory.mktemp("demo")
+    """One run of the demo as it is installed, from an empty folder; shared by the tests of this file."""
+    package = installed_package(tmp_path_factory)
     with RIG_LOCK:
-        answer = orthocapture("demo", "--out", str(out), "--json", timeout_s=840)
+        answer = package.run("demo", "--json", cwd=tmp_path_factory.mktemp("demo"), timeout_s=840)
     assert answer.returncode == 0, answer.stdout + answer.stderr
     return json.loads(answer.stdout.splitlines()[-1])
 

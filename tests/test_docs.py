@@ -297,7 +297,8 @@ def test_the_test_that_runs_it_exists(command: str, test: str) -> None:
 def test_make_targets_do_what_the_documents_say() -> None:
     """The last line of each target; tests/test_demo.py runs the command of `make demo`."""
     for target, last in (
-        ("test", ".venv/bin/pytest"),
+        ("test", '.venv/bin/pytest -m "not slow"'),
+        ("test-all", ".venv/bin/pytest"),
         ("demo", ".venv/bin/orthocapture demo"),
         ("lint", ".venv/bin/lint-imports"),
         ("test-versions", ".ci/versions"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,6 @@ from service.store.tables import jobs as job_table
 FORMAT = "orthocapture bundle v1"
 MANIFEST_PREFIX = b"orthocapture bundle manifest v1\n"
 MARK = "SIMULATED"
-_VERIFIER = Path(__file__).with_name("verifier.py")
 _EVENT = ("actor", "at_utc", "monotonic_s", "previous_sha256", "run_id", "seq", "sha256")
 _NOT_OF_JOBS = (
     "position",
@@ -229,7 +229,7 @@ def _write_records(
 ) -> None:
     readme = _readme(run_id, keys[-1].key_id, root, missing)
     bundle.add("README.txt", [readme.encode()])
-    bundle.add("verify.py", chunks_of(_VERIFIER))
+    bundle.add("verify.py", [(files("service.audit") / "verifier.py").read_bytes()])
     bundle.add("events.jsonl", _event_lines(connection, run_id))
     bundle.add("site_events.jsonl", _event_lines(connection, SITE))
     order = (artefact_table.c.seq, artefact_table.c.position)

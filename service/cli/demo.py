@@ -32,6 +32,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.cli.run import drive
+from service.cli.shipped_protocols import shipped_protocols
 from service.compute.registration.evaluation import true_error_m
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import inverse
@@ -46,7 +47,6 @@ from service.store.audit import verify
 from service.store.store import Store
 
 _ARM_PORTS = (29999, 30003, 30004)  # of a Universal Robots controller
-_PROTOCOL = Path(__file__).parents[2] / "protocols" / "demo.yaml"
 
 
 def demo_command(
@@ -67,7 +67,7 @@ def demo_command(
         folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
         with _simulated_rig(folder / "rig", scene, image_width, host or free_address()) as ready:
             rig = load_rig(Path(ready["rig"]))
-            loaded = load_protocol(_PROTOCOL, params_models())
+            loaded = load_protocol(shipped_protocols() / "demo.yaml", params_models())
             data = folder / "data"
             with Store.open(data) as store:
                 run_id = start_run(store, loaded, rig, operator="demo", auto_confirm=True)

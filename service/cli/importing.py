@@ -26,6 +26,7 @@ from service.cli.common import (
 )
 from service.cli.import_operator import part_of
 from service.cli.run import OperatorOption, WorkerOption, drive
+from service.cli.shipped_protocols import shipped_protocols
 from service.core.entered import RunAbout, about_run
 from service.core.errors import ConfigurationError
 from service.core.imported import FileRole, ImportedView, ImportList, PhotographRole
@@ -39,7 +40,7 @@ from service.runs import start_run
 from service.steps import params_models
 from service.store.store import Store
 
-_PROTOCOL = Path(__file__).parents[2] / "protocols" / "import_spine.yaml"
+_PROTOCOL = shipped_protocols() / "import_spine.yaml"
 _SHOWN = 12  # files left out that are shown one by one
 _PARTS: dict[PhotographRole, str] = {
     "calibration": "calibration images",
@@ -50,7 +51,12 @@ _PARTS: dict[PhotographRole, str] = {
 
 def import_command(
     folder: Annotated[Path, typer.Argument(help="Folder with calibration/, images/, control/, scan/ and so on.")],
-    protocol: Annotated[Path, typer.Option("--protocol", help="The protocol of the import.")] = _PROTOCOL,
+    protocol: Annotated[
+        Path,
+        typer.Option(
+            "--protocol", help="The protocol of the import.", show_default="import_spine.yaml, which comes with it"
+        ),
+    ] = _PROTOCOL,
     calibration_images: Annotated[
         Path | None, typer.Option("--calibration-images", metavar="DIR", help="Images of the board.")
     ] = None,

@@ -21,6 +21,7 @@ from service.cli.common import (
     print_json,
     reporting_errors,
 )
+from service.cli.shipped_protocols import shipped_protocols
 from service.core.errors import ConfigurationError
 from service.logs.file_log import file_log
 from service.people.people import People
@@ -39,14 +40,19 @@ from service.web.server import known_proxies, listening, server
 from service.web.site import Site
 from service.web.sparing_log import sparing_log, told
 
-_PROTOCOLS = Path(__file__).parents[2] / "protocols"
+_PROTOCOLS = shipped_protocols()
 _LIMITS = ConnectionLimits()
 
 
 def serve_command(
     rig: Annotated[Path, typer.Option("--rig", help="The rig file: devices and stations of this site.")],
     data: DataOption = DEFAULT_DATA,
-    protocols: Annotated[Path, typer.Option("--protocols", help="Folder with the protocols to offer.")] = _PROTOCOLS,
+    protocols: Annotated[
+        Path,
+        typer.Option(
+            "--protocols", help="Folder with the protocols to offer.", show_default="those that come with it"
+        ),
+    ] = _PROTOCOLS,
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", help="0 takes a free one.", min=0, max=65535)] = 8000,
     tls_certificate: Annotated[Path | None, typer.Option("--tls-certificate", help="PEM, chain included.")] = None,

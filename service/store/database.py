@@ -23,7 +23,7 @@ BUSY_TIMEOUT_S = 30.0
 REVISIONS = ("0001", "0002", "0003", "0004", "0005")  # of migrations/versions, in order
 RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
 LOOK = "Look at the disk of the data folder: room, cable, permissions; then resume the run. What was recorded is safe"
-_MIGRATIONS = Path(__file__).with_name("migrations")
+_MIGRATIONS = "service.store:migrations"  # package:folder, which Alembic reads with importlib.resources
 
 
 def database_path(data_dir: Path) -> Path:
@@ -218,7 +218,7 @@ def _upgrade(connection: Connection, path: Path) -> None:
         from alembic.config import Config  # noqa: PLC0415
 
         config = Config()
-        config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
+        config.set_main_option("script_location", _MIGRATIONS)
         config.set_main_option("path_separator", "os")
         config.attributes["connection"] = connection
         command.upgrade(config, "head")

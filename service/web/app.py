@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from fastapi import Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 
@@ -73,5 +71,5 @@ def create_app(site: Site) -> FastAPI:
     health_pages.install_metrics(app)
     for page in _PAGES:
         app.include_router(page.router)
-    app.mount("/static", StaticFiles(directory=Path(__file__).with_name("static")), name="static")
+    app.mount("/static", StaticFiles(packages=[("service.web", "static")]), name="static")
     return app

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from functools import cache
-from pathlib import Path as FilePath
+from importlib.resources import files
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Path, Query, Request
@@ -32,7 +32,7 @@ router = APIRouter(tags=["run"])
 RunId = Annotated[str, Path(max_length=64)]
 Name = Annotated[str, Query(max_length=64)]
 Parts = Annotated[str, part_names("banner", "control", "vitals", "step", "actions", "dialogs", "side")]
-_DRAWINGS = FilePath(__file__).with_name("static") / "drawings"
+_DRAWINGS = files("service.web") / "static" / "drawings"
 
 
 @router.get("/runs/{run_id}", name="run", dependencies=[Depends(requires("read"))])
@@ -119,7 +119,8 @@ def _looker(site: Site, person: Person, run_id: str) -> Looker:
 @cache
 def _drawings() -> dict[str, Markup]:
     # Our own files; they stand inside the page so that they take its colours.
-    return {path.stem: Markup(path.read_text("utf-8")) for path in sorted(_DRAWINGS.glob("*.svg"))}
+    found = sorted((file for file in _DRAWINGS.iterdir() if file.name.endswith(".svg")), key=lambda file: file.name)
+    return {file.name.removesuffix(".svg"): Markup(file.read_text("utf-8")) for file in found}
 
 
 def drawing(name: str) -> Markup:

@@ -1,0 +1,11 @@
+"""Where the protocols that come with orthocapture lie, in a checkout and in an installed wheel alike."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from pathlib import Path
+
+
+def shipped_protocols() -> Path:
+    """The folder of the protocols that come with orthocapture."""
+    return Path(str(files("protocols")))
