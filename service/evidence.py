@@ -42,50 +42,85 @@ def recorded_protocol(store: Store, root: RunStarted) -> Protocol:
     return parse_protocol(content, params_models(), name=root.protocol.original_name).protocol
 
 
-@dataclass
+@dataclass(frozen=True, slots=True)
 class RunLog:
-    """The events of one run, kept up to date with the database, and their fold.
+    """What is recorded of one run, as read at one moment: its events and their fold belong together."""
 
+    store: Store
+    run_id: str
+    protocol: Protocol
+    events: tuple[Event, ...]
+    state: RunState
+
+    def captures(self, step_id: str) -> tuple[View, ...]:
+        """The valid captures of a step's current attempt, in order."""
+        payloads = (self.events[seq - 1].payload for seq in sorted(self.state.steps[step_id].captured.values()))
+        return tuple(payload for payload in payloads if isinstance(payload, View))
+
+
+@dataclass
+class RunFollower:
+    """Reads the events of one run as they are recorded, and folds them; safe to use from several threads.
+
+    An event that cannot have happened is not taken: every later `refresh` and `now` raises IntegrityError again.
     `leave_not_before_s` is the host's time.monotonic() when the newest leave to move was not in the record yet.
     """
 
     store: Store
     run_id: str
     protocol: Protocol
-    events: list[Event] = field(default_factory=list[Event])
-    state: RunState = field(init=False)
     leave_not_before_s: float = field(init=False, default=-math.inf)
+    _events: list[Event] = field(init=False, default_factory=list[Event], repr=False)
+    _state: RunState = field(init=False, repr=False)
+    _log: RunLog | None = field(init=False, default=None, repr=False)  # of the newest state, once it was asked for
     _looked_s: float = field(init=False, default=-math.inf)
-    # The web has one log of a run for all its threads: an event that two of them read must be taken once.
-    _refreshing: Lock = field(init=False, default_factory=Lock, repr=False, compare=False)
+    _reading: Lock = field(init=False, default_factory=Lock, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        self.state = fold(self.protocol, [])
+        self._state = fold(self.protocol, [])
         self.refresh()
 
-    def refresh(self) -> RunState:
-        """Read what other processes (worker, command line, web) have appended meanwhile."""
-        with self._refreshing:
-            leave, looked_s = self.state.leave, time.monotonic()
-            for event in self.store.events(self.run_id, after_seq=len(self.events)):
-                self.events.append(event)
-                self.state = advance(self.protocol, self.state, event)
-            if self.state.leave != leave:
-                self.leave_not_before_s = self._looked_s
-            self._looked_s = looked_s
-            return self.state
+    @property
+    def state(self) -> RunState:
+        """The fold of what was read last."""
+        return self._state
 
-    def captures(self, step_id: str) -> tuple[View, ...]:
-        """The valid captures of a step's current attempt, in order."""
-        payloads = (self.events[seq - 1].payload for seq in sorted(self.refresh().steps[step_id].captured.values()))
-        return tuple(payload for payload in payloads if isinstance(payload, View))
+    def refresh(self) -> RunState:
+        """Read what other processes (worker, command line, web) have appended meanwhile. Raises IntegrityError."""
+        with self._reading:
+            return self._read()
+
+    def now(self) -> RunLog:
+        """Events and state as recorded up to now. Raises IntegrityError."""
+        with self._reading:
+            state = self._read()
+            if self._log is None or self._log.state is not state:
+                self._log = RunLog(self.store, self.run_id, self.protocol, tuple(self._events), state)
+            return self._log
+
+    def _read(self) -> RunState:
+        leave, looked_s = self._state.leave, time.monotonic()
+        for event in self.store.events(self.run_id, after_seq=len(self._events)):
+            self._state = advance(
+                self.protocol, self._state, event
+            )  # it may refuse the event, which is not kept then
+            self._events.append(event)
+        if self._state.leave != leave:
+            self.leave_not_before_s = self._looked_s
+        self._looked_s = looked_s
+        return self._state
+
+
+def read_log(store: Store, run_id: str, protocol: Protocol) -> RunLog:
+    """A run's record as of now, for who looks once. Raises IntegrityError for events that cannot have happened."""
+    return RunFollower(store, run_id, protocol).now()
 
 
 def results_to_come(log: RunLog) -> list[Left]:
     """What was planned for a registration and has not arrived, with the time left; empty when all has."""
     started = log.store.jobs_started(log.run_id)
     cores = os.cpu_count() or 1
-    left = missing_results(log.protocol, log.refresh(), started, datetime.now(UTC).isoformat(), cores)
+    left = missing_results(log.protocol, log.state, started, datetime.now(UTC).isoformat(), cores)
     return [replace(one, waits=not started) for one in left]
 
 
@@ -93,7 +128,7 @@ def results_to_come(log: RunLog) -> list[Left]:
 class StepEvidence:
     """service.steps.context.Evidence for one execution of one step."""
 
-    log: RunLog
+    log: RunFollower
     lease: RunLease
     step: str
     attempt: int
@@ -124,7 +159,7 @@ class StepEvidence:
 
     def captures(self, step_id: str) -> tuple[View, ...]:
         """See service.steps.context.Evidence."""
-        return self.log.captures(step_id)
+        return self.log.now().captures(step_id)
 
     def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
         """Enqueue jobs, once whatever restarts happen, and wait for their results in order.

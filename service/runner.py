@@ -52,7 +52,7 @@ from service.core.protocol import Protocol
 from service.core.recovery import recovery_policy
 from service.core.run_state import RunState
 from service.core.space import Forecast, Verdict
-from service.evidence import RunLog, StepEvidence
+from service.evidence import RunFollower, StepEvidence
 from service.logs.where import at
 from service.monitor.host_clock import host_clock
 from service.monitor.snapshot import Doing
@@ -133,7 +133,7 @@ class Runner:
     signature_copy: Path | None = None  # second place of the log of signatures
     monotonic_s: Callable[[], float] = time.monotonic
     wait: Callable[[float], None] = time.sleep
-    _log: RunLog = field(init=False)
+    _log: RunFollower = field(init=False)
     _lease: RunLease = field(init=False)
     _asked: AskOperator | None = field(init=False, default=None)
     _pedal: int | None = field(init=False, default=None)  # presses when the open question was first asked
@@ -152,7 +152,7 @@ class Runner:
         """
         with self.store.lease(self.run_id, f"runner on {socket.gethostname()}", _LEASE_S) as lease:
             self._lease = lease
-            self._log = RunLog(self.store, self.run_id, self.protocol)
+            self._log = RunFollower(self.store, self.run_id, self.protocol)
             if self._log.state.terminal:
                 if self.authority is None or not self.store.timestamps(self.run_id):
                     self._seal()  # the process died before it could, or the authority did not answer
@@ -291,7 +291,7 @@ class Runner:
 
     def _look_at_clocks(self) -> None:
         """A clock beyond its limit is told once a session."""
-        for reading in clock_readings(self._log.events):
+        for reading in clock_readings(self._log.now().events):
             if reading.within is False and reading.device not in self._clocks_told:
                 self._clocks_told.add(reading.device)
                 self.operator.tell(reading.words)

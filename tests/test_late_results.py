@@ -43,7 +43,7 @@ from service.core.model import (
 from service.core.priorities import LATER
 from service.core.protocol import Protocol, parse_protocol
 from service.core.registered import shared_adjustment_note
-from service.evidence import RunLog
+from service.evidence import RunLog, read_log
 from service.rig import load_rig
 from service.runs import start_run
 from service.steps import params_models
@@ -117,7 +117,7 @@ class Run:
         return self.add(measured, evaluate_gates(self.protocol.step(step), 1, measures))
 
     def log(self) -> RunLog:
-        return RunLog(self.store, self.run_id, self.protocol)
+        return read_log(self.store, self.run_id, self.protocol)
 
     def digest(self) -> Digest:
         computed = digests(self.store)

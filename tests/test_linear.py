@@ -10,7 +10,7 @@ import pytest
 
 from bench.soak.large_record import STEP, LargeRecord
 from service.core.model import StepNote
-from service.evidence import RunLog, StepEvidence
+from service.evidence import RunFollower, StepEvidence, read_log
 from service.runs import recorded_run
 from service.store.audit import show
 from service.web.capture_view import views_of
@@ -43,12 +43,12 @@ def audit_show(record: LargeRecord) -> Callable[[], object]:
 
 
 def capture_page(record: LargeRecord) -> Callable[[], object]:
-    log = RunLog(record.store, record.run_id, recorded_run(record.store, record.run_id)[0])
+    log = read_log(record.store, record.run_id, recorded_run(record.store, record.run_id)[0])
     return lambda: views_of(log, log.protocol.step(STEP))
 
 
 def held_already(record: LargeRecord) -> Callable[[], object]:
-    log = RunLog(record.store, record.run_id, recorded_run(record.store, record.run_id)[0])
+    log = RunFollower(record.store, record.run_id, recorded_run(record.store, record.run_id)[0])
     lease = record.store.lease(record.run_id, "test", 60)
     evidence = StepEvidence(log, lease, STEP, 1, lambda: None, lambda *_: None, lambda _s: None, lambda: None)
     last = record.store.artefacts(record.run_id)[-1].ref.sha256

@@ -22,7 +22,7 @@ import yaml
 from bench.soak.creep import CHILD, Sample, judge
 from service.core.model import Payload, ViewpointCaptured
 from service.core.run_state import RunState
-from service.evidence import RunLog
+from service.evidence import RunFollower
 from service.runs import recorded_run
 from service.store.audit import verify
 from service.store.store import Store
@@ -141,17 +141,17 @@ class _Soak:
         ends_s = next_s = 0.0
         told_s = time.monotonic()
         with Store.open(self.data) as store:
-            log: RunLog | None = None
+            run: RunFollower | None = None
             count = seen = 0
             while not ends_s or time.monotonic() < ends_s:
                 if runner.poll() is not None:
                     self.faults.append(f"the run ended by itself: {self.log.read_text()[-500:]}")
                     return
-                if log is None and store.runs():
+                if run is None and store.runs():
                     run_id = store.find_run("latest")
-                    log = RunLog(store, run_id, recorded_run(store, run_id)[0])
-                if log is not None:
-                    log.refresh()
+                    run = RunFollower(store, run_id, recorded_run(store, run_id)[0])
+                if run is not None:
+                    log = run.now()
                     count += sum(_is_of_the_capture(event.payload) for event in log.events[seen:])
                     seen = len(log.events)
                     self._look(client, log.run_id, log.state)

@@ -18,7 +18,7 @@ from service.core.fold import fold
 from service.core.model import CaptureAsked, OperatorAction
 from service.core.protocol import Protocol
 from service.core.run_state import RunState
-from service.evidence import RunLog
+from service.evidence import read_log
 from service.notes import Photograph, require_size, take_note
 from service.people.people import People
 from service.people.proof import Identity, identity_for, who_acts
@@ -135,7 +135,7 @@ def note_command(
         photograph = None if photo is None else _photograph(photo)
         name = operator or getpass.getuser()
         name = who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin)).name
-        log = RunLog(store, run_id, protocol)
+        log = read_log(store, run_id, protocol)
         event = take_note(log, text, photograph, step=step, actor=name, via="cli")
         _report_recorded(run_id, "note", step or log.state.current, name, json=json, seq=event.seq)
 

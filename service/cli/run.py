@@ -40,7 +40,7 @@ from service.core.model import GateVerdict
 from service.core.protocol import Protocol, load_protocol
 from service.core.run_state import RunState, StepState
 from service.core.ways_on import takes_words, ways_on
-from service.evidence import RunLog, results_to_come
+from service.evidence import read_log, results_to_come
 from service.logs.file_log import file_log
 from service.monitor.alarm import alarm_of
 from service.monitor.reporter import OpenDevices, Reporter
@@ -148,7 +148,7 @@ def status_command(
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, root = recorded_run(store, run_id)
-        log = RunLog(store, run_id, protocol)
+        log = read_log(store, run_id, protocol)
         state, missing = log.state, [left.text for left in results_to_come(log)]
     if json:
         ways = [asdict(way) for way in ways_on(protocol, state)]

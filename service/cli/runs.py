@@ -24,7 +24,7 @@ from service.cli.common import (
     reporting_errors,
     require_writable,
 )
-from service.evidence import RunLog
+from service.evidence import read_log
 from service.runs import recorded_run
 from service.store.store import Store
 
@@ -141,7 +141,7 @@ def _compared(store: Store, name: str) -> ComparedRun:
     run_id = store.find_run(name)
     protocol, root = recorded_run(store, run_id)
     source = store.artefact_path(root.protocol.sha256, verify=True).read_text("utf-8")
-    log = RunLog(store, run_id, protocol)
+    log = read_log(store, run_id, protocol)
     return ComparedRun(run_id, root, protocol, source, log.events, log.state)
 
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 from service.cli.operators import Display
 from service.core.protocol import Protocol
-from service.evidence import RunLog, results_to_come
+from service.evidence import RunFollower, results_to_come
 from service.steps.time_left import duration_words
 from service.store.store import Store
 
@@ -18,8 +18,8 @@ _LOOK_S = 2.0  # a look at a whole run costs a sixth of a second, which the resu
 
 def wait_for_results(store: Store, run_id: str, protocol: Protocol, display: Display) -> None:
     """Show what is still computed until nothing is; Ctrl-C leaves it to another worker, and loses nothing."""
-    log = RunLog(store, run_id, protocol)
-    pending = [one for one in results_to_come(log) if not one.failed]
+    run = RunFollower(store, run_id, protocol)
+    pending = [one for one in results_to_come(run.now()) if not one.failed]
     if not pending or not store.open_jobs(run_id):
         return
     display.tell("The run is complete. Results for comparison are still being computed; Ctrl-C leaves them for later")
@@ -28,7 +28,7 @@ def wait_for_results(store: Store, run_id: str, protocol: Protocol, display: Dis
     try:
         with _told_to_leave() as leave:
             while store.open_jobs(run_id) and not leave.is_set():
-                left = results_to_come(log)
+                left = results_to_come(run.now())
                 for one in left:
                     if one.failed and one.name not in seen:
                         seen.add(one.name)

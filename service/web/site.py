@@ -9,7 +9,7 @@ from typing import Annotated, cast
 
 from fastapi import Depends, Request
 
-from service.evidence import RunLog
+from service.evidence import RunFollower, RunLog
 from service.people.people import People
 from service.rig import Rig
 from service.runs import recorded_run
@@ -33,18 +33,17 @@ class Site:
     hosts: tuple[str, ...] = ("127.0.0.1", "localhost")  # names by which browsers may ask
     sealed_seq: int = 0  # last event of the site's chain that is known to be signed
     streams: OpenStreams = field(default_factory=OpenStreams)
-    _logs: dict[str, RunLog] = field(default_factory=dict[str, RunLog])
+    _runs: dict[str, RunFollower] = field(default_factory=dict[str, RunFollower])
     _lock: Lock = field(default_factory=Lock)
 
     def run(self, run_id: str) -> RunLog:
-        """Protocol, events and state of a run, as recorded up to now. Raises UnknownRunError, IntegrityError."""
+        """A run's record as of now. Raises UnknownRunError, IntegrityError."""
         with self._lock:
-            if run_id not in self._logs:
+            if run_id not in self._runs:
                 protocol, _ = recorded_run(self.store, run_id)
-                self._logs[run_id] = RunLog(self.store, run_id, protocol)
-            log = self._logs[run_id]
-            log.refresh()
-            return log
+                self._runs[run_id] = RunFollower(self.store, run_id, protocol)
+            run = self._runs[run_id]
+        return run.now()
 
     def protocol_files(self) -> list[Path]:
         """Protocols that can be started."""

@@ -11,7 +11,7 @@ from service.core.arrival import late_s
 from service.core.errors import OrthocaptureError, StoreError
 from service.core.fold import advance
 from service.core.model import Event
-from service.evidence import RunLog, recorded_protocol, recorded_root
+from service.evidence import RunFollower, recorded_protocol, recorded_root
 from service.steps.sources import due
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.signing import checkpoint
@@ -26,7 +26,7 @@ class Following:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._logs: dict[str, RunLog | None] = {}
+        self._logs: dict[str, RunFollower | None] = {}
 
     def finish(self, job: Job, answer: JobAnswer, duration_s: float) -> None:
         """Record an answer, and in the same transaction enqueue what it makes possible. Raises LeaseLostError.
@@ -61,12 +61,12 @@ class Following:
         except StoreError as error:
             _log.warning("the record of %s could not be signed: %s", run_id, error)
 
-    def _log_of(self, run_id: str) -> RunLog | None:
+    def _log_of(self, run_id: str) -> RunFollower | None:
         """None for a run whose protocol this version cannot read: its jobs are done, and nothing follows."""
         if run_id not in self._logs:
             try:
                 protocol = recorded_protocol(self._store, recorded_root(self._store, run_id))
-                self._logs = {run_id: RunLog(self._store, run_id, protocol)}
+                self._logs = {run_id: RunFollower(self._store, run_id, protocol)}
             except OrthocaptureError as error:
                 _log.warning("what follows from the jobs of %s cannot be told: %s", run_id, error)
                 self._logs = {run_id: None}

@@ -15,7 +15,7 @@ from bench.torture.crash.mortal import read_journal
 from bench.torture.crash.run import Place, Role
 from bench.torture.crash.scene import import_list, planned
 from service.core.model import Event, JobFinished, OperatorAction, SessionStarted, StepMeasured, View
-from service.evidence import RunLog
+from service.evidence import read_log
 from service.runs import recorded_run
 from service.store.audit import verify
 from service.store.database import database_path
@@ -97,7 +97,7 @@ def at_the_end(place: Place, expected: Outcome | None) -> tuple[list[str], int]:
     with Store.open(place.data) as store:
         run_id = store.find_run("latest")
         protocol, _ = recorded_run(store, run_id)
-        log = RunLog(store, run_id, protocol)
+        log = read_log(store, run_id, protocol)
         if (log.state.status, log.state.released_by) != ("completed", "Sue"):
             found.append(f"the run is {log.state.status}, released by {log.state.released_by or 'nobody'}")
         found += _once(log.events, [v.name for v in planned()] + [v.name for v in import_list(place.files).views])
