@@ -329,10 +329,10 @@ class Check:
         ]
         self._check_heads(run, site)
         rows = self._check_artefacts(bundle, run, whole)
-        checkpoints = {chain.run_id: chain for chain in (run, site)}
+        chains = {chain.run_id: chain for chain in (run, site)}
         signatures = list(self.records(bundle, "checkpoints.jsonl", whole))
         self._check_keys(site, signatures)
-        self._check_checkpoints(signatures, checkpoints, site, rows)
+        self._check_checkpoints(signatures, chains, site, rows)
         self._check_key_file(bundle, whole)
         self._check_signature(bundle, signed)
         self._check_jobs(bundle, run, whole)
