@@ -5,9 +5,11 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +26,9 @@ from tests.support.bench_run import PROTOCOL, record_runs
 ROOT = Path(__file__).parents[1]
 COMMAND = Path(sys.executable).with_name("orthocapture")
 COMMANDS = (
-    "demo", "run", "resume", "act", "note", "status", "runs", "compare", "history", "worker", "doctor", "register",
-    "simulate", "audit", "protocol",
+    "demo", "serve", "run", "resume", "import", "act", "note", "status", "runs", "compare", "history", "worker",
+    "doctor", "calibrate", "sfm", "register", "spheres", "layout", "simulate", "audit", "store", "replay", "protocol",
+    "plan",
 )  # fmt: skip
 
 
@@ -55,8 +58,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
 def test_the_installed_command_names_every_command() -> None:
     done = subprocess.run([COMMAND, "--help"], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
-    for command in COMMANDS:
-        assert f" {command} " in done.stdout
+    listed = re.findall(r"^│ (\S*) +(?=[A-Z])", done.stdout[done.stdout.index("Commands") :], re.MULTILINE)
+    assert listed == list(COMMANDS), "in this order, none without its name"
+
+
+def test_the_installed_command_tells_its_version() -> None:
+    done = subprocess.run([COMMAND, "--version"], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == f"orthocapture {version('orthocapture')}\n"
 
 
 @pytest.mark.parametrize("command", [c for c in COMMANDS if c != "simulate"])
