@@ -341,3 +341,13 @@ def test_links_of_the_documents_lead_somewhere() -> None:
     for document in DOCUMENTS:
         for target in re.findall(r"\]\(([^)#]+)\)", document.read_text(encoding="utf-8")):
             assert "://" in target or (document.parent / target).exists(), f"{document.name}: {target}"
+
+
+def test_what_the_readme_says_of_a_corrected_arm_is_what_was_measured() -> None:
+    """For the simulated arm's own family of errors, and for an arm that errs otherwise (bench/hand_eye)."""
+    measured = json.loads((ROOT / "bench" / "results" / "hand_eye-2026-11-21.json").read_text())
+    text = " ".join((ROOT / "README.md").read_text().split())
+    for kind, words in (("systematic", "poses good to {} … {} mm once"), ("odd", "{} … {} mm are left")):
+        rows = [row for row in measured[kind] if row["session"].startswith("hand-eye step")]
+        left = [row["error_mm"]["arm corrected"] for row in rows]
+        assert words.format(f"{min(left):.2f}", f"{max(left):.2f}") in text
