@@ -114,7 +114,11 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class SettleCriteria:
-    """When an arm counts as standing still (facts/ur_rtde.md, practice on a real arm)."""
+    """When an arm counts as standing still.
+
+    The defaults suit a UR10e with a camera on its flange: for a 60-megapixel camera with a 50 mm lens at 0.6 m,
+    20 µm are half a pixel and 5 millidegrees about one.
+    """
 
     window_s: float = 0.5
     joint_speed_rad_s: float = 0.001

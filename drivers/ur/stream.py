@@ -10,11 +10,10 @@ from collections.abc import Callable, Sequence
 from itertools import takewhile
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotSample, SafetyState, SettleCriteria, SettleReport
-from service.core.geometry import transform
+from drivers.stillness import pose_spread
 
 BUFFER_S = 300.0  # an image's pose is looked up once its files have arrived, which takes a while for 60 megapixels
 STREAM_HZ = 125.0
@@ -155,17 +154,8 @@ class PoseStream:
 
 
 def judge(samples: Sequence[RobotSample], criteria: SettleCriteria) -> SettleReport:
-    """Whether an arm stood still over `samples`, which should span criteria.window_s.
-
-    Peak to peak is the diagonal of the box around the positions, and of the box around the rotation vectors
-    relative to the mean orientation: never less than the largest distance between two samples.
-    """
-    T = np.stack([s.T_base_flange for s in samples])
-    rotations = Rotation.from_matrix(T[:, :3, :3])
-    mean = rotations.mean()
-    turns = (mean.inv() * rotations).as_rotvec()
-    position_m = float(np.linalg.norm(np.ptp(T[:, :3, 3], axis=0)))
-    rotation_rad = float(np.linalg.norm(np.ptp(turns, axis=0)))
+    """Whether an arm stood still over `samples`, which should span criteria.window_s; see drivers.stillness."""
+    spread = pose_spread(samples)
     joint_speed = float(max(np.max(np.abs(s.joint_velocities_rad_s)) for s in samples))
     tcp_speed = max(s.tcp_speed_m_s for s in samples)
     at_target = not any(driven(s) for s in samples)
@@ -176,15 +166,14 @@ def judge(samples: Sequence[RobotSample], criteria: SettleCriteria) -> SettleRep
             and covered_s >= MINIMUM_COVERAGE * criteria.window_s
             and joint_speed < criteria.joint_speed_rad_s
             and tcp_speed < criteria.tcp_speed_m_s
-            and position_m < criteria.position_peak_to_peak_m
-            and rotation_rad < criteria.rotation_peak_to_peak_rad
+            and spread.within(criteria)
         ),
-        samples=len(samples),
+        samples=spread.samples,
         joint_speed_rad_s=joint_speed,
         tcp_speed_m_s=tcp_speed,
-        position_peak_to_peak_m=position_m,
-        rotation_peak_to_peak_rad=rotation_rad,
-        T_base_flange=transform(mean, T[:, :3, 3].mean(axis=0)),
+        position_peak_to_peak_m=spread.position_peak_to_peak_m,
+        rotation_peak_to_peak_rad=spread.rotation_peak_to_peak_rad,
+        T_base_flange=spread.T_base_flange,
         joints_rad=np.mean([s.joints_rad for s in samples], axis=0),
     )
 

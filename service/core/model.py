@@ -154,7 +154,7 @@ class ViewpointCaptured(View):
     kind: Literal["viewpoint_captured"] = "viewpoint_captured"
     T_base_flange: Matrix4  # mean over the exposure
     pose_sigma_m: float  # standard deviation of the position over the exposure
-    pose_sigma_rad: float
+    pose_sigma_rad: float  # of the rotation vector; early runs recorded that of its length, which is less
     joints_rad: tuple[float, ...]
     pose_samples: int
     trigger_monotonic_s: float

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from drivers.errors import DeviceBusyError, DeviceUnavailableError
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, RobotSample, SettleReport
+from drivers.stillness import PoseSpread, pose_spread
 from service.core.errors import ConfigurationError, DataError
-from service.core.geometry import Array, Transform, inverse
+from service.core.geometry import Array, Transform
 from service.core.model import ArtefactRef, Matrix4, ViewpointCaptured
 from service.steps.context import StepContext
 from service.steps.motion import settle_criteria
@@ -62,14 +62,12 @@ def expose(
     try:
         image = expose_when_free(context, camera, Path(folder.name), was_busy=was_busy)
         window = robot.samples(image.trigger_monotonic_s, image.trigger_monotonic_s + wanted.exposure_s + 0.3)
-        pose = _mean_pose(window, settled)
+        pose = exposure_pose(window)
     except BaseException:
         folder.cleanup()
         raise
-    criteria = settle_criteria(context)
     verdicts = {
-        "still": pose.spread_m <= criteria.position_peak_to_peak_m
-        and pose.spread_rad <= criteria.rotation_peak_to_peak_rad,
+        "still": pose.spread.within(settle_criteria(context)),
         "settings": settings_agree(image.exif, wanted),
     }
     return Shot(viewpoint, image, folder, window, pose, environment, verdicts, image_kind, settled.ringing_s)
@@ -108,11 +106,11 @@ def record_shot(context: StepContext, shot: Shot) -> None:
             viewpoint=viewpoint.name,
             station=viewpoint.station,
             artefacts=tuple(refs),
-            T_base_flange=_rows(pose.T_base_flange),
-            pose_sigma_m=pose.sigma_m,
-            pose_sigma_rad=pose.sigma_rad,
+            T_base_flange=_rows(pose.spread.T_base_flange),
+            pose_sigma_m=pose.spread.position_sigma_m,
+            pose_sigma_rad=pose.spread.rotation_sigma_rad,
             joints_rad=tuple(float(q) for q in pose.joints_rad),
-            pose_samples=pose.samples,
+            pose_samples=pose.spread.samples,
             trigger_monotonic_s=image.trigger_monotonic_s,
             arrival_monotonic_s=image.arrival_monotonic_s,
             controller_time_s=pose.controller_time_s,
@@ -144,42 +142,29 @@ def expose_when_free(context: StepContext, camera: Camera, folder: Path, *, was_
 
 @dataclass(frozen=True, slots=True)
 class ExposurePose:
-    """The mean pose of the flange over an exposure, and how far it strayed."""
+    """The mean pose of the flange over an exposure, how far it strayed, and the clocks in the middle of it."""
 
-    T_base_flange: Transform
-    joints_rad: Array
-    samples: int
-    sigma_m: float
-    sigma_rad: float
-    spread_m: float
-    spread_rad: float
+    spread: PoseSpread
+    joints_rad: Array  # (6,) or (7,), mean
     controller_time_s: float
-    clock_offset_s: float
+    clock_offset_s: float  # controller time minus host monotonic time
 
 
-def _mean_pose(window: Sequence[RobotSample], settled: SettleReport) -> ExposurePose:
-    """Average the pose over the exposure; rotations average on the tangent of the settled pose."""
+def exposure_pose(window: Sequence[RobotSample]) -> ExposurePose:
+    """The pose of the flange over the samples of an exposure, oldest first.
+
+    Raises DeviceUnavailableError when there is none.
+    """
     if not window:
         raise DeviceUnavailableError(
             "the robot's pose stream has no sample during the exposure",
             where="robot",
             remedy="The image cannot be used without its pose; the viewpoint is taken again",
         )
-    poses = np.stack([s.T_base_flange for s in window])
-    deltas = inverse(settled.T_base_flange) @ poses
-    positions = poses[:, :3, 3]
-    angles = Rotation.from_matrix(deltas[:, :3, :3]).magnitude()
     middle = window[len(window) // 2]
-    T = settled.T_base_flange.copy() if len(window) < 3 else middle.T_base_flange.copy()
-    T[:3, 3] = positions.mean(axis=0)
     return ExposurePose(
-        T_base_flange=T,
+        spread=pose_spread(window),
         joints_rad=np.mean([s.joints_rad for s in window], axis=0),
-        samples=len(window),
-        sigma_m=float(np.sqrt(positions.var(axis=0).sum())),
-        sigma_rad=float(angles.std()),
-        spread_m=float(np.ptp(positions, axis=0).max()),
-        spread_rad=float(np.ptp(angles)),
         controller_time_s=middle.controller_time_s,
         clock_offset_s=middle.controller_time_s - middle.monotonic_s,
     )
