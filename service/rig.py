@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
+from service.core.checked_yaml import checked, decoded, problem_of, refuse
 from service.core.errors import ConfigurationError, DataError, ProtocolError
 from service.core.imported import ImportList
 from service.core.json_text import parse_json
 from service.core.model import Record
-from service.core.yaml_tree import parse_yaml
+from service.core.yaml_tree import NO_LINES, FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
 
 _REMEDY = "Compare it with the example in docs/your_hardware.md"
 
@@ -29,7 +30,7 @@ class StationSection(Record):
 
     robot: str
     scene_centre_m: Vector3
-    scene_up: Vector3 = (0.0, 0.0, 1.0)
+    scene_up: Vector3 = (0.0, 0.0, 1.0)  # the only one: an arm at a wall or ceiling is not planned for
     approach_azimuth_deg: float  # direction from the scene to the base, about the base's z axis
 
 
@@ -159,6 +160,7 @@ class Rig:
     section: RigSection
     path: Path
     source: bytes
+    tree: YamlTree = NO_LINES  # for the lines of what a driver finds wrong later
 
     @property
     def folder(self) -> Path:
@@ -186,9 +188,14 @@ class Rig:
 
 
 def load_rig(path: Path) -> Rig:
-    """Read rig.yaml; ConfigurationError names the file and the field."""
+    """Read rig.yaml. Raises ConfigurationError with line and field of everything that is wrong, all of it at once."""
+    return parse_rig(read_rig(path), path)
+
+
+def read_rig(path: Path) -> bytes:
+    """The bytes of a rig file. Raises ConfigurationError where it cannot be read."""
     try:
-        source = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError as error:
         raise ConfigurationError(
             "there is no such rig file",
@@ -202,49 +209,65 @@ def load_rig(path: Path) -> Rig:
             where=str(path),
             remedy="Check the path and its permissions",
         ) from error
-    return parse_rig(source, path)
 
 
 def parse_rig(source: bytes, path: Path) -> Rig:
-    """The same for a file's bytes, such as a recorded artefact; ConfigurationError names the file and the field."""
-    # The list of an import is JSON, of thousands of lines, which YAML would take seconds for.
-    data = _parsed_json(source, path) if source.startswith(b"{") else _parsed_yaml(source, path)
-    if not isinstance(data, Mapping):
-        raise ConfigurationError("the rig file holds no mapping", where=str(path), remedy=_REMEDY)
+    """The rig that a file's bytes describe. Raises ConfigurationError with line and field of all that is wrong."""
+    tree = _tree(source, path)
+    section, problems = checked(tree.data, RigSection, tree)
+    problems += tree.problems
+    problems += [Problem(tree.line(at), field_name(at), message) for at, message in _violations(tree.data)]
+    if problems or section is None:
+        refuse(problems, what="rig file", name=str(path), remedy=_REMEDY, error=ConfigurationError)
+    return Rig(section, path.resolve(), source, tree)
+
+
+def parse_recorded_rig(source: bytes, path: Path) -> Rig:
+    """The rig of a recorded run. What was taken for a number or truth value when the run began still is.
+
+    Raises ConfigurationError for what is no rig at all.
+    """
+    tree = _tree(source, path)
     try:
-        section = RigSection.model_validate(data)
+        return Rig(RigSection.model_validate(tree.data), path.resolve(), source, tree)
     except ValidationError as error:
-        problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise ConfigurationError(f"the rig file is wrong: {problems}", where=str(path), remedy=_REMEDY) from error
-    for name, station in section.stations.items():
-        if station.robot not in section.devices:
-            raise ConfigurationError(
-                f"station {name!r} names robot {station.robot!r}, which is not among the devices",
-                where=str(path),
-                remedy=f"Name one of the devices: {', '.join(section.devices) or 'there are none'}",
+        problems = [problem_of(details, tree, RigSection) for details in error.errors()]
+        refuse(problems, what="rig file", name=str(path), remedy=_REMEDY, error=ConfigurationError)
+
+
+def _violations(data: Plain) -> Iterator[tuple[FieldPath, str]]:
+    """(field, what is wrong) for what the types of the fields cannot say; the data may be malformed in any way."""
+    devices, stations = (data.get(name) if isinstance(data, dict) else None for name in ("devices", "stations"))
+    known: list[str] = list(devices) if isinstance(devices, dict) else []
+    for name, station in stations.items() if isinstance(stations, dict) else ():
+        if not isinstance(station, dict):
+            continue
+        robot, up = station.get("robot"), station.get("scene_up", [0, 0, 1])
+        if isinstance(robot, str) and robot not in known:
+            among = ", ".join(known) or "there are none"
+            yield ("stations", name, "robot"), f"{robot!r} is not among the devices: {among}"
+        if isinstance(up, list) and up != [0, 0, 1]:
+            yield (
+                ("stations", name, "scene_up"),
+                "only arms that stand upright are planned for: the scene's up is the base's z axis, [0, 0, 1]",
             )
-    return Rig(section, path.resolve(), source)
 
 
-def _parsed_yaml(source: bytes, path: Path) -> object:
+def _tree(source: bytes, path: Path) -> YamlTree:
+    """The file as plain data. Raises ConfigurationError for what is neither YAML nor JSON, or holds no fields."""
+    # The list of an import is JSON, of thousands of lines, which YAML would take seconds for.
     try:
-        tree = parse_yaml(source.decode(), name=str(path))
-    except UnicodeDecodeError as error:
-        raise ConfigurationError(
-            "the rig file is not UTF-8 text", where=str(path), remedy="Save the file as UTF-8"
-        ) from error
-    except ProtocolError as error:
+        tree = _read_json(source, path) if source.startswith(b"{") else _read_yaml(source, path)
+    except (DataError, ProtocolError) as error:
         raise ConfigurationError(f"the rig file: {error.what}", where=error.where, remedy=error.remedy) from error
-    if tree.problems:
-        problems = "; ".join(f"line {p.line}, {p.field or 'the file'}: {p.message}" for p in tree.problems)
-        raise ConfigurationError(
-            f"the rig file is wrong: {problems}", where=f"{path}:{tree.problems[0].line}", remedy="Give each key once"
-        )
-    return tree.data
+    if not isinstance(tree.data, dict):
+        raise ConfigurationError("the rig file holds no mapping", where=str(path), remedy=_REMEDY)
+    return tree
 
 
-def _parsed_json(source: bytes, path: Path) -> object:
-    try:
-        return parse_json(source, name=str(path))
-    except DataError as error:
-        raise ConfigurationError(f"the rig file: {error.what}", where=error.where, remedy=error.remedy) from error
+def _read_yaml(source: bytes, path: Path) -> YamlTree:
+    return parse_yaml(decoded(source, name=str(path), error=ConfigurationError), name=str(path))
+
+
+def _read_json(source: bytes, path: Path) -> YamlTree:
+    return replace(NO_LINES, data=parse_json(source, name=str(path)))

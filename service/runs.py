@@ -11,7 +11,7 @@ from service.core.model import ActionAfterEnd, ActionRefused, OperatorAction, Ru
 from service.core.protocol import LoadedProtocol, Protocol
 from service.core.run_state import RunState
 from service.evidence import recorded_protocol, recorded_root
-from service.rig import Rig, load_rig, parse_rig
+from service.rig import Rig, parse_recorded_rig, read_rig
 from service.runner import software_versions
 from service.store.records import NewArtefact
 from service.store.space import forecast_of, require_space
@@ -90,15 +90,16 @@ def recorded_rig(store: Store, root: RunStarted) -> Rig:
     """
     if root.origin == "imported":
         source = store.artefact_path(root.rig.sha256, verify=True).read_bytes()
-        return parse_rig(source, Path(root.rig.original_name))
-    rig = load_rig(Path(root.rig.original_name))
-    if rig.source != store.artefact_path(root.rig.sha256, verify=True).read_bytes():
+        return parse_recorded_rig(source, Path(root.rig.original_name))
+    path = Path(root.rig.original_name)
+    source = read_rig(path)
+    if source != store.artefact_path(root.rig.sha256, verify=True).read_bytes():
         raise ConfigurationError(
             "the rig file has changed since the run began",
-            where=str(rig.path),
+            where=str(path),
             remedy="Restore it, or start a new run: calibration and poses belong to one rig",
         )
-    return rig
+    return parse_recorded_rig(source, path)
 
 
 def time_stamp_authority(rig: Rig) -> Authority | None:

@@ -26,6 +26,7 @@ from drivers.interfaces import (
     Transform,
 )
 from drivers.plugin import DriverConfig, DriverSpec
+from service.core.checked_yaml import problem_of, refuse
 from service.core.errors import ConfigurationError
 from service.core.imported import ImportList
 from service.rig import CollisionSection, LensSection, OpticsSection, Rig
@@ -244,10 +245,10 @@ class Station:
         try:
             return spec.config.model_validate(settings)
         except ValidationError as error:
-            problems = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-            raise ConfigurationError(
-                f"device {name!r} is configured wrongly: {problems}", where=str(self.rig.path)
-            ) from error
+            tree, at = self.rig.tree, ("devices", name)
+            problems = [problem_of(details, tree, spec.config, at) for details in error.errors()]
+            remedy = "Compare it with the example in docs/your_hardware.md"
+            refuse(problems, what="rig file", name=str(self.rig.path), remedy=remedy, error=ConfigurationError)
 
 
 def layout_of(rig: Rig, station: str) -> StationLayout:

@@ -86,7 +86,7 @@ def test_what_a_rig_lacks_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("robot: arm", "robot: leg", "names robot 'leg'"),
+        ("robot: arm", "robot: leg", "'leg' is not among the devices"),
         ("scene_centre_m: [0, 0.8, 0]", "scene_centre_m: [0, 0.8]", "scene_centre_m"),
         ("name: folders", "name: [", "not valid YAML"),
         ("name: folders", "nome: folders", "nome"),

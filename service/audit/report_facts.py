@@ -13,7 +13,7 @@ from service.audit.shots import failed_exposures, shots_by_step, together
 from service.core.errors import OrthocaptureError
 from service.core.late import late_results
 from service.core.model import SessionStarted
-from service.rig import parse_rig
+from service.rig import parse_recorded_rig
 
 
 def facts(run: RecordedRun) -> Facts:
@@ -75,7 +75,7 @@ def _rig_name(run: RecordedRun) -> str:
         return ""
     try:
         path = run.files.artefact_path(run.root.rig.sha256, verify=True)
-        return parse_rig(path.read_bytes(), path).section.name
+        return parse_recorded_rig(path.read_bytes(), path).section.name
     except (OrthocaptureError, OSError):
         return ""  # the first page says which file it is
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,18 +15,17 @@ from pydantic import (
     Field,
     SerializeAsAny,
     TypeAdapter,
-    ValidationError,
     WithJsonSchema,
     create_model,
 )
-from pydantic_core import ErrorDetails
 
+from service.core.checked_yaml import checked, decoded, did_you_mean, refuse
 from service.core.errors import ProtocolError
 from service.core.lifecycle import RESERVED_STEP_IDS
 from service.core.model import Record
 from service.core.protocol_rules import rule_violations
 from service.core.reasons import Reasons
-from service.core.yaml_tree import FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
+from service.core.yaml_tree import Plain, Problem, YamlTree, field_name, parse_yaml
 
 ParamsT = TypeVar("ParamsT", bound=BaseModel)
 
@@ -272,26 +269,19 @@ def load_protocol(path: Path, params_models: Mapping[str, type[BaseModel]]) -> L
 
 def parse_protocol(content: bytes, params_models: Mapping[str, type[BaseModel]], *, name: str) -> LoadedProtocol:
     """The same for a file's bytes (a recorded artefact, an editor's buffer); `name` stands for the file in errors."""
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        raise ProtocolError("not UTF-8 text", where=f"{name}:{line}", remedy="Save the file as UTF-8") from error
+    text = decoded(content, name=name, error=ProtocolError)
     tree = parse_yaml(text, name=name)
     problems = list(tree.problems)
     data = tree.data if isinstance(tree.data, dict) else {}
     if not isinstance(tree.data, dict):
         problems.append(Problem(1, "", "not a protocol: the file must hold fields such as id, version and steps"))
-        _raise(problems, name)
-    parsed, params = None, {}
-    try:
-        parsed = _FileProtocol.model_validate_json(json.dumps(data), strict=True)
-    except ValidationError as error:
-        problems += [_problem(details, (), tree) for details in error.errors()]
+        _refuse(problems, name)
+    parsed, found = checked(data, _FileProtocol, tree)
+    problems += found
     problems += [Problem(tree.line(at), field_name(at), message) for at, message in rule_violations(data)]
     params = _validate_params(data, params_models, tree, problems)
     if problems or parsed is None:
-        _raise(problems, name)
+        _refuse(problems, name)
     steps = tuple(
         Step(params=params[index], **{field: getattr(step, field) for field in StepFields.model_fields})
         for index, step in enumerate(parsed.steps)
@@ -311,70 +301,22 @@ def _validate_params(
             continue
         kind, at = str(step["kind"]), ("steps", index)
         if kind not in models:
-            message = f"unknown kind {kind!r}{_did_you_mean(kind, models)}; kinds: {', '.join(sorted(models))}"
+            message = f"unknown kind {kind!r}{did_you_mean(kind, models)}; kinds: {', '.join(sorted(models))}"
             problems.append(Problem(tree.line((*at, "kind")), field_name((*at, "kind")), message))
             continue
         given = step.get("params", {})
         if not isinstance(given, dict):
             continue  # the structure's own check has said so
-        try:
-            params[index] = models[kind].model_validate_json(json.dumps(given), strict=True)
-        except ValidationError as error:
-            problems += [_problem(details, (*at, "params"), tree, models[kind]) for details in error.errors()]
+        found, wrong = checked(given, models[kind], tree, (*at, "params"))
+        problems += wrong
+        if found is not None:
+            params[index] = found
     return params
 
 
-def _problem(
-    details: ErrorDetails, prefix: FieldPath, tree: YamlTree, model: type[BaseModel] | None = None
-) -> Problem:
-    """Say in a technician's words what pydantic found, and where it stands in the file."""
-    at: FieldPath = prefix
-    for part in details["loc"]:
-        if (*at, part) in tree.lines:  # parts that are not in the file are names of union members
-            at = (*at, part)
-    kind, last = details["type"], details["loc"][-1] if details["loc"] else ""
-    if kind == "missing":
-        return Problem(tree.line(at), field_name((*at, last)), "missing field")
-    if kind == "extra_forbidden":
-        known = model.model_fields if model else _known_fields(at)
-        return Problem(tree.line(at), field_name(at), f"unknown field{_did_you_mean(str(last), known)}")
-    message = details["msg"].removeprefix("Value error, ")
-    given = details["input"]
-    shown = "" if isinstance(given, (dict, list)) else f" (it is {json.dumps(given)})"
-    quote = '; put it in quotes: "…"' if kind == "string_type" and isinstance(given, (int, float)) else ""
-    return Problem(tree.line(at), field_name(at), f"{message}{shown}{quote}")
-
-
-_SECTIONS: Mapping[str, type[BaseModel]] = {
-    "spheres": Spheres,
-    "board": Board,
-    "camera": CameraSection,
-    "motion": Motion,
-    "settle": Settle,
-    "gates": Gate,
-    "recovery": Recovery,
-    "steps": _FileStep,
-}
-
-
-def _known_fields(at: FieldPath) -> Mapping[str, object]:
-    section = next((part for part in reversed(at[:-1]) if isinstance(part, str)), "")
-    return _SECTIONS.get(section, _FileProtocol).model_fields
-
-
-def _did_you_mean(word: str, known: Mapping[str, object]) -> str:
-    near = difflib.get_close_matches(word, known, n=1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
-
-
-def _raise(problems: list[Problem], name: str) -> NoReturn:
-    ordered = sorted(set(problems), key=lambda p: (p.line, p.field))
-    places = [f"{name}:{p.line}" + (f" {p.field}" if p.field else "") for p in ordered]
+def _refuse(problems: list[Problem], name: str) -> NoReturn:
     remedy = "See docs/protocol.schema.json for what a protocol may hold"
-    if len(ordered) == 1:
-        raise ProtocolError(ordered[0].message, where=places[0], remedy=remedy)
-    listed = "\n".join(f"  {place}: {p.message}" for place, p in zip(places, ordered, strict=True))
-    raise ProtocolError(f"{len(ordered)} things are wrong in this protocol:\n{listed}\n", where=name, remedy=remedy)
+    refuse(problems, what="protocol", name=name, remedy=remedy, error=ProtocolError)
 
 
 def protocol_json_schema(params_models: Mapping[str, type[BaseModel]]) -> dict[str, Any]:

@@ -51,6 +51,9 @@ class YamlTree:
         return self.lines[path]
 
 
+NO_LINES = YamlTree(data={}, lines={(): 0}, problems=())  # of data that came from no YAML file
+
+
 def field_name(path: FieldPath) -> str:
     """`steps[3].gates[0].max` for ("steps", 3, "gates", 0, "max")."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")

@@ -16,7 +16,7 @@ from service.core.geometry import Transform
 from service.core.model import RunStarted
 from service.core.protocol import Step
 from service.evidence import RunLog
-from service.rig import RigSection, parse_rig
+from service.rig import RigSection, parse_recorded_rig
 from service.steps.context import StationLayout
 from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 
@@ -136,4 +136,4 @@ def recorded_rig(log: RunLog) -> RigSection:
 
 @lru_cache(maxsize=8)
 def _rig_section(path: Path) -> RigSection:
-    return parse_rig(path.read_bytes(), path).section
+    return parse_recorded_rig(path.read_bytes(), path).section
