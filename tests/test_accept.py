@@ -18,10 +18,10 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner, Result
 
-from service.audit.bundle import export_bundle
-from service.audit.recorded import read_run
-from service.audit.report_content import report_content
-from service.audit.report_html import render_html
+from service.audit.bundle.export import export_bundle
+from service.audit.record.run import read_run
+from service.audit.report.content import report_content
+from service.audit.report.output.html import render_html
 from service.cli.hands import SimulatedHands
 from service.cli.main import app
 from service.cli.operators import Display, TerminalOperator
@@ -373,7 +373,7 @@ def test_report_data_set_and_bundle_say_it(accepted_run: tuple[Path, str]) -> No
     assert described["accepted_gates"] == [f"Evaluate: best_mean_radial_error_mm {text}"]
     with Store.open(data) as store:
         bundle = export_bundle(store, run_id, folder / "bundle.zip", actor="Emmy", hashes_only=True).path
-    verifier = ROOT / "service" / "audit" / "verifier.py"
+    verifier = ROOT / "service" / "audit" / "verify" / "bundle_verifier.py"
     done = subprocess.run([sys.executable, verifier, bundle], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "evaluation counts as passed with figures outside their limits, as Emmy (supervisor)" in done.stdout

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from service.cli.main import app
 from service.core.model import FilesKept, StepStarted
 from service.store.records import NewArtefact
-from service.web.pages import local_time
+from service.web.page.rendering import local_time
 from tests.support.reported_run import record_reported_run
 from tests.support.web import WebSite, web_site
 

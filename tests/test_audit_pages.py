@@ -13,13 +13,14 @@ from fastapi.routing import APIRoute
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.audit import artefact_queries, findings, first_page, queries
-from service.audit.computed import Progress
-from service.audit.correcting import correct
-from service.audit.digest import Digest, digests
-from service.audit.provenance import graphs, origin
-from service.audit.provenance_drawing import draw
-from service.audit.queries import EventFilter, EventPage
+from service.audit.background.incremental import Progress
+from service.audit.overview import findings, first_page
+from service.audit.overview.corrections import correct
+from service.audit.overview.digest import Digest, digests
+from service.audit.provenance.drawing import draw
+from service.audit.provenance.graph import graphs, origin
+from service.audit.record import artefact_queries, queries
+from service.audit.record.queries import EventFilter, EventPage
 from service.core.errors import DataError
 from service.core.fold import fold
 from service.core.model import StepNote
@@ -29,7 +30,7 @@ from service.runs import recorded_run
 from service.store.audit import verify
 from service.store.errors import UnknownRunError
 from service.store.store import Store
-from service.web import audit_pages
+from service.web.audit import pages as audit_pages
 from tests.support.large_run import Sizes, write_large_run
 from tests.support.recorded_run import record_run
 from tests.support.store import rows, tamper

@@ -16,7 +16,7 @@ from service.rig import load_rig
 from service.runs import start_run
 from service.steps import params_models
 from service.store.records import NewJob
-from service.web.board_use import board_uses
+from service.web.record.board_images import board_uses
 from tests.support.calibrated_run import PROTOCOL, RIG, begin_calibrated_run, capture
 from tests.support.core import EYE
 from tests.support.web import WebSite, web_site

@@ -23,9 +23,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from service.audit import verifier
-from service.audit.bundle import export_bundle
-from service.audit.bundle_report import bundle_report
+from service.audit.bundle.export import export_bundle
+from service.audit.bundle.report import bundle_report
+from service.audit.verify import bundle_verifier
 from service.cli.audit import audit_app
 from service.core.errors import DataError, IllegalTransitionError, IntegrityError
 from service.core.model import EvidenceExported, RunReleased, StepNote
@@ -84,7 +84,7 @@ def unpacked(site: Site, tmp_path: Path) -> Path:
 
 def check(path: Path, **options: Any) -> list[str]:
     """What the verifier names, called in this process."""
-    found = verifier.Check()
+    found = bundle_verifier.Check()
     found.run(path, options.get("key"), options.get("certificates"))
     return [f"{fault['where']}: {fault['what']}" for fault in found.faults]
 
@@ -110,14 +110,14 @@ def test_the_verifier_in_the_bundle_finds_it_whole(site: Site, unpacked: Path, t
     assert (done.returncode, result["ok"], result["faults"], result["run_id"]) == (0, True, [], site.run_id)
     assert result["counts"]["artefacts"] >= 6
     assert list(empty.iterdir()) == []
-    assert (unpacked / "verify.py").read_bytes() == Path(verifier.__file__).read_bytes()
+    assert (unpacked / "verify.py").read_bytes() == Path(bundle_verifier.__file__).read_bytes()
     done = run_verifier(unpacked / "verify.py", str(empty), cwd=empty)
     assert (done.returncode, done.stdout) == (2, "")
     assert "not a bundle" in done.stderr
 
 
 def test_the_verifier_needs_nothing_of_this_project_and_no_new_python() -> None:
-    tree = ast.parse(Path(verifier.__file__).read_text(encoding="utf-8"), feature_version=(3, 9))
+    tree = ast.parse(Path(bundle_verifier.__file__).read_text(encoding="utf-8"), feature_version=(3, 9))
     imported = {
         (name.name if isinstance(node, ast.Import) else str(node.module)).split(".")[0]
         for node in ast.walk(tree)
@@ -216,7 +216,7 @@ def test_hashes_alone_are_enough_to_verify_the_records(site: Site, tmp_path: Pat
 
 
 def test_without_its_one_package_the_verifier_says_so() -> None:
-    script = Path(verifier.__file__)
+    script = Path(bundle_verifier.__file__)
     done = subprocess.run(
         [sys.executable, "-I", "-S", str(script), "b.zip"], capture_output=True, text=True, check=False
     )
@@ -270,7 +270,7 @@ def test_nothing_is_overwritten_and_nothing_half_written_stays(
         def interrupted(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("service.audit.bundle.sign", interrupted)
+        monkeypatch.setattr("service.audit.bundle.export.sign", interrupted)
         with pytest.raises(KeyboardInterrupt):
             export_bundle(store, site.run_id, tmp_path / "c.zip", actor="ada")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b-SIMULATED.zip", "data"]
@@ -295,7 +295,7 @@ def test_every_changed_file_is_named(unpacked: Path) -> None:
         flip(path)
         try:
             found = check(unpacked)
-        except verifier.NotABundleError as error:
+        except bundle_verifier.NotABundleError as error:
             found = [str(error)]
         assert any(name in fault.split(": ")[0] for fault in found), (name, found)
         path.write_bytes(before)
@@ -304,7 +304,7 @@ def test_every_changed_file_is_named(unpacked: Path) -> None:
 
 def test_a_manifest_of_random_bytes_is_told_in_few_words(unpacked: Path) -> None:
     (unpacked / "manifest.json").write_bytes(bytes(range(256)) * 40)
-    with pytest.raises(verifier.NotABundleError, match="cannot be read: UnicodeDecodeError") as refused:
+    with pytest.raises(bundle_verifier.NotABundleError, match="cannot be read: UnicodeDecodeError") as refused:
         check(unpacked)
     assert len(str(refused.value)) < 250
 
@@ -315,7 +315,7 @@ def test_every_missing_file_is_named_and_every_other_too(unpacked: Path) -> None
         path.rename(unpacked.with_name("aside"))
         try:
             found = check(unpacked)
-        except verifier.NotABundleError as error:
+        except bundle_verifier.NotABundleError as error:
             found = [str(error)]
         assert any(name in fault for fault in found), (name, found)
         unpacked.with_name("aside").rename(path)
@@ -341,9 +341,9 @@ def seal(folder: Path) -> None:
 
 
 def change_lines(path: Path, change: Callable[[list[dict[str, Any]]], None]) -> None:
-    records = [verifier.parse(line) for line in path.read_bytes().splitlines()]
+    records = [bundle_verifier.parse(line) for line in path.read_bytes().splitlines()]
     change(records)
-    path.write_bytes(b"".join(verifier.canonical(record) + b"\n" for record in records))
+    path.write_bytes(b"".join(bundle_verifier.canonical(record) + b"\n" for record in records))
 
 
 def rewrite(records: list[dict[str, Any]]) -> None:
@@ -423,13 +423,13 @@ def test_any_value_of_any_kind_in_any_place_is_named_and_breaks_nothing(unpacked
         }
         lines = before[path.name].splitlines()
         number = chance.randrange(len(lines))
-        changed = verifier.parse(lines[number])
+        changed = bundle_verifier.parse(lines[number])
         *way, last = chance.choice(list(places(changed)))
         within = changed
         for key in way:
             within = within[key]
         within[last] = chance.choice([value for value in other if value != within[last]])
-        lines[number] = verifier.canonical(changed)
+        lines[number] = bundle_verifier.canonical(changed)
         path.write_bytes(b"".join(line + b"\n" for line in lines))
         seal(unpacked)
         found = check(unpacked)
@@ -570,9 +570,9 @@ VALUES = st.recursive(
 @example({"\u20ac": 1, "\r": 2, "\ufb33": 3, "1": 4, "\U0001f600": 5, "\x80": 6, "\u00f6": 7})
 @example('\x00\x1f\x7f\u2028/\\"\b\t\n\f\r')
 def test_canonical_json_is_rfc_8785(value: object) -> None:
-    text = verifier.canonical(value)
+    text = bundle_verifier.canonical(value)
     assert text == rfc8785.dumps(value)  # pyright: ignore[reportArgumentType]  # any JSON value
-    assert verifier.canonical(verifier.parse(text)) == text
+    assert bundle_verifier.canonical(bundle_verifier.parse(text)) == text
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))
@@ -588,7 +588,7 @@ def test_canonical_json_is_rfc_8785(value: object) -> None:
 @example(0.1 + 0.2)
 @example(4.35)
 def test_numbers_are_written_as_ecmascript_does(value: float) -> None:
-    assert verifier.number(value).encode() == rfc8785.dumps(value)
+    assert bundle_verifier.number(value).encode() == rfc8785.dumps(value)
 
 
 @pytest.mark.parametrize(
@@ -604,7 +604,7 @@ def test_numbers_are_written_as_ecmascript_does(value: float) -> None:
 )
 def test_what_is_no_json_is_refused(text: bytes, said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        verifier.parse(text)
+        bundle_verifier.parse(text)
 
 
 # --- command line ------------------------------------------------------------------------------------------------

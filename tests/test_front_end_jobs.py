@@ -8,8 +8,8 @@ from typing import Any
 import cv2
 import pytest
 
-from service.audit.recorded import RecordedFiles
-from service.audit.replay import ScratchStore
+from service.audit.record.run import RecordedFiles
+from service.audit.replay.replay import ScratchStore
 from service.compute.poses.front_end import pairs_of
 from service.compute.poses.sfm_options import SfmOptions
 from service.core.model import ArtefactRef

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.audit import first_page
-from service.audit.computed import Progress
-from service.audit.digest import digests
-from service.audit.recorded import read_run
-from service.audit.report_content import report_content
-from service.audit.report_html import render_html
+from service.audit.background.incremental import Progress
+from service.audit.overview import first_page
+from service.audit.overview.digest import digests
+from service.audit.record.run import read_run
+from service.audit.report.content import report_content
+from service.audit.report.output.html import render_html
 from service.cli.common import console
 from service.cli.main import app
 from service.core.gates import describe, describe_judged, figure, quantity, standing

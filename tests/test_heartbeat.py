@@ -16,7 +16,7 @@ from service.core.run_state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
 from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot, write_snapshot
 from service.store.store import Store
-from service.web.run_frame import Banner, robot_banner
+from service.web.page.run_frame import Banner, robot_banner
 from tests.support.bench_rig import BenchArm, BenchLightbox, BenchRig
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.waiting import until

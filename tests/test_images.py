@@ -10,7 +10,7 @@ import pytest
 
 from service.compute.images import read_grey
 from service.core.errors import DataError
-from service.web.pictures import reduced_jpeg
+from service.web.record.pictures import reduced_jpeg
 
 PICTURE = np.random.default_rng(3).integers(0, 255, (32, 48), dtype=np.uint8)
 

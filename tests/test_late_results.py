@@ -19,12 +19,12 @@ import cv2
 import numpy as np
 import pytest
 
-from service.audit import first_page
-from service.audit.bundle import export_bundle
-from service.audit.bundle_report import bundle_report
-from service.audit.computed import Progress
-from service.audit.digest import Digest, digests
-from service.audit.verifier import main as verify_bundle
+from service.audit.background.incremental import Progress
+from service.audit.bundle.export import export_bundle
+from service.audit.bundle.report import bundle_report
+from service.audit.overview import first_page
+from service.audit.overview.digest import Digest, digests
+from service.audit.verify.bundle_verifier import main as verify_bundle
 from service.cli.operators import Display
 from service.cli.waiting import wait_for_results
 from service.core.fold import fold

@@ -13,7 +13,7 @@ from service.core.model import StepNote
 from service.evidence import RunFollower, StepEvidence, read_log
 from service.runs import recorded_run
 from service.store.audit import show
-from service.web.capture_view import views_of
+from service.web.capture.view import views_of
 from tests.support.counting import lines_of
 
 SMALL, LARGE = 100, 200

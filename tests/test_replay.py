@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.comparison import compare_data, compare_files
-from service.audit.recorded import read_run
-from service.audit.replay import ReplayReport, replay
+from service.audit.record.run import read_run
+from service.audit.replay.differences import compare_data, compare_files
+from service.audit.replay.replay import ReplayReport, replay
 from service.cli.main import app
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError
 from service.core.model import ArtefactRef

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.audit.recorded import read_run
-from service.audit.report_content import report_content
-from service.audit.report_html import render_html
+from service.audit.record.run import read_run
+from service.audit.report.content import report_content
+from service.audit.report.output.html import render_html
 from service.cli.main import app
 from service.store.audit import verify
 from tests.support.reported_run import record_reported_run

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from service.audit import verifier
-from service.audit.bundle import export_bundle
-from service.audit.recorded import read_run
-from service.audit.report_content import report_content
-from service.audit.report_html import render_html
-from service.audit.report_pdf import write_pdf
-from service.audit.run_search import RunWanted, find_runs
+from service.audit.bundle.export import export_bundle
+from service.audit.record.run import read_run
+from service.audit.report.content import report_content
+from service.audit.report.output.html import render_html
+from service.audit.report.output.pdf import write_pdf
+from service.audit.runs.search import RunWanted, find_runs
+from service.audit.verify import bundle_verifier
 from service.cli.main import app
 from service.core.entered import NoteTaken
 from service.core.model import PAYLOAD, RunAborted, RunStarted
@@ -339,7 +339,7 @@ def test_a_bundle_with_notes_verifies_elsewhere_and_an_altered_note_does_not(web
     made = export_bundle(web.store, run_id, tmp_path / "bundle.zip", actor="ada")
     with zipfile.ZipFile(made.path) as archive:
         archive.extractall(tmp_path / "bundle")
-    whole = verifier.Check()
+    whole = bundle_verifier.Check()
     whole.run(tmp_path / "bundle", None, None)
     assert whole.faults == []
     (taken,) = notes(web, run_id)
@@ -347,6 +347,6 @@ def test_a_bundle_with_notes_verifies_elsewhere_and_an_altered_note_does_not(web
     assert list((tmp_path / "bundle").rglob(f"*{taken.photograph.sha256}*"))
     record = next((tmp_path / "bundle").rglob("events.jsonl"))
     record.write_text(record.read_text().replace("the wire slipped", "the wire held"))
-    altered = verifier.Check()
+    altered = bundle_verifier.Check()
     altered.run(tmp_path / "bundle", None, None)
     assert altered.faults

@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from service.audit.history import by_instrument, history
+from service.audit.runs.history import by_instrument, history
 from service.cli.main import app
 from service.core.model import DeviceOpened
 from service.store.audit import verify
 from service.store.store import Store
-from service.web.time_charts import TimePoint, time_chart
+from service.web.home.time_charts import TimePoint, time_chart
 from tests.support.reported_run import record_reported_run
 from tests.support.web import WebSite, web_site
 

@@ -17,7 +17,7 @@ import pytest
 from service.core.model import SignInRecorded
 from service.store.records import SITE
 from service.store.store import Store
-from service.web.open_streams import OpenStream, OpenStreams
+from service.web.server.open_streams import OpenStream, OpenStreams
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.certificates import self_signed
 from tests.support.rig import orthocapture

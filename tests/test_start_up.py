@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from service.audit import start_up
-from service.audit.start_up import record_start
+from service.audit.record.starts import record_start
 from service.core.errors import ConfigurationError
 from service.core.model import RunAborted, ServiceStarted
 from service.rig import Rig, load_rig

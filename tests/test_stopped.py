@@ -12,7 +12,7 @@ import pytest
 from service.core.decide import AskOperator, decide, evaluate_gates
 from service.core.model import GateVerdict, StepFailed, StepMeasured, StepNote, StepStarted
 from service.core.protocol import Protocol
-from service.web.run_words import needs, stopped_words
+from service.web.page.run_words import needs, stopped_words
 from tests.support.attended import attended
 from tests.support.bench_run import Bench
 from tests.support.shown_site import skip

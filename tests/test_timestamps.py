@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from service.audit import verifier
-from service.audit.bundle import export_bundle
+from service.audit.bundle.export import export_bundle
+from service.audit.verify import bundle_verifier
 from service.core.model import DeviceTrouble
 from service.rig import load_rig
 from service.runs import time_stamp_authority as time_stamp_authority_of
@@ -79,7 +79,7 @@ def test_a_checkpoint_is_stamped_once_and_verified_with_and_without_certificates
         (authority.certificates, 0, "it existed at"),
         (other, 1, "no line of certificates"),
     ):
-        check = verifier.Check()
+        check = bundle_verifier.Check()
         check.run(bundle, None, certificates)
         assert len(check.faults) == faults, check.faults
         assert said in " ".join([*check.notes, *(fault["what"] for fault in check.faults)])

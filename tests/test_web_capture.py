@@ -19,11 +19,11 @@ from service.core.geometry import apply, inverse, look_at
 from service.core.model import StepNote, ViewpointFailed
 from service.dataset.scene_view import Scene, SceneSphere, figure_json, scene_figure, viewing_frame
 from service.steps.context import StationLayout
-from service.web.board_advice import empty_regions
-from service.web.capture_view import View
-from service.web.charts import LEVELS, dots, heat_map, vector_field
-from service.web.plan_drawing import WIDTH, plan_drawing
-from service.web.planned import Station
+from service.web.calibration.board_advice import empty_regions
+from service.web.capture.plan_drawing import WIDTH, plan_drawing
+from service.web.capture.view import View
+from service.web.page.charts import LEVELS, dots, heat_map, vector_field
+from service.web.record.planned_poses import Station
 from tests.support.calibrated_run import VIEWS, begin_calibrated_run, capture
 from tests.support.core import EYE
 from tests.support.recorded_run import record_run

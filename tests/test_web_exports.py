@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from service.audit import verifier
-from service.audit.export_process import export
+from service.audit.export.process import export
+from service.audit.verify import bundle_verifier
 from service.compute.poses.pose_files import read_poses_csv
 from service.core.errors import StoreError
 from service.core.model import EvidenceExported, RunReleased
 from service.store.audit import verify
 from service.store.store import Store
-from service.web.export_pages import MEANINGS
+from service.web.audit.exports import MEANINGS
 from tests.support.bench_run import PROTOCOL
 from tests.support.reported_run import T_SCAN_CAMERA, record_reported_run
 from tests.support.web import Browser, WebSite, password_of, web_site
@@ -104,7 +104,7 @@ def test_a_bundle_is_made_recorded_and_fetched(web: WebSite, run: str, superviso
     assert fetched.status_code == 200
     assert fetched.headers["content-disposition"].startswith("attachment")
     (tmp_path / "b.zip").write_bytes(fetched.content)
-    assert verifier.main([str(tmp_path / "b.zip")]) == 0
+    assert bundle_verifier.main([str(tmp_path / "b.zip")]) == 0
     assert "SIMULATED" in exported.payload.file_name
     for role in ("technician", "auditor", "administrator"):
         assert web.browser(role).send_form(f"/runs/{run}/exports", what="bundle").status_code == 403
@@ -204,7 +204,7 @@ def test_a_data_set_leaves_with_all_that_belongs_to_it(
     assert [path.name for path in tmp_path.iterdir()] == ["poses.csv"]
     # The report that goes along in a bundle shows the scene.
     made = export(web.site.data, run, "bundle", tmp_path / "b.zip", "emmy", lambda *_: None)
-    assert verifier.main([str(made)]) == 0
+    assert bundle_verifier.main([str(made)]) == 0
     with zipfile.ZipFile(made) as archive:
         html = archive.read("report.html").decode()
     assert 'id="scene-data"' in html

@@ -17,7 +17,7 @@ from service.core.errors import DataError
 from service.core.model import FilesKept
 from service.monitor.snapshot import frame_path, frames_wanted, write_frame
 from service.store.records import NewArtefact
-from service.web.pictures import Mark, cached, draw_marks, nearest_width, picture_size, reduced_jpeg, safe_name
+from service.web.record.pictures import Mark, cached, draw_marks, nearest_width, picture_size, reduced_jpeg, safe_name
 from tests.support.calibrated_run import begin_calibrated_run, capture
 from tests.support.core import EYE
 from tests.support.web import Browser, WebSite, web_site
@@ -107,7 +107,7 @@ def test_pictures_are_made_small_once(shown: Shown, monkeypatch: pytest.MonkeyPa
     first = shown.browser.get(address)
     assert picture_size(first.content) == (160, 107)
     assert "immutable" in first.headers["cache-control"]
-    monkeypatch.setattr("service.web.media.reduced_jpeg", lambda *_: pytest.fail("decoded again"))
+    monkeypatch.setattr("service.web.capture.media.reduced_jpeg", lambda *_: pytest.fail("decoded again"))
     assert shown.browser.get(address).content == first.content
     assert not list((shown.site.site.data / "cache").rglob("*.part"))
 

@@ -25,10 +25,10 @@ from service.core.model import (
 from service.core.protocol import Protocol, load_protocol
 from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
-from service.web.run_figures import duration, view_intervals_s
-from service.web.run_frame import robot_banner
-from service.web.run_view import Looker, RunView, run_view
-from service.web.run_words import limit, measure_name, planned_views
+from service.web.page.run_frame import robot_banner
+from service.web.page.run_words import limit, measure_name, planned_views
+from service.web.run.figures import duration, view_intervals_s
+from service.web.run.view import Looker, RunView, run_view
 from tests.support.core import Log
 
 PROTOCOLS = Path(__file__).parents[1] / "protocols"

@@ -20,8 +20,8 @@ from schemathesis.schemas import APIOperation
 
 from service.people.roles import ROLES, Role, may
 from service.store.records import SITE
-from service.web.security import cookie_name
-from service.web.shield import CONTENT_SECURITY_POLICY, SAFETY_HEADERS
+from service.web.security.guards import cookie_name
+from service.web.security.shield import CONTENT_SECURITY_POLICY, SAFETY_HEADERS
 from tests.support.store import SteppedClock
 from tests.support.web import HOST, PIN, Browser, WebSite, web_site
 

@@ -16,7 +16,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.audit.verifying import keep_verification, verification_of
+from service.audit.verify.verifications import keep_verification, verification_of
 from service.cli.audit_figures import figures_command
 from service.cli.audit_report import report_command
 from service.cli.common import (
@@ -181,8 +181,8 @@ def export_command(
     Refused when the evidence does not verify, and when the protocol asks for a release that was not given.
     """
     # These load the numerics, which `verify` does without.
-    from service.audit.bundle import export_bundle  # noqa: PLC0415
-    from service.audit.bundle_report import bundle_report  # noqa: PLC0415
+    from service.audit.bundle.export import export_bundle  # noqa: PLC0415
+    from service.audit.bundle.report import bundle_report  # noqa: PLC0415
 
     with (
         reporting_errors(json),

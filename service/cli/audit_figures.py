@@ -47,9 +47,9 @@ def figures_command(
                 error_console.print(f"[bold red]The evidence does NOT verify:[/] {escape(str(verified.first_fault))}")
                 raise typer.Exit(1)
             # Numerics take a second to load: `audit verify` must not wait for them.
-            from service.audit.recorded import read_run  # noqa: PLC0415
-            from service.audit.report_content import report_content  # noqa: PLC0415
-            from service.audit.report_figures import figure_files, write_figures  # noqa: PLC0415
+            from service.audit.record.run import read_run  # noqa: PLC0415
+            from service.audit.report.content import report_content  # noqa: PLC0415
+            from service.audit.report.output.figures import figure_files, write_figures  # noqa: PLC0415
 
             progress("drawing the figures", 0, 1)
             recorded = read_run(data, run_id)

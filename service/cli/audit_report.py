@@ -57,10 +57,10 @@ def report_command(
         with progress_bar(quiet=json) as progress:
             verified = audit.verify(data, run_id, progress)
             # Numerics, pictures and fonts take a second to load: `audit verify` must not wait for them.
-            from service.audit.recorded import read_run  # noqa: PLC0415
-            from service.audit.report_content import report_content  # noqa: PLC0415
-            from service.audit.report_html import write_html  # noqa: PLC0415
-            from service.audit.report_pdf import write_pdf  # noqa: PLC0415
+            from service.audit.record.run import read_run  # noqa: PLC0415
+            from service.audit.report.content import report_content  # noqa: PLC0415
+            from service.audit.report.output.html import write_html  # noqa: PLC0415
+            from service.audit.report.output.pdf import write_pdf  # noqa: PLC0415
 
             progress("writing the report", 0, 1)
             report = report_content(read_run(data, run_id), verified, with_scene=html is not None)
@@ -108,7 +108,7 @@ def _write(path: Path, write: Callable[[Path], None], leave: Callable[[Path, str
 
 
 def _record(data: Path, run_id: str, head_sha256: str, actor: str, part: Path, file_name: str) -> None:
-    from service.audit.bundle import record_export  # noqa: PLC0415  # with the rest of what `verify` does without
+    from service.audit.bundle.export import record_export  # noqa: PLC0415  # with the rest of what `verify` does without
 
     with Store.open(data, create=False) as store:
         record_export(store, run_id, part, file_name=file_name, what="report", head_sha256=head_sha256, actor=actor)

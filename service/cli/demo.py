@@ -18,10 +18,10 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.audit.not_in_yet import not_in_yet
-from service.audit.recorded import read_run
-from service.audit.report_content import report_content
-from service.audit.report_html import write_html
+from service.audit.record.missing_results import not_in_yet
+from service.audit.record.run import read_run
+from service.audit.report.content import report_content
+from service.audit.report.output.html import write_html
 from service.cli.common import (
     JsonOption,
     console,

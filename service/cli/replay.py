@@ -12,9 +12,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.audit.comparison import Difference
-from service.audit.recorded import read_run
-from service.audit.replay import DEFAULT_KINDS, JobReplay, ReplayReport, replay
+from service.audit.record.run import read_run
+from service.audit.replay.differences import Difference
+from service.audit.replay.replay import DEFAULT_KINDS, JobReplay, ReplayReport, replay
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,

@@ -11,9 +11,9 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from service.audit.history import history, history_csv
-from service.audit.run_comparison import ComparedRun, RunComparison, compare_runs
-from service.audit.run_search import RESULT_WORDS, RESULTS, FoundRun, RunWanted, find_runs
+from service.audit.runs.comparison import ComparedRun, RunComparison, compare_runs
+from service.audit.runs.history import history, history_csv
+from service.audit.runs.search import RESULT_WORDS, RESULTS, FoundRun, RunWanted, find_runs
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,

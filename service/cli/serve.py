@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from service.audit.start_up import record_start
+from service.audit.record.starts import record_start
 from service.cli.common import (
     DEFAULT_DATA,
     DataOption,
@@ -33,12 +33,12 @@ from service.store.signature_copy import keep_elsewhere
 from service.store.signing import checkpoint
 from service.store.store import Store
 from service.web.app import create_app
-from service.web.connections import ConnectionLimits
 from service.web.launch import Launcher
-from service.web.listener import affordable_connections
-from service.web.server import known_proxies, listening, server
+from service.web.server.connections import ConnectionLimits
+from service.web.server.http import known_proxies, listening, server
+from service.web.server.listener import affordable_connections
+from service.web.server.sparing_log import sparing_log, told
 from service.web.site import Site
-from service.web.sparing_log import sparing_log, told
 
 _PROTOCOLS = shipped_protocols()
 _LIMITS = ConnectionLimits()

@@ -152,7 +152,7 @@ class StepFields(Record):
     title: Text
     why: str = ""
     instructions: str = ""
-    drawing: str = ""  # of service/web/static/drawings, beside the instructions; "": as the kind of step suggests
+    drawing: str = ""  # of service/web/run/drawings, beside the instructions; "": as the kind of step suggests
     checklist: tuple[Text, ...] = ()
     gates: tuple[Gate, ...] = ()
     sign: bool = False

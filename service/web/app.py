@@ -2,59 +2,51 @@
 
 from __future__ import annotations
 
-from fastapi import Depends, FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 
-from service.web import (
-    account_pages,
-    acting,
-    audit_pages,
-    badge_pages,
-    calibration_pages,
-    capture_pages,
-    checklist_pages,
-    compare_pages,
-    devices_pages,
-    export_pages,
-    gates_pages,
-    health_pages,
-    held_pages,
-    history_pages,
-    home_pages,
-    media,
-    note_pages,
-    run_pages,
-    scene_pages,
-    start_pages,
-    stream,
-)
-from service.web.seal import sealed
-from service.web.security import install_security
+import service.web.audit.pages
+import service.web.calibration.pages
+import service.web.capture.pages
+import service.web.handheld.pages
+import service.web.home.pages
+import service.web.monitoring.pages
+import service.web.run.pages
+import service.web.scene.pages
+from service.web.audit import devices, exports, gates
+from service.web.capture import media
+from service.web.home import checklist, compare, history, start
+from service.web.monitoring.pages import install_metrics
+from service.web.people import account, badges
+from service.web.run import actions, news, notes
+from service.web.security.guards import install_security
+from service.web.security.seal import sealed
 from service.web.site import Site
 
-_PAGES = (
-    account_pages,
-    badge_pages,
-    home_pages,
-    start_pages,
-    compare_pages,
-    history_pages,
-    run_pages,
-    acting,
-    note_pages,
-    stream,
-    capture_pages,
-    checklist_pages,
-    held_pages,
-    media,
-    scene_pages,
-    calibration_pages,
-    audit_pages,
-    gates_pages,
-    devices_pages,
-    export_pages,
-    health_pages,
+_ROUTERS: tuple[APIRouter, ...] = (
+    account.router,
+    badges.router,
+    service.web.home.pages.router,
+    start.router,
+    compare.router,
+    history.router,
+    service.web.run.pages.router,
+    actions.router,
+    notes.router,
+    news.router,
+    service.web.capture.pages.router,
+    checklist.router,
+    service.web.handheld.pages.router,
+    media.router,
+    service.web.scene.pages.router,
+    service.web.calibration.pages.router,
+    service.web.audit.pages.router,
+    gates.router,
+    devices.router,
+    exports.router,
+    service.web.monitoring.pages.router,
 )
+_WITH_STATIC_FILES = ("audit", "calibration", "capture", "handheld", "home", "people", "run", "scene")
 
 
 def create_app(site: Site) -> FastAPI:
@@ -68,8 +60,11 @@ def create_app(site: Site) -> FastAPI:
     )
     app.state.site = site
     install_security(app)
-    health_pages.install_metrics(app)
-    for page in _PAGES:
-        app.include_router(page.router)
-    app.mount("/static", StaticFiles(packages=[("service.web", "static")]), name="static")
+    install_metrics(app)
+    for router in _ROUTERS:
+        app.include_router(router)
+    for folder in _WITH_STATIC_FILES:
+        files = StaticFiles(packages=[(f"service.web.{folder}", "static")])
+        app.mount(f"/static/{folder}", files, name=f"static_{folder}")
+    app.mount("/static", StaticFiles(packages=[("service.web.page", "static")]), name="static")  # of every page
     return app

@@ -15,7 +15,7 @@ from service.rig import Rig
 from service.runs import recorded_run
 from service.store.store import Store
 from service.web.launch import Launcher
-from service.web.open_streams import OpenStreams
+from service.web.server.open_streams import OpenStreams
 
 
 @dataclass

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from service.audit.digest import FOLDED
+from service.audit.overview.digest import FOLDED
 from service.core.actions import record_to_sign
 from service.core.fold import advance, initial_state
 from service.core.gates import evaluate_gates

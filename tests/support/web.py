@@ -24,7 +24,7 @@ from service.store.seam import Clock
 from service.store.store import Store
 from service.web.app import create_app
 from service.web.launch import Launcher
-from service.web.security import cookie_name
+from service.web.security.guards import cookie_name
 from service.web.site import Site
 from tests.support.bench_run import PROTOCOL, Bench, begin_run
 

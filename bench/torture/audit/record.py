@@ -10,8 +10,8 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from service.audit.correcting import correct
-from service.audit.start_up import record_start
+from service.audit.overview.corrections import correct
+from service.audit.record.starts import record_start
 from service.core.errors import DataError
 from service.core.model import EvidenceExported, OperatorAction, RunAborted, RunReleased
 from service.people.control import Control

@@ -236,7 +236,7 @@ def _work(store: Store, place: Place, parent: int, _person: str) -> None:
 
 
 def _release(store: Store, place: Place, _parent: int, person: str) -> None:
-    """As service.web.export_pages.release does: a second person lets the completed run go."""
+    """As service.web.audit.exports.release does: a second person lets the completed run go."""
     run_id = store.find_run("latest")
     protocol, _ = recorded_run(store, run_id)
     state = fold(protocol, store.events(run_id))

@@ -22,7 +22,7 @@ from service.compute.images import read_grey, read_image
 from service.compute.poses.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
 from service.importing import camera_record
 from service.store.events import canonical
-from service.web.pictures import reduced_jpeg
+from service.web.record.pictures import reduced_jpeg
 from simulators.ct_suite import write_series
 from simulators.ct_volume import Grid
 from simulators.faults import FaultPlan
@@ -217,7 +217,7 @@ TARGETS: tuple[Target, ...] = (
         _jpegs,
     ),
     Target("image", "service.compute.images:read_image", _image, _pictures, memory_mib=1536, pace=2.0),
-    Target("web_picture", "service.web.pictures:reduced_jpeg", _web_picture, _pictures, memory_mib=1024),
+    Target("web_picture", "service.web.record.pictures:reduced_jpeg", _web_picture, _pictures, memory_mib=1024),
     Target("mesh_ply", "drivers.mesh_file:read_mesh_file", _mesh("ply"), _plys, (*BYTES, *TEXT)),
     Target("mesh_stl", "drivers.mesh_file:read_mesh_file", _mesh("stl"), _stls, (*BYTES, *TEXT)),
     Target("mesh_obj", "drivers.mesh_file:read_mesh_file", _mesh("obj"), lambda _: _scan("obj"), TEXT),

@@ -22,9 +22,9 @@ from rfc3161_client import HashAlgorithm, TimestampRequestBuilder
 
 from bench.torture.fuzz.mutations import BYTES, JSON, TEXT
 from bench.torture.fuzz.target import MisbehavedError, Target
-from service.audit import verifier
-from service.audit.bundle import export_bundle
-from service.audit.verifying import Verifications
+from service.audit.bundle.export import export_bundle
+from service.audit.verify import bundle_verifier
+from service.audit.verify.verifications import Verifications
 from service.monitor.snapshot import Snapshot, read_snapshot, write_snapshot
 from service.store.audit import verify
 from service.store.checkpoints import key_fingerprint
@@ -87,9 +87,9 @@ def _stamp(folder: Path, signed: Checkpoint) -> tuple[bytes, Path]:
 
 def _check(bundle: Path, certificates: Path | None = None) -> None:
     """As the stand-alone verifier does, up to the words that it prints."""
-    check = verifier.Check()
+    check = bundle_verifier.Check()
     check.run(bundle, None, certificates)
-    verifier.report(check).encode()
+    bundle_verifier.report(check).encode()
     json.dumps(check.faults)
 
 
@@ -146,7 +146,8 @@ def _token(data: bytes, folder: Path) -> None:
     for member in MEMBERS:
         os.link(known.unpacked / member, bundle / member)
     line = (
-        verifier.canonical({"run_id": stamp.run_id, "seq": stamp.seq, "authority": "x", "token": stamp.token}) + b"\n"
+        bundle_verifier.canonical({"run_id": stamp.run_id, "seq": stamp.seq, "authority": "x", "token": stamp.token})
+        + b"\n"
     )
     manifest = json.loads((bundle / "manifest.json").read_bytes())
     manifest["files"].append({"path": "timestamps.jsonl", "sha256": "0" * 64, "size_bytes": len(line)})
@@ -166,8 +167,8 @@ def _certificates(data: bytes, folder: Path) -> None:
     path.write_bytes(data)
     stamp = Timestamp(known.run_id, known.stamped.seq, "http://here", "", base64.b64encode(known.token).decode())
     timestamp_findings([known.stamped], [stamp], path)
-    with contextlib.suppress(verifier.NotABundleError):
-        verifier.load_certificates(path)
+    with contextlib.suppress(bundle_verifier.NotABundleError):
+        bundle_verifier.load_certificates(path)
 
 
 # --- signatures and keys ------------------------------------------------------------------------------------------
@@ -340,12 +341,20 @@ def _web(data: bytes, _: Path) -> None:
             raise MisbehavedError(f"an answer without its safety headers: {address[:60]}")
 
 
-_VERIFIER: dict[str, Any] = {"errors": (verifier.NotABundleError,), "says_place": False}
+_VERIFIER: dict[str, Any] = {"errors": (bundle_verifier.NotABundleError,), "says_place": False}
 _REFUSES_NOTHING: dict[str, Any] = {"errors": ()}
 
 TARGETS: tuple[Target, ...] = (
-    Target("bundle_zip", "service.audit.verifier:Check.run", _zip, _zips, **_VERIFIER),
-    Target("bundle_member", "service.audit.verifier:Check.run", _member, _members, JSON, pace=0.5, **_VERIFIER),
+    Target("bundle_zip", "service.audit.verify.bundle_verifier:Check.run", _zip, _zips, **_VERIFIER),
+    Target(
+        "bundle_member",
+        "service.audit.verify.bundle_verifier:Check.run",
+        _member,
+        _members,
+        JSON,
+        pace=0.5,
+        **_VERIFIER,
+    ),
     Target("time_stamp", "service.store.timestamping:timestamp_findings", _token, _tokens, pace=0.5, **_VERIFIER),
     Target(
         "certificates",

@@ -1,0 +1,150 @@
+"""What takes longer than a page may: computed in the background, kept while the process lives, brought up to date."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as FutureTimeoutError
+from contextlib import suppress
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import Generic, Protocol, Self, TypeVar
+
+from sqlalchemy import text
+
+from service.audit.record.queries import head
+from service.store.store import Store
+
+WAIT_S = 0.08  # that a page waits before it says "being computed"
+_LARGE = 2000  # events; a larger run is not waited for the first time
+_GRACE_S = 0.25  # before a long computation begins: the page that asked is answered first
+_REST_S = 0.001  # between two chunks, so that pages come first
+
+
+class Copied(Protocol):
+    """What can be computed."""
+
+    def copy(self) -> Self:
+        """Another one, to go on with while pages read this one."""
+        ...
+
+
+T = TypeVar("T", bound=Copied)
+
+
+@dataclass(frozen=True, slots=True)
+class Step(Generic[T]):
+    """A result after one more chunk of events."""
+
+    value: T
+    seq: int  # up to which event
+    last: int  # of the run
+    sha256: str  # of its last event
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a computation is."""
+
+    done: int
+    total: int
+
+
+@dataclass(slots=True)
+class _Entry(Generic[T]):
+    lock: Lock = field(default_factory=Lock)
+    step: Step[T] | None = None
+    future: Future[None] | None = None
+    somebody_waits: bool = False
+
+
+class Computed(Generic[T]):
+    """One value a run, made chunk by chunk by `advance(run_id, value before or None)`.
+
+    Nothing of it is kept on the disk: what a page shows was read from the evidence by this very process.
+    """
+
+    def __init__(self, store: Store, advance: Callable[[str, T | None], Step[T]], name: str) -> None:
+        self._store = store
+        self._advance = advance
+        self._asked = ThreadPoolExecutor(max_workers=2, thread_name_prefix=f"{name}-asked")
+        self._ahead = ThreadPoolExecutor(max_workers=1, thread_name_prefix=f"{name}-ahead")
+        self._entries: dict[str, _Entry[T]] = {}
+        self._lock = Lock()
+        self._warm = False
+
+    def get(self, run_id: str, wait_s: float = WAIT_S) -> T | Progress:
+        """The value of the run as it is now, or how far it is. Raises UnknownRunError and what `advance` raises."""
+        ready = self.ready(run_id)
+        if not isinstance(ready, Progress):
+            return ready
+        # What is computed first in a process also loads what it needs, which takes a second.
+        long = ready.total - ready.done > _LARGE or not self._warm
+        future = self._submit(run_id, somebody_waits=True, grace_s=_GRACE_S if long and wait_s <= WAIT_S else 0.0)
+        with suppress(FutureTimeoutError):
+            future.result(0 if long and wait_s <= WAIT_S else wait_s)
+        return self.ready(run_id)
+
+    def ready(self, run_id: str) -> T | Progress:
+        """The same without computing anything. Raises UnknownRunError."""
+        with self._store.database.reading() as connection:
+            last, sha256 = head(connection, run_id)
+        return self.at(run_id, last, sha256)
+
+    def at(self, run_id: str, last: int, sha256: str) -> T | Progress:
+        """The same for a head that is known."""
+        entry = self._entry(run_id)
+        step = entry.step
+        if step is None:
+            return Progress(0, last)
+        # The hash too: the folder may have been put back to an earlier copy of itself.
+        return step.value if (step.seq, step.sha256) == (last, sha256) else Progress(min(step.seq, last), last)
+
+    def warm(self, run_id: str) -> None:
+        """Compute it when nobody waits for another."""
+        self._submit(run_id, somebody_waits=False)
+
+    def close(self) -> None:
+        """Let the threads end."""
+        for executor in (self._asked, self._ahead):
+            executor.shutdown(wait=True, cancel_futures=True)
+
+    def _entry(self, run_id: str) -> _Entry[T]:
+        with self._lock:
+            return self._entries.setdefault(run_id, _Entry())
+
+    def _submit(self, run_id: str, *, somebody_waits: bool, grace_s: float = _GRACE_S) -> Future[None]:
+        entry = self._entry(run_id)
+        with self._lock:
+            future = entry.future
+            under_way = future is not None and not future.done()
+            if future is None or not under_way or (somebody_waits and not entry.somebody_waits):
+                executor = self._asked if somebody_waits else self._ahead
+                entry.future = future = executor.submit(self._compute, run_id, entry, grace_s)
+                entry.somebody_waits = somebody_waits
+            return future
+
+    def _compute(self, run_id: str, entry: _Entry[T], grace_s: float) -> None:
+        if not self._warm:
+            time.sleep(grace_s)
+        with entry.lock:
+            if entry.step is not None and not self._still_holds(run_id, entry.step):
+                entry.step = None
+            with self._store.database.reading() as connection:
+                last, _ = head(connection, run_id)
+            value = entry.step.value.copy() if entry.step is not None else None
+            while entry.step is None or entry.step.seq < max(last, entry.step.last):
+                entry.step = self._advance(run_id, value)
+                value = entry.step.value
+                self._warm = True
+                time.sleep(_REST_S)
+
+    def _still_holds(self, run_id: str, step: Step[T]) -> bool:
+        if step.seq < step.last:
+            return False  # was interrupted
+        with self._store.database.reading() as connection:
+            rows = connection.execute(
+                text("SELECT sha256 FROM events WHERE run_id = :run AND seq = :seq"), {"run": run_id, "seq": step.seq}
+            )
+            return rows.scalar_one_or_none() == step.sha256

@@ -1,0 +1,1 @@
+"""The evidence of a run as one file for people outside."""

@@ -1,0 +1,256 @@
+"""RO-Crate 1.1 metadata of a bundle: what is in it, who made it, with what, and what came from what."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from service.audit.bundle.zip_file import Listed
+from service.core.acceptance import describe_accepted
+from service.core.bodies import bodies
+from service.core.imported import imported_sentence
+from service.core.model import (
+    ArtefactRef,
+    DeviceOpened,
+    Event,
+    JobEnqueued,
+    JobFinished,
+    RunStarted,
+    ViewHeld,
+    ViewImported,
+    ViewpointCaptured,
+)
+from service.core.run_state import RunState
+from service.store.events import references
+from service.store.records import Artefact
+
+METADATA = "ro-crate-metadata.json"
+_CONTEXT = ["https://w3id.org/ro/crate/1.1/context", {"sha256": "https://w3id.org/ro/terms/workflow-run#sha256"}]
+_FORMATS = {
+    "jsonl": "application/x-ndjson",
+    "json": "application/json",
+    "yaml": "application/yaml",
+    "txt": "text/plain",
+    "py": "text/x-python",
+    "html": "text/html",
+}
+_DESCRIPTIONS = {
+    "README.txt": "How to read and verify this bundle",
+    "events.jsonl": "The run's chain of events: one canonical JSON record a line",
+    "site_events.jsonl": "The site's chain: accounts, sign-ins, signing keys, starts of the service",
+    "artefacts.jsonl": "Where each recorded file came from",
+    "jobs.jsonl": "Computations",
+    "checkpoints.jsonl": "Ed25519 signatures over both chains",
+    "timestamps.jsonl": "RFC 3161 time stamps of checkpoints",
+    "keys.jsonl": "Public keys of the site, oldest first",
+    "protocol.yaml": "The protocol with which the run began",
+    "rig.yaml": "The rig with which the run began",
+    "report.html": "Report for people",
+    "verify.py": "Stand-alone verifier",
+}
+
+
+def crate(
+    run_id: str,
+    root: RunStarted,
+    state: RunState,
+    events: Sequence[Event],
+    artefacts: Sequence[Artefact],
+    files: Sequence[Listed],
+    full_names: Mapping[str, str],
+    missing: Sequence[str] = (),
+) -> dict[str, Any]:
+    """The metadata as plain data. `files` are those of the bundle; recorded ones may be missing (only hashes).
+
+    `missing`: results that had not arrived yet, in words.
+    """
+    described = _artefact_entities(artefacts, {item.path for item in files})
+    ids = {artefact.ref.sha256: entity["@id"] for artefact, entity in described}
+    accepted = [f"{name}: {describe_accepted(s.accepted)}" for name, s in state.steps.items() if s.accepted]
+    own = [_file_entity(item) for item in files if not item.path.startswith("artefacts/")]
+    parts = [*own, *(entity for _, entity in described)]
+    people = [
+        _person(name, full_names)
+        for name in sorted({*state.people, *filter(None, (root.operator, state.released_by))})
+    ]
+    devices = list(_devices(events))
+    actions = [*_captures(events, ids, {d["@id"] for d in devices}), *_jobs(events, ids)]
+    marked = "SIMULATED " if root.simulated else ""
+    dataset: dict[str, Any] = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": f"{marked}Evidence of run {run_id}",
+        "description": (
+            f"{marked}Evidence of {root.protocol_id} {root.protocol_version}: every event, signature and file."
+            + (" No real device took part: the whole rig was simulated." if root.simulated else "")
+            + (f" {imported_sentence(events[0].at_utc, root.operator)}." if root.origin == "imported" else "")
+            + "".join(f" Accepted outside its limits: {text}." for text in accepted)
+            + (f" Not in when this was made: {'; '.join(missing)}." if missing else "")
+        ),
+        "datePublished": events[-1].at_utc,
+        "license": {"@id": "#rights"},
+        "keywords": ["simulated"] if root.simulated else [],
+        "author": [{"@id": person["@id"]} for person in people],
+        "hasPart": [{"@id": part["@id"]} for part in parts if part["@type"] == "File"],
+        "mentions": [{"@id": item["@id"]} for item in (*(p for p in parts if p["@type"] != "File"), *actions)],
+    }
+    return {
+        "@context": _CONTEXT,
+        "@graph": [
+            {
+                "@id": METADATA,
+                "@type": "CreativeWork",
+                "conformsTo": {"@id": "https://w3id.org/ro/crate/1.1"},
+                "about": {"@id": "./"},
+            },
+            dataset,
+            {
+                "@id": "#rights",
+                "@type": "CreativeWork",
+                "name": "Rights",
+                "description": "This bundle grants none; ask the site that made it.",
+            },
+            {
+                "@id": "#software",
+                "@type": "SoftwareApplication",
+                "name": "orthocapture",
+                "softwareVersion": root.software.get("orthocapture", "unknown"),
+            },
+            *people,
+            *devices,
+            *parts,
+            *actions,
+        ],
+    }
+
+
+def _file_entity(item: Listed) -> dict[str, Any]:
+    return {
+        "@id": item.path,
+        "@type": "File",
+        "name": item.path,
+        "description": _DESCRIPTIONS.get(item.path, ""),
+        "encodingFormat": _FORMATS.get(item.path.rpartition(".")[2], "application/octet-stream"),
+        "contentSize": str(item.size_bytes),
+        "sha256": item.sha256,
+    }
+
+
+def _artefact_entities(artefacts: Iterable[Artefact], present: set[str]) -> list[tuple[Artefact, dict[str, Any]]]:
+    """One entity a content; a recorded file that is not in the bundle is described, but is no File of it."""
+    found: dict[str, tuple[Artefact, dict[str, Any]]] = {}
+    for artefact in artefacts:
+        ref = artefact.ref
+        path = f"artefacts/{ref.sha256[:2]}/{ref.sha256}"
+        entity = {
+            "@id": path if path in present else f"#artefact-{ref.sha256}",
+            "@type": "File" if path in present else "CreativeWork",
+            "name": ref.original_name,
+            "additionalType": ref.kind,
+            "encodingFormat": ref.media_type,
+            "contentSize": str(ref.size_bytes),
+            "sha256": ref.sha256,
+            "dateCreated": artefact.at_utc,
+        }
+        found.setdefault(ref.sha256, (artefact, entity))
+    return list(found.values())
+
+
+def _person(account: str, full_names: Mapping[str, str]) -> dict[str, Any]:
+    """By full name; the account, as the records have it, is the other name."""
+    person = {"@id": _anchor("person", account), "@type": "Person", "name": full_names.get(account) or account}
+    return person if person["name"] == account else person | {"alternateName": account}
+
+
+def _anchor(kind: str, name: str) -> str:
+    """An identifier within the crate that is a valid URI reference."""
+    return f"#{kind}-" + "".join(c if c.isascii() and c.isalnum() else f"_{ord(c):x}_" for c in name)
+
+
+def _devices(events: Sequence[Event]) -> Iterable[dict[str, Any]]:
+    """Every device as it first answered."""
+    opened: dict[str, DeviceOpened] = {}
+    for event in events:
+        if isinstance(event.payload, DeviceOpened):
+            opened.setdefault(event.payload.device, event.payload)
+    known = bodies(events)
+    for name, payload in opened.items():
+        identity: Mapping[str, Any] = payload.report.get("identity", {})
+        wire = str(identity.get("serial") or "")
+        yield {
+            "@id": _anchor("device", name),
+            "@type": "IndividualProduct",
+            "name": name,
+            "description": " ".join(str(identity.get(key) or "") for key in ("vendor", "model", "firmware")).strip(),
+            "serialNumber": known.shown(identity),
+            # As its connection states it, where photographs state the body's own: one camera.
+            **({"identifier": wire} if known.shown(identity) != wire else {}),
+        }
+
+
+def _captures(events: Sequence[Event], ids: Mapping[str, str], devices: set[str]) -> Iterable[dict[str, Any]]:
+    camera = _anchor("device", "camera")
+    for event in events:
+        payload = event.payload
+        if isinstance(payload, (ViewpointCaptured, ViewHeld)):
+            yield {
+                "@id": f"#event-{event.seq}",
+                "@type": "CreateAction",
+                "name": f"Capture of {payload.viewpoint}, attempt {payload.attempt} of {payload.step}",
+                "instrument": [{"@id": camera if camera in devices else "#software"}],
+                "endTime": event.at_utc,
+                "result": _links(payload.artefacts, ids),
+            }
+        elif isinstance(payload, ViewImported):
+            yield {
+                "@id": f"#event-{event.seq}",
+                "@type": "CreateAction",
+                "name": f"Import of {payload.file_name} as {payload.viewpoint} in {payload.step}",
+                "description": "How the photograph was captured is not in evidence.",
+                "agent": {"@id": _anchor("person", payload.imported_by)},
+                "instrument": [{"@id": "#software"}],
+                "endTime": event.at_utc,
+                "result": _links(payload.artefacts, ids),
+            }
+
+
+def _jobs(events: Sequence[Event], ids: Mapping[str, str]) -> Iterable[dict[str, Any]]:
+    enqueued = {e.payload.job: e for e in events if isinstance(e.payload, JobEnqueued)}
+    for event in events:
+        payload = event.payload
+        if not isinstance(payload, JobFinished):
+            continue
+        begun = enqueued.get(payload.job)
+        arguments = begun.payload.arguments if begun is not None and isinstance(begun.payload, JobEnqueued) else {}
+        yield {
+            "@id": _anchor("job", payload.job),
+            "@type": "CreateAction",
+            "name": f"{payload.job_kind} for {payload.step}",
+            "instrument": {"@id": "#software"},
+            "startTime": event.at_utc if begun is None else begun.at_utc,
+            "endTime": event.at_utc,
+            "actionStatus": {"@id": "http://schema.org/CompletedActionStatus"},
+            "object": _named(arguments, ids),
+            "result": _links(payload.artefacts, ids),
+        }
+
+
+def _links(refs: Iterable[ArtefactRef], ids: Mapping[str, str]) -> list[dict[str, str]]:
+    return [{"@id": ids[ref.sha256]} for ref in refs if ref.sha256 in ids]
+
+
+def _named(arguments: Mapping[str, Any], ids: Mapping[str, str]) -> list[dict[str, str]]:
+    """The recorded files that a job's arguments name, as references or by their hash alone."""
+    found = {ref.sha256: None for ref in references(arguments)} | dict.fromkeys(_hashes(arguments, ids))
+    return [{"@id": ids[sha256]} for sha256 in found if sha256 in ids]
+
+
+def _hashes(value: object, ids: Mapping[str, str]) -> Iterable[str]:
+    if isinstance(value, str) and value in ids:
+        yield value
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from _hashes(item, ids)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _hashes(item, ids)

@@ -1,0 +1,30 @@
+"""The report for people that goes along in a bundle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+from service.store.audit import AuditReport
+
+
+def bundle_report(data: Path, run_id: str, *, with_pictures: bool) -> Callable[[AuditReport, int], bytes]:
+    """What makes the report (HTML) of a run up to an event, from what verifying it gave.
+
+    The same evidence gives the same bytes, as it does for the rest of a bundle: the report is dated by the last event
+    that it tells, which the bundle ends with.
+    """
+
+    def make(audit: AuditReport, last_seq: int) -> bytes:
+        # Numerics, pictures and the 3D scene, for which nothing else of a bundle waits.
+        from service.audit.record.run import read_run  # noqa: PLC0415
+        from service.audit.report.content import report_content  # noqa: PLC0415
+        from service.audit.report.output.html import render_html  # noqa: PLC0415
+
+        run = read_run(data, run_id, last_seq=last_seq)
+        made_at = datetime.fromisoformat(run.events[-1].at_utc)
+        report = report_content(run, audit, made_at=made_at, with_scene=with_pictures, with_pictures=with_pictures)
+        return render_html(report).encode()
+
+    return make

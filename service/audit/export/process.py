@@ -1,0 +1,122 @@
+"""Exports one thing in a process of its own, so that pages stay quick: `python -m service.audit.export.process`.
+
+Its progress goes out line by line, its result last, as JSON. It ends the export whether or not anybody listens.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from service.audit.bundle.export import export_bundle, marked_name, record_export, require_exportable
+from service.audit.bundle.report import bundle_report
+from service.audit.bundle.zip_file import writing_bundle
+from service.core.errors import ConfigurationError, OrthocaptureError
+from service.store.artefacts import chunks_of
+from service.store.space import require_export_space
+from service.store.store import Store
+
+if TYPE_CHECKING:
+    from service.audit.record.run import RecordedRun
+    from service.store.audit import AuditReport
+
+Progress = Callable[[str, int, int], None]
+_OLDEST = (1980, 1, 1, 0, 0, 0)  # zip knows no earlier time; the files say themselves what they are of
+
+
+def export(data: Path, run_id: str, what: str, target: Path, actor: str, progress: Progress) -> Path:
+    """Make a bundle, a data set or a report, and record that it was exported. The file as it was named.
+
+    Raises OrthocaptureError: the evidence does not verify, nothing was released, there is nothing to export …
+    """
+    with Store.open(data, create=False) as store:
+        if what in ("bundle", "hashes"):
+            hashes_only = what == "hashes"
+            report = bundle_report(data, run_id, with_pictures=not hashes_only)
+            made = export_bundle(
+                store, run_id, target, actor=actor, hashes_only=hashes_only, report=report, progress=progress
+            )
+            return made.path
+        if what == "dataset":
+            require_export_space(store, run_id, target)
+        exportable = require_exportable(store, run_id, progress)
+        # These load the numerics and the typesetting, which a bundle does without.
+        from service.audit.record.run import read_run  # noqa: PLC0415
+
+        run = read_run(data, run_id)
+        path = target.with_name(marked_name(target.name, simulated=run.root.simulated))
+        progress("writing", 0, 0)
+        kind = "dataset" if what == "dataset" else "report"
+
+        def leave(part: Path) -> None:
+            head_sha256 = run.events[-1].sha256
+            record_export(store, run_id, part, file_name=path.name, what=kind, head_sha256=head_sha256, actor=actor)
+
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".export-") as folder:
+            part = Path(folder) / "part"
+            if what == "dataset":
+                _write_dataset(run, part, path, leave)
+            elif what in ("report", "report_pdf"):
+                _write_report(run, exportable.audit, part, pdf=what == "report_pdf")
+                leave(part)
+                part.replace(path)
+            else:
+                raise ConfigurationError(f"nothing is called {what!r}", where="what")
+        return path
+
+
+def _write_dataset(run: RecordedRun, folder: Path, target: Path, leave: Callable[[Path], None]) -> None:
+    from service.audit.record.missing_results import not_in_yet  # noqa: PLC0415
+    from service.dataset.export import export_dataset  # noqa: PLC0415
+
+    export_dataset(run.summary(), folder, not_in_yet(run.protocol, run.state, run.events))
+    with writing_bundle(target, _OLDEST, leave) as archive:
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+            compress = path.suffix.lower() not in (".jpg", ".jpeg", ".png", ".npz")
+            archive.add(path.relative_to(folder).as_posix(), chunks_of(path), compress=compress)
+
+
+def _write_report(run: RecordedRun, audit: AuditReport, path: Path, *, pdf: bool) -> None:
+    from service.audit.report.content import report_content  # noqa: PLC0415
+    from service.audit.report.output.html import write_html  # noqa: PLC0415
+    from service.audit.report.output.pdf import write_pdf  # noqa: PLC0415
+
+    (write_pdf if pdf else write_html)(report_content(run, audit, with_scene=not pdf), path)
+
+
+def main(arguments: list[str]) -> None:
+    """Write the lines."""
+    data, run_id, what, target, actor = arguments
+    listening = True
+    last = 0.0
+
+    def say(**line: Any) -> None:
+        nonlocal listening
+        try:
+            if listening:
+                sys.stdout.write(json.dumps(line) + "\n")
+                sys.stdout.flush()
+        except BrokenPipeError:  # the web process was restarted: the export goes on
+            listening = False
+
+    def progress(doing: str, done: int, total: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > 0.2:
+            last = time.monotonic()
+            say(what=doing, done=done, total=total)
+
+    try:
+        made = export(Path(data), run_id, what, Path(target), actor, progress)
+    except OrthocaptureError as error:
+        say(problem={"what": error.what, "where": error.where, "remedy": error.remedy})
+    else:
+        say(result=made.name)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,229 @@
+"""A run's state for its first page: folded in the background from the few kinds of events that decide it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from pydantic import TypeAdapter
+from sqlalchemy import Connection, text
+
+from service.audit.background.incremental import Computed, Step
+from service.audit.record.queries import Facets, head, root
+from service.core.errors import IntegrityError, OrthocaptureError
+from service.core.fold import advance, initial_state
+from service.core.late import LateResult, late_results
+from service.core.model import PAYLOAD, Event, GatesEvaluated, GateVerdict, Payload, ViewImported, ViewpointCaptured
+from service.core.protocol import Protocol, parse_protocol
+from service.core.run_state import Deviation, RunState
+from service.store.store import Store
+
+CHUNK = 300  # events between two looks at who waits
+
+# The others change neither the lifecycle nor the deviations; a run of 100 000 events consists mostly of them.
+FOLDED = (
+    "run_started",
+    "operator_action",
+    "action_refused",
+    "gates_evaluated",
+    "step_started",
+    "step_failed",
+    "step_retried",
+    "step_passed",
+    "step_measured",
+    "viewpoint_captured",
+    "view_imported",
+    "viewpoint_failed",
+    "run_completed",
+    "run_aborted",
+    "run_released",
+    "control_taken",
+)
+
+# Of computations only these change what a first page says: results that came after the evaluation.
+_JOB_EVENTS = ("job_enqueued", "job_finished")
+_JOB_KINDS = ("evaluate",)
+
+# Of these the fold needs only step, attempt and name.
+_VIEWS: Mapping[str, type[ViewpointCaptured | ViewImported]] = {
+    "viewpoint_captured": ViewpointCaptured,
+    "view_imported": ViewImported,
+}
+_PLACE: TypeAdapter[tuple[str, int, str]] = TypeAdapter(tuple[str, int, str])
+
+
+@dataclass(frozen=True, slots=True)
+class FailedGate:
+    """A gate that did not pass, and when: outside its limits, or not decided."""
+
+    seq: int
+    at_utc: str
+    step: str
+    attempt: int
+    verdict: GateVerdict
+
+
+@dataclass
+class Digest:
+    """What a run's events add up to, as far as `seq`."""
+
+    run_id: str
+    seq: int = 0
+    protocol: Protocol | None = None
+    state: RunState | None = None  # None when the protocol cannot be read
+    failed_gates: list[FailedGate] = field(default_factory=list[FailedGate])
+    times: dict[int, str] = field(default_factory=dict[int, str])  # of the deviations' events
+    facets: Facets = field(default_factory=Facets)
+    problem: str = ""  # why the fold ends before the chain does
+
+    def copy(self) -> Digest:
+        """Another one, to go on with."""
+        return replace(self, failed_gates=list(self.failed_gates), times=dict(self.times), facets=self.facets.copy())
+
+    @property
+    def deviations(self) -> Sequence[Deviation]:
+        """All, in order; notes included."""
+        return self.state.deviations if self.state else ()
+
+    @property
+    def late(self) -> list[LateResult]:
+        """Results that came after the evaluation."""
+        return late_results(self.protocol, self.state) if self.protocol and self.state else []
+
+    @property
+    def status(self) -> str:
+        """active, paused, completed, aborted; unknown when the events do not add up."""
+        return self.state.status if self.state and not self.problem else "unknown"
+
+    @property
+    def people(self) -> list[str]:
+        """Who took part, in alphabetical order."""
+        return sorted(self.state.people) if self.state else []
+
+    @property
+    def unsigned(self) -> list[tuple[str, str]]:
+        """Steps that the protocol wants signed and that are not, each with how it stands."""
+        if self.protocol is None or self.state is None:
+            return []
+        steps = [(step.id, self.state.steps[step.id]) for step in self.protocol.steps if step.sign]
+        return [(name, "skipped" if s.skipped else s.phase) for name, s in steps if not s.signed]
+
+
+def digests(store: Store) -> Computed[Digest]:
+    """Digests of a data folder's runs, kept up in the background."""
+    return Computed(store, lambda run_id, before: step(store, run_id, before), "digest")
+
+
+def step(store: Store, run_id: str, before: Digest | None) -> Step[Digest]:
+    """One chunk further. Raises UnknownRunError, StoreError."""
+    digest = before or Digest(run_id)
+    with store.database.reading() as connection:
+        last, sha256 = head(connection, run_id)
+        if before is None:
+            _begin(digest, store, connection)
+        upto = _chunk_end(connection, run_id, digest.seq, last)
+        rows = [] if digest.problem else _rows(connection, run_id, digest.seq, upto)
+        digest.facets.add(connection, run_id, digest.seq, upto)
+    for row in rows:
+        if not digest.problem:
+            _advance(digest, row)
+    digest.seq = upto
+    return Step(digest, upto, last, sha256)
+
+
+def _begin(digest: Digest, store: Store, connection: Connection) -> None:
+    # Loading every step kind for its parameters takes a second: not when the pages are loaded.
+    from service.steps import params_models  # noqa: PLC0415
+
+    try:
+        started = root(connection, digest.run_id)
+        content = store.artefact_path(started.protocol.sha256, verify=True).read_bytes()
+        loaded = parse_protocol(content, params_models(), name=started.protocol.original_name)
+    except (OrthocaptureError, OSError) as error:
+        digest.problem = f"The protocol of this run cannot be read: {error}"
+        return
+    digest.protocol = loaded.protocol
+    digest.state = initial_state(loaded.protocol)
+
+
+def _chunk_end(connection: Connection, run_id: str, after: int, last: int) -> int:
+    """Where a chunk of the events that count ends; those between them cost nothing."""
+    found = connection.execute(
+        text(
+            "SELECT seq FROM event_index WHERE run_id = :run AND seq > :after "
+            f"AND kind IN ({_quoted(FOLDED)}) ORDER BY seq LIMIT 1 OFFSET :chunk"
+        ),
+        {"run": run_id, "after": after, "chunk": CHUNK - 1},
+    ).scalar_one_or_none()
+    return last if found is None else int(found)
+
+
+def _quoted(kinds: Sequence[str]) -> str:
+    return ", ".join(f"'{kind}'" for kind in kinds)
+
+
+# A result without all but the evaluation's table, where it has one; its files are not needed either.
+_WITH_TABLE_ALONE = (
+    "json_set(json_remove(payload, '$.artefacts'), '$.result', CASE json_type(payload, '$.result.table') "
+    "WHEN 'array' THEN json_object('table', json_extract(payload, '$.result.table')) ELSE json('{}') END)"
+)
+
+
+def _rows(connection: Connection, run_id: str, after: int, upto: int) -> Sequence[Any]:
+    return connection.execute(
+        text(
+            "SELECT seq, kind, at_utc, monotonic_s, actor, previous_sha256, sha256, CASE "
+            f"WHEN kind IN ('step_measured', 'job_finished') THEN {_WITH_TABLE_ALONE} "
+            "WHEN kind = 'job_enqueued' THEN json_set(payload, '$.arguments', json('{}')) "
+            "WHEN kind IN ('viewpoint_captured', 'view_imported') THEN json_array(json_extract(payload, '$.step'), "
+            "json_extract(payload, '$.attempt'), json_extract(payload, '$.viewpoint')) "
+            "ELSE payload END AS payload FROM events "
+            f"WHERE run_id = :run AND seq > :after AND seq <= :upto AND (kind IN ({_quoted(FOLDED)}) "
+            f"OR kind IN ({_quoted(_JOB_EVENTS)}) "
+            f"AND json_extract(payload, '$.job_kind') IN ({_quoted(_JOB_KINDS)})) "
+            "ORDER BY seq"
+        ),
+        {"run": run_id, "after": after, "upto": upto},
+    ).all()
+
+
+def _advance(digest: Digest, row: Any) -> None:
+    assert digest.protocol is not None  # _begin has set a problem otherwise
+    assert digest.state is not None
+    try:
+        payload = _payload(row.kind, row.payload)
+    except ValueError as error:
+        digest.problem = f"Event {row.seq} cannot be read: {str(error).splitlines()[0]}"
+        return
+    event = Event.model_construct(
+        seq=row.seq,
+        run_id=digest.run_id,
+        at_utc=row.at_utc,
+        monotonic_s=row.monotonic_s,
+        actor=row.actor,
+        payload=payload,
+        previous_sha256=row.previous_sha256,
+        sha256=row.sha256,
+    )
+    known = len(digest.state.deviations)
+    try:
+        digest.state = advance(digest.protocol, replace(digest.state, seq=row.seq - 1), event)
+    except IntegrityError as error:
+        digest.problem = str(error)
+        return
+    if len(digest.state.deviations) > known:
+        digest.times[row.seq] = row.at_utc
+    if isinstance(payload, GatesEvaluated) and not payload.passed:
+        digest.failed_gates += [
+            FailedGate(row.seq, row.at_utc, payload.step, payload.attempt, verdict)
+            for verdict in payload.verdicts
+            if not verdict.passed
+        ]
+
+
+def _payload(kind: str, content: str) -> Payload:
+    if kind not in _VIEWS:
+        return PAYLOAD.validate_json(content)
+    step, attempt, viewpoint = _PLACE.validate_json(content)
+    return _VIEWS[kind].model_construct(step=step, attempt=attempt, viewpoint=viewpoint)

@@ -1,0 +1,216 @@
+"""What an auditor reads first: every deviation in plain words, counted and listed; and the list of runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from service.audit.background.incremental import Progress
+from service.audit.overview.digest import Digest, FailedGate
+from service.audit.record.queries import RunBasics
+from service.audit.verify.verifications import Verification
+from service.core.gates import describe_judged
+from service.core.run_state import DeviationKind
+
+# Group on the page → its name, and the kinds of deviations in it.
+GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {
+    "accepted": ("Gates accepted", frozenset({"gate_accepted"})),
+    "redone": ("Re-dos", frozenset({"redo", "redo_viewpoint", "reset_by_redo"})),
+    "skipped_views": ("Skipped views", frozenset({"viewpoint_skipped"})),
+    "skipped_steps": ("Skipped steps", frozenset({"skip"})),
+    "overridden": ("Gates overridden", frozenset({"gate_overridden"})),
+    "refused": ("Refused actions", frozenset({"refused"})),
+    "failed_gates": ("Failed gates", frozenset()),
+    "undecided_gates": ("Gates not decided", frozenset()),
+    "late_results": ("Results that came later", frozenset()),
+    "automatic": ("Automatic confirmations", frozenset({"automatic"})),
+}
+# The same of one alone.
+_OF_ONE: Mapping[str, str] = {
+    "accepted": "Gate accepted",
+    "redone": "Re-do",
+    "skipped_views": "Skipped view",
+    "skipped_steps": "Skipped step",
+    "overridden": "Gate overridden",
+    "refused": "Refused action",
+    "failed_gates": "Failed gate",
+    "undecided_gates": "Gate not decided",
+    "late_results": "Result that came later",
+    "automatic": "Automatic confirmation",
+}
+
+
+def group_name(group: str, number: int) -> str:
+    """Name of a group beside how many are in it."""
+    return _OF_ONE[group] if number == 1 else GROUPS[group][0]
+
+
+_NAMES: Mapping[str, str] = {
+    "skip": "Step skipped",
+    "gate_accepted": "Gate accepted outside its limits",
+    "gate_overridden": "Gate overridden",
+    "redo": "Step done again",
+    "redo_viewpoint": "View taken again",
+    "reset_by_redo": "Reset by a re-do",
+    "viewpoint_skipped": "View skipped",
+    "refused": "Refused",
+    "automatic": "Automatic (note)",
+    "late_result": "Result came later (note)",
+    "failed_gate": "Gate failed",
+    "undecided_gate": "Gate not decided",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the list."""
+
+    seq: int
+    at_utc: str
+    kind: str
+    step: str
+    person: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        """The kind in words."""
+        return _NAMES[self.kind]
+
+    @property
+    def is_note(self) -> bool:
+        """For the record only."""
+        return self.kind in ("automatic", "late_result")
+
+
+def findings(digest: Digest, group: str = "") -> list[Finding]:
+    """Deviations and failed gates, what was accepted first; of one group, or all without the notes."""
+    kinds = GROUPS[group][1] if group in GROUPS else None
+    found = [
+        Finding(d.seq, digest.times.get(d.seq, ""), d.kind, d.step or "", d.actor, d.text)
+        for d in digest.deviations
+        if (d.kind in kinds if kinds is not None else not d.is_note)
+    ]
+    if kinds is None or group in _GATE_GROUPS.values():
+        found += [
+            _of_gate(gate) for gate in digest.failed_gates if kinds is None or _GATE_GROUPS[_gate_kind(gate)] == group
+        ]
+        found.sort(key=lambda finding: (finding.kind != "gate_accepted", finding.seq))
+    if group == "late_results":
+        found += [Finding(late.seq, late.at_utc, "late_result", late.step, "", late.text) for late in digest.late]
+    return found
+
+
+_GATE_GROUPS = {"failed_gate": "failed_gates", "undecided_gate": "undecided_gates"}
+
+
+def _gate_kind(gate: FailedGate) -> str:
+    return "undecided_gate" if gate.verdict.undecided else "failed_gate"
+
+
+def _of_gate(gate: FailedGate) -> Finding:
+    text = f"{describe_judged(gate.verdict)} (attempt {gate.attempt})"
+    return Finding(gate.seq, gate.at_utc, _gate_kind(gate), gate.step, "", text)
+
+
+def counts(digest: Digest) -> dict[str, int]:
+    """How many of each group."""
+    by_kind: dict[str, int] = {}
+    for deviation in digest.deviations:
+        by_kind[deviation.kind] = by_kind.get(deviation.kind, 0) + 1
+    found = {group: sum(by_kind.get(kind, 0) for kind in kinds) for group, (_, kinds) in GROUPS.items()}
+    kinds_of_gates = [_gate_kind(gate) for gate in digest.failed_gates]
+    of_gates = {group: kinds_of_gates.count(kind) for kind, group in _GATE_GROUPS.items()}
+    return found | of_gates | {"late_results": len(digest.late)}
+
+
+# --- the list of runs -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RunFilter:
+    """Which runs are wanted; an empty field wants all."""
+
+    since: str = ""  # 2026-11-21
+    until: str = ""
+    protocol: str = ""
+    person: str = ""
+    status: str = ""
+    simulated: str = ""  # yes, no
+    deviations: bool = False  # only those with some
+    unverified: bool = False  # only those that do not verify as they are now
+    q: str = ""
+
+    def query(self) -> dict[str, str]:
+        """For a link that keeps it."""
+        names = ("since", "until", "protocol", "person", "status", "simulated", "q")
+        fields = {name: getattr(self, name) for name in names}
+        fields |= {"deviations": "1" if self.deviations else "", "unverified": "1" if self.unverified else ""}
+        return {name: value for name, value in fields.items() if value}
+
+
+@dataclass(frozen=True, slots=True)
+class ListedRun:
+    """One line of the list of runs."""
+
+    basics: RunBasics
+    digest: Digest | None  # None: being computed
+    verification: Verification | None
+
+    @property
+    def status(self) -> str:
+        """As the digest says; "" while it is being computed."""
+        return self.digest.status if self.digest else ""
+
+    @property
+    def deviations(self) -> int | None:
+        """How many, without the notes."""
+        if self.digest is None or self.digest.state is None:
+            return None
+        return self.digest.state.deviation_count
+
+    @property
+    def verified(self) -> str:
+        """See verified."""
+        return verified(self.verification, self.basics.head_sha256)
+
+
+def verified(verification: Verification | None, head_sha256: str) -> str:
+    """never, faults, outdated (events came since), or current."""
+    if verification is None:
+        return "never"
+    if not verification.ok:
+        return "faults"
+    return "current" if verification.head_sha256 == head_sha256 else "outdated"
+
+
+def matches(run: ListedRun, wanted: RunFilter) -> bool:
+    """Whether a run is wanted, its words aside (`find_runs`). What is not known yet does not hide a run."""
+    basics, digest = run.basics, run.digest
+    day = basics.created_utc[:10]
+    fits = (
+        (not wanted.since or wanted.since <= day)
+        and (not wanted.until or day <= wanted.until)
+        and wanted.protocol in ("", basics.protocol)
+        and (not wanted.simulated or basics.simulated == (wanted.simulated == "yes"))
+        and not (wanted.unverified and run.verified == "current")
+    )
+    if digest is None or not fits:
+        return fits
+    return (
+        wanted.person in ("", basics.operator, *digest.people)
+        and wanted.status in ("", run.status)
+        and not (wanted.deviations and run.deviations == 0)
+    )
+
+
+def known(value: Digest | Progress) -> Digest | None:
+    """The digest, when there is one."""
+    return None if isinstance(value, Progress) else value
+
+
+def people_of(runs: Sequence[ListedRun]) -> list[str]:
+    """Everybody who took part in any of them."""
+    return sorted(
+        {name for run in runs for name in (run.basics.operator, *(run.digest.people if run.digest else ()))}
+    )

@@ -1,0 +1,268 @@
+"""Where every result came from: files grouped by step and kind, and the computations between them."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from sqlalchemy import Connection, text
+
+from service.audit.background.incremental import Computed, Step
+from service.audit.record.artefact_queries import ArtefactRow, artefacts_of_events, one_artefact
+from service.audit.record.queries import EventRow, head, plain, read_rows
+from service.store.store import Store
+
+CHUNK = 500  # events between two looks at who waits
+_HASH = re.compile(r'"([0-9a-f]{64})"')
+# Later jobs hold earlier results by value too (a camera, centres of spheres): so many digits nobody typed.
+_NUMBER = re.compile(r"-?\d+\.\d{12,}(?:e-?\d+)?")
+_NUMBERS_A_JOB = 3000
+_JOBS_A_KIND = 20  # whose numbers are remembered: views by the thousand give nothing to others by value
+_KEPT_AS_IT_CAME = "kept "  # how the note of a file begins that no program has decoded
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """Files of one kind from one step, or computations of one kind."""
+
+    key: str
+    is_job: bool
+    step: str
+    kind: str  # of the files, or of the jobs
+    count: int
+    first_seq: int
+    failed: int = 0  # jobs that failed
+    device: str = ""
+    seqs: tuple[int, ...] = ()  # of the first few events
+
+
+@dataclass
+class Graph:
+    """Files and computations, and how many files pass along each edge (into computations: the most that one took)."""
+
+    run_id: str
+    seq: int = 0
+    nodes: dict[str, Node] = field(default_factory=dict[str, Node])
+    edges: dict[tuple[str, str], int] = field(default_factory=dict[tuple[str, str], int])
+    by_value: set[tuple[str, str]] = field(default_factory=set[tuple[str, str]])  # numbers of a result, not its files
+    groups: dict[str, str] = field(default_factory=dict[str, str])  # SHA-256 → key of its node
+    jobs: dict[str, str] = field(default_factory=dict[str, str])  # job → key of its node
+    numbers: dict[str, str] = field(default_factory=dict[str, str])  # a number of a result → key of its job's node
+    originals: dict[tuple[str, int, str], str] = field(default_factory=dict[tuple[str, int, str], str])
+
+    def copy(self) -> Graph:
+        """Another one, to go on with."""
+        names = ("nodes", "edges", "groups", "jobs", "numbers", "originals")
+        return replace(self, by_value=set(self.by_value), **{name: dict(getattr(self, name)) for name in names})
+
+    def ordered(self) -> list[Node]:
+        """By first event."""
+        return sorted(self.nodes.values(), key=lambda node: (node.first_seq, not node.is_job, node.key))
+
+    def sources(self, key: str) -> list[tuple[Node, int]]:
+        """What goes into a node, with how many files of it."""
+        return [(self.nodes[a], n) for (a, b), n in self.edges.items() if b == key]
+
+    def results(self, key: str) -> list[tuple[Node, int]]:
+        """What comes out of a node, or where its files go."""
+        return [(self.nodes[b], n) for (a, b), n in self.edges.items() if a == key]
+
+
+def graphs(store: Store) -> Computed[Graph]:
+    """Graphs of a data folder's runs, kept up in the background."""
+    return Computed(store, lambda run_id, before: _step(store, run_id, before), "provenance")
+
+
+def _step(store: Store, run_id: str, before: Graph | None) -> Step[Graph]:
+    graph = before or Graph(run_id)
+    with store.database.reading() as connection:
+        last, sha256 = head(connection, run_id)
+        upto = min(graph.seq + CHUNK, last)
+        values = {"run": plain(run_id), "after": graph.seq, "upto": upto}
+        files = connection.execute(text(_FILES), values).all()
+        jobs = connection.execute(text(_JOBS), values).all()
+    both = [(row.seq, row.position, row, True) for row in files] + [(row.seq, -1, row, False) for row in jobs]
+    for _seq, _position, row, is_file in sorted(both, key=lambda item: item[:2]):
+        if is_file:
+            _add_file(graph, row)
+        else:
+            _add_job(graph, row)
+    graph.seq = upto
+    return Step(graph, upto, last, sha256)
+
+
+_FILES = (
+    "SELECT a.seq, a.position, a.sha256, a.kind, a.step, a.attempt, a.device, i.kind AS event, "
+    "CASE i.kind WHEN 'job_finished' THEN (SELECT json_extract(e.payload, '$.job') FROM events AS e "
+    "WHERE e.run_id = a.run_id AND e.seq = a.seq) WHEN 'files_kept' THEN (SELECT json_extract(e.payload, '$.note') "
+    "FROM events AS e WHERE e.run_id = a.run_id AND e.seq = a.seq) END AS how "
+    "FROM artefacts AS a JOIN event_index AS i ON i.run_id = a.run_id AND i.seq = a.seq "
+    "WHERE a.run_id = :run AND a.seq > :after AND a.seq <= :upto"
+)
+_JOBS = (
+    "SELECT i.seq, i.kind AS event, i.step, e.payload, json_extract(e.payload, '$.job') AS job, "
+    "json_extract(e.payload, '$.job_kind') AS kind "
+    "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
+    "WHERE i.run_id = :run AND i.kind IN ('job_enqueued', 'job_finished', 'job_failed') "
+    "AND i.seq > :after AND i.seq <= :upto"
+)
+
+
+def _add_file(graph: Graph, row: Any) -> None:
+    job = graph.jobs.get(row.how or "") if row.event == "job_finished" else None
+    made_by = f" by {graph.nodes[job].kind}" if job else ""
+    key = f"file {row.step or ''} {row.kind}{made_by}"
+    _count(graph, key, row, is_job=False)
+    graph.groups.setdefault(row.sha256, key)
+    if job:
+        _connect(graph, job, key)
+    elif row.event == "files_kept":
+        place = (row.step or "", row.attempt or 0, row.device)
+        if str(row.how or "").startswith(_KEPT_AS_IT_CAME):
+            graph.originals[place] = key
+        elif place in graph.originals and graph.originals[place] != key:
+            _connect(graph, graph.originals[place], key)
+
+
+def _add_job(graph: Graph, row: Any) -> None:
+    if row.event == "job_failed":
+        key = graph.jobs.get(row.job)
+        if key:
+            graph.nodes[key] = replace(graph.nodes[key], failed=graph.nodes[key].failed + 1)
+        return
+    key = f"job {row.step or ''} {row.kind}"
+    if row.event == "job_finished":
+        if key in graph.nodes and graph.nodes[key].count <= _JOBS_A_KIND:
+            for number in _NUMBER.findall(row.payload)[:_NUMBERS_A_JOB]:
+                graph.numbers.setdefault(number, key)
+        return
+    _count(graph, key, row, is_job=True)
+    graph.jobs[row.job] = key
+    taken = Counter(graph.groups[name] for name in set(_HASH.findall(row.payload)) if name in graph.groups)
+    for source, number in taken.items():
+        graph.edges[source, key] = max(graph.edges.get((source, key), 0), number)
+    for source in {graph.numbers[name] for name in _NUMBER.findall(row.payload) if name in graph.numbers} - {key}:
+        graph.edges.setdefault((source, key), 0)
+        graph.by_value.add((source, key))
+
+
+def _count(graph: Graph, key: str, row: Any, *, is_job: bool) -> None:
+    node = graph.nodes.get(key)
+    if node is None:
+        device = "" if is_job else row.device
+        node = Node(key, is_job, row.step or "", row.kind, 0, row.seq, device=device)
+    seqs = node.seqs if len(node.seqs) >= 10 else (*node.seqs, row.seq)
+    graph.nodes[key] = replace(node, count=node.count + 1, seqs=seqs)
+
+
+def _connect(graph: Graph, source: str, target: str) -> None:
+    graph.edges[source, target] = graph.edges.get((source, target), 0) + 1
+
+
+# --- one artefact ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where one file came from and what was made of it."""
+
+    records: Sequence[ArtefactRow]  # the first is where it came from
+    event: EventRow  # that brought it
+    job: EventRow | None  # job_enqueued of the computation that made it
+    inputs: Sequence[ArtefactRow]  # files that this computation was given, or beside which it was decoded
+    input_count: int
+    beside: Sequence[ArtefactRow]  # what the same event brought
+    used_by: Sequence[EventRow]  # events that name it, up to a page of them
+    made_of_it: Sequence[ArtefactRow]  # results of the computations that were given it
+
+
+LISTED = 50
+
+
+def origin(connection: Connection, run_id: str, sha256: str) -> Origin:
+    """Both ways from one file. Raises UnknownRunError when the run has none of this hash."""
+    records = one_artefact(connection, run_id, sha256)
+    (event,) = read_rows(connection, run_id, [records[0].seq], whole=True)
+    job = _job_of(connection, run_id, event)
+    inputs, count = _inputs(connection, run_id, job) if job else _decoded_from(connection, run_id, event, records[0])
+    uses = [seq for seq in _naming(connection, run_id, sha256) if seq != event.seq]
+    used_by = read_rows(connection, run_id, uses)
+    jobs = [str(row.payload.get("job")) for row in used_by if row.kind == "job_enqueued"]
+    return Origin(
+        records=records,
+        event=event,
+        job=job,
+        inputs=inputs,
+        input_count=count,
+        beside=[row for row in artefacts_of_events(connection, run_id, [event.seq]) if row.sha256 != sha256][:LISTED],
+        used_by=used_by,
+        made_of_it=artefacts_of_events(connection, run_id, sorted(_ends(connection, run_id, jobs)))[:LISTED],
+    )
+
+
+def _naming(connection: Connection, run_id: str, word: str, limit: int = LISTED) -> list[int]:
+    """Events in whose payload this word stands."""
+    found = connection.execute(
+        text(
+            "SELECT i.seq FROM event_words AS w JOIN event_index AS i ON i.position = w.rowid "
+            "WHERE w.event_words MATCH :match AND i.run_id = :run ORDER BY w.rowid LIMIT :limit"
+        ),
+        {"run": plain(run_id), "match": f'"{plain(word).replace(chr(34), "")}"', "limit": limit},
+    ).scalars()
+    return list(found)
+
+
+def _job_of(connection: Connection, run_id: str, event: EventRow) -> EventRow | None:
+    if event.kind != "job_finished":
+        return None
+    named = read_rows(connection, run_id, _naming(connection, run_id, str(event.payload.get("job", ""))), whole=True)
+    job = event.payload.get("job")
+    return next((row for row in named if row.kind == "job_enqueued" and row.payload.get("job") == job), None)
+
+
+def _ends(connection: Connection, run_id: str, jobs: Sequence[str]) -> Iterator[int]:
+    for job in jobs:
+        for row in read_rows(connection, run_id, _naming(connection, run_id, job)):
+            if row.kind == "job_finished" and row.payload.get("job") == job:
+                yield row.seq
+
+
+def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[ArtefactRow], int]:
+    named = list(dict.fromkeys(_HASH.findall(job.shown)))
+    rows = connection.execute(
+        text(
+            "SELECT min(seq * 1000 + position) AS place FROM artefacts WHERE run_id = :run "
+            "AND sha256 IN (SELECT value FROM json_each(:named)) GROUP BY sha256 ORDER BY 1"
+        ),
+        {"run": plain(run_id), "named": "[" + ",".join(f'"{sha256}"' for sha256 in named) + "]"},
+    ).scalars()
+    places = list(rows)
+    first = artefacts_of_events(connection, run_id, sorted({place // 1000 for place in places[:LISTED]}))
+    return [row for row in first if row.sha256 in set(named)][:LISTED], len(places)
+
+
+def _decoded_from(
+    connection: Connection, run_id: str, event: EventRow, row: ArtefactRow
+) -> tuple[list[ArtefactRow], int]:
+    """The files as they came, for one that a driver decoded: kept before it in the same step from the same device."""
+    if event.kind != "files_kept" or str(event.payload.get("note", "")).startswith(_KEPT_AS_IT_CAME):
+        return [], 0
+    seqs = connection.execute(
+        text(
+            "SELECT seq FROM artefacts WHERE run_id = :run AND step = :step AND attempt = :attempt "
+            "AND device = :device AND kind <> :kind AND seq < :seq ORDER BY seq"
+        ),
+        {
+            "run": plain(run_id),
+            "step": row.step,
+            "attempt": row.attempt,
+            "device": row.device,
+            "kind": row.kind,
+            "seq": row.seq,
+        },
+    ).scalars()
+    found = list(seqs)
+    return artefacts_of_events(connection, run_id, found[:LISTED]), len(found)

@@ -1,0 +1,1 @@
+"""Recorded computations done again and compared with the record."""

@@ -1,0 +1,358 @@
+"""Replay: every recorded computation done again from the recorded files and parameters, and compared."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from service.audit.record.run import RecordedFiles, RecordedRun
+from service.audit.replay.differences import Comparison, Difference, compare_data, compare_files
+from service.audit.replay.recomputed import Drift, Recomputed, drifts
+from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
+from service.core.gates import evaluate_gates
+from service.core.model import ArtefactRef, GateVerdict, JobFinished, SessionStarted
+from service.core.run_state import JobState
+from service.runner import software_versions
+from service.store.audit import verify
+from service.store.events import parse_canonical, payload_text
+from service.worker.job import JobAnswer, JobContext
+from service.worker.loop import HANDLERS
+
+Progress = Callable[[str, int, int], None]
+Verdict = Literal["identical", "within_tolerance", "different", "not_replayed"]
+
+# What a specimen's data set rests on; the looks at each image during the capture are left out unless asked for.
+DEFAULT_KINDS = (
+    "calibrate",
+    "ct_surface",
+    "locate_spheres",
+    "layout",
+    "features",
+    "match",
+    "structure_from_motion",
+    "hybrid",
+    "detect_spheres",
+    "register",
+    "evaluate",
+)
+_WORST_FIRST: tuple[Verdict, ...] = ("not_replayed", "different", "within_tolerance")
+_FAILURES = (ValueError, ArithmeticError, LookupError, OSError, MemoryError, np.linalg.LinAlgError)
+
+
+@dataclass(frozen=True, slots=True)
+class VersionChange:
+    """A distribution that is not what it was when the run was recorded; "" where it is or was not installed."""
+
+    name: str
+    recorded: str
+    now: str
+
+
+@dataclass(frozen=True, slots=True)
+class ArtefactReplay:
+    """A file that a job wrote, and the same file written again."""
+
+    name: str
+    kind: str
+    recorded_sha256: str
+    recomputed_sha256: str
+    content: Comparison  # empty where the hashes are the same
+
+
+@dataclass(frozen=True, slots=True)
+class JobReplay:
+    """One job computed again."""
+
+    job: str
+    kind: str
+    step: str
+    attempt: int
+    label: str  # what tells it from others of its kind: the source of poses
+    verdict: Verdict
+    measures: Comparison = field(default_factory=Comparison)
+    result: Comparison = field(default_factory=Comparison)
+    artefacts: tuple[ArtefactReplay, ...] = ()
+    recorded_s: float = 0.0
+    duration_s: float = 0.0
+    error: str = ""  # why it could not be replayed
+
+    @property
+    def differences(self) -> tuple[Difference, ...]:
+        """Of measures, result and files, in this order, each worst first."""
+        parts = (self.measures, self.result, *(artefact.content for artefact in self.artefacts))
+        return tuple(difference for part in parts for difference in part.differences)
+
+
+@dataclass(frozen=True, slots=True)
+class GateReplay:
+    """A step's gates judged again by the measures that the replay gave."""
+
+    step: str
+    attempt: int
+    recorded: tuple[GateVerdict, ...]
+    recomputed: tuple[GateVerdict, ...]
+
+    @property
+    def changed(self) -> tuple[tuple[GateVerdict, GateVerdict], ...]:
+        """Verdicts that come out otherwise."""
+        pairs = zip(self.recorded, self.recomputed, strict=True)
+        return tuple((old, new) for old, new in pairs if old.passed != new.passed)
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayReport:
+    """What came of it. `gates_judged`: verdicts that follow again from the recorded measures."""
+
+    run_id: str
+    head_sha256: str
+    end_to_end: bool
+    versions: tuple[VersionChange, ...]
+    files_verified: int
+    bytes_verified: int
+    gates_judged: int
+    gates: tuple[GateReplay, ...]
+    jobs: tuple[JobReplay, ...]
+    drifts: tuple[Drift, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of all jobs; a gate that comes out otherwise is a difference."""
+        found: set[Verdict] = {job.verdict for job in self.jobs}
+        if any(gate.changed for gate in self.gates):
+            found.add("different")
+        for verdict in _WORST_FIRST:
+            if verdict in found:
+                return verdict
+        return "identical"
+
+
+class ScratchStore:
+    """What handlers see as the store: reads the evidence, writes into a folder of its own."""
+
+    def __init__(self, recorded: RecordedFiles, folder: Path) -> None:
+        self._recorded = recorded
+        self._folder = folder
+
+    def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
+        """A recomputed file, or else the recorded one. Raises IntegrityError."""
+        own = self._folder / sha256
+        return own if own.is_file() else self._recorded.artefact_path(sha256, verify=verify)
+
+    def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Keep bytes in the scratch folder."""
+        digest = hashlib.sha256(data).hexdigest()
+        self._folder.mkdir(parents=True, exist_ok=True)
+        (self._folder / digest).write_bytes(data)
+        return ArtefactRef(
+            sha256=digest, kind=kind, media_type=media_type, size_bytes=len(data), original_name=original_name
+        )
+
+
+def replay(
+    run: RecordedRun,
+    *,
+    kinds: Collection[str] = DEFAULT_KINDS,
+    step: str | None = None,
+    end_to_end: bool = False,
+    out: Path | None = None,
+    progress: Progress,
+) -> ReplayReport:
+    """Compute the finished, valid jobs of a run again and compare each with what was recorded.
+
+    Each job gets the recorded results of the jobs before it, so that it is judged by itself; with `end_to_end` it
+    gets the recomputed ones. Nothing is written into the data folder.
+
+    Args:
+        run: as `read_run` gives it.
+        kinds: of jobs.
+        step: only this step's jobs.
+        end_to_end: see above; the report then has the drift of each registration.
+        out: folder to keep the recomputed files in, by step, job and name.
+        progress: told what is being done, how much of it is, and all of it.
+
+    Raises:
+        IntegrityError: the evidence does not verify; the message names the first fault.
+        ConfigurationError: unknown kind or step, `out` within the data folder, nothing to replay.
+    """
+    if out is not None and run.data_dir.resolve() in (out.resolve(), *out.resolve().parents):
+        raise ConfigurationError("the recomputed files do not belong into the evidence", where=str(out))
+    chosen = _chosen(run, kinds, step)
+    checked = verify(run.data_dir, run.run_id, progress)
+    if checked.first_fault is not None:
+        raise IntegrityError(
+            f"the evidence does not verify, so there is nothing to compare with: {checked.first_fault}",
+            where=str(run.data_dir),
+            remedy="See `orthocapture audit verify`; restore the file from a copy",
+        )
+    recomputed = Recomputed()
+    replays: list[JobReplay] = []
+    with tempfile.TemporaryDirectory(prefix="orthocapture-replay-") as folder:
+        store = ScratchStore(run.files, Path(folder))
+        for number, (step_id, job) in enumerate(chosen, 1):
+            title = f"{number}/{len(chosen)} {job.kind.replace('_', ' ')}"
+            progress(title, 0, 1)
+
+            def show(what: str, done: int, total: int, title: str = title) -> None:
+                progress(f"{title}: {what}", done, total)
+
+            arguments = recomputed.in_place_of_recorded(job.arguments) if end_to_end else job.arguments
+            replays.append(_replay_job(run, store, step_id, job, arguments, recomputed, show))
+            if out is not None:
+                _keep(store, replays[-1], out / step_id / f"{number:02d}_{job.kind}")
+        return ReplayReport(
+            run_id=run.run_id,
+            head_sha256=run.events[-1].sha256,
+            end_to_end=end_to_end,
+            versions=changed_versions(run),
+            files_verified=checked.files,
+            bytes_verified=checked.bytes_hashed,
+            gates_judged=sum(len(state.verdicts) for state in run.state.steps.values()),
+            gates=tuple(_gates(run, recomputed)),
+            jobs=tuple(replays),
+            drifts=tuple(drifts(run.summary(), recomputed)) if end_to_end else (),
+        )
+
+
+def _chosen(run: RecordedRun, kinds: Collection[str], step: str | None) -> list[tuple[str, JobState]]:
+    unknown = sorted(set(kinds) - set(HANDLERS))
+    if unknown:
+        raise ConfigurationError(
+            f"no worker computes {', '.join(unknown)}", remedy=f"Jobs are of the kinds {', '.join(HANDLERS)}"
+        )
+    if step is not None and step not in run.state.steps:
+        raise ConfigurationError(f"the protocol has no step {step!r}", remedy=f"Steps: {', '.join(run.state.steps)}")
+    jobs = [
+        (name, job)
+        for name, state in run.state.steps.items()
+        if step in (None, name)
+        for job in state.jobs.values()
+        if job.status == "finished" and job.kind in kinds
+    ]
+    if not jobs:
+        raise ConfigurationError(
+            "nothing of these kinds was computed in this run",
+            where=run.run_id if step is None else f"{run.run_id}, step {step}",
+            remedy="Choose others with --jobs or --step",
+        )
+    return sorted(jobs, key=lambda named: named[1].enqueued_seq)
+
+
+def _replay_job(
+    run: RecordedRun,
+    store: ScratchStore,
+    step: str,
+    job: JobState,
+    arguments: Mapping[str, Any],
+    recomputed: Recomputed,
+    progress: Progress,
+) -> JobReplay:
+    recorded = _finished(run, job)
+    about = JobReplay(
+        job=job.job,
+        kind=job.kind,
+        step=step,
+        attempt=job.attempt,
+        label=str(job.arguments.get("poses", "")),
+        verdict="not_replayed",
+        recorded_s=recorded.duration_s,
+    )
+    started_s = time.monotonic()
+    try:
+        with tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
+            answer = HANDLERS[job.kind](JobContext(arguments, store, Path(scratch), progress))
+        now = _as_recorded(recorded, answer)
+    except OrthocaptureError as error:
+        return replace(about, error=f"{type(error).__name__}: {error}", duration_s=time.monotonic() - started_s)
+    except _FAILURES as error:
+        return replace(about, error=repr(error), duration_s=time.monotonic() - started_s)
+    about = replace(about, duration_s=time.monotonic() - started_s)
+    before = parse_canonical(payload_text(recorded))
+    recomputed.add(job, before, now, answer)
+    renamed = recomputed.renamed
+    artefacts = [
+        _compare_artefacts(store, run.files, old, new, renamed)
+        for old, new in zip(recorded.artefacts, answer.artefacts, strict=False)
+    ]
+    names = [[ref.original_name for ref in refs] for refs in (recorded.artefacts, answer.artefacts)]
+    files = compare_data(*names, path="files")
+    measures = compare_data(before["measures"], now["measures"], path="measures")
+    result = compare_data(before["result"], now["result"], path="result", renamed=renamed)
+    parts = (measures, result, files, *(artefact.content for artefact in artefacts))
+    same_files = all(artefact.recorded_sha256 == artefact.recomputed_sha256 for artefact in artefacts)
+    verdict: Verdict = (
+        "different"
+        if not all(part.equal for part in parts)
+        else "identical"
+        if same_files and all(part.identical for part in parts)
+        else "within_tolerance"
+    )
+    result = replace(result, differences=(*files.differences, *result.differences))
+    return replace(about, verdict=verdict, measures=measures, result=result, artefacts=tuple(artefacts))
+
+
+def _finished(run: RecordedRun, job: JobState) -> JobFinished:
+    """The event whose result counts: the first one, when a second worker finished it too."""
+    events = (event.payload for event in run.events)
+    return next(p for p in events if isinstance(p, JobFinished) and p.job == job.job)
+
+
+def _as_recorded(recorded: JobFinished, answer: JobAnswer) -> Any:
+    """An answer as it would stand in the evidence: plain data, through the same canonical form."""
+    payload = recorded.model_copy(
+        update={
+            "measures": dict(answer.measures),
+            "artefacts": tuple(answer.artefacts),
+            "result": dict(answer.result),
+        }
+    )
+    return parse_canonical(payload_text(payload))
+
+
+def _compare_artefacts(
+    store: ScratchStore, recorded: RecordedFiles, old: ArtefactRef, new: ArtefactRef, renamed: Mapping[str, str]
+) -> ArtefactReplay:
+    content = Comparison()
+    if old.sha256 != new.sha256:
+        paths = recorded.artefact_path(old.sha256), store.artefact_path(new.sha256)
+        content = compare_files(old, *paths, renamed=renamed)
+    return ArtefactReplay(old.original_name, old.kind, old.sha256, new.sha256, content)
+
+
+def _gates(run: RecordedRun, recomputed: Recomputed) -> Iterator[GateReplay]:
+    """The gates of every step whose measures hold a recomputed one.
+
+    That the recorded verdicts follow from the recorded measures is what reading the run has shown: `fold` refuses
+    others.
+    """
+    for step_id, state in run.state.steps.items():
+        measures = recomputed.measures_of(step_id, state.measures)
+        if state.verdicts and measures is not None:
+            judged = evaluate_gates(
+                run.protocol.step(step_id), state.attempt, measures, run.state.skipped, state.uncertainties
+            )
+            if len(judged.verdicts) == len(state.verdicts):
+                yield GateReplay(step_id, state.attempt, state.verdicts, judged.verdicts)
+
+
+def _keep(store: ScratchStore, job: JobReplay, folder: Path) -> None:
+    for artefact in job.artefacts:
+        folder.mkdir(parents=True, exist_ok=True)
+        content = store.artefact_path(artefact.recomputed_sha256).read_bytes()
+        (folder / Path(artefact.name).name).write_bytes(content)
+
+
+def changed_versions(run: RecordedRun) -> tuple[VersionChange, ...]:
+    """Distributions that differ between the run's last session and this process."""
+    sessions = [e.payload for e in run.events if isinstance(e.payload, SessionStarted)]
+    recorded = sessions[-1].software if sessions else run.root.software
+    now = software_versions()
+    names = sorted({**recorded, **now}, key=str.lower)
+    changes = (VersionChange(name, recorded.get(name, ""), now.get(name, "")) for name in names)
+    return tuple(change for change in changes if change.recorded != change.now)

@@ -1,0 +1,102 @@
+"""What a report says, put together from a run's evidence; how it looks is report_html's and report_pdf's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+from service.audit.record.run import RecordedRun
+from service.audit.report.blocks import Cell, Paragraph, Report, Section
+from service.audit.report.sections.accuracy import accuracy_section, budget_section, later_section, result_sentence
+from service.audit.report.sections.certificates import certificate_sections
+from service.audit.report.sections.course import deviations, deviations_section, people_section, steps_section
+from service.audit.report.sections.facts import facts
+from service.audit.report.sections.notes import notes_section
+from service.audit.report.sections.origin import devices_section, software_section
+from service.audit.report.sections.photographs import pictures_section
+from service.audit.report.sections.verification import verification_section
+from service.core.count_words import counted
+from service.core.imported import imported_sentence
+from service.store.audit import AuditReport
+
+
+def report_content(
+    run: RecordedRun,
+    audit: AuditReport,
+    *,
+    made_at: datetime | None = None,
+    true_error_mm: Mapping[str, float] | None = None,
+    with_scene: bool = True,
+    with_pictures: bool = True,
+) -> Report:
+    """The report of a run.
+
+    Args:
+        run: the run.
+        audit: what verifying it gave, before anything else; the first page says so.
+        made_at: the time stamp of the report; now unless given. With the same one the same evidence gives the same.
+        true_error_mm: by source of poses, on a simulated rig where the truth is known; marked as such.
+        with_scene: the scene to be turned as well, which only HTML can show; its drawing is there without.
+        with_pictures: False leaves out what shows the photographs.
+    """
+    summary = run.summary()
+    listed = deviations(run)
+    result = result_sentence(summary)
+    sections = [
+        deviations_section(run, listed),
+        accuracy_section(summary, true_error_mm),
+        later_section(summary),
+        budget_section(summary),
+        steps_section(run),
+        people_section(run),
+        notes_section(run, with_pictures=with_pictures),
+        *certificate_sections(run),
+        devices_section(run),
+        pictures_section(run, turning=with_scene)
+        if with_pictures
+        else Section("Pictures", (Paragraph("They were left out: this report goes with hashes alone."),)),
+        verification_section(run, audit),
+        software_section(run),
+    ]
+    return Report(
+        title=run.protocol.title,
+        simulated=run.root.simulated,
+        origin=_origin(run),
+        verification=_verification(audit),
+        result=result,
+        deviations=Cell(f"{counted(len(listed), 'deviation')}, listed first", "attention")
+        if listed
+        else Cell("No deviation: every step was done as the protocol says", "ok"),
+        release=_release(run),
+        facts=facts(run),
+        sections=tuple(section for section in sections if section is not None),
+        run_id=run.run_id,
+        head_sha256=run.events[-1].sha256,
+        made_at=(made_at or datetime.now(UTC)).astimezone(UTC).replace(microsecond=0),
+    )
+
+
+def _verification(audit: AuditReport) -> Cell:
+    if audit.first_fault is None:
+        return Cell("The evidence verifies: every file and every record is as it was recorded", "ok")
+    others = len(audit.faults) - 1
+    more = f", and {others} more {'fault' if others == 1 else 'faults'}" if others else ""
+    return Cell(
+        f"THE EVIDENCE DOES NOT VERIFY: {audit.first_fault}{more}. Nothing in this report can be relied on.", "stop"
+    )
+
+
+def _origin(run: RecordedRun) -> Cell | None:
+    """None where the run captured its photographs itself."""
+    if run.root.origin != "imported":
+        return None
+    return Cell(imported_sentence(run.events[0].at_utc, run.named(run.root.operator)), "attention")
+
+
+def _release(run: RecordedRun) -> Cell | None:
+    """None where the protocol asks for no release."""
+    if run.protocol.release != "second_person":
+        return None
+    if run.state.released_by:
+        return Cell(f"Released by a second person: {run.named(run.state.released_by)}", "ok")
+    return Cell("NOT RELEASED: the protocol asks that a second person reads and releases this run", "stop")

@@ -1,0 +1,1 @@
+"""A report written as HTML, PDF, SVG and CSV."""

@@ -1,0 +1,53 @@
+"""A report as one HTML file that opens anywhere: nothing in it is fetched from elsewhere."""
+
+from __future__ import annotations
+
+import base64
+from html import escape
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from markupsafe import Markup
+
+from service.audit.report.blocks import Cell, Drawing, Picture, Report
+from service.audit.report.output.svg import drawing_svg
+from service.audit.report.words import moment
+
+
+def write_html(report: Report, path: Path) -> None:
+    """Write the file, and its folder where there is none."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(render_html(report), encoding="utf-8")
+
+
+def render_html(report: Report) -> str:
+    """The whole document."""
+    environment = Environment(
+        loader=PackageLoader("service.audit.report.output"),
+        autoescape=select_autoescape(["html", "j2"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"cell": _cell, "data_url": _data_url, "svg": _svg, "kind": _kind, "moment": moment}
+    return environment.get_template("report.html.j2").render(report=report)
+
+
+def _kind(block: object) -> str:
+    return type(block).__name__
+
+
+def _cell(value: Cell | str) -> Markup:
+    if isinstance(value, str):
+        return Markup(escape(value))
+    if value.tone == "plain":
+        return Markup(escape(value.text))
+    return Markup('<span class="{}">{}</span>').format(value.tone, value.text)
+
+
+def _data_url(picture: Picture) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(picture.jpeg or b"").decode()
+
+
+def _svg(drawing: Drawing) -> Markup:
+    return Markup(drawing_svg(drawing))

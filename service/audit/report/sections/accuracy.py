@@ -1,0 +1,215 @@
+"""How accurate a run's data set is: in one sentence, by source of camera poses beside the paper, and as a budget."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from service.audit.record.missing_results import not_in_yet
+from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
+from service.audit.report.words import mm, utc, words
+from service.core.dependence import depends_on
+from service.core.late import late_results
+from service.core.registered import shared_adjustment_note
+from service.dataset.summary import RunSummary
+
+PAPER_LIMIT_MM = 0.35
+_LIMITED = "best_mean_radial_error_mm"
+_HONEST = (0.5, 2.0)
+
+# The paper's table: mean radial error (mm) and mean reprojection error (px) by source and width of the images.
+_PAPER = {
+    ("robot", 9504): (0.89, 8.99),
+    ("colmap", 1920): (1.10, 11.53),
+    ("colmap", 4752): (0.37, 3.91),
+    ("colmap", 9504): (0.35, 3.71),
+    ("glomap", 9504): (0.44, 4.67),
+}
+_SOURCES = {
+    "robot": "the robot's poses as reported",
+    "robot_corrected": "the robot's poses, its errors corrected",
+    "triangulated": "adjusted from the corrected robot poses",
+    "colmap": "incremental structure from motion, COLMAP",
+    "glomap": "global structure from motion, GLOMAP",
+    "hybrid": "structure from motion, robot and spheres adjusted together",
+}
+
+
+def result_sentence(summary: RunSummary) -> Cell:
+    """The result with its uncertainty and its limit."""
+    best, row = summary.best(), _best_row(summary)
+    if best is None or row is None:
+        return Cell("Not evaluated: nothing can be said about the accuracy of this data set.", "attention")
+    limit_mm, whose = _limit(summary)
+    error_mm = float(row["mean_radial_error_mm"])
+    within = error_mm <= limit_mm
+    simulated = " These are figures of a simulated rig." if summary.root.simulated else ""
+    total_mm = summary.budgets().get(best, {}).get("total_mm")
+    budget = "" if total_mm is None else f", {total_mm:.3f} mm with the scan's own error"
+    on = {"control spheres": "control spheres, which took no part in the registration,"}
+    return Cell(
+        f"With {best} poses ({_SOURCES.get(row['source'], words(row['source']))}), the mean error on the "
+        f"{on.get(row['evaluated_on'], 'spheres, each predicted by the others,')} is {error_mm:.3f} mm, "
+        f"{'within' if within else 'OUTSIDE'} the limit of {limit_mm:g} mm ({whose}), with a predicted uncertainty "
+        f"of the registration of {row['predicted_error_mm']:.3f} mm (1σ, 3D){budget}.{simulated}"
+        + (" It depends on figures that were accepted outside their limits, see below." if rests_on(summary) else ""),
+        ("attention" if rests_on(summary) else "ok") if within else "stop",
+    )
+
+
+def rests_on(summary: RunSummary) -> tuple[str, ...]:
+    """The accepted gates on which the evaluation rests, in words."""
+    evaluations = [step.id for step in summary.protocol.steps if step.kind == "evaluation"]
+    gates = (gate for step in evaluations for gate in depends_on(summary.protocol, summary.state, step))
+    return tuple(dict.fromkeys(f"Depends on an accepted gate: {gate.text}" for gate in gates))
+
+
+def _limit(summary: RunSummary) -> tuple[float, str]:
+    gates = (gate for step in summary.protocol.steps for gate in step.gates if gate.measure == _LIMITED)
+    limits = [gate.max for gate in gates if gate.max is not None]
+    return (limits[-1], "the protocol's gate") if limits else (PAPER_LIMIT_MM, "the paper's figure")
+
+
+def _best_row(summary: RunSummary) -> Mapping[str, Any] | None:
+    return next((row for row in summary.table() if row["poses"] == summary.best()), None)
+
+
+def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | None) -> Section:
+    """One row a source of poses, beside what the paper reached."""
+    rows = summary.table()
+    title = "Registration error by source of camera poses"
+    if not rows:
+        return Section(title, (Paragraph("Not evaluated."),))
+    columns = [
+        Column("camera poses", 2.6),
+        Column("images", 1.1),
+        Column("mean radial error (mm)", 1.0, "number"),
+        Column("mean reprojection error (px)", 1.15, "number"),
+        Column("predicted error (mm)", 1.0, "number"),
+        Column("outlines", 0.8, "number"),
+        Column("the paper: mm / px (image width)", 1.4, "number"),
+    ]
+    if true_error_mm is not None:
+        columns.append(Column("true error (mm), known to the simulator alone", 1.2, "number"))
+    shown: list[tuple[Cell | str, ...]] = []
+    strong: set[int] = set()
+    for number, row in enumerate(rows):
+        best = row["poses"] == summary.best()
+        if best:
+            strong.add(number)
+        late = f" ({row['late']})" if row["late"] else ""
+        named = row["poses"] + (" (best)" if best else late)
+        texts: list[Cell | str] = [
+            f"{named}: {_SOURCES.get(row['source'], words(row['source']))}",
+            str(row["resolution"]).replace(" ", "\N{NO-BREAK SPACE}"),
+            f"{row['mean_radial_error_mm']:.3f}",
+            f"{row['mean_reprojection_error_px']:.2f}",
+            f"{row['predicted_error_mm']:.3f}",
+            str(row["control_outlines"]),
+            _paper(row),
+        ]
+        if true_error_mm is not None:
+            texts.append(mm(true_error_mm.get(row["poses"])))
+        shown.append(tuple(texts))
+    on = rows[0]["evaluated_on"]
+    explained = (
+        f"Measured on {on}. The radial error is how far the sphere seen by the camera lies from the sphere of the "
+        "scan, across the line of sight; the reprojection error is the same in the image. The paper's figures are of "
+        "real images at its own widths; reprojection errors compare only at the same width."
+    )
+    blocks: list[Block] = [Paragraph(text, "attention") for text in rests_on(summary)]
+    blocks += [Table(tuple(columns), tuple(shown), frozenset(strong)), Paragraph(explained)]
+    note = shared_adjustment_note(summary.protocol, summary.state)
+    if note:
+        blocks.append(Paragraph(note))
+    return Section(title, tuple(blocks))
+
+
+def later_section(summary: RunSummary) -> Section | None:
+    """Results that came after the evaluation, what they changed, and those that had not come; None without any."""
+    late = late_results(summary.protocol, summary.state)
+    missing = not_in_yet(summary.protocol, summary.state, summary.events)
+    if not late and not missing:
+        return None
+    blocks: list[Block] = []
+    if late:
+        columns = (Column("event", 0.5, "number"), Column("time", 1.2), Column("what came, and what it changed", 5.0))
+        blocks.append(Table(columns, tuple((str(one.seq), utc(one.at_utc), f"{one.text}.") for one in late)))
+        better = summary.better_later()
+        if better is not None:
+            blocks.append(
+                Paragraph(
+                    f"{better['poses']} has the smallest error of all, {better['mean_radial_error_mm']:.3f} mm. What "
+                    f"was judged and signed is {summary.best()}, and the data set has its poses."
+                )
+            )
+    if missing:
+        blocks.append(Paragraph("Not in when this was made:", "attention"))
+        blocks += [Paragraph(f"{line}.", "attention") for line in missing]
+    return Section("Results that came later", tuple(blocks))
+
+
+def _paper(row: Mapping[str, Any]) -> str:
+    """What the paper reached with this source, at the width nearest to the row's."""
+    width = int(str(row["resolution"]).split()[0])
+    known = [at for source, at in _PAPER if source == row["source"]]
+    if not known:
+        return "–"
+    at = min(known, key=lambda candidate: abs(np.log(candidate / width)))
+    radial_mm, reprojection_px = _PAPER[row["source"], at]
+    return f"{radial_mm:.2f} / {reprojection_px:.2f} ({at})"
+
+
+def budget_section(summary: RunSummary) -> Section | None:
+    """Source by source, and what independent measurements say of it; None without an evaluation."""
+    best = summary.best()
+    budget: Mapping[str, Any] | None = summary.budgets().get(best or "")
+    if budget is None:
+        return None
+    contributions = [
+        (c["name"] + ("" if c["counted"] else " (not in the sum)"), f"{c['sigma_mm']:.4f}", c["how"])
+        for c in budget["contributions"]
+    ]
+    total = ("sum", f"{budget['total_mm']:.4f}", "root of the sum of squares")
+    sources = Table(
+        (Column("source", 1.3), Column("σ (mm)", 0.7, "number"), Column("how it was got", 4.5)),
+        (*contributions, total),
+        frozenset({len(contributions)}),
+    )
+    checks = Table(
+        (
+            Column("independent measurement", 3.0),
+            Column("spheres", 0.8, "number"),
+            Column("observed (mm)", 0.85, "number"),
+            Column("predicted (mm)", 0.85, "number"),
+            Column("normalised χ²", 0.9, "number"),
+            Column("verdict", 2.0),
+        ),
+        tuple(
+            (
+                f"{o['name']}: {o['how']}",
+                str(o["n"]),
+                f"{o['observed_mm']:.4f}",
+                f"{o['predicted_mm']:.4f}",
+                f"{o['normalised_chi2']:.2f}",
+                Cell(o["verdict"], "ok" if _HONEST[0] <= o["normalised_chi2"] <= _HONEST[1] else "attention"),
+            )
+            for o in budget["observations"]
+        ),
+    )
+    return Section(
+        "Error budget",
+        (
+            *(Paragraph(text, "attention") for text in rests_on(summary)),
+            Paragraph(f"Standard deviations (3D) in the middle of the anatomy, with the poses of {best}."),
+            sources,
+            Heading("Does it hold?"),
+            Paragraph(
+                "Each comparison of independent measurements is set against what the budget predicts for it. "
+                "A normalised χ² near 1 says that the stated errors can be believed."
+            ),
+            checks,
+        ),
+    )

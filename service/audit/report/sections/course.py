@@ -1,0 +1,206 @@
+"""How a run went: what departed from the protocol, the steps with their gates, and who did and signed what."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from service.audit.overview.shots import Shots, failed_exposures, shots_by_step
+from service.audit.record.run import RecordedRun
+from service.audit.report.blocks import Block, Cell, Column, Paragraph, Section, Table
+from service.audit.report.words import clock, duration, judged, limit, measured, utc, words
+from service.core.count_words import counted
+from service.core.gates import BOUNDS_HOLD, describe_judged
+from service.core.model import (
+    DeviceTrouble,
+    GatesEvaluated,
+    OperatorAction,
+    RecordCorrected,
+    RunReleased,
+    StepFailed,
+    ViewpointFailed,
+)
+from service.core.run_state import StepState
+
+
+@dataclass(frozen=True, slots=True)
+class Departure:
+    """Something that an outsider must know of, with its event."""
+
+    seq: int
+    kind: str
+    step: str
+    text: str
+    who: str
+
+
+def deviations(run: RecordedRun) -> list[Departure]:
+    """Accepted gates first; then deviations, failed gates, troubles of devices and corrections, by their events."""
+    titles = {step.id: step.title for step in run.protocol.steps}
+    found = [
+        Departure(d.seq, words(d.kind), titles.get(d.step or "", ""), d.text, d.actor)
+        for d in run.state.deviations
+        if not d.is_note
+    ]
+    for event in run.events:
+        found += [
+            Departure(event.seq, kind, titles.get(step, ""), text, event.actor)
+            for kind, step, text in _of_event(event.payload)
+        ]
+    last = run.events[-1].seq
+    for step in run.protocol.steps:
+        state = run.state.steps[step.id]
+        if step.sign and state.phase == "passed" and not state.skipped and not state.signed:
+            found.append(Departure(last, "unsigned", step.title, "nobody has signed this step", ""))
+        elif state.phase != "passed":
+            found.append(Departure(last, "not done", step.title, f"the step is {words(state.phase)}", ""))
+    return sorted(found, key=lambda departure: (departure.kind != words("gate_accepted"), departure.seq))
+
+
+def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
+    match payload:
+        case GatesEvaluated(passed=False):
+            for verdict in payload.verdicts:  # each counts, as on the auditor's pages
+                if not verdict.passed:
+                    kind = "gate not decided" if verdict.undecided else "gate failed"
+                    yield kind, payload.step, f"attempt {payload.attempt}: {describe_judged(verdict)}"
+        case StepFailed():
+            yield "step failed", payload.step, f"attempt {payload.attempt}: {payload.message}"
+        case ViewpointFailed(skipped=False):
+            yield "exposure failed", payload.step, f"{payload.viewpoint}: {payload.message}"
+        case DeviceTrouble():
+            yield "device", "", f"{payload.device}: {payload.message}"
+        case RecordCorrected():
+            text = f"event {payload.of_seq}, {payload.field}: {payload.old!r} → {payload.new!r}; {payload.reason}"
+            yield "correction", "", text
+        case _:
+            return
+
+
+def deviations_section(run: RecordedRun, listed: Sequence[Departure]) -> Section:
+    """First of all."""
+    blocks: list[Block] = []
+    if listed:
+        at = {event.seq: clock(event.at_utc) for event in run.events}
+        columns = (
+            Column("event", 0.55, "number"),
+            Column("time (UTC)", 0.8),
+            Column("kind", 1.0),
+            Column("step", 1.5),
+            Column("what happened", 3.2),
+            Column("who", 0.8),
+        )
+        rows = tuple(
+            (str(d.seq), at[d.seq], Cell(d.kind, "attention"), d.step, d.text, run.named(d.who)) for d in listed
+        )
+        blocks.append(Table(columns, rows))
+    else:
+        blocks.append(Paragraph("None: every step was done once, as the protocol says, within its limits.", "ok"))
+    automatic = sum(deviation.is_note for deviation in run.state.deviations)
+    if automatic:
+        were = "was" if automatic == 1 else "were"
+        text = f"{counted(automatic, 'confirmation')} {were} given automatically, which only a simulated rig allows."
+        blocks.append(Paragraph(text, "attention"))
+    retaken = [past for past in run.state.superseded if past.viewpoint is not None]
+    redone = [past for past in run.state.superseded if past.viewpoint is None]
+    if retaken or redone:
+        told = f"Replaced by later ones: attempts at steps {len(redone)}, single views {len(retaken)}."
+        blocks.append(Paragraph(f"{told} Their evidence was kept and is part of what was verified."))
+    return Section("Deviations", tuple(blocks))
+
+
+def steps_section(run: RecordedRun) -> Section:
+    """Every step with its gates, value against limit."""
+    columns = (
+        Column("gate", 3.4),
+        Column("value", 1.4, "number"),
+        Column("limit", 1.4, "number"),
+        Column("verdict", 1.1),
+    )
+    rows: list[tuple[Cell | str, ...]] = []
+    heads: set[int] = set()
+    shots = {one.step: one for one in shots_by_step(run.protocol, run.state, failed_exposures(run.events))}
+    for number, step in enumerate(run.protocol.steps, 1):
+        state = run.state.steps[step.id]
+        heads.add(len(rows))
+        rows.append((_state(run, f"{number}. {step.title}", state, shots), "", "", ""))
+        accepted = state.accepted is not None
+        rows += [(*measured(v), limit(v), judged(v, accepted=accepted)) for v in state.verdicts]
+    table = Table(columns, tuple(rows), frozenset(heads), frozenset(heads))
+    bounded = any(v.lower is not None for state in run.state.steps.values() for v in state.verdicts)
+    return Section("Steps and gates", (table, *([Paragraph(f"{BOUNDS_HOLD}.")] if bounded else [])))
+
+
+def _state(run: RecordedRun, title: str, state: StepState, shots: Mapping[str, Shots]) -> Cell:
+    went_on = state.phase == "passed" and not state.skipped
+    phase = ("gates overridden" if state.verdicts else "skipped") if state.skipped else words(state.phase)
+    parts = [
+        phase,
+        "accepted outside its limits" if state.accepted else "",
+        f"attempt {state.attempt}" if state.attempt > 1 else "",
+    ]
+    if state.started_utc:
+        parts.append(f"begun {clock(state.started_utc)}")
+    if state.started_utc and state.ended_utc:
+        parts.append(f"took {duration(state.started_utc, state.ended_utc)}")
+    parts.append(shots[state.step].words if state.step in shots else "")
+    parts.append(f"signed by {run.named(state.signed_by)}" if state.signed_by else "")
+    within = went_on and state.accepted is None
+    return Cell(f"{title}: {', '.join(filter(None, parts))}", "plain" if within else "attention")
+
+
+def people_section(run: RecordedRun) -> Section:
+    """Signatures with name, time, meaning and the hash that they bind; then who acted how often."""
+    titles = {step.id: step.title for step in run.protocol.steps}
+    rows: list[tuple[Cell | str, ...]] = []
+    acts: dict[str, dict[str, int]] = {}
+    for event in run.events:
+        payload = event.payload
+        if isinstance(payload, OperatorAction):
+            counts = acts.setdefault(event.actor, {})
+            counts[payload.action] = counts.get(payload.action, 0) + 1
+            if payload.action in ("sign", "accept"):
+                how = "automatic" if payload.automatic else payload.via
+                how += {"pin": ", by PIN", "badge": ", by badge"}.get(payload.identified, "")
+                said = (
+                    f"accepted outside its limits, {payload.reason}"
+                    if payload.action == "accept"
+                    else payload.meaning
+                )
+                meaning = f"{titles.get(payload.step or '', '')}: {said or 'no meaning given'} ({how})"
+                rows.append(
+                    (str(event.seq), utc(event.at_utc), run.named(event.actor), meaning, payload.signed_sha256)
+                )
+        elif isinstance(payload, RunReleased):
+            meaning = f"Release of the run: {payload.meaning}"
+            rows.append((str(event.seq), utc(event.at_utc), run.named(event.actor), meaning, payload.signed_sha256))
+    signatures = Table(
+        (
+            Column("event", 0.5, "number"),
+            Column("time", 1.35),
+            Column("name", 0.9),
+            Column("what and in what meaning", 2.4),
+            Column("SHA-256 of the record that was signed", 2.3, "code"),
+        ),
+        tuple(rows),
+        small=True,
+    )
+    people = Table(
+        (Column("name", 1.0), Column("took part by", 4.0)),
+        tuple(
+            (run.named(name), ", ".join(f"{count} × {words(action)}" for action, count in sorted(counts.items())))
+            for name, counts in sorted(acts.items())
+        ),
+    )
+    unsigned = [
+        step.title
+        for step in run.protocol.steps
+        if step.sign and not run.state.steps[step.id].signed and not run.state.steps[step.id].skipped
+    ]
+    blocks: list[Block] = [signatures if rows else Paragraph("Nothing was signed.", "attention")]
+    if unsigned:
+        blocks.append(
+            Paragraph(f"Without a signature that the protocol asks for: {', '.join(unsigned)}.", "attention")
+        )
+    blocks.append(people if acts else Paragraph("Nobody acted on this run."))
+    return Section("People and signatures", tuple(blocks))

@@ -1,0 +1,89 @@
+"""What a report says of the run as a whole: of what and where, who began it, by which protocol, how it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from service.audit.overview.shots import failed_exposures, shots_by_step, together
+from service.audit.record.missing_results import not_in_yet
+from service.audit.record.run import RecordedRun
+from service.audit.report.blocks import Cell, Facts
+from service.audit.report.sections.notes import about_facts
+from service.audit.report.words import duration, utc
+from service.core.errors import OrthocaptureError
+from service.core.late import late_results
+from service.core.model import SessionStarted
+from service.rig import parse_recorded_rig
+
+
+def facts(run: RecordedRun) -> Facts:
+    """Names and values for the first page."""
+    root, state, events = run.root, run.state, run.events
+    shots = shots_by_step(run.protocol, state, failed_exposures(events))
+    others = sorted(run.named(person) for person in state.people - {root.operator})
+    status = {"active": "not finished"}.get(state.status, state.status)
+    return Facts(
+        (
+            *_of_what_and_where(run),
+            ("Run", run.run_id),
+            ("Begun", utc(events[0].at_utc)),
+            ("Last record", f"{utc(events[-1].at_utc)}, after {duration(events[0].at_utc, events[-1].at_utc)}"),
+            (
+                "State",
+                Cell(
+                    status + (f": {state.stop_reason}" if state.stop_reason else ""),
+                    "ok" if status == "completed" else "attention",
+                ),
+            ),
+            ("Begun by", run.named(root.operator)),
+            ("Others who took part", ", ".join(others) or "none"),
+            ("Released by", run.named(state.released_by) if state.released_by else "nobody"),
+            ("Protocol", f"{root.protocol_id}, version {root.protocol_version}"),
+            ("SHA-256 of the protocol", root.protocol_sha256),
+            (
+                "SHA-256 of the list of imported files"
+                if root.origin == "imported"
+                else "SHA-256 of the rig's description",
+                root.rig.sha256,
+            ),
+            *_later(run),
+            ("Photographs", together(shots).words),
+            ("Records", str(len(events))),
+            ("Chain head", events[-1].sha256),
+        )
+    )
+
+
+def _of_what_and_where(run: RecordedRun) -> Iterator[tuple[str, Cell | str]]:
+    """What was entered of specimen, site and purpose; a run's root names its rig, a session its machine."""
+    entered = about_facts(run)
+    names = {name for name, _ in entered}
+    if "Specimen" not in names:
+        yield "Specimen", "not recorded"
+    yield from entered
+    if "Site" not in names:
+        yield "Site", "not recorded"
+    hosts = list(dict.fromkeys(e.payload.host for e in run.events if isinstance(e.payload, SessionStarted)))
+    at = f", driven from the machine {', '.join(hosts)}" if hosts else ""
+    name = _rig_name(run)
+    yield "Rig", f"{name}{at}" if name else f"not recorded{at}"
+
+
+def _rig_name(run: RecordedRun) -> str:
+    """As its description says; "" for imported photographs, and where the description is missing or altered."""
+    if run.root.origin == "imported":
+        return ""
+    try:
+        path = run.files.artefact_path(run.root.rig.sha256, verify=True)
+        return parse_recorded_rig(path.read_bytes(), path).section.name
+    except (OrthocaptureError, OSError):
+        return ""  # the first page says which file it is
+
+
+def _later(run: RecordedRun) -> Iterator[tuple[str, Cell]]:
+    late = late_results(run.protocol, run.state)
+    if late:
+        yield "Results that came after the evaluation", Cell(", ".join(one.name for one in late), "attention")
+    missing = not_in_yet(run.protocol, run.state, run.events)
+    if missing:
+        yield "Results not in yet", Cell("; ".join(missing), "attention")

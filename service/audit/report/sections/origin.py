@@ -1,0 +1,140 @@
+"""Where the data comes from: devices and clocks, and the software."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from service.audit.record.run import RecordedRun
+from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
+from service.audit.report.words import clock
+from service.core.bodies import bodies
+from service.core.clocks import clock_of, clock_readings, offset_told
+from service.core.count_words import counted
+from service.core.model import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
+from service.core.terms import term
+
+_COMPUTES = ("orthocapture", "numpy", "scipy", "opencv-python-headless", "pycolmap", "trimesh", "scikit-image")
+
+
+def devices_section(run: RecordedRun) -> Section:
+    """Every device that answered, its versions and clocks; light and temperature over the captures."""
+    columns = (
+        Column("device", 0.8),
+        Column("model", 1.6),
+        Column("serial number", 1.2),
+        Column("firmware", 1.1),
+        Column("driver", 1.9),
+        Column("its clock when it was opened", 1.7),
+        Column("opened (UTC)", 0.9),
+    )
+    known = bodies(run.events)
+    rows: list[tuple[Cell | str, ...]] = []
+    for event in run.events:
+        if isinstance(event.payload, DeviceOpened):
+            report: Mapping[str, Any] = event.payload.report
+            identity: Mapping[str, Any] = report.get("identity") or {}
+            rows.append(
+                (
+                    event.payload.device,
+                    str(identity.get("model", "")),
+                    known.shown(identity) or "–",
+                    str(identity.get("firmware", "")) or "–",
+                    f"{identity.get('driver', '')}: {identity.get('driver_version', '')}",
+                    offset_told(report.get("clock_offset_s"), clock_of(report)),
+                    clock(event.at_utc),
+                )
+            )
+    blocks: list[Block] = [Table(columns, tuple(rows), small=True)]
+    blocks += [Paragraph(f"{text}.") for text in known.explained]
+    if known.strange:
+        blocks.append(Paragraph(f"{known.strange}.", "stop"))
+    blocks += _clocks(run)
+    captures = [view for view in run.summary().captures() if isinstance(view, ViewpointCaptured)]
+    if captures:
+        offsets = np.array([capture.clock_offset_s for capture in captures])
+        sigma_m = max(capture.pose_sigma_m for capture in captures)
+        text = (
+            f"Over {counted(len(captures), 'capture')} the robot's clock stayed within "
+            f"{1e3 * float(np.ptp(offsets)):.1f} ms of its distance from the host's "
+            f"monotonic clock; the flange stood still within {1e6 * sigma_m:.2f} µm "
+            "(1σ) during every exposure."
+        )
+        blocks.append(Paragraph(text + _environment(captures)))
+    return Section("Devices and clocks", tuple(blocks))
+
+
+def _clocks(run: RecordedRun) -> Iterator[Block]:
+    """Each clock as it was last compared, and what rests on it."""
+    readings = clock_readings(run.events)
+    if not readings:
+        return
+    columns = (
+        Column("clock of", 0.9),
+        Column("against", 1.1),
+        Column("difference", 1.0, "number"),
+        Column("limit", 0.8, "number"),
+        Column("verdict", 0.9),
+        Column("what it means", 3.6),
+    )
+    verdicts = {True: Cell("✓ within", "ok"), False: Cell("✗ beyond", "stop"), None: Cell("? not known", "attention")}
+    yield Heading("Clocks")
+    yield Table(
+        columns,
+        tuple(
+            (
+                reading.name,
+                reading.other,
+                reading.difference,
+                f"± {reading.limit_s:.2f} s",
+                verdicts[reading.within],
+                f"{reading.meaning}{f' ({reading.note})' if reading.note else ''}.",
+            )
+            for reading in readings
+        ),
+    )
+
+
+def _environment(captures: list[ViewpointCaptured]) -> str:
+    parts: list[str] = []
+    for key, name, unit, digits in (("light_lux", "light", "lx", 0), ("temperature_c", "temperature", "°C", 1)):
+        values = [capture.environment[key] for capture in captures if key in capture.environment]
+        if values:
+            parts.append(f"{name} {min(values):.{digits}f} to {max(values):.{digits}f} {unit}")
+    return f" Meanwhile: {', '.join(parts)}." if parts else ""
+
+
+def software_section(run: RecordedRun) -> Section:
+    """What computed, for how long, and every version installed."""
+    sessions = [event.payload for event in run.events if isinstance(event.payload, SessionStarted)]
+    software = sessions[-1].software if sessions else run.root.software
+    first = ", ".join(f"{name} {software[name]}" for name in _COMPUTES if name in software)
+    differing = [s for s in sessions if s.software != run.root.software]
+    blocks: list[Block] = [Paragraph(f"Computed with {first}.")]
+    if differing:
+        blocks.append(
+            Paragraph(
+                f"{len(differing)} of {counted(len(sessions), 'session')} ran with other versions.", "attention"
+            )
+        )
+    jobs: dict[str, tuple[int, float]] = {}
+    for event in run.events:
+        if isinstance(event.payload, JobFinished):
+            count, seconds = jobs.get(event.payload.job_kind, (0, 0.0))
+            jobs[event.payload.job_kind] = count + 1, seconds + event.payload.duration_s
+    if jobs:
+        columns = (Column("computed", 2.0), Column("times", 1.0, "number"), Column("seconds together", 1.0, "number"))
+        rows = tuple((term(kind), str(n), f"{seconds:.1f}") for kind, (n, seconds) in jobs.items())
+        blocks.append(Table(columns, rows))
+    names = sorted(software, key=str.lower)
+    texts = [f"{name} {software[name]}" for name in names]
+    texts += [""] * (-len(texts) % 3)
+    third = len(texts) // 3
+    rows = tuple(zip(texts[:third], texts[third : 2 * third], texts[2 * third :], strict=True))
+    blocks += [
+        Heading("Every installed distribution"),
+        Table((Column(""), Column(""), Column("")), rows, small=True),
+    ]
+    return Section("Software", tuple(blocks))

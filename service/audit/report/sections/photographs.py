@@ -1,0 +1,64 @@
+"""The pictures of a report: outlines found and predicted, the scene, every photograph that counts, and its original.
+
+A report is sent by post: 36 photographs, the scene and all else are to stay under 3 MB. The photographs themselves
+are named by their hashes, under which they lie in the evidence.
+"""
+
+from __future__ import annotations
+
+from service.audit.record.run import RecordedRun
+from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Pictures, Section, Table
+from service.audit.report.drawings.pictures import LARGE_PX, THUMBNAIL_PX, picture
+from service.audit.report.drawings.scene import report_scene
+from service.core.model import View
+
+
+def pictures_section(run: RecordedRun, *, turning: bool) -> Section:
+    """Overlays of the evaluation, the scene, then a contact sheet of every capture that counts, and the originals.
+
+    `turning`: the scene can be turned, which only HTML can show.
+    """
+    blocks: list[Block] = []
+    overlays = run.summary().artefacts("overlay")
+    if overlays:
+        blocks += [
+            Heading("Detected and predicted outlines"),
+            Paragraph(
+                "Green: registration spheres. Blue: control spheres, which took no part in the registration. Yellow, "
+                "dashed: predicted by the registration."
+            ),
+            Pictures(tuple(picture(run, ref.sha256, ref.original_name, LARGE_PX) for ref in overlays), 2),
+        ]
+    scene = report_scene(run.summary(), turning=turning)
+    if scene is not None:
+        blocks += [Heading(scene.drawing.title), scene]
+    originals: list[tuple[Cell | str, ...]] = []
+    for step in run.protocol.steps:
+        seqs = sorted(run.state.steps[step.id].captured.values())
+        captures = [(seq, run.events[seq - 1].payload) for seq in seqs]
+        views = [(seq, capture) for seq, capture in captures if isinstance(capture, View)]
+        if views:
+            sheet = tuple(picture(run, view.artefacts[0].sha256, _caption(view), THUMBNAIL_PX) for _, view in views)
+            blocks += [Heading(f"Contact sheet: {step.title}"), Pictures(sheet, 5)]
+        originals += [
+            (str(seq), view.viewpoint, view.artefacts[0].original_name, view.artefacts[0].sha256)
+            for seq, view in views
+        ]
+    if originals:
+        columns = (
+            Column("event", 0.5, "number"),
+            Column("view", 0.9),
+            Column("file as it came", 1.4),
+            Column("SHA-256, its name in the evidence", 4.2, "code"),
+        )
+        text = (
+            "What is shown above are small copies. The photographs as they came from the camera lie in the folder "
+            "artefacts of the evidence, and of a bundle made from it, each under its SHA-256."
+        )
+        blocks += [Heading("Originals"), Paragraph(text), Table(columns, tuple(originals), small=True)]
+    return Section("Pictures", tuple(blocks) or (Paragraph("No photograph was taken."),))
+
+
+def _caption(capture: View) -> str:
+    failed = [name for name, passed in capture.verdicts.items() if not passed]
+    return capture.viewpoint + (f" ✗ {', '.join(failed)}" if failed else "")

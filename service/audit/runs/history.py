@@ -1,0 +1,245 @@
+"""How calibration and accuracy went over time, by camera, lens and arm: one row for each run with such figures."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from sqlalchemy import Connection, text
+
+from service.audit.runs.search import FoundRun, RunWanted, find_runs
+from service.store.store import Store
+
+InstrumentKind = Literal["camera", "lens", "arm"]
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A number that is followed: its unit, what it is in words, and of which instruments it tells something."""
+
+    key: str
+    name: str
+    unit: str
+    of: tuple[InstrumentKind, ...]
+    from_zero: bool = True  # its axis; a focal length changes by a thousandth of itself
+
+
+FIGURES: tuple[Figure, ...] = (
+    Figure("rms_px", "Residual of the intrinsics (rms)", "px", ("camera", "lens")),
+    Figure("uncertainty_mm", "Uncertainty of a projection, worst in the image", "mm", ("camera", "lens")),
+    Figure("fx_px", "Focal length fx", "px", ("lens",), from_zero=False),
+    Figure("cx_px", "Principal point cx", "px", ("camera",), from_zero=False),
+    Figure("hand_eye_held_out_mm", "Hand-eye error of held-out images (median)", "mm", ("arm",)),
+    Figure("hand_eye_sigma_mm", "Uncertainty of the hand-eye transform (σ)", "mm", ("arm",)),
+    Figure("robot_noise_mm", "Noise of the arm's poses", "mm", ("arm",)),
+    Figure("mean_radial_error_mm", "Accuracy: mean radial error", "mm", ("camera", "lens", "arm")),
+)
+_MEASURED = (
+    "rms_px",
+    "five_fold_rms_px",
+    "uncertainty_mm",
+    "hand_eye_sigma_mm",
+    "hand_eye_held_out_mm",
+    "robot_noise_mm",
+)
+_OF_CAMERA = ("fx", "fy", "cx", "cy")
+_COLUMNS = (*_MEASURED, *(f"{name}_px" for name in _OF_CAMERA), "mean_radial_error_mm")
+
+
+@dataclass(frozen=True, slots=True)
+class Instrument:
+    """A camera, lens or arm as its makers number them; "" is what was not told."""
+
+    kind: InstrumentKind
+    model: str
+    serial: str
+
+    @property
+    def name(self) -> str:
+        """`ILCE-7RM5, serial number 1234567`."""
+        return f"{self.model or 'model not told'}, serial number {self.serial or 'not told'}"
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryRow:
+    """The figures of one run, with the time of its calibration, else of its beginning."""
+
+    run: FoundRun
+    at_utc: str
+    camera: Instrument | None
+    lens: Instrument | None
+    arms: tuple[Instrument, ...]  # whose flange carried the camera
+    values: Mapping[str, float]
+
+    def instruments(self) -> tuple[Instrument, ...]:
+        """All that took part."""
+        return tuple(one for one in (self.camera, self.lens, *self.arms) if one is not None)
+
+
+def history(store: Store) -> list[HistoryRow]:
+    """Every run with a calibration or an accuracy, oldest first."""
+    runs = find_runs(store, RunWanted())[::-1]
+    with store.database.reading() as connection:
+        calibrations = _calibrations(connection)
+        devices = _devices(connection)
+        optics = _optics(connection)
+    rows: list[HistoryRow] = []
+    for run in runs:
+        steps = calibrations.get(run.run_id, ())
+        values = _values(steps)
+        if run.accuracy is not None:
+            values["mean_radial_error_mm"] = run.accuracy.error_mm
+        if values:
+            at_utc = max((step.at_utc for step in steps), default=run.created_utc)
+            mine = devices.get(run.run_id, {})
+            rows.append(
+                HistoryRow(run, at_utc, *_optical(mine, optics.get(run.run_id, {})), _arms(mine, steps), values)
+            )
+    return sorted(rows, key=lambda row: row.at_utc)
+
+
+def by_instrument(rows: Sequence[HistoryRow]) -> dict[Instrument, list[HistoryRow]]:
+    """The rows of each instrument, cameras before lenses before arms, each by its model and number."""
+    found: dict[Instrument, list[HistoryRow]] = defaultdict(list)
+    for row in rows:
+        for instrument in row.instruments():
+            found[instrument].append(row)
+    order = ("camera", "lens", "arm")
+    return {one: found[one] for one in sorted(found, key=lambda i: (order.index(i.kind), i.model, i.serial))}
+
+
+# --- reading -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Calibration:
+    """What one step of a run solved, as it measured it last."""
+
+    at_utc: str
+    measures: Mapping[str, float]
+    camera: Mapping[str, float]
+    robots: tuple[str, ...]
+
+
+def _calibrations(connection: Connection) -> dict[str, tuple[_Calibration, ...]]:
+    rows = connection.execute(
+        text(
+            "SELECT e.run_id, e.at_utc, json_extract(e.payload, '$.step') AS step, "
+            "json_extract(e.payload, '$.measures') AS measures, "
+            "json_extract(e.payload, '$.result.camera') AS camera, "
+            "json_extract(e.payload, '$.result.robots') AS robots FROM runs AS r CROSS JOIN event_index AS i "
+            "ON i.run_id = r.run_id AND i.kind = 'step_measured' CROSS JOIN events AS e "
+            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE json_valid(e.payload) "
+            "AND json_type(e.payload, '$.result.camera') = 'object' ORDER BY e.run_id, e.seq"
+        )
+    )
+    found: dict[str, dict[str, _Calibration]] = defaultdict(dict)
+    for row in rows:
+        measures = _numbers(row.measures)
+        if any(name in measures for name in _MEASURED):
+            robots = json.loads(row.robots) if row.robots else []
+            found[row.run_id][str(row.step)] = _Calibration(
+                row.at_utc, measures, _numbers(row.camera), tuple(map(str, robots))
+            )
+    return {run: tuple(steps.values()) for run, steps in found.items()}
+
+
+def _devices(connection: Connection) -> dict[str, dict[str, Mapping[str, Any]]]:
+    """By run and name in the rig: who answered, the last time."""
+    rows = connection.execute(
+        text(
+            "SELECT e.run_id, json_extract(e.payload, '$.device') AS device, "
+            "json_extract(e.payload, '$.report.identity') AS identity FROM runs AS r CROSS JOIN event_index AS i "
+            "ON i.run_id = r.run_id AND i.kind = 'device_opened' CROSS JOIN events AS e "
+            "ON e.run_id = i.run_id AND e.seq = i.seq WHERE json_valid(e.payload) "
+            "AND json_type(e.payload, '$.report.identity') = 'object' ORDER BY e.run_id, e.seq"
+        )
+    )
+    found: dict[str, dict[str, Mapping[str, Any]]] = defaultdict(dict)
+    for row in rows:
+        found[row.run_id][str(row.device)] = json.loads(row.identity)
+    return found
+
+
+def _optics(connection: Connection) -> dict[str, Mapping[str, Any]]:
+    """By run: what the first photograph says of camera and lens."""
+    rows = connection.execute(
+        text(
+            "SELECT e.run_id, json_extract(e.payload, '$.camera') AS camera FROM runs AS r CROSS JOIN events AS e "
+            "ON e.run_id = r.run_id AND e.seq = (SELECT min(i.seq) FROM event_index AS i WHERE i.run_id = r.run_id "
+            "AND i.kind IN ('viewpoint_captured', 'view_held', 'view_imported')) WHERE json_valid(e.payload)"
+        )
+    )
+    return {row.run_id: json.loads(row.camera) for row in rows if row.camera}
+
+
+def _numbers(content: str | None) -> dict[str, float]:
+    read: dict[str, Any] = json.loads(content) if content else {}
+    return {name: float(v) for name, v in read.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+
+
+def _values(steps: Iterable[_Calibration]) -> dict[str, float]:
+    values: dict[str, float] = {}
+    for step in steps:
+        values |= {name: step.measures[name] for name in _MEASURED if name in step.measures}
+        values |= {f"{name}_px": step.camera[name] for name in _OF_CAMERA if name in step.camera}
+    return values
+
+
+def _optical(
+    devices: Mapping[str, Mapping[str, Any]], told: Mapping[str, Any]
+) -> tuple[Instrument | None, Instrument | None]:
+    """Camera and lens: by what the images say, which the certificate shows too; else as the camera answered."""
+    answered = next((i for name, i in devices.items() if i.get("kind") == "camera" or name == "camera"), {})
+    model = str(told.get("model") or answered.get("model") or "")
+    serial = str(told.get("body_serial") or answered.get("serial") or "")
+    lens, lens_serial = str(told.get("lens") or ""), str(told.get("lens_serial") or "")
+    return (
+        Instrument("camera", model, serial) if model or serial else None,
+        Instrument("lens", lens, lens_serial) if lens or lens_serial else None,
+    )
+
+
+def _arms(devices: Mapping[str, Mapping[str, Any]], steps: Sequence[_Calibration]) -> tuple[Instrument, ...]:
+    """Those that the calibration names; where it names none, every arm that answered."""
+    named = dict.fromkeys(robot for step in steps for robot in step.robots)
+    names = named or [name for name, i in devices.items() if i.get("kind") == "robot" or name.startswith("robot")]
+    arms = (devices[name] for name in names if name in devices)
+    return tuple(dict.fromkeys(Instrument("arm", str(a.get("model", "")), str(a.get("serial", ""))) for a in arms))
+
+
+# --- CSV -------------------------------------------------------------------------------------------------------
+
+
+def history_csv(rows: Sequence[HistoryRow]) -> str:
+    """The rows as CSV (RFC 4180) with a line of names; units are in the names."""
+    out = io.StringIO()
+    writer = csv.writer(out)
+    about = ("run", "at_utc", "simulated", "state", "specimen", "purpose", "site", "protocol", "version")
+    instruments = ("camera_model", "camera_serial", "lens", "lens_serial", "arm_models", "arm_serials")
+    writer.writerow([*about, *instruments, *_COLUMNS, "mean_radial_error_limit_mm", "accuracy"])
+    for row in rows:
+        run, accuracy = row.run, row.run.accuracy
+        arms = [" + ".join(getattr(arm, field) for arm in row.arms) for field in ("model", "serial")]
+        optical = [
+            getattr(one, field) if one else "" for one in (row.camera, row.lens) for field in ("model", "serial")
+        ]
+        words = (
+            run.run_id, row.at_utc, "yes" if run.simulated else "no", run.status, run.about.specimen,
+            run.about.purpose, run.about.site, run.protocol, run.version, *optical, *arms,
+        )  # fmt: skip
+        judged = "" if accuracy is None else {True: "within", False: "outside", None: "not decided"}[accuracy.within]
+        limit = "" if accuracy is None or accuracy.most_mm is None else f"{accuracy.most_mm:g}"
+        numbers = [f"{row.values[name]:.9g}" if name in row.values else "" for name in _COLUMNS]
+        writer.writerow([*map(_harmless, words), *numbers, limit, judged])
+    return out.getvalue()
+
+
+def _harmless(word: str) -> str:
+    """A spreadsheet takes a text that begins so for a formula."""
+    return f"'{word}" if word.startswith(("=", "+", "-", "@", "\t")) else word

@@ -1,0 +1,49 @@
+"""The auditor's page of a run's devices: which they were, how their clocks stood, what troubled them."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import HTMLResponse, Response
+
+from service.audit.overview import findings
+from service.audit.overview.devices import bodies_of_run
+from service.audit.record import queries
+from service.core.clocks import clock_of, clock_readings, offset_told
+from service.web.audit.frame import Auditing, audit_frame
+from service.web.page.rendering import render
+from service.web.security.guards import requires
+
+router = APIRouter(tags=["audit"])
+
+
+@router.get(
+    "/audit/runs/{run_id}/devices",
+    name="audit_devices",
+    dependencies=[Depends(requires("read"))],
+    response_class=HTMLResponse,
+)
+def devices_page(request: Request, audit: Auditing, run_id: str) -> Response:
+    """Devices with versions, clocks, troubles; sessions and software."""
+    frame = audit_frame(audit, run_id, "/devices")
+    with audit.site.store.database.reading() as connection:
+        opened = findings.events_of(connection, run_id, "device_opened", newest=True)
+        sessions = findings.events_of(connection, run_id, "session_started", newest=True)
+        troubles = findings.events_of(connection, run_id, "device_trouble", newest=True)
+        trouble_count = queries.count_of_kind(connection, run_id, "device_trouble")
+        clocks = findings.clock_offsets(connection, run_id)
+        bodies = bodies_of_run(connection, run_id, opened)
+    readings = clock_readings(audit.site.run(run_id).events)
+    return render(
+        request,
+        "audit/devices.html.j2",
+        audit=frame,
+        opened=opened,
+        bodies=bodies,
+        offset_told=offset_told,
+        clock_of=clock_of,
+        sessions=findings.sessions(sessions),
+        troubles=troubles[-50:],
+        trouble_count=trouble_count,
+        clocks=clocks,
+        readings=readings,
+    )

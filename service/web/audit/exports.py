@@ -1,0 +1,121 @@
+"""What leaves the system: release by a second person, bundle, report, data set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from threading import Lock
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Form, Path, Request, Response
+from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse
+
+from service.audit.export.exports import Exports, What
+from service.core.errors import ConfigurationError
+from service.core.model import RunReleased
+from service.core.release import refuse_export, refuse_release
+from service.store.signing import checkpoint
+from service.web.audit.frame import Auditing, audit_frame
+from service.web.page.rendering import render
+from service.web.security.guards import Signed, requires
+from service.web.site import Here
+
+router = APIRouter(tags=["exports"])
+
+RunId = Annotated[str, Path(max_length=64)]
+MEANINGS = (
+    "I have read this run and release it",
+    "I have read it and release it with its deviations",
+)
+_READ = [Depends(requires("read"))]
+_LOCK = Lock()
+
+
+def _exports(request: Request, site: Here) -> Exports:
+    state = request.app.state
+    with _LOCK:
+        if not hasattr(state, "exports"):
+            state.exports = Exports(site.data, site.store.clock)
+        found: Exports = state.exports
+    return found
+
+
+Exporting = Annotated[Exports, Depends(_exports)]
+
+
+@router.get("/runs/{run_id}/exports", name="exports", dependencies=_READ, response_class=HTMLResponse)
+def exports_page(
+    request: Request, site: Here, audit: Auditing, exports: Exporting, person: Signed, run_id: RunId
+) -> Response:
+    """Whether the run may leave the system, what has left already, and how to make more."""
+    log = site.run(run_id)
+    refusal = refuse_export(log.protocol, log.state)
+    released = next(
+        (e for e in log.events if isinstance(e.payload, RunReleased) and e.actor == log.state.released_by), None
+    )
+    unfit = refuse_release(log.state, person.account, log.state.completed_sha256)
+    return render(
+        request,
+        "audit/exports.html.j2",
+        audit=replace(audit_frame(audit, run_id, ""), here=f"/runs/{run_id}/exports"),
+        state=log.state,
+        needs_release=log.protocol.release == "second_person",
+        released=released,
+        refusal=refusal,
+        may_release=person.may("release"),
+        unfit=unfit,
+        meanings=MEANINGS,
+        may_export=person.may("export"),
+        exporting=exports.now(run_id),
+        files=exports.files(log.events),
+        signed_to=max((item.seq for item in site.store.checkpoints(run_id)), default=0),
+    )
+
+
+@router.post("/runs/{run_id}/release", name="release", dependencies=[Depends(requires("release"))])
+def release(
+    site: Here,
+    person: Signed,
+    run_id: RunId,
+    meaning: Annotated[str, Form(max_length=200)],
+    password: Annotated[str, Form(max_length=1000)],
+    signed_sha256: Annotated[str, Form(max_length=64)],
+) -> RedirectResponse:
+    """Sign, as a second person, that a completed run may leave the system."""
+    log = site.run(run_id)
+    if meaning not in MEANINGS:
+        raise ConfigurationError("the meaning is none of those offered", where="meaning", remedy="Choose one of them")
+    refusal = refuse_release(log.state, person.account, signed_sha256)
+    if refusal is not None:
+        raise refusal
+    site.people.check_password(person.account, password)
+    site.store.record(run_id, [RunReleased(meaning=meaning, signed_sha256=signed_sha256)], actor=person.account)
+    checkpoint(site.store, run_id)
+    return _back(run_id)
+
+
+@router.post("/runs/{run_id}/exports", name="start_export", dependencies=[Depends(requires("export"))])
+def start_export(
+    site: Here, exports: Exporting, person: Signed, run_id: RunId, what: Annotated[What, Form()]
+) -> RedirectResponse:
+    """Begin an export. It verifies everything first, and ends without a file when anything differs."""
+    log = site.run(run_id)
+    refusal = refuse_export(log.protocol, log.state)
+    if refusal is not None:
+        raise refusal
+    exports.start(run_id, what, person.account)
+    return _back(run_id)
+
+
+@router.get("/runs/{run_id}/exports/{file_name}", name="exported_file", dependencies=_READ)
+def exported_file(
+    site: Here, exports: Exporting, run_id: RunId, file_name: Annotated[str, Path(max_length=200)]
+) -> FileResponse:
+    """Download one of the recorded exports."""
+    path, record = exports.path(site.run(run_id).events, file_name)
+    # Never shown within this origin: a report is a page of its own, and pages from here may act.
+    headers = {"X-SHA256": record.sha256, "Cache-Control": "private, no-store"}
+    return FileResponse(path, filename=path.name, media_type="application/octet-stream", headers=headers)
+
+
+def _back(run_id: str) -> RedirectResponse:
+    return RedirectResponse(f"/runs/{run_id}/exports", status_code=303)

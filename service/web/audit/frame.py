@@ -1,0 +1,113 @@
+"""What the audit's pages share: the computations of one data folder, and the frame of a run's pages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from threading import Lock
+from typing import Annotated
+from urllib.parse import urlencode
+
+from fastapi import Depends, FastAPI, Request
+
+from service.audit.background.incremental import Computed
+from service.audit.overview.digest import Digest, digests
+from service.audit.overview.first_page import verified
+from service.audit.provenance.graph import Graph, graphs
+from service.audit.record import queries
+from service.audit.record.queries import RunBasics
+from service.audit.verify.verifications import Verification, Verifications, Verifying
+from service.core.imported import imported_sentence
+from service.store.errors import UnknownRunError
+from service.web.site import Here, Site
+
+LONGEST = 200  # characters of a filter; more is cut
+_LOCK = Lock()
+_TABS = (
+    ("", "Overview"),
+    ("/gates", "Gates"),
+    ("/timeline", "Timeline"),
+    ("/artefacts", "Artefacts"),
+    ("/provenance", "Provenance"),
+    ("/corrections", "Corrections"),
+    ("/signatures", "Signatures"),
+    ("/devices", "Devices and clocks"),
+    ("/verification", "Verification"),
+)
+
+
+@dataclass
+class Audit:
+    """What is computed for one data folder."""
+
+    site: Site
+    digests: Computed[Digest]
+    graphs: Computed[Graph]
+    verifications: Verifications
+
+
+def _audit(request: Request, site: Here) -> Audit:
+    state = request.app.state
+    with _LOCK:
+        if not hasattr(state, "audit"):
+            state.audit = Audit(
+                site, digests(site.store), graphs(site.store), Verifications(site.data, site.store.clock)
+            )
+        found: Audit = state.audit
+    return found
+
+
+def close_audit(app: FastAPI) -> None:
+    """End what is still being computed."""
+    found: Audit | None = getattr(app.state, "audit", None)
+    if found is not None:
+        found.digests.close()
+        found.graphs.close()
+
+
+Auditing = Annotated[Audit, Depends(_audit)]
+
+
+@dataclass(frozen=True, slots=True)
+class AuditFrame:
+    """What stands around every page of one run."""
+
+    run: RunBasics
+    base: str  # /audit/runs/RUN
+    tabs: tuple[tuple[str, str], ...]  # address, text
+    here: str  # address of the present tab
+    verification: Verification | None
+    verified: str
+    verifying: Verifying | None
+    imported: str  # the sentence that says so; "" for a run that captured its photographs itself
+
+
+def audit_frame(audit: Audit, run_id: str, tab: str) -> AuditFrame:
+    """Of one run, for the page at `tab`. Raises UnknownRunError."""
+    with audit.site.store.database.reading() as connection:
+        found = queries.runs(connection, run_id)
+    if not found:
+        raise UnknownRunError(f"there is no run {run_id!r}", remedy="Choose one from the list of runs")
+    base = f"/audit/runs/{run_id}"
+    last = audit.verifications.last(run_id)
+    return AuditFrame(
+        run=found[0],
+        base=base,
+        tabs=(*((base + path, text) for path, text in _TABS), (f"/runs/{run_id}/exports", "Exports")),
+        here=base + tab,
+        verification=last,
+        verified=verified(last, found[0].head_sha256),
+        verifying=audit.verifications.running(run_id),
+        imported=imported_sentence(found[0].created_utc, found[0].operator) if found[0].origin == "imported" else "",
+    )
+
+
+def link(address: str, query: Mapping[str, object]) -> str:
+    """An address with its query; empty fields are left out."""
+    fields = {name: value for name, value in query.items() if value not in ("", None, 0)}
+    return f"{address}?{urlencode(fields)}" if fields else address
+
+
+def cut(text: str) -> str:
+    """A filter as it is used and shown."""
+    return text[:LONGEST].replace("\0", "")

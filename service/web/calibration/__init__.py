@@ -1,0 +1,1 @@
+"""The calibration of a run: coverage, residuals, advice, certificate."""

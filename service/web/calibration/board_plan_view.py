@@ -1,0 +1,58 @@
+"""The planned board images of a run's calibration step: as recorded, or before the step as they will be planned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from service.core.count_words import counted
+from service.core.errors import ConfigurationError, OrthocaptureError
+from service.evidence import RunLog
+from service.rig import Rig
+from service.steps.board_plan import NOTE, describe_prediction
+from service.steps.calibration import Params
+from service.steps.context import StationLayout
+from service.steps.preview import preview_board_poses
+from service.web.calibration.board_plan_drawing import board_plan_svg
+from service.web.record.pictures import cached
+from service.web.record.planned_poses import recorded_rig, station_of
+
+
+def board_plan_of(log: RunLog, step_id: str, data: Path) -> bytes:
+    """An SVG document; computed once for what is recorded of a step.
+
+    Raises:
+        ProtocolError: no such step.
+        ConfigurationError: the software plans no board images in it.
+    """
+    step = log.protocol.step(step_id)
+    wanted = step.params.board_poses if isinstance(step.params, Params) else None
+    if wanted is None:
+        raise ConfigurationError("no board images are planned in this step", where=f"step {step_id}")
+    solve = step.params_as(Params).solve
+    notes = [note for note in log.state.steps[step_id].notes if note.note == NOTE]
+
+    def layout(name: str) -> StationLayout:
+        station = station_of(log, name)
+        if station is None:
+            raise ConfigurationError(f"the rig has no station {name!r}", where=f"step {step_id}")
+        return station.layout
+
+    def make() -> bytes:
+        approach = np.array(layout(wanted.station).approach)
+        if notes:
+            poses = np.array([pose["T_base_camera"] for note in notes for pose in note.data["poses"]])
+            prediction = notes[-1].data["prediction"]
+            text = f"{counted(len(poses), 'board pose')} so far; predicted {describe_prediction(prediction, solve)}"
+            return board_plan_svg(text, prediction["coverage_map"], poses, approach).encode()
+        try:
+            found = preview_board_poses(log.protocol, step, Rig(recorded_rig(log), Path(), b""), layout)
+        except OrthocaptureError as error:
+            return board_plan_svg(str(error), [[0] * 12] * 8, np.zeros((0, 4, 4)), approach).encode()
+        assert found is not None  # the step plans board images
+        return board_plan_svg(found.text, found.prediction["coverage_map"], found.T_base_camera, approach).encode()
+
+    return cached(
+        data, f"board plan {log.state.run_id} {step_id} {notes[-1].seq if notes else 0}", ".svg", make
+    ).read_bytes()

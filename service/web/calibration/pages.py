@@ -1,0 +1,116 @@
+"""The calibration: coverage, residuals, uncertainty, poses to add, certificate."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Path, Query, Request
+from fastapi.responses import HTMLResponse, Response
+
+from service.core.dependence import AcceptedGate, depends_on
+from service.core.errors import IllegalTransitionError
+from service.core.gates import figure
+from service.core.model import ViewpointCaptured
+from service.evidence import RunLog
+from service.web.calibration.view import (
+    Calibration,
+    calibration_of,
+    certificate_of,
+    charts_of,
+    hand_eye_chart,
+    held_out_mm,
+    image_rows,
+)
+from service.web.page.rendering import render
+from service.web.page.run_frame import run_frame
+from service.web.page.run_words import gate_word, limit, measure_name
+from service.web.security.guards import requires
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["calibration"])
+
+_WORDS: dict[str, Any] = {"measure_name": measure_name, "figure": figure, "limit": limit, "gate_word": gate_word}
+RunId = Annotated[str, Path(max_length=64)]
+
+
+@router.get("/runs/{run_id}/calibration", name="calibration", dependencies=[Depends(requires("read"))])
+def calibration(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
+    """Whether the calibration is good, in pixels and in millimetres, and what would make it better."""
+    log = site.run(run_id)
+    found = calibration_of(log)
+    context: dict[str, Any] = {**_WORDS, "run_id": run_id, "found": found, "frame": run_frame(site, run_id)}
+    if found is not None:
+        context |= {
+            "charts": charts_of(found),
+            "hand_eye_chart": hand_eye_chart(found),
+            "images": image_rows(found),
+            "held_out": held_out_mm(found),
+            "depends": _depends(log, found),
+            **_advice(site, log, found),
+        }
+    return render(request, "calibration/calibration.html.j2", **context)
+
+
+@router.get("/runs/{run_id}/board-plan.svg", name="board_plan", dependencies=[Depends(requires("read"))])
+def board_plan(site: Here, run_id: RunId, step: Annotated[str, Query(max_length=64)]) -> Response:
+    """The board images of a calibration step as they are planned: corners over the image, and the camera's places."""
+    # The planning of poses brings scipy, which the start of the service does not wait for.
+    from service.web.calibration.board_plan_view import board_plan_of  # noqa: PLC0415
+
+    headers = {"Cache-Control": "private, no-cache"}
+    return Response(board_plan_of(site.run(run_id), step, site.data), media_type="image/svg+xml", headers=headers)
+
+
+@router.get(
+    "/runs/{run_id}/calibration/certificate",
+    name="calibration_certificate",
+    dependencies=[Depends(requires("read"))],
+)
+def certificate(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
+    """The calibration on a page to print."""
+    log = site.run(run_id)
+    found = calibration_of(log)
+    if found is None:
+        raise IllegalTransitionError(
+            "there is no calibration to certify yet", where=run_id, remedy="Finish the calibration step first"
+        )
+    return render(
+        request,
+        "calibration/certificate.html.j2",
+        frame=run_frame(site, run_id),
+        run_id=run_id,
+        found=found,
+        held_out=held_out_mm(found),
+        depends=_depends(log, found),
+        certificate=certificate_of(log, found),
+        simulated=log.state.simulated,
+        head=log.events[-1],
+        **_WORDS,
+    )
+
+
+def _depends(log: RunLog, found: Calibration) -> list[AcceptedGate]:
+    gates = (gate for step, _ in found.steps for gate in depends_on(log.protocol, log.state, step.id))
+    return list(dict.fromkeys(gates))
+
+
+def _advice(site: Site, log: RunLog, found: Calibration) -> dict[str, object]:
+    # The planning of poses brings scipy, which the start of the service does not wait for.
+    from service.web.calibration.board_advice import advised_poses, empty_regions  # noqa: PLC0415
+    from service.web.record.planned_poses import recorded_rig  # noqa: PLC0415
+
+    regions = [] if found.intrinsics is None else empty_regions(found.intrinsics["coverage"]["corners"])
+    board = log.protocol.board
+    if found.hand_eye is None or found.best is None or board is None or found.artefact is None:
+        return {"regions": regions, "poses": ()}
+    used = set(found.best["residuals"]["mm"])
+    poses = advised_poses(
+        found.hand_eye,
+        found.camera,
+        [c for c in found.captures if isinstance(c, ViewpointCaptured) and c.viewpoint in used],
+        board,
+        recorded_rig(log).collision.arm or "",
+        site.data,
+        found.artefact.sha256,
+    )
+    return {"regions": regions, "poses": poses}

@@ -1,0 +1,1 @@
+"""Live capture by the robot: viewpoints, last image, plan and pictures."""

@@ -1,0 +1,211 @@
+"""Pictures: thumbnails, images with detected spheres, live view frames, recorded files; and plotly's own script."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import re
+import time
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+from fastapi import Path as UrlPath
+from fastapi.responses import FileResponse
+from sqlalchemy import select
+
+from service.core.errors import OrthocaptureError
+from service.core.model import ArtefactRef
+from service.evidence import RunLog
+from service.monitor.snapshot import ask_for_frames, frame_path
+from service.notes import NOTE_PHOTOGRAPH
+from service.store.artefacts import to_artefact
+from service.store.tables import artefacts
+from service.web.record.images import Capture, find_capture
+from service.web.record.pictures import IMAGE_WIDTHS, PICTURES, cached, nearest_width, reduced_jpeg, safe_name
+from service.web.security.guards import requires
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["media"])
+
+RunId = Annotated[str, UrlPath(pattern=r"^[0-9A-Za-z_-]{1,64}$")]
+Sha256 = Annotated[str, UrlPath(pattern=r"^[0-9a-f]{64}$")]
+Viewpoint = Annotated[str, UrlPath(pattern=r"^[0-9A-Za-z_.+-]{1,64}$")]
+StepName = Annotated[str, Query(pattern=r"^[0-9A-Za-z_-]{0,64}$")]
+Number = Annotated[int | None, Query(ge=1, le=2**53)]
+
+_FOR_EVER = "private, max-age=31536000, immutable"  # its address holds the hash of its content
+_ASK_AGAIN = "private, no-cache"
+_STALE_FRAME_S = 5.0
+_MEDIA_TYPE = re.compile(r"[a-z]+/[a-z0-9.+-]+")
+
+
+@router.get("/vendor/plotly.js", name="plotly_script", response_class=FileResponse)
+def plotly_script(request: Request, site: Here) -> Response:
+    """plotly's script out of the installed package; charts and the 3D view load it in their sandboxed frames."""
+    path = _plotly()
+    stat = path.stat()
+    tag = f'"{stat.st_size:x}-{stat.st_mtime_ns:x}"'
+    headers = {"ETag": tag, "Cache-Control": "public, max-age=604800", "Vary": "Accept-Encoding"}
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers=headers)
+    if "gzip" in request.headers.get("accept-encoding", ""):
+        path = cached(site.data, f"plotly {tag}", ".js.gz", lambda: gzip.compress(path.read_bytes(), 6))
+        headers["Content-Encoding"] = "gzip"
+    return FileResponse(path, media_type="text/javascript", headers=headers)
+
+
+@cache
+def _plotly() -> Path:
+    spec = find_spec("plotly")  # found, not imported: the package itself takes a while
+    for folder in () if spec is None else spec.submodule_search_locations or ():
+        path = Path(folder, "package_data", "plotly.min.js")
+        if path.is_file():
+            return path
+    raise HTTPException(404, "plotly's script is not installed; install orthocapture anew, its dependencies included")
+
+
+@router.get(
+    "/runs/{run_id}/files/{sha256}",
+    name="run_file",
+    dependencies=[Depends(requires("read"))],
+    response_class=FileResponse,
+)
+def run_file(
+    request: Request,
+    site: Here,
+    run_id: RunId,
+    sha256: Sha256,
+    thumbnail: Annotated[int | None, Query(ge=64, le=640)] = None,
+) -> Response:
+    """A file of this run's evidence, hashed again before it is sent; or a small copy of a picture."""
+    ref = recorded_file(site, run_id, sha256)
+    tag = f'"{sha256}{"" if thumbnail is None else f"-{nearest_width(thumbnail)}"}"'
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers={"ETag": tag, "Cache-Control": _FOR_EVER})
+    if thumbnail is not None:
+        path = _reduced(site, ref, nearest_width(thumbnail))
+        return _picture(path, tag, _FOR_EVER)
+    path = site.store.artefact_path(sha256, verify=True)
+    digest = base64.b64encode(bytes.fromhex(sha256)).decode()
+    headers = {
+        "ETag": tag,
+        "Cache-Control": _FOR_EVER,
+        "X-Content-Type-Options": "nosniff",
+        "Content-Security-Policy": "sandbox; default-src 'none'",
+        "Repr-Digest": f"sha-256=:{digest}:",  # RFC 9530
+    }
+    media_type = ref.media_type if _MEDIA_TYPE.fullmatch(ref.media_type) else "application/octet-stream"
+    return FileResponse(path, media_type=media_type, headers=headers, filename=safe_name(ref.original_name, sha256))
+
+
+@router.get(
+    "/runs/{run_id}/images/{viewpoint}",
+    name="viewpoint_image",
+    dependencies=[Depends(requires("read"))],
+    response_class=FileResponse,
+)
+def viewpoint_image(
+    request: Request,
+    site: Here,
+    run_id: RunId,
+    viewpoint: Viewpoint,
+    step: StepName = "",
+    attempt: Annotated[int | None, Query(ge=1, le=10_000)] = None,
+    seq: Number = None,
+    width: Annotated[int, Query(ge=64, le=4096)] = 1280,
+    marked: bool = False,
+) -> Response:
+    """The image of a viewpoint, the valid one unless `attempt` or `seq` asks for another, for the screen."""
+    log = site.run(run_id)
+    capture = find_capture(log, viewpoint, step=step, attempt=attempt, seq=seq)
+    if capture is None:
+        raise HTTPException(404, f"there is no image of viewpoint {viewpoint} in this run")
+    size = nearest_width(width, IMAGE_WIDTHS)
+    source = mark_source(log, capture) if marked else ""
+    ref = capture.payload.artefacts[0]
+    tag = f'"{ref.sha256}-{size}{f"-{source}" if source else ""}"'
+    if request.headers.get("if-none-match") == tag:
+        return Response(status_code=304, headers={"ETag": tag, "Cache-Control": _ASK_AGAIN})
+    return _picture(_reduced(site, ref, size, log, capture, source), tag, _ASK_AGAIN)
+
+
+@router.get(
+    "/runs/{run_id}/live-view",
+    name="live_view",
+    dependencies=[Depends(requires("read"))],
+    responses={204: {"description": "no frame yet"}},
+    response_class=FileResponse,
+)
+def live_view(site: Here, run_id: RunId) -> Response:
+    """The camera's newest frame. Asking keeps the frames coming; a frame of some seconds ago is not shown as live."""
+    site.run(run_id)
+    ask_for_frames(site.data, run_id)
+    path = frame_path(site.data, run_id)
+    headers = {"Cache-Control": "no-store"}
+    try:
+        age_s = time.time() - path.stat().st_mtime
+        content = path.read_bytes()  # now: it may be replaced while a response is sent piece by piece
+    except OSError:
+        return Response(status_code=204, headers=headers)
+    if age_s > _STALE_FRAME_S:
+        return Response(status_code=204, headers=headers)
+    return Response(content, media_type="image/jpeg", headers=headers | {"X-Frame-Age-S": f"{max(age_s, 0.0):.1f}"})
+
+
+def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
+    """What this run has recorded of a file. HTTP 404 when it has recorded none of this name, whatever others have."""
+    with site.store.database.reading() as connection:
+        row = connection.execute(
+            select(artefacts)
+            .where(artefacts.c.sha256 == sha256, artefacts.c.run_id == run_id)
+            .order_by(artefacts.c.seq, artefacts.c.position)
+            .limit(1)
+        ).first()
+    if row is None:
+        raise HTTPException(404, "this run has recorded no such file")
+    return to_artefact(row).ref
+
+
+def mark_source(log: RunLog, capture: Capture) -> str:
+    """Names what would be drawn over an image: changes when something better becomes known; "" for nothing."""
+    from service.web.record.outlines import outlines_of  # noqa: PLC0415 - the matching of spheres, not needed to start
+
+    found = outlines_of(log, capture)
+    return "" if found is None else found.source
+
+
+def _reduced(
+    site: Site,
+    ref: ArtefactRef,
+    width: int,
+    log: RunLog | None = None,
+    capture: Capture | None = None,
+    source: str = "",
+) -> Path:
+    """The cached copy. HTTP 415 for what is no picture; the original is hashed again when a copy is made."""
+    if ref.media_type not in PICTURES:
+        raise HTTPException(415, f"{safe_name(ref.original_name, ref.sha256)} is not a picture")
+
+    def make() -> bytes:
+        from service.web.record.outlines import marks_of  # noqa: PLC0415 - as above
+
+        marks = marks_of(log, capture) if log is not None and capture is not None and source else ()
+        path = site.store.artefact_path(ref.sha256, verify=True)
+        return reduced_jpeg(path, width, marks, upright=ref.kind == NOTE_PHOTOGRAPH)
+
+    try:
+        return cached(site.data, f"{ref.sha256} {width} {source}", ".jpg", make)
+    except OSError as error:
+        raise OrthocaptureError(
+            f"a small copy of a picture cannot be kept: {error.strerror}",
+            where=str(site.data / "cache"),
+            remedy="Free some space on the disk; the recorded pictures are untouched",
+        ) from error
+
+
+def _picture(path: Path, tag: str, caching: str) -> Response:
+    headers = {"ETag": tag, "Cache-Control": caching, "X-Content-Type-Options": "nosniff"}
+    return FileResponse(path, media_type="image/jpeg", headers=headers)

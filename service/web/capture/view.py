@@ -1,0 +1,317 @@
+"""What the capture page shows, read from a run: its viewpoints and how each stands, and what is known of an image."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any, Literal
+
+import numpy as np
+
+from service.core.actions import refuse
+from service.core.gates import limits
+from service.core.model import OperatorAction, ViewpointCaptured
+from service.core.protocol import Protocol, Step
+from service.core.run_state import StepState
+from service.evidence import RunLog
+from service.web.record.board_images import board_use, board_uses
+from service.web.record.images import Capture, captures_of, last_failures
+from service.web.record.planned_poses import Vector, nominal_T_flange_camera, place, planned_viewpoints
+
+ViewState = Literal["done", "departs", "unused", "next", "open", "again", "failed", "skipped", "left_out"]
+WORDS: Mapping[ViewState, str] = {
+    "done": "Done",
+    "departs": "Taken, departs",
+    "unused": "Taken, not used",
+    "next": "Next",
+    "open": "To do",
+    "again": "To be redone",
+    "failed": "Failed",
+    "skipped": "Skipped",
+    "left_out": "Left out by the plan",
+}
+TONES: Mapping[ViewState, str] = {
+    "done": "ok",
+    "departs": "attention",
+    "unused": "attention",
+    "next": "now",
+    "open": "open",
+    "again": "now",
+    "failed": "stop",
+    "skipped": "attention",
+    "left_out": "attention",
+}
+# Guides for the eye, not gates: what the protocol demands is in its gates.
+_EDGE_PX = 4.0
+_EDGE_FACTOR = 1.5  # of the median of the step's images
+_CLIPPED = 0.01
+_FEWEST_SPHERES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One viewpoint of a step."""
+
+    name: str
+    station: str
+    state: ViewState
+    why: str  # of a failure, of being left out
+    position_m: Vector | None  # of the camera in the base frame of its station
+    looks: Vector | None  # its optical axis there
+    capture: Capture | None  # the valid one
+    replaced: int  # captures that no longer count
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One thing to know of an image: word, figures, and the guide or limit that it was held against."""
+
+    name: str
+    passed: bool | None  # None: not known
+    word: str
+    figures: str
+    limit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Redo:
+    """Whether a viewpoint may be redone now; and whether the robot drives there at once."""
+
+    refused: str
+    moves: bool
+
+
+def capture_steps(protocol: Protocol) -> list[Step]:
+    """The steps that take images with the robot."""
+    return [
+        step
+        for step in protocol.steps
+        if getattr(step.params, "viewpoints", ()) or getattr(step.params, "board_poses", None) is not None
+    ]
+
+
+def step_to_show(log: RunLog, wanted: str) -> Step | None:
+    """The step asked for; else the current one, the last one with images, or the first; None without any."""
+    steps = {step.id: step for step in capture_steps(log.protocol)}
+    if wanted in steps:
+        return steps[wanted]
+    if log.state.current in steps:
+        return steps[log.state.current]
+    done = [step for step in steps.values() if log.state.steps[step.id].captured]
+    return done[-1] if done else next(iter(steps.values()), None)
+
+
+def views_of(log: RunLog, step: Step) -> list[View]:
+    """Every viewpoint of a step in the order of capture: planned, suggested, and taken without either."""
+    state = log.state.steps[step.id]
+    planned = {v.name: v for v in planned_viewpoints(log, step)}
+    refused = _refused(state)
+    failures = last_failures(log, step.id)
+    captures = captures_of(log, step.id)
+    replaced_of = Counter(c.payload.viewpoint for c in captures if c.replaced is not None)
+    uses = board_uses(log.state, log.events, step.id)
+    valid = {c.payload.viewpoint: c for c in captures if state.captured.get(c.payload.viewpoint) == c.seq}
+    order = [name for name in _order(state) if name in planned]
+    names = list(dict.fromkeys([*order, *planned, *valid, *state.skipped_viewpoints, *state.viewpoint_failures]))
+    names.sort(key=lambda name: name in refused)
+    out: list[View] = []
+    next_found = state.phase not in ("ready", "running", "recovering") or log.state.current != step.id
+    for name in names:
+        capture = valid.get(name)
+        replaced = replaced_of[name]
+        now, why = _state(name, state, capture, refused, failures, replaced=replaced > 0)
+        use = None if capture is None else uses.get(capture.sha256)
+        if use is not None and use.used is False:
+            now, why = "unused", use.why
+        if now in ("open", "again", "failed") and not next_found:
+            next_found = True
+            now = "next" if now == "open" else now
+        position, looks = _place(log, capture) if capture is not None else (None, None)
+        station = "" if capture is None else capture.payload.station
+        if name in planned:
+            position, looks, station = planned[name].position_m, planned[name].looks, planned[name].station
+        out.append(View(name, station, now, why, position, looks, capture, replaced))
+    return out
+
+
+def _state(
+    name: str,
+    state: StepState,
+    capture: Capture | None,
+    refused: Mapping[str, str],
+    failures: Mapping[str, str],
+    *,
+    replaced: bool,
+) -> tuple[ViewState, str]:
+    if capture is not None:
+        departs = [key for key, passed in capture.payload.verdicts.items() if not passed]
+        return ("departs", f"not as wanted: {', '.join(departs)}") if departs else ("done", "")
+    if name in refused:
+        return "left_out", refused[name]
+    if name in state.skipped_viewpoints:
+        return "skipped", failures.get(name, "")
+    if name in state.viewpoint_failures:
+        return "failed", failures.get(name, "")
+    return ("again", "") if replaced else ("open", "")
+
+
+def _order(state: StepState) -> list[str]:
+    plans = [note for note in state.notes if note.note == "motion_plan"]
+    stations = plans[-1].data["stations"] if plans else ()
+    taken = sorted(state.captured, key=lambda name: state.captured[name])
+    return taken + [str(view["viewpoint"]) for station in stations for view in station["views"]]
+
+
+def _refused(state: StepState) -> dict[str, str]:
+    plans = [note for note in state.notes if note.note == "motion_plan"]
+    stations = plans[-1].data["stations"] if plans else ()
+    views = [view for station in stations for view in station["views"]]
+    return {str(v["viewpoint"]): str(v["reason"]) for v in views if v["outcome"] == "refused"}
+
+
+def _place(log: RunLog, capture: Capture) -> tuple[Vector, Vector] | tuple[None, None]:
+    """Where a camera stood that no plan names, by the drawing of its mount."""
+    mount = nominal_T_flange_camera(log)
+    if mount is None or not isinstance(capture.payload, ViewpointCaptured):
+        return None, None
+    return place(np.array(capture.payload.T_base_flange) @ np.array(mount))
+
+
+# --- one image ---------------------------------------------------------------------------------------------------
+
+
+def verdicts_of(log: RunLog, step: Step, capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
+    """Sharp, exposed, spheres, pose, settings: in words, with the figures behind them."""
+    of_board = capture.payload.artefacts[0].kind == "board_image"
+    found = [_board(log, step, capture)] if of_board else _found(capture, others)
+    return [*found, *_taken(log.protocol, capture)]
+
+
+def _board(log: RunLog, step: Step, capture: Capture) -> Verdict:
+    """Whether the calibration uses an image of the board."""
+    use, name = board_use(log.state.steps[step.id], capture.payload), capture.payload.viewpoint
+    details: Any = log.state.steps[step.id].result.get("details", {})
+    intrinsics = details.get("intrinsics") or {}
+    if use.used and "per_view_rms_px" in intrinsics:
+        rms = dict(zip(intrinsics["images"], intrinsics["per_view_rms_px"], strict=True))[name]
+        return Verdict("Board", True, "Found", f"corners {rms:.3f} px rms against the calibration")
+    return Verdict("Board", use.used, use.word, use.why)
+
+
+def _found(capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
+    """What the live numbers say."""
+    live = capture.live
+    measures = {} if live is None else dict(live.measures)
+    waiting = live is not None and live.status == "enqueued"
+    unknown = "being looked at" if waiting else "not measured"
+    out: list[Verdict] = []
+
+    edge = measures.get("edge_width_px")
+    known = [o.live.measures["edge_width_px"] for o in others if o.live and "edge_width_px" in o.live.measures]
+    guide = max(_EDGE_PX, _EDGE_FACTOR * median(known)) if known else _EDGE_PX
+    sharp = None if edge is None else edge <= guide
+    words = {None: unknown, True: "Sharp", False: "Soft"}
+    figures = "" if edge is None else f"edges {edge:.1f} px wide, outlines {measures['outline_rms_px']:.2f} px rms"
+    out.append(Verdict("Sharpness", sharp, words[sharp], figures, f"guide ≤ {guide:.1f} px"))
+
+    clipped = measures.get("clipped_fraction")
+    exposed = None if clipped is None else clipped <= _CLIPPED
+    words = {None: unknown, True: "Well exposed", False: "Overexposed"}
+    figures = "" if clipped is None else f"{100 * clipped:.2f} % of the pixels clipped"
+    out.append(Verdict("Exposure", exposed, words[exposed], figures, f"guide ≤ {100 * _CLIPPED:.0f} %"))
+
+    spheres, expected = measures.get("spheres_seen"), measures.get("spheres_expected")
+    seen = None if spheres is None else spheres >= max(_FEWEST_SPHERES, expected or 0)
+    words = {None: unknown, True: "All seen", False: "Some missing"}
+    figures = "" if spheres is None else f"{spheres:.0f} seen"
+    if expected is not None:
+        figures += f", {expected:.0f} expected whole in the image"
+    reason = "" if live is None else str(live.result.get("reason", "")) or live.message
+    out.append(Verdict("Spheres", seen, words[seen], f"{figures}; {reason}".strip("; ") if reason else figures))
+
+    return out
+
+
+def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
+    """What was judged when the image was taken."""
+    payload = capture.payload
+    out: list[Verdict] = []
+    if isinstance(payload, ViewpointCaptured):
+        still = payload.verdicts.get("still")
+        words = {None: "not judged", True: "Still", False: "Moved"}
+        figures = (
+            f"σ {_small(1e3 * payload.pose_sigma_m)} mm, {_small(1e3 * payload.pose_sigma_rad)} mrad "
+            f"over {payload.pose_samples} poses"
+        )
+        limit = f"limit {1e3 * protocol.settle.position_peak_to_peak_m:.3g} mm peak to peak"
+        out.append(Verdict("Pose", still, words[still], figures, limit))
+
+    settings = payload.verdicts.get("settings")
+    words = {None: "not judged", True: "As wanted", False: "Differ"}
+    camera = payload.camera
+    figures = _settings(camera.get("aperture_f"), camera.get("exposure_s"), camera.get("iso"))
+    demanded = protocol.camera
+    limit = ""
+    if demanded is not None:
+        limit = f"wanted {_settings(demanded.aperture_f, demanded.exposure_s, demanded.iso)}"
+    out.append(Verdict("Settings", settings, words[settings], figures, limit))
+    return out
+
+
+def _small(value: float) -> str:
+    return "< 0.0001" if value < 1e-4 else f"{value:.4f}"
+
+
+def _settings(aperture_f: object, exposure_s: object, iso: object) -> str:
+    parts: list[str] = []
+    if isinstance(aperture_f, (int, float)):
+        parts.append(f"f/{aperture_f:g}")
+    if isinstance(exposure_s, (int, float)) and exposure_s > 0:
+        parts.append(f"1/{1 / exposure_s:.0f} s" if exposure_s < 0.5 else f"{exposure_s:g} s")
+    if isinstance(iso, (int, float)):
+        parts.append(f"ISO {iso:.0f}")
+    return " · ".join(parts)
+
+
+def summary_of(step: Step, capture: Capture) -> list[Verdict]:
+    """What all images up to this one come to, against the step's gates where it has any."""
+    measures = {} if capture.live is None else dict(capture.live.measures)
+    out: list[Verdict] = []
+    for measure, name, unit, factor, digits in (
+        ("predicted_target_error_mm", "Predicted target error", "mm", 1.0, 3),
+        ("specimen_coverage", "Specimen covered", "%", 100.0, 0),
+        ("registration_rms_px", "Outlines and registration differ by", "px rms", 1.0, 2),
+    ):
+        if measure not in measures:
+            continue
+        value = measures[measure]
+        gate = next((g for g in step.gates if g.measure == measure), None)
+        passed = None
+        limit = ""
+        if gate is not None:
+            passed = (gate.min is None or value >= gate.min) and (gate.max is None or value <= gate.max)
+            low, high = (None if end is None else factor * end for end in (gate.min, gate.max))
+            limit = f"allowed {limits(low, high)} {unit}"
+        out.append(Verdict(name, passed, "", f"{factor * value:.{digits}f} {unit}", limit))
+    return out
+
+
+def redo_of(log: RunLog, step: Step, view: View, account: str) -> Redo:
+    """Whether a viewpoint may be sent back now. While the step runs, the robot then drives there by itself."""
+    action = OperatorAction(action="redo", step=step.id, viewpoint=view.name, reason="asked", via="web")
+    refusal = refuse(log.protocol, log.state, action, account)
+    moves = log.state.current == step.id and log.state.phase == "running"
+    return Redo("" if refusal is None else ". ".join(filter(None, (refusal.what, refusal.remedy))), moves)
+
+
+def suggestions_of(log: RunLog, step: Step) -> tuple[str, list[dict[str, object]]]:
+    """What the step found wanting and the views that would help most; "" and none when nothing is wanting."""
+    state = log.state.steps[step.id]
+    notes = [note for note in state.notes if note.note == "suggested_viewpoints"]
+    if notes:
+        return str(notes[-1].data["advice"]), [dict(view) for view in notes[-1].data["viewpoints"]]
+    jobs = [job for job in state.jobs.values() if job.kind == "live_summary" and job.status == "finished"]
+    views = jobs[-1].result.get("next_best_views", ()) if jobs else ()
+    return "", [dict(view) for view in views]

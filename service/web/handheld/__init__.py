@@ -1,0 +1,1 @@
+"""Capture by hand: the way to go, the last image and the hemisphere."""

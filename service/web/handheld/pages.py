@@ -1,0 +1,76 @@
+"""Capture by hand: live view with the way to go, release, last image, hemisphere."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Depends, Form, Path, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
+
+from service.core.actions import capture_refusal
+from service.core.model import CaptureAsked
+from service.people.control import Control
+from service.people.person import Person
+from service.web.page.rendering import part_names, render
+from service.web.page.run_frame import run_frame
+from service.web.security.guards import Signed, requires
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["capture by hand"])
+
+RunId = Annotated[str, Path(max_length=64)]
+Name = Annotated[str, Query(max_length=64)]
+Parts = Annotated[str, part_names("way", "image", "plan", "overlay")]
+
+
+@router.get("/runs/{run_id}/held", name="held", dependencies=[Depends(requires("read"))])
+def held(request: Request, site: Here, person: Signed, run_id: RunId, step: Name = "") -> HTMLResponse:
+    """The page that a technician has beside the camera."""
+    return render(
+        request, "handheld/handheld.html.j2", frame=run_frame(site, run_id), **_shown(site, person, run_id, step)
+    )
+
+
+@router.get("/runs/{run_id}/held/parts/{names}", name="held_parts", dependencies=[Depends(requires("read"))])
+def held_parts(
+    request: Request, site: Here, person: Signed, run_id: RunId, names: Parts, step: Name = ""
+) -> HTMLResponse:
+    """Parts of the page, all of one moment, for the script that keeps it up to date."""
+    return render(request, "handheld/parts.html.j2", names=names.split(","), **_shown(site, person, run_id, step))
+
+
+@router.post("/runs/{run_id}/held", name="ask_capture", dependencies=[Depends(requires("operate"))])
+def ask(
+    site: Here,
+    person: Signed,
+    run_id: RunId,
+    step: Annotated[str, Form(max_length=64)],
+    attempt: Annotated[int, Form(ge=1, le=10_000)],
+    what: Annotated[Literal["release", "finish"], Form()],
+) -> RedirectResponse:
+    """Release the shutter, or end the capture with what it has."""
+    log = site.run(run_id)
+    Control(site.store).require(run_id, person)
+    refusal = capture_refusal(log.protocol, log.state, step, attempt)
+    if refusal is not None:
+        raise refusal
+    site.store.record(run_id, [CaptureAsked(step=step, attempt=attempt, what=what)], actor=person.account)
+    return RedirectResponse(f"/runs/{run_id}/held", status_code=303)
+
+
+def _shown(site: Site, person: Person, run_id: str, wanted: str) -> dict[str, Any]:
+    from service.web.handheld import view as held_view  # noqa: PLC0415 - brings numerics that the start does not wait for
+
+    log = site.run(run_id)
+    step = held_view.step_to_show(log, wanted)
+    holder = Control(site.store).holder(run_id)
+    return {
+        "run_id": run_id,
+        "log": log,
+        "steps": held_view.held_steps(log.protocol),
+        "step": step,
+        "now": None if step is None else held_view.held_now(log, step),
+        "attempt": 1 if step is None else log.state.steps[step.id].attempt,
+        "in_control": person.may("operate") and holder.screen == person.screen,
+        "size": held_view.SIZE,
+    }

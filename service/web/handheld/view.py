@@ -1,0 +1,196 @@
+"""What the page of a capture by hand shows: the last image's verdict, where to go next, the hemisphere from above."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from service.core.gates import quantity
+from service.core.model import DeviceOpened, ViewHeld
+from service.core.protocol import Protocol, Step
+from service.core.run_state import JobState
+from service.evidence import RunLog
+from service.steps.manual_capture import failure_words
+from service.web.page.run_words import limit, measure_name
+from service.web.record.images import captures_of
+
+SIZE = 480.0  # of the drawing, which is square
+_REACH = 190.0  # from the middle to the lowest place of the hemisphere
+_LARGEST_ARROW = 30.0  # of the overlay, whose frame is 100 wide
+_METRES_FOR_LARGEST = 0.25
+_KINDS = ("hand_view", "hand_board")
+_TOLD = ("images_used", "hemisphere_coverage", "coverage", "predicted_target_error_mm", "specimen_coverage")
+
+SpotState = Literal["done", "open", "next"]
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A place of the hemisphere, or the camera, on the drawing."""
+
+    name: str
+    state: SpotState
+    x: float
+    y: float
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """Over the live view, in a frame of 150 × 100: which way the camera goes in the picture, and nearer or away."""
+
+    arrow: tuple[float, float] | None  # tip, from the middle
+    nearer_m: float  # positive: towards the scene
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One image with what was found."""
+
+    viewpoint: str
+    sha256: str
+    state: Literal["waiting", "used", "not_used"]
+    why: str
+    figures: str
+
+
+@dataclass(frozen=True, slots=True)
+class HeldNow:
+    """One step of this kind as it stands."""
+
+    step: Step
+    running: bool
+    words: str
+    failures: tuple[str, ...]  # of work on the images: what failed, what to do
+    photographs_from: str  # folder of a camera without a cable; "" for one that can be released from here
+    overlay: Overlay | None
+    spots: tuple[Spot, ...]
+    camera: Spot | None
+    seen: tuple[Seen, ...]  # newest first
+    figures: tuple[tuple[str, str, str, bool | None], ...]  # name, value, limit, whether it is met
+
+
+def held_steps(protocol: Protocol) -> list[Step]:
+    """The steps in which a person holds the camera."""
+    return [step for step in protocol.steps if step.kind == "manual_capture"]
+
+
+def step_to_show(log: RunLog, wanted: str) -> Step | None:
+    """The step asked for, else the current one, else the last one that has begun; None without any."""
+    steps = {step.id: step for step in held_steps(log.protocol)}
+    if wanted in steps:
+        return steps[wanted]
+    if log.state.current in steps:
+        return steps[log.state.current]
+    begun = [step for step in steps.values() if log.state.steps[step.id].captured]
+    return begun[-1] if begun else next(iter(steps.values()), None)
+
+
+def held_now(log: RunLog, step: Step) -> HeldNow:
+    """All of it, from the record alone."""
+    state = log.state.steps[step.id]
+    jobs = {str(j.arguments["image"]["sha256"]): j for j in state.jobs.values() if j.kind in _KINDS}
+    done = sorted((j for j in jobs.values() if j.status == "finished"), key=lambda j: j.enqueued_seq)
+    last = done[-1] if done else None
+    newest = max((j.enqueued_seq for j in jobs.values()), default=0)  # what failed before it has been told
+    failed = [
+        j
+        for j in state.jobs.values()
+        if j.status == "failed" and (j.kind == "coverage_points" or (j.kind in _KINDS and j.enqueued_seq == newest))
+    ]
+    running = log.state.current == step.id and state.phase == "running" and not log.state.paused
+    captures = [c for c in captures_of(log, step.id) if c.replaced is None and isinstance(c.payload, ViewHeld)]
+    result: Mapping[str, Any] = {} if last is None else last.result
+    target = result.get("target")
+    here = result.get("T_level_camera")
+    return HeldNow(
+        step=step,
+        running=running,
+        words=str(result.get("words", "")) if running else "",
+        photographs_from=_photographs_from(log),
+        failures=tuple(failure_words(job) for job in failed) if running else (),
+        overlay=_overlay(here, target["T_level_camera"]) if running and here and target else None,
+        spots=_spots(result.get("places", ()), "" if target is None else str(target["name"])),
+        camera=None if not here else _spot("camera", "done", here, _lowest(result["places"])),
+        seen=tuple(_seen(c.payload.viewpoint, c.sha256, jobs.get(c.sha256)) for c in reversed(captures)),
+        figures=_figures(step, {} if last is None else last.measures),
+    )
+
+
+def _photographs_from(log: RunLog) -> str:
+    opened = (e.payload.report for e in reversed(log.events) if isinstance(e.payload, DeviceOpened))
+    camera = next((report for report in opened if report["identity"]["kind"] == "camera"), {})
+    return str(camera.get("details", {}).get("photographs_from", ""))
+
+
+def _overlay(here: Any, there: Any) -> Overlay:
+    away = (np.linalg.inv(np.array(here)) @ np.array(there))[:3, 3]
+    x, y, z = (float(v) for v in away)
+    length = math.hypot(x, y)
+    if length < 0.01:
+        return Overlay(None, z)
+    reach = _LARGEST_ARROW * min(1.0, length / _METRES_FOR_LARGEST) / length
+    return Overlay((round(reach * x, 1), round(reach * y, 1)), z)
+
+
+def _lowest(places: Sequence[Mapping[str, Any]]) -> float:
+    """Largest distance of a place from the vertical through the middle, metres."""
+    radii = [math.hypot(p["T_level_camera"][0][3], p["T_level_camera"][1][3]) for p in places]
+    return max([0.05, *radii])
+
+
+def _spots(places: Sequence[Mapping[str, Any]], target: str) -> tuple[Spot, ...]:
+    lowest = _lowest(places)
+    return tuple(
+        _spot(
+            str(place["name"]),
+            "next" if place["name"] == target else "done" if place["done"] else "open",
+            place["T_level_camera"],
+            lowest,
+        )
+        for place in places
+    )
+
+
+def _spot(name: str, state: SpotState, T_level_camera: Any, lowest: float) -> Spot:
+    """From above, the side of the person at the bottom."""
+    x, y = T_level_camera[0][3], T_level_camera[1][3]
+    scale = _REACH / lowest
+    return Spot(name, state, round(SIZE / 2 + scale * x, 1), round(SIZE / 2 - scale * y, 1))
+
+
+def _seen(viewpoint: str, sha256: str, job: JobState | None) -> Seen:
+    if job is None or job.status == "enqueued":
+        return Seen(viewpoint, sha256, "waiting", "", "")
+    if job.status == "failed":
+        return Seen(viewpoint, sha256, "not_used", job.message, "")
+    m = job.measures
+    parts: list[str] = []
+    if m.get("spheres_expected"):
+        parts.append(f"{m['spheres_seen']:.0f} of {m['spheres_expected']:.0f} spheres")
+    if "edge_width_px" in m:
+        parts.append(f"edges {m['edge_width_px']:.1f} px wide")
+    if "clipped_fraction" in m:
+        parts.append(f"{100 * m['clipped_fraction']:.1f} % clipped")
+    if "corners" in m:
+        parts.append(f"{m['corners']:.0f} corners")
+    state: Literal["used", "not_used"] = "used" if job.result["used"] else "not_used"
+    return Seen(viewpoint, sha256, state, str(job.result["why"]), ", ".join(parts))
+
+
+def _figures(step: Step, measures: Mapping[str, float]) -> tuple[tuple[str, str, str, bool | None], ...]:
+    out: list[tuple[str, str, str, bool | None]] = []
+    for gate in step.gates:
+        if gate.measure not in _TOLD:  # those that are measured at the end
+            continue
+        value = measures.get(gate.measure)
+        met = None
+        if value is not None:
+            met = (gate.min is None or value >= gate.min) and (gate.max is None or value <= gate.max)
+        out.append(
+            (measure_name(gate.measure), quantity(value, gate.unit), limit(gate.min, gate.max, gate.unit), met)
+        )
+    return tuple(out)

@@ -1,0 +1,1 @@
+"""The first page and what concerns many runs: start, comparison, history, checklists."""

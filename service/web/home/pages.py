@@ -1,0 +1,204 @@
+"""The first page: runs under way and recorded, and protocols to start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+from urllib.parse import urlencode
+
+from fastapi import APIRouter, Depends, Form, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse
+
+from service.audit.runs.search import RESULT_WORDS, RESULTS, RunWanted, find_runs
+from service.core.decide import AskOperator, decide
+from service.core.entered import RunAbout
+from service.core.errors import OrthocaptureError
+from service.core.model import RunStarted
+from service.core.protocol import LoadedProtocol, Protocol, load_protocol
+from service.core.run_state import RunState
+from service.people.approvals import ProtocolStanding, difference, standing_of
+from service.steps import params_models
+from service.store.records import RunRow
+from service.store.space import forecast_of
+from service.web.page.rendering import render
+from service.web.page.run_frame import driven_frames, robot_banner
+from service.web.page.run_words import stopped_words
+from service.web.security.guards import Signed, requires
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["home"])
+_PAGE = 12
+Sought = Annotated[str, Query(max_length=200)]
+
+
+@dataclass(frozen=True, slots=True)
+class RunLine:
+    """A run in a list."""
+
+    run_id: str
+    title: str
+    created_utc: str
+    operator: str
+    simulated: bool
+    status: str
+    step: str
+    passed: int
+    steps: int
+    deviations: int
+    robot: str
+    standing: tuple[str, str] = ("Under way", "now")  # how it stands, and the tone of it
+    why: str = ""  # it is stopped, and what is recommended
+    fault: str = ""  # what is wrong with its record
+    about: RunAbout = field(default_factory=RunAbout)
+
+
+@dataclass(frozen=True, slots=True)
+class Startable:
+    """A protocol file."""
+
+    file: str
+    loaded: LoadedProtocol | None
+    fault: str = ""
+    space: str = ""  # why the disk will not do for it
+    standing: ProtocolStanding | None = None
+    changes: tuple[str, ...] = ()  # against the approved content of its id and version
+
+
+@router.get("/", name="home", dependencies=[Depends(requires("read"))])
+def home(
+    request: Request,
+    site: Here,
+    person: Signed,
+    page: Annotated[int, Query(ge=1, le=100_000)] = 1,
+    q: Sought = "",
+    since: Sought = "",
+    until: Sought = "",
+    result: Sought = "",
+) -> HTMLResponse:
+    """Runs under way first (those that a process drives before the others), then those that have ended, newest first.
+
+    Only the runs of the page shown are read whole; where some are sought, those that fit are shown.
+    """
+    driven = set(site.launcher.driven_runs())
+    under_way = site.store.open_runs() | driven
+    wanted = RunWanted(q, since, until, result if result in RESULTS else "")
+    found = {run.run_id: run for run in find_runs(site.store, wanted)}
+    newest_first = [row for row in site.store.runs()[::-1] if row.run_id in found]
+    rows = sorted(newest_first, key=lambda row: (row.run_id not in driven, row.run_id not in under_way))
+    pages = max(1, -(-len(rows) // _PAGE))
+    page = min(page, pages)
+    lines = [_line(site, row) for row in rows[_PAGE * (page - 1) : _PAGE * page]]
+    asked = person.may("operate") and not wanted.active
+    startable = [startable_of(path.name, site) for path in site.protocol_files()] if asked else []
+    return render(
+        request,
+        "home/home.html.j2",
+        under_way=[line for line in lines if line.status in ("active", "paused")],
+        ended=[line for line in lines if line.status not in ("active", "paused")],
+        found=found,
+        count=len(rows),
+        wanted=wanted,
+        results=RESULT_WORDS,
+        query="".join(f"&{urlencode({name: value})}" for name, value in wanted.query().items()),
+        page=page,
+        pages=pages,
+        protocols=startable,
+        rig=site.rig.section,
+    )
+
+
+@router.get("/robots", name="robots", dependencies=[Depends(requires("read"))])
+def robots(request: Request, site: Here, but: Annotated[str, Query(max_length=64)] = "") -> HTMLResponse:
+    """How the robots stand that are driven now, for the script that keeps every page up to date."""
+    return render(request, "page/robots.html.j2", others=driven_frames(site, but=but))
+
+
+@router.post(
+    "/theme",
+    name="theme",
+    dependencies=[Depends(requires("read", while_locked=True))],
+    response_class=RedirectResponse,
+)
+def theme(
+    site: Here,
+    theme: Annotated[Literal["light", "dark", "auto"], Form()],
+    back: Annotated[str, Form(max_length=400)] = "/",
+) -> RedirectResponse:
+    """Light or dark on this screen, remembered by its browser."""
+    # Only pages of this site: neither //elsewhere nor /\elsewhere.
+    inside = back.startswith("/") and not back.startswith(("//", "/\\"))
+    response = RedirectResponse(back if inside else "/", status_code=303)
+    response.set_cookie("theme", theme, max_age=365 * 24 * 3600, samesite="lax", secure=site.secure, httponly=True)
+    return response
+
+
+def _line(site: Site, row: RunRow) -> RunLine:
+    try:
+        log = site.run(row.run_id)
+    except OrthocaptureError as error:
+        return RunLine(
+            row.run_id,
+            row.run_id,
+            row.created_utc,
+            "",
+            row.simulated,
+            "unreadable",
+            "",
+            0,
+            0,
+            0,
+            "",
+            fault=str(error),
+        )
+    state = log.state
+    # Imported here: one small file a run is read for those under way only.
+    from service.monitor.snapshot import read_snapshot  # noqa: PLC0415
+
+    robot, standing, why = "", ("", ""), ""
+    if not state.terminal:
+        snapshot, driven = read_snapshot(site.data, row.run_id), site.launcher.driven(row.run_id)
+        robot = robot_banner(state, snapshot, driven=driven).title
+        standing, why = _standing(log.protocol, state, driven=driven)
+    return RunLine(
+        run_id=row.run_id,
+        title=log.protocol.title,
+        created_utc=row.created_utc,
+        operator=state.operator,
+        simulated=state.simulated,
+        status=state.status,
+        step=log.protocol.step(state.current).title,
+        passed=sum(step.phase == "passed" for step in state.steps.values()),
+        steps=len(log.protocol.steps),
+        deviations=state.deviation_count,
+        robot=robot,
+        standing=standing,
+        why=why,
+        about=root.about or RunAbout() if isinstance(root := log.events[0].payload, RunStarted) else RunAbout(),
+    )
+
+
+def _standing(protocol: Protocol, state: RunState, *, driven: bool) -> tuple[tuple[str, str], str]:
+    """How a run that has not ended stands: word and tone; and why, where it is stopped."""
+    if not driven:
+        return ("Stopped", "stop"), "the program that drives it does not run → open it and go on"
+    if state.paused:
+        return ("Paused", "attention"), ""
+    question = decide(protocol, state)
+    if not isinstance(question, AskOperator):
+        return ("Under way", "now"), ""
+    if question.for_ == "recovery":
+        return ("Stopped", "stop"), stopped_words(protocol, state, question)
+    return ("Waits for a signature" if question.for_ == "sign" else "Waits for a confirmation", "attention"), ""
+
+
+def startable_of(name: str, site: Site) -> Startable:
+    """A protocol file, and how it stands on the site."""
+    try:
+        loaded = load_protocol(site.protocols / name, params_models())
+        space = forecast_of(site.store, loaded.protocol, simulated=site.rig.section.simulated)
+        standing = standing_of(site.store, loaded)
+        changes = difference(standing.other.payload.source, loaded.source) if standing.other is not None else []
+        words = "" if space.verdict == "enough" else space.words
+        return Startable(name, loaded, "", words, standing, tuple(changes))
+    except OrthocaptureError as error:
+        return Startable(name, None, str(error))

@@ -1,0 +1,95 @@
+"""For machines that watch this one: `/health` for everybody, `/metrics` for this machine and for readers."""
+
+from __future__ import annotations
+
+from ipaddress import ip_address
+from typing import cast
+
+from fastapi import APIRouter, Depends, FastAPI, Request, Response
+from fastapi.responses import JSONResponse
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
+
+from service.core.clocks import clock_readings
+from service.core.errors import StoreError
+from service.core.space import Forecast
+from service.monitor.figures import read_figures
+from service.monitor.health import read_health
+from service.store.space import forecast_of
+from service.web.monitoring.metrics import DataFolderMetrics
+from service.web.monitoring.request_counts import RequestCounts
+from service.web.security.guards import Guard
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["health"])
+_FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+
+
+class ReaderOrThisMachine(Guard):
+    """Lets through what this machine itself asks, with no proxy between; everybody else must be signed in to read.
+
+    A program that scrapes cannot sign in. Who is on this machine could read the data folder as well.
+    """
+
+    async def __call__(self, request: Request, site: Here) -> None:
+        """See Guard."""
+        if not _is_this_machine(request):
+            await super().__call__(request, site)
+
+
+def _is_this_machine(request: Request) -> bool:
+    if request.client is None or any(name in request.headers for name in _FORWARDED):
+        return False
+    try:
+        return ip_address(request.client.host).is_loopback
+    except ValueError:
+        return False
+
+
+def install_metrics(app: FastAPI) -> None:
+    """A registry of this application's own. `app.state.site` is set before."""
+    site = cast(Site, app.state.site)
+    registry = CollectorRegistry()
+    registry.register(
+        DataFolderMetrics(
+            lambda: read_figures(site.store, site.data, site.launcher.driven_runs()),
+            lambda: _forecasts(site),
+            lambda run_ids: {run_id: clock_readings(site.run(run_id).events) for run_id in run_ids},
+            lambda: read_health(site.store, site.data, _driven(site)),
+        )
+    )
+    ProcessCollector(namespace="orthocapture_web", registry=registry)
+    app.state.metrics = registry
+    app.add_middleware(RequestCounts, registry=registry)
+
+
+def _forecasts(site: Site) -> dict[str, Forecast]:
+    logs = {run_id: site.run(run_id) for run_id in site.launcher.driven_runs()}
+    return {run_id: forecast_of(site.store, log.protocol, log.state) for run_id, log in logs.items()}
+
+
+def _driven(site: Site) -> list[str]:
+    try:
+        return site.launcher.driven_runs()
+    except StoreError:  # which the health of the database tells
+        return []
+
+
+@router.get("/health", name="health")
+def health(site: Here) -> JSONResponse:
+    """Whether database, data folder, worker and runners live. Status 200 when they do, 503 when one does not."""
+    found = read_health(site.store, site.data, _driven(site))
+    parts = {
+        "database": found.database,
+        "data_folder": found.data_folder,
+        "worker": found.worker,
+        "runners": found.runners,
+    }
+    content = {"ok": found.ok} | {name: {"ok": not wrong, "what": wrong} for name, wrong in parts.items()}
+    return JSONResponse(content, status_code=200 if found.ok else 503)
+
+
+@router.get("/metrics", name="metrics", dependencies=[Depends(ReaderOrThisMachine("read", while_locked=False))])
+def metrics(request: Request) -> Response:
+    """What Prometheus scrapes."""
+    content = generate_latest(cast(CollectorRegistry, request.app.state.metrics))
+    return Response(content, media_type=CONTENT_TYPE_LATEST)

@@ -1,0 +1,93 @@
+"""Rendering: every page gets who looks, the theme, how the robots stand, and the tokens that its forms need."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime
+from functools import partial
+from itertools import takewhile
+from typing import TYPE_CHECKING, Any, cast
+
+from fastapi import Path, Request
+from fastapi.responses import HTMLResponse
+from jinja2 import Environment, PackageLoader, PrefixLoader, StrictUndefined, select_autoescape
+from pydantic import ValidationError
+
+if TYPE_CHECKING:
+    from service.audit.record.queries import EventRow
+
+from service.core.count_words import counted
+from service.core.entered import RunAbout, about_rows
+from service.web.page.run_frame import LOST, driven_frames
+
+_FOLDERS = (
+    "audit",
+    "calibration",
+    "capture",
+    "evidence",
+    "handheld",
+    "home",
+    "page",
+    "people",
+    "run",
+    "scene",
+)
+
+# Templates lie beside their pages: "run/step.html.j2" is service/web/run/templates/step.html.j2.
+TEMPLATES = Environment(
+    loader=PrefixLoader({folder: PackageLoader(f"service.web.{folder}") for folder in _FOLDERS}),
+    autoescape=select_autoescape(["html", "j2"]),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+
+
+def local_time(at_utc: str) -> str:
+    """A recorded time on the clock of this machine and its site: `10:12:03 CET`; "" where that is UTC itself."""
+    try:
+        there = datetime.fromisoformat(at_utc).astimezone()
+    except ValueError:
+        return ""
+    if not there.utcoffset():
+        return ""
+    day = f"{there:%Y-%m-%d} " if f"{there:%Y-%m-%d}" != at_utc[:10] else ""
+    return f"{day}{there:%H:%M:%S} {there.tzname()}"
+
+
+def kept_in_a_row(rows: Sequence[EventRow], start: int) -> int:
+    """How many events from `start` on keep files for the same step."""
+    first = rows[start]
+    return sum(1 for _ in takewhile(lambda row: (row.kind, row.step) == (first.kind, first.step), rows[start:]))
+
+
+def entered_of(root: EventRow) -> list[tuple[str, str]]:
+    """What was entered of a run when it began, from its first event as it is in the database."""
+    try:
+        return about_rows(RunAbout.model_validate(root.payload.get("about") or {}))
+    except ValidationError:  # altered: the verification says so
+        return []
+
+
+# Its type names its own names only.
+cast("dict[str, Any]", TEMPLATES.globals).update(kept_in_a_row=kept_in_a_row, about_rows=entered_of, counted=counted)
+TEMPLATES.filters["local_time"] = local_time
+
+
+def part_names(*names: str) -> Any:
+    """Path parameter that names one or more of a page's parts, between commas."""
+    one = f"({'|'.join(names)})"
+    return Path(pattern=f"^{one}(,{one}){{0,{len(names) - 1}}}$")
+
+
+def render(request: Request, template: str, *, status: int = 200, **context: Any) -> HTMLResponse:
+    """A page, or a part of one. `person` is who is signed in, or None on the few public pages."""
+    person = getattr(request.state, "person", None)
+    text = TEMPLATES.get_template(template).render(
+        request=request,
+        person=person,
+        robots=partial(driven_frames, request.app.state.site),  # asked by whole pages, not by parts
+        robots_lost=LOST,
+        **context,
+    )
+    return HTMLResponse(text, status_code=status)

@@ -1,0 +1,302 @@
+"""Signing in and out, one-time links, the screen's lock, and a person's own account."""
+
+from __future__ import annotations
+
+from typing import Annotated, cast
+
+from fastapi import APIRouter, Depends, Form, Path, Query, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+
+from service.core.errors import OrthocaptureError
+from service.people.errors import AccountError, AccountJustChangedError, SignInRefusedError
+from service.web.page.errors import status_of, wants_json
+from service.web.page.rendering import render
+from service.web.people import administration
+from service.web.people.administration import utc_of
+from service.web.security.guards import Signed, clear_cookie, requires, set_cookie, token_of
+from service.web.security.shield import Limiter
+from service.web.site import Here
+
+router = APIRouter(tags=["people"])
+router.include_router(administration.router)
+
+Name = Annotated[str, Form(max_length=80)]
+Secret = Annotated[str, Form(max_length=256)]
+Pin = Annotated[str, Form(max_length=12)]
+Back = Annotated[str, Form(max_length=500)]
+Token = Annotated[str, Path(max_length=100)]
+
+
+def own_page(address: str) -> str:
+    """An address of this site to go to, or the first page when it is anything else."""
+    plain = address.isascii() and address.isprintable() and "\\" not in address
+    return address if plain and address.startswith("/") and not address.startswith("//") else "/"
+
+
+def _go(address: str) -> RedirectResponse:
+    return RedirectResponse(address, status_code=303)
+
+
+def _limiter(request: Request) -> Limiter:
+    return cast(Limiter, request.app.state.limiter)
+
+
+def _address(request: Request) -> str:
+    return request.client.host if request.client else ""
+
+
+# --- signing in and out --------------------------------------------------------------------------------------
+
+
+@router.get("/sign-in", name="sign_in_page", response_class=HTMLResponse)
+def sign_in_page(
+    request: Request,
+    site: Here,
+    next_page: Annotated[str, Query(alias="next", max_length=500)] = "/",
+    done: Annotated[str, Query(max_length=20)] = "",
+) -> HTMLResponse:
+    """The form to sign in with."""
+    return render(
+        request,
+        "people/sign_in.html.j2",
+        next_page=own_page(next_page),
+        nobody=not site.people.accounts.all(),
+        done=done,
+        account="",
+        problem=None,
+    )
+
+
+@router.post("/sign-in", name="sign_in", response_class=RedirectResponse, status_code=303)
+def sign_in(
+    request: Request,
+    site: Here,
+    account: Name,
+    password: Secret,
+    next_page: Annotated[str, Form(alias="next", max_length=500)] = "/",
+) -> Response:
+    """Sign in; the browser gets a new token, whatever it had before."""
+    limiter, address = _limiter(request), _address(request)
+    limiter.require(address)
+    try:
+        token = site.people.sign_in(account, password, address=address, replaces=token_of(request, site))
+    except SignInRefusedError as error:
+        # What is counted is what is recorded, so that a restart counts the same.
+        if not isinstance(error, AccountJustChangedError) and limiter.failed(address):
+            site.people.refuse_address(address)
+        if wants_json(request):
+            raise
+        return render(
+            request,
+            "people/sign_in.html.j2",
+            status=401,
+            next_page=own_page(next_page),
+            nobody=False,
+            done="",
+            account=account,
+            problem=error,
+        )
+    response = _go(own_page(next_page))
+    set_cookie(response, site, token)
+    return response
+
+
+@router.post(
+    "/sign-out",
+    name="sign_out",
+    dependencies=[Depends(requires("read", while_locked=True))],
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def sign_out(site: Here, person: Signed) -> Response:
+    """End this sign-in."""
+    site.people.sign_out(person)
+    response = _go("/sign-in?done=signed-out")
+    clear_cookie(response, site)
+    return response
+
+
+# --- one-time links ------------------------------------------------------------------------------------------
+
+
+@router.get("/set-up/{token}", name="set_up_page", response_class=HTMLResponse)
+def set_up_page(request: Request, site: Here, token: Token) -> HTMLResponse:
+    """The form behind a one-time link. Looking at it does not use it up."""
+    return _set_up_form(request, site, token, None)
+
+
+@router.post("/set-up/{token}", name="set_up", response_class=RedirectResponse, status_code=303)
+def set_up(
+    request: Request,
+    site: Here,
+    token: Token,
+    password: Secret,
+    repeated: Secret,
+    pin: Pin,
+    account: Name = "",
+    full_name: Name = "",
+) -> Response:
+    """Use a link: the first administrator chooses a name, everybody a password and a PIN."""
+    invitation = site.people.accounts.invitation(token)
+    try:
+        _require_same(password, repeated)
+        if invitation.account:
+            site.people.accounts.accept(token, password, pin)
+        else:
+            site.people.accounts.set_up(token, account, full_name, password, pin)
+    except AccountError as error:
+        if wants_json(request):
+            raise
+        return _set_up_form(request, site, token, error, account, full_name)
+    return _go("/sign-in?done=set-up")
+
+
+def _set_up_form(
+    request: Request, site: Here, token: str, problem: AccountError | None, account: str = "", full_name: str = ""
+) -> HTMLResponse:
+    invitation = site.people.accounts.invitation(token)
+    return render(
+        request,
+        "people/set_up.html.j2",
+        status=422 if problem else 200,
+        invitation=invitation,
+        token=token,
+        account=account,
+        full_name=full_name,
+        problem=problem,
+    )
+
+
+def _require_same(password: str, repeated: str) -> None:
+    if password != repeated:
+        raise AccountError("the two passwords differ", where="repeated", remedy="Type the same one twice")
+
+
+# --- the screen's lock ---------------------------------------------------------------------------------------
+
+
+@router.post(
+    "/lock",
+    name="lock",
+    dependencies=[Depends(requires("read", while_locked=True))],
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def lock(site: Here, person: Signed, back: Back = "/") -> Response:
+    """Lock this screen: it goes on showing, and acts no more until the PIN is given."""
+    site.people.lock(person)
+    return _go(own_page(back))
+
+
+@router.get("/unlock", name="unlock_page", dependencies=[Depends(requires("read"))], response_class=HTMLResponse)
+def unlock_page(request: Request, back: Annotated[str, Query(max_length=500)] = "/") -> HTMLResponse:
+    """The form for the PIN, for browsers without script; pages show it over themselves."""
+    return render(request, "people/unlock.html.j2", back=own_page(back), problem=None)
+
+
+@router.post(
+    "/unlock",
+    name="unlock",
+    dependencies=[Depends(requires("read", while_locked=True))],
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def unlock(request: Request, site: Here, person: Signed, pin: Pin, back: Back = "/") -> Response:
+    """Open this screen with the PIN."""
+    try:
+        site.people.unlock(person, pin)
+    except OrthocaptureError as error:
+        if wants_json(request) or status_of(error) == 401:
+            raise
+        return render(request, "people/unlock.html.j2", status=status_of(error), back=own_page(back), problem=error)
+    return _go(own_page(back))
+
+
+# --- one's own account ---------------------------------------------------------------------------------------
+
+
+@router.get("/account", name="own_account", dependencies=[Depends(requires("read"))], response_class=HTMLResponse)
+def own_account(
+    request: Request, site: Here, person: Signed, done: Annotated[str, Query(max_length=20)] = ""
+) -> HTMLResponse:
+    """Password, PIN and screens of the person who looks."""
+    return _own_account(request, site, person, done=done)
+
+
+@router.post(
+    "/account/password",
+    name="change_password",
+    dependencies=[Depends(requires("read"))],
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def change_password(
+    request: Request, site: Here, person: Signed, password: Secret, new_password: Secret, repeated: Secret
+) -> Response:
+    """Set a new password; the person's other screens are signed out."""
+    try:
+        _require_same(new_password, repeated)
+        site.people.check_password(person.account, password)
+        site.people.accounts.change_password(person, new_password)
+    except (AccountError, SignInRefusedError) as error:
+        if wants_json(request):
+            raise
+        return _own_account(request, site, person, problem=error, form="password")
+    return _go("/account?done=password")
+
+
+@router.post(
+    "/account/pin",
+    name="change_pin",
+    dependencies=[Depends(requires("read"))],
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def change_pin(request: Request, site: Here, person: Signed, password: Secret, pin: Pin) -> Response:
+    """Set a new PIN."""
+    try:
+        site.people.check_password(person.account, password)
+        site.people.accounts.change_pin(person, pin)
+    except (AccountError, SignInRefusedError) as error:
+        if wants_json(request):
+            raise
+        return _own_account(request, site, person, problem=error, form="pin")
+    return _go("/account?done=pin")
+
+
+@router.post(
+    "/account/screens/{screen}/end",
+    name="end_screen",
+    dependencies=[Depends(requires("read"))],
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def end_screen(site: Here, person: Signed, screen: Annotated[str, Path(max_length=20)]) -> Response:
+    """Sign out another screen of one's own."""
+    site.people.end_screen(person, screen)
+    return _go("/account?done=screen")
+
+
+def _own_account(
+    request: Request,
+    site: Here,
+    person: Signed,
+    *,
+    done: str = "",
+    problem: OrthocaptureError | None = None,
+    form: str = "",
+) -> HTMLResponse:
+    screens = [
+        {"screen": screen.screen, "since": utc_of(screen.created_utc_s), "seen": utc_of(screen.seen_utc_s)}
+        for screen in site.people.screens(person.account)
+    ]
+    return render(
+        request,
+        "people/account.html.j2",
+        status=status_of(problem) if problem else 200,
+        screens=screens,
+        badge=site.people.accounts.get(person.account).badge,
+        done=done,
+        problem=problem,
+        form=form,
+    )

@@ -1,0 +1,194 @@
+"""The administrator's pages: accounts, invitations, roles; every change with a reason, every link shown once."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Annotated
+
+import segno
+from fastapi import APIRouter, Depends, Form, Path, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from markupsafe import Markup
+
+from service.core.errors import OrthocaptureError
+from service.people.accounts import INVITATION_S
+from service.people.errors import AccountError
+from service.people.roles import ROLES, Role
+from service.store.seam import utc_text
+from service.web.page.errors import status_of, wants_json
+from service.web.page.rendering import render
+from service.web.security.guards import Signed, requires
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["administration"])
+
+Name = Annotated[str, Form(max_length=80)]
+Reason = Annotated[str, Form(max_length=500)]
+AccountName = Annotated[str, Path(max_length=40)]
+_ADMINISTER = [Depends(requires("administer"))]
+
+
+@router.get("/accounts", name="accounts", dependencies=_ADMINISTER, response_class=HTMLResponse)
+def accounts(request: Request, site: Here) -> HTMLResponse:
+    """All accounts, and the form to invite somebody."""
+    return _list(request, site)
+
+
+@router.post("/accounts", name="invite", dependencies=_ADMINISTER, response_class=HTMLResponse)
+def invite(
+    request: Request, site: Here, person: Signed, account: Name, full_name: Name, role: Annotated[Role, Form()]
+) -> Response:
+    """Make an account; the page with its one-time link is shown once."""
+    try:
+        token = site.people.accounts.invite(person, account, full_name, role)
+    except AccountError as error:
+        if wants_json(request):
+            raise
+        return _list(request, site, problem=error, typed={"account": account, "full_name": full_name, "role": role})
+    return _link(request, full_name, token)
+
+
+@router.get("/accounts/{account}", name="account", dependencies=_ADMINISTER, response_class=HTMLResponse)
+def account_page(request: Request, site: Here, account: AccountName) -> HTMLResponse:
+    """One account and what can be changed of it."""
+    return _one(request, site, account)
+
+
+@router.post(
+    "/accounts/{account}/role",
+    name="change_role",
+    dependencies=_ADMINISTER,
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def change_role(
+    request: Request,
+    site: Here,
+    person: Signed,
+    account: AccountName,
+    role: Annotated[Role, Form()],
+    reason: Reason,
+) -> Response:
+    """Give an account another role."""
+    try:
+        site.people.accounts.change_role(person, account, role, reason)
+    except AccountError as error:
+        return _refused(request, site, account, error)
+    return _back(account)
+
+
+@router.post(
+    "/accounts/{account}/disable",
+    name="disable_account",
+    dependencies=_ADMINISTER,
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def disable(request: Request, site: Here, person: Signed, account: AccountName, reason: Reason) -> Response:
+    """Shut an account out."""
+    try:
+        site.people.accounts.disable(person, account, reason)
+    except AccountError as error:
+        return _refused(request, site, account, error)
+    return _back(account)
+
+
+@router.post(
+    "/accounts/{account}/enable",
+    name="enable_account",
+    dependencies=_ADMINISTER,
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def enable(request: Request, site: Here, person: Signed, account: AccountName, reason: Reason) -> Response:
+    """Let a disabled account in again."""
+    try:
+        site.people.accounts.enable(person, account, reason)
+    except AccountError as error:
+        return _refused(request, site, account, error)
+    return _back(account)
+
+
+@router.post(
+    "/accounts/{account}/end-wait",
+    name="end_wait",
+    dependencies=_ADMINISTER,
+    response_class=RedirectResponse,
+    status_code=303,
+)
+def end_wait(site: Here, person: Signed, account: AccountName) -> Response:
+    """End an account's wait after wrong passwords."""
+    site.people.accounts.end_wait(person, account)
+    return _back(account)
+
+
+@router.post("/accounts/{account}/reset", name="reset_account", dependencies=_ADMINISTER, response_class=HTMLResponse)
+def reset(request: Request, site: Here, person: Signed, account: AccountName, reason: Reason) -> Response:
+    """Take away password and PIN; the page with the new one-time link is shown once."""
+    try:
+        token = site.people.accounts.reset(person, account, reason)
+    except AccountError as error:
+        return _refused(request, site, account, error)
+    return _link(request, account, token)
+
+
+def utc_of(utc_s: float) -> str:
+    """Seconds since 1970 as the record writes times."""
+    return utc_text(datetime.fromtimestamp(utc_s, UTC))
+
+
+def _back(account: str) -> RedirectResponse:
+    return RedirectResponse(f"/accounts/{account}", status_code=303)
+
+
+def _link(request: Request, whose: str, token: str) -> HTMLResponse:
+    address = f"{request.url.scheme}://{request.url.netloc}/set-up/{token}"
+    # A picture in the page itself: the link is a secret, and no other address may give it away.
+    svg = segno.make_qr(address, error="m").svg_inline(
+        omitsize=True, border=4, dark="#000", light="#fff", svgclass="qr"
+    )
+    return render(
+        request,
+        "people/account_link.html.j2",
+        whose=whose,
+        address=address,
+        qr=Markup(svg),
+        reachable=request.url.hostname not in ("127.0.0.1", "localhost", "::1"),
+        hours=round(INVITATION_S / 3600),
+    )
+
+
+def _refused(request: Request, site: Site, account: str, error: AccountError) -> Response:
+    if wants_json(request):
+        raise error
+    return _one(request, site, account, problem=error)
+
+
+def _list(
+    request: Request, site: Site, *, problem: OrthocaptureError | None = None, typed: dict[str, str] | None = None
+) -> HTMLResponse:
+    return render(
+        request,
+        "people/accounts.html.j2",
+        status=status_of(problem) if problem else 200,
+        accounts=site.people.accounts.all(),
+        now_s=site.store.clock.utc_now().timestamp(),
+        roles=ROLES,
+        problem=problem,
+        typed=typed or {"account": "", "full_name": "", "role": "technician"},
+    )
+
+
+def _one(request: Request, site: Site, account: str, *, problem: OrthocaptureError | None = None) -> HTMLResponse:
+    shown = site.people.accounts.get(account)
+    waits = shown.locked_until_utc_s > site.store.clock.utc_now().timestamp()
+    return render(
+        request,
+        "people/account_administration.html.j2",
+        status=status_of(problem) if problem else 200,
+        shown=shown,
+        waits_until=utc_of(shown.locked_until_utc_s) if waits else "",
+        screens=len(site.people.screens(account)),
+        roles=ROLES,
+        problem=problem,
+    )

@@ -1,0 +1,106 @@
+"""What is drawn over an image: outlines of its spheres, told apart as well as the run can by now."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.archive import outline_from_record
+from service.compute.markers.records import SphereOutline
+from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE
+from service.compute.registration.hypotheses import match, sightings
+from service.core.geometry import Transform, apply, inverse
+from service.evidence import RunLog
+from service.web.record.images import Capture
+from service.web.record.known_spheres import Sphere, best_registration, ct_spheres, scan_spheres
+from service.web.record.pictures import Mark
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Where outlines of an image come from.
+
+    Attributes:
+        source: changes with what would be drawn.
+        artefact: file with the outlines.
+        T_camera_scan: of the frame of `spheres`; None while it is not known.
+    """
+
+    source: str
+    artefact: str
+    spheres: tuple[Sphere, ...]
+    camera: CameraModel
+    T_camera_scan: Transform | None
+    live: bool
+
+
+def outlines_of(log: RunLog, capture: Capture) -> Found | None:
+    """The registration's outlines of a valid image, else what the live numbers found, else None."""
+    registered = best_registration(log)
+    if registered is not None and capture.replaced is None:
+        T = registered.record["T_scan_camera"].get(capture.payload.viewpoint)
+        artefact = str(registered.record["outlines"])
+        if T is not None and capture.payload.artefacts[0].kind in ("image", "control_image"):
+            return Found(
+                f"{artefact[:16]}-{registered.name}",
+                artefact,
+                scan_spheres(log, registered),
+                CameraModel.from_record(registered.record["camera"]),
+                inverse(np.array(T, dtype=np.float64)),
+                live=False,
+            )
+    job = capture.live
+    if job is None or job.status != "finished" or not job.artefacts:
+        return None
+    camera = CameraModel.from_record(job.arguments["camera"])
+    return Found(f"live-{job.artefacts[0].sha256[:16]}", job.artefacts[0].sha256, ct_spheres(log), camera, None, True)
+
+
+def marks_of(log: RunLog, capture: Capture) -> tuple[Mark, ...]:
+    """Outlines with numbers: registration spheres 0, 1, 2 …, control spheres C0, C1 …, and what is neither."""
+    found = outlines_of(log, capture)
+    if found is None:
+        return ()
+    data = _read(log.store.artefact_path(found.artefact))
+    records: Sequence[dict[str, Any]] = data["outlines"] if found.live else data.get(capture.payload.viewpoint, [])
+    outlines = [outline_from_record(record, found.camera) for record in records]
+    placed = _provisional(data) if found.live else found.T_camera_scan
+    named = _named(outlines, found, placed, log.protocol.spheres.radius_mm / 1000)
+    return tuple(
+        Mark(
+            named[i].kind if i in named else "unassigned",
+            named[i].label if i in named else "?",
+            outline.captured_px(found.camera),
+        )
+        for i, outline in enumerate(outlines)
+    )
+
+
+def _provisional(data: Mapping[str, Any]) -> Transform | None:
+    if data["T_base_scan"] is None:
+        return None
+    return inverse(np.array(data["T_base_camera"])) @ np.array(data["T_base_scan"])
+
+
+def _named(
+    outlines: Sequence[SphereOutline], found: Found, T_camera_scan: Transform | None, radius_m: float
+) -> Mapping[int, Sphere]:
+    if T_camera_scan is None or not outlines or not found.spheres:
+        return {}
+    placed = apply(T_camera_scan, np.array([sphere.centre_m for sphere in found.spheres]))
+    pairs = match(sightings(outlines, radius_m, found.camera), placed, radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
+    return {outline: found.spheres[m] for outline, m, _ in pairs}
+
+
+@lru_cache(maxsize=8)
+def _read(path: Path) -> dict[str, Any]:
+    """An artefact never changes under its name."""
+    data: dict[str, Any] = json.loads(path.read_bytes())
+    return data

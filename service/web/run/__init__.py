@@ -1,0 +1,1 @@
+"""The guided screen of a run: its steps, actions, notes and news."""

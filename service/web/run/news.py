@@ -1,0 +1,79 @@
+"""News for the pages as server-sent events: that something changed, never what."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncGenerator
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Path, Request
+from fastapi.responses import StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from service.monitor.snapshot import STALE_S, read_snapshot
+from service.people.person import Person
+from service.web.security.guards import Signed, requires, token_of
+from service.web.site import Here, Site
+
+router = APIRouter(tags=["stream"])
+
+_LOOK_S = 0.3
+_BEAT_S = 1.5  # a page that hears nothing for twice this says that the connection is lost
+_CHECK_S = 5.0
+RunId = Annotated[str, Path(max_length=64)]
+
+
+@router.get("/runs/{run_id}/stream", name="stream", dependencies=[Depends(requires("read"))])
+async def stream(request: Request, site: Here, person: Signed, run_id: RunId) -> StreamingResponse:
+    """`changed` with {"seq", "monitor", "locked"} whenever one of them is another than before.
+
+    `replaced` is the end: the sign-in has opened more streams than it may have, and this is the oldest.
+    """
+    await run_in_threadpool(site.store.head, run_id)  # an unknown run is refused before the stream begins
+    return StreamingResponse(
+        _news(request, site, person.screen, run_id),
+        media_type="text/event-stream",
+        headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
+    )
+
+
+async def _news(request: Request, site: Site, screen: str, run_id: str) -> AsyncGenerator[str]:
+    told: tuple[int, int, bool] | None = None
+    beat_s = checked_s = time.monotonic()
+    token, locked = token_of(request, site), False
+    with site.streams.opened(screen) as place:
+        while not await request.is_disconnected():
+            now_s = time.monotonic()
+            if place.replaced:
+                yield "event: replaced\ndata: {}\n\n"
+                return
+            if now_s - checked_s > _CHECK_S:
+                checked_s = now_s
+                person = await run_in_threadpool(_signed_in, site, token)
+                if person is None:
+                    yield "event: signed_out\ndata: {}\n\n"
+                    return
+                locked = person.locked
+            news = (*await run_in_threadpool(_newest, site, run_id), locked)
+            if news != told:
+                told, beat_s = news, now_s
+                data = {"seq": news[0], "monitor": news[1], "locked": locked}
+                yield f"event: changed\ndata: {json.dumps(data)}\n\n"
+            elif now_s - beat_s > _BEAT_S:
+                beat_s = now_s
+                yield "event: beat\ndata: {}\n\n"
+            await asyncio.sleep(_LOOK_S)
+
+
+def _signed_in(site: Site, token: str) -> Person | None:
+    """Who sits there; a screen that was left alone is locked by this look."""
+    return site.people.person(token, idle_lock_s=site.idle_lock_s, deliberate=False)
+
+
+def _newest(site: Site, run_id: str) -> tuple[int, int]:
+    """The last event, and a number that changes with what the runner tells; its falling silent is news as well."""
+    snapshot = read_snapshot(site.data, run_id)
+    silent = snapshot.age_s() // STALE_S if snapshot.stale else 0
+    return site.store.head(run_id), hash((silent, *snapshot.shown()))

@@ -1,0 +1,475 @@
+"""What the run page shows, as plain data: a pure function of the record, the runner's last word and who looks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+from typing import Protocol as Interface
+
+from service.core.acceptance import acceptors, demanded_role, failed_gates
+from service.core.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
+from service.core.clocks import clock_readings
+from service.core.decide import AskOperator, decide
+from service.core.dependence import AcceptedGate, dependent_steps, depends_on
+from service.core.model import Event, OperatorVerb
+from service.core.protocol import Protocol, Step
+from service.core.registered import evaluated
+from service.core.run_state import Deviation, RunState
+from service.core.space import Forecast
+from service.core.ways_on import WayOn, takes_words
+from service.monitor.snapshot import STOPS, Snapshot
+from service.web.page.run_words import (
+    count,
+    drawing_of,
+    figure_line,
+    irreversible_warning,
+    phase_words,
+    planned_views,
+    sentence,
+    station_of,
+    stopped_words,
+    way_words,
+    will_happen,
+)
+from service.web.record.board_images import unused_count
+from service.web.run.figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
+
+
+class Recorded(Interface):
+    """A run's record: service.evidence.RunLog."""
+
+    @property
+    def protocol(self) -> Protocol:
+        """As it was when the run began."""
+        ...
+
+    @property
+    def events(self) -> Sequence[Event]:
+        """All of them, in order."""
+        ...
+
+    @property
+    def state(self) -> RunState:
+        """Their fold."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Looker:
+    """Who looks, and how they stand to the control of this run."""
+
+    may_operate: bool = False
+    may_take_over: bool = False
+    in_control: bool = False  # this screen
+    holder: str = ""  # name of whoever has control; "" for nobody
+    holder_screen: str = ""
+    mine_elsewhere: bool = False  # the same person, on another screen
+    asked_by: str = ""  # who asks for control
+    asked_by_me: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StepLine:
+    """A step in the list at the side."""
+
+    id: str
+    title: str
+    word: str
+    tone: str
+    icon: str
+    shown: bool
+    reachable: bool  # something of it can be looked at
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """An item of the checklist."""
+
+    text: str
+    ticked: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """The step on the screen."""
+
+    id: str
+    title: str
+    number: int
+    attempt: int
+    kind: str
+    why: str
+    instructions: str
+    drawing: str
+    picture: str  # SHA-256 of the photograph on which the step shows what it found; "" without one
+    station: str
+    status: str
+    current: bool
+    checklist: tuple[Check, ...]
+    open_items: int
+    gates: tuple[GateLine, ...]
+    warning: str  # of an irreversible step that has not been done
+    requires: tuple[tuple[str, bool], ...]
+    captured: int
+    unused: int  # of them, board images without use
+    planned: int
+    signed_by: str
+    skipped: bool
+    started_utc: str
+    ended_utc: str
+    table: Sequence[Mapping[str, Any]]  # of an evaluation
+    depends: tuple[AcceptedGate, ...]  # what was accepted outside its limits and this rests on
+
+
+@dataclass(frozen=True, slots=True)
+class Main:
+    """The one large target."""
+
+    verb: str  # an operator's verb, or go-on
+    text: str
+    note: str = ""
+    hold: bool = False
+    enabled: bool = True
+    why_not: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Redo:
+    """A step that can be done again, and what that resets."""
+
+    step: str
+    title: str
+    resets: tuple[str, ...]
+    images: int  # whose evidence stays, but which no longer count
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """What a signature binds."""
+
+    sha256: str
+    title: str
+    figures: tuple[tuple[str, tuple[str, ...]], ...]  # by step
+    meaning: str  # offered; the person may change it
+
+
+@dataclass(frozen=True, slots=True)
+class Acceptance:
+    """What somebody could accept outside its limits now, and who."""
+
+    sha256: str  # of the figures that the acceptance binds
+    title: str
+    figures: tuple[str, ...]
+    role: str
+    another: bool  # neither who began the run nor who confirmed the step
+    affects: tuple[str, ...]  # later steps that will say that they rest on it
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """A step that needs a decision."""
+
+    title: str
+    short: str  # why it is stopped, and what is recommended
+    what: str
+    safe: str
+    advice: str
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A choice of what to do now."""
+
+    verb: OperatorVerb
+    step: str
+    words: str
+    takes: str
+    loses: str
+    why_not: str  # "" where it can be taken
+    button: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunView:
+    """The run page."""
+
+    run_id: str
+    title: str
+    seq: int
+    status: str  # active, paused, completed, aborted
+    mode: str  # ask, sign, recover, work, paused, died, ended
+    headline: str  # news for screen readers when it changes
+    current: str
+    attempt: int
+    steps: tuple[StepLine, ...]
+    passed: int
+    shown: Shown
+    main: Main | None
+    options: tuple[OperatorVerb, ...]  # besides the main one
+    can_pause: bool
+    asked_anew: bool  # the program that drove the robot ended: nothing moves before a fresh confirmation
+    standing: bool  # paused, and the robot stands still
+    looker: Looker
+    trouble: Trouble | None
+    ways: tuple[Way, ...]  # where it is stopped, the recommended one first
+    signature: Signature | None
+    acceptance: Acceptance | None
+    redos: tuple[Redo, ...]
+    skip_overrides: bool  # a skip now would set aside figures outside of their limits
+    progress: Progress
+    readings: tuple[Reading, ...]
+    working: tuple[str, int, int]
+    deviations: tuple[Deviation, ...]
+    news: tuple[tuple[str, str], ...]
+    to_come: tuple[str, ...]  # results that are still being computed, with the time left
+    pedal_armed: bool
+    stop_reason: str
+    operator: str
+    released_by: str
+
+
+def run_view(
+    log: Recorded,
+    snapshot: Snapshot,
+    looker: Looker,
+    *,
+    driven: bool,
+    show: str = "",
+    to_come: Sequence[str] = (),
+    space: Forecast | None = None,
+) -> RunView:
+    """The page of a run that has begun.
+
+    Args:
+        to_come: what is still being computed, in words.
+        driven: whether a living process drives the run.
+        show: step to look at; the current one when it is "" or unknown.
+        space: what the run will still write, where it is known.
+    """
+    protocol, state = log.protocol, log.state
+    shown = show if show in state.steps else state.current
+    decision = decide(protocol, state)
+    mode = _mode(state, decision, driven=driven)
+    return RunView(
+        run_id=state.run_id,
+        title=protocol.title,
+        seq=state.seq,
+        status=state.status,
+        mode=mode,
+        headline=_headline(protocol, state, mode, decision),
+        current=state.current,
+        attempt=state.step.attempt,
+        steps=tuple(_line(protocol, state, step, shown, stopped=mode == "recover") for step in protocol.steps),
+        passed=sum(step.phase == "passed" for step in state.steps.values()),
+        shown=_shown(
+            protocol,
+            state,
+            protocol.step(shown),
+            stopped=mode == "recover",
+            unused=unused_count(state, log.events, shown),
+        ),
+        main=_main(protocol, state, decision, mode, stopped=snapshot.robot in STOPS),
+        options=_options(decision, state),
+        can_pause=mode not in ("ended", "died", "paused") and looker.may_operate,
+        asked_anew=needs_leave(protocol, state) and mode in ("ask", "recover"),
+        standing=snapshot.doing == "paused" and snapshot.robot != "moving",
+        looker=looker,
+        trouble=_trouble(protocol, state, decision),
+        ways=tuple(map(_way, decision.ways)) if isinstance(decision, AskOperator) else (),
+        signature=_signature(protocol, state),
+        acceptance=_acceptance(protocol, state),
+        redos=() if state.terminal else tuple(_redo(protocol, state, s) for s in redoable_steps(protocol, state)),
+        skip_overrides=bool(state.step.verdicts) and not state.step.gates_passed,
+        progress=capture_progress(protocol, state, log.events),
+        readings=readings(snapshot, space, clock_readings(log.events)),
+        working=(snapshot.what, snapshot.done, snapshot.total) if snapshot.doing == "working" else ("", 0, 0),
+        deviations=tuple(reversed(state.deviations)),
+        news=tuple((m.at_utc, m.text) for m in reversed(snapshot.messages)),
+        to_come=tuple(to_come),
+        pedal_armed=snapshot.pedal_armed,
+        stop_reason=state.stop_reason,
+        operator=state.operator,
+        released_by=state.released_by,
+    )
+
+
+def _mode(state: RunState, decision: object, *, driven: bool) -> str:
+    if state.terminal:
+        return "ended"
+    if not driven:
+        return "died"
+    if state.paused:
+        return "paused"
+    if isinstance(decision, AskOperator):
+        return {"confirm": "ask", "sign": "sign", "recovery": "recover"}[decision.for_]
+    return "work"
+
+
+def _headline(protocol: Protocol, state: RunState, mode: str, decision: object) -> str:
+    title = protocol.step(state.current).title
+    if mode == "recover" and isinstance(decision, AskOperator):
+        return f"{title}. Stopped: {stopped_words(protocol, state, decision)}."
+    return {
+        "ended": f"The run is {state.status}.",
+        "died": "The program that drives the robot has stopped. Everything captured is safe.",
+        "paused": f"Paused at: {title}.",
+        "ask": f"Now: {title}. Your confirmation is awaited.",
+        "sign": f"{title}: a signature is due.",
+        "work": f"Working: {title}.",
+    }[mode]
+
+
+def _line(protocol: Protocol, state: RunState, step: Step, shown: str, *, stopped: bool) -> StepLine:
+    there = state.steps[step.id]
+    word, tone, icon = phase_words(state, there, stopped=stopped)
+    again = any(past.step == step.id and past.viewpoint is None for past in state.superseded)
+    if again and tone in ("passed", "current"):
+        word = f"{word}, attempt {there.attempt}"
+    return StepLine(step.id, step.title, word, tone, icon, step.id == shown, there.phase != "pending")
+
+
+def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, unused: int) -> Shown:
+    now = state.steps[step.id]
+    checks = tuple(Check(item, item in now.ticked) for item in step.checklist)
+    undone = step.irreversible and now.phase != "passed"
+    return Shown(
+        id=step.id,
+        title=step.title,
+        number=protocol.index(step.id) + 1,
+        attempt=now.attempt,
+        kind=step.kind,
+        why=step.why,
+        instructions="\n".join(" ".join(part.split()) for part in step.instructions.split("\n\n")),
+        drawing=drawing_of(step),
+        picture=next((ref.sha256 for ref in reversed(now.artefacts) if ref.kind == "layout_overlay"), ""),
+        station=station_of(step),
+        status=phase_words(state, now, stopped=stopped)[0],
+        current=step.id == state.current and not state.terminal,
+        checklist=checks,
+        open_items=sum(not check.ticked for check in checks),
+        gates=gate_lines(step, now, state.skipped),
+        warning=irreversible_warning(protocol, step) if undone else "",
+        requires=tuple((protocol.step(name).title, state.steps[name].passed_its_gates) for name in step.requires),
+        captured=len(now.captured),
+        unused=unused,
+        planned=planned_views(step),
+        signed_by=now.signed_by,
+        skipped=now.skipped,
+        started_utc=now.started_utc,
+        ended_utc=now.ended_utc,
+        table=evaluated(protocol, state) if step.kind == "evaluation" and now.result else (),
+        depends=depends_on(protocol, state, step.id),
+    )
+
+
+def _main(protocol: Protocol, state: RunState, decision: object, mode: str, *, stopped: bool) -> Main | None:
+    main = _wanted(protocol, state, decision, mode)
+    if main is not None and main.hold and stopped:
+        return replace(main, enabled=False, why_not="The robot is stopped. Clear the stop at the robot first.")
+    return main
+
+
+def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) -> Main | None:
+    step, now = protocol.step(state.current), state.step
+    moves = step.moves_robot
+    if mode == "died":
+        asks = " You are asked again before the robot moves." if moves else " Nothing moves."
+        return Main("go-on", "Go on", "The run goes on where it stopped." + asks)
+    if mode == "paused":
+        under_way = now.phase == "running"
+        note = "The robot goes on with its viewpoints." if moves and under_way else "The run goes on where it paused."
+        return Main("resume", "Resume", note, hold=moves)
+    if mode == "ask":
+        text, note = will_happen(step, now)
+        left = sum(item not in now.ticked for item in step.checklist)
+        why_not = f"{count(left, 'item is', 'items are')} not ticked yet." if left else ""
+        return Main("confirm", text, note, hold=moves, enabled=not left, why_not=why_not)
+    if mode == "sign":
+        return Main("sign", f"Sign: {step.title[:1].lower()}{step.title[1:]}", "Your signature is asked for.")
+    if mode == "recover" and isinstance(decision, AskOperator) and "confirm" in decision.options:
+        note = "What was captured is kept; only what is missing is done."
+        first = next((way for way in decision.ways if way.available), None)
+        mends = first is not None and first.verb == "confirm" and state.step.mend
+        text = f"Try again: {way_words(state, first)}" if mends and first is not None else "Try again"
+        return Main("confirm", text, note + (" The robot moves." if moves else ""), hold=moves)
+    return None
+
+
+def _options(decision: object, state: RunState) -> tuple[OperatorVerb, ...]:
+    if state.terminal:
+        return ()
+    asked = decision.options if isinstance(decision, AskOperator) else ()
+    others: list[OperatorVerb] = [verb for verb in asked if verb in ("accept", "skip")]
+    return (*others, "redo", "abort")
+
+
+def _trouble(protocol: Protocol, state: RunState, decision: object) -> Trouble | None:
+    if not isinstance(decision, AskOperator) or decision.for_ != "recovery":
+        return None
+    step, now = protocol.step(state.current), state.step
+    images = sum(len(there.captured) for there in state.steps.values())
+    safe = f"Yes. {count(images, 'image is', 'images are')} recorded, and every result so far."
+    advice = str(now.mend.get("advice", ""))
+    short = stopped_words(protocol, state, decision)
+    if now.failure is not None:
+        return Trouble(f"{step.title} did not work", short, sentence(now.failure.message), safe, advice)
+    failed = [figure_line(verdict) for verdict in now.verdicts if not verdict.passed]
+    if failed:
+        undecided = all(verdict.passed or verdict.undecided for verdict in now.verdicts)
+        found = "not decided yet" if undecided else "outside its limits"
+        return Trouble(f"{step.title}: {found}", short, "; ".join(failed), safe, advice)
+    return Trouble(f"{step.title} cannot begin yet", short, decision.text, safe, advice)
+
+
+_BUTTONS: Mapping[OperatorVerb, str] = {
+    "redo": "Do again…",
+    "skip": "Go on without…",
+    "accept": "Accept…",
+    "abort": "End here…",
+}
+
+
+def _way(way: WayOn) -> Way:
+    takes = takes_words(way.minutes)
+    return Way(way.verb, way.step, sentence(way.words), takes, way.loses, way.why_not, _BUTTONS.get(way.verb, ""))
+
+
+def _signature(protocol: Protocol, state: RunState) -> Signature | None:
+    if state.terminal or not needs_signature_now(protocol, state):
+        return None
+    step = protocol.step(state.current)
+    if step.irreversible:
+        steps: tuple[str, ...] = step.requires
+        meaning = f"I release this step, which cannot be undone: {step.title}"
+    else:
+        steps = (step.id,)
+        meaning = f"I have checked these figures and accept them: {step.title}"
+    figures = tuple(
+        (protocol.step(name).title, tuple(figure_line(verdict) for verdict in state.steps[name].verdicts))
+        for name in steps
+        if state.steps[name].verdicts
+    )
+    sha256 = record_to_sign(protocol, state)
+    return Signature(sha256, step.title, figures, meaning) if sha256 else None
+
+
+def _acceptance(protocol: Protocol, state: RunState) -> Acceptance | None:
+    role = "" if state.terminal else demanded_role(protocol, state)
+    if not role:
+        return None
+    return Acceptance(
+        sha256=state.step.gates_sha256,
+        title=protocol.step(state.current).title,
+        figures=tuple(figure_line(verdict) for verdict in failed_gates(state.step)),
+        role=role,
+        another="another_supervisor" in acceptors(protocol, state),
+        affects=tuple(protocol.step(name).title for name in dependent_steps(protocol, state.current)),
+    )
+
+
+def _redo(protocol: Protocol, state: RunState, target: str) -> Redo:
+    steps = protocol.steps[protocol.index(target) :]
+    begun = [s for s in steps if state.steps[s.id].started_utc or state.steps[s.id].skipped]
+    images = sum(len(state.steps[s.id].captured) for s in begun)
+    return Redo(target, protocol.step(target).title, tuple(s.title for s in begun if s.id != target), images)

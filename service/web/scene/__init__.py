@@ -1,0 +1,1 @@
+"""The scene of a run in 3D and as tables."""

@@ -1,0 +1,274 @@
+"""The scene of a run as far as it is known by now: registered, or placed by the live numbers, or as planned."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.budget.closure import Alignment
+from service.core.geometry import Array, Transform, inverse
+from service.core.model import ArtefactRef, ViewpointCaptured
+from service.core.registered import registrations
+from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
+from service.evidence import RunLog
+from service.web.record.images import captures_of
+from service.web.record.known_spheres import (
+    Registered,
+    Sphere,
+    best_registration,
+    ct_spheres,
+    result_of_kind,
+    scan_spheres,
+)
+from service.web.record.pictures import cached
+from service.web.record.planned_poses import nominal_T_flange_camera, planned_poses, station_of
+
+_WITH_STATIONS = ("hybrid", "robot_corrected", "robot")  # sources that tell where each station's base stood
+
+
+@dataclass(frozen=True, slots=True)
+class SceneNow:
+    """A scene and what pages say of it.
+
+    Attributes:
+        frame: in words: whose frame positions are in.
+        how: where the poses come from, in words.
+        missing: what is not shown, and why.
+        mesh: file of the surface; None: there is none yet.
+        sphere_images: by sphere's label, in how many images it was seen.
+    """
+
+    scene: Scene
+    spheres: tuple[Sphere, ...]
+    frame: str
+    how: str
+    missing: tuple[str, ...] = ()
+    mesh: ArtefactRef | None = None
+    registered: Registered | None = None
+    sphere_images: Mapping[str, int] = field(default_factory=dict[str, int])
+
+
+@dataclass(frozen=True, slots=True)
+class MeshFacts:
+    """What the table says of a surface."""
+
+    vertices: int
+    faces: int
+    shown_faces: int
+    size_mm: tuple[float, float, float]
+
+
+def scene_of(log: RunLog) -> SceneNow:
+    """The best that the record has."""
+    registered = best_registration(log)
+    if registered is not None:
+        return _registered(log, registered)
+    live = _live(log)
+    return live if live is not None else _planned(log)
+
+
+# --- after the registration -------------------------------------------------------------------------------------
+
+
+def _registered(log: RunLog, registered: Registered) -> SceneNow:
+    record = registered.record
+    cameras = {name: np.array(T, dtype=np.float64) for name, T in record["T_scan_camera"].items()}
+    spheres = scan_spheres(log, registered)
+    bases, missing = _bases(log, record)
+    scan = log.protocol.step(registered.step).params.model_dump()["scan"]
+    meshes = [ref for ref in log.state.steps[scan].artefacts if ref.kind == "scan_mesh"]
+    left_out: Mapping[str, Any] = record.get("leave_one_out") or {}
+    seen = {label: int(row[2]) for label, row in left_out.get("spheres", {}).items()}
+    scene = Scene(
+        cameras=cameras,
+        stations=dict.fromkeys(cameras, "")
+        | {c.viewpoint: c.station for c in _all_captures(log) if c.viewpoint in cameras},
+        spheres=[SceneSphere(s.label, s.kind, s.centre_m) for s in spheres],
+        radius_m=log.protocol.spheres.radius_mm / 1000,
+        bases=bases,
+    )
+    words = registered.name.replace("_", " ")
+    return SceneNow(
+        scene,
+        spheres,
+        "of the scan",
+        f"registered, camera poses by {words}",
+        tuple(missing),
+        meshes[-1] if meshes else None,
+        registered,
+        seen,
+    )
+
+
+def _bases(log: RunLog, record: Mapping[str, Any]) -> tuple[dict[str, Transform], list[str]]:
+    """T_scan_base by station: from this registration, or from one of the same run that keeps the stations apart."""
+    known_registrations = registrations(log.protocol, log.state)
+    known = [record, *(known_registrations[n] for n in _WITH_STATIONS if n in known_registrations)]
+    for candidate in known:
+        if candidate["poses"] in _WITH_STATIONS:
+            T_scan_world = inverse(np.array(candidate["T_world_scan"]))
+            return {name: T_scan_world @ np.array(T) for name, T in candidate["T_world_station"].items()}, []
+    return {}, ["Robot bases: the poses come from the images alone, which do not tell where the robots stood."]
+
+
+# --- while images are being taken ---------------------------------------------------------------------------------
+
+
+def _live(log: RunLog) -> SceneNow | None:
+    """In the frame of the CT, by the newest provisional registration of each station; None while there is none."""
+    records: dict[str, dict[str, Any]] = {}
+    for step in log.protocol.steps:
+        for capture in captures_of(log, step.id):
+            job = capture.live
+            if capture.replaced is None and job is not None and job.status == "finished" and job.artefacts:
+                records[capture.payload.viewpoint] = _read(log.store.artefact_path(job.artefacts[0].sha256))
+    placed = {r["station"]: np.array(r["T_base_scan"]) for r in records.values() if r["T_base_scan"] is not None}
+    if not placed:
+        return None
+    T_ct_base = {station: inverse(T) for station, T in placed.items()}
+    mine = {name: r for name, r in records.items() if r["station"] in placed}
+    spheres = ct_spheres(log)
+    planned: dict[str, Transform] = {}
+    stations = {name: str(r["station"]) for name, r in mine.items()}
+    for name, station, T in _to_come(log):
+        if station in T_ct_base:
+            planned[name], stations[name] = T_ct_base[station] @ T, station
+    away = len(records) - len(mine)
+    scene = Scene(
+        cameras={n: T_ct_base[r["station"]] @ np.array(r["T_base_camera"]) for n, r in mine.items()},
+        stations=stations,
+        spheres=[SceneSphere(s.label, s.kind, s.centre_m) for s in spheres],
+        radius_m=log.protocol.spheres.radius_mm / 1000,
+        planned=planned,
+        bases=T_ct_base,
+    )
+    step, _ = result_of_kind(log, "ct_import")
+    meshes = [ref for ref in log.state.steps[step].artefacts if ref.kind == "ct_mesh"] if step else []
+    return SceneNow(
+        scene,
+        spheres,
+        "of the CT",
+        "provisional: placed by the spheres seen so far",
+        (f"{away} images of a station whose place is not known yet.",) if away else (),
+        meshes[-1] if meshes else None,
+    )
+
+
+def _to_come(log: RunLog) -> list[tuple[str, str, Transform]]:
+    """Viewpoints of the current step that are still to be taken: name, station, T_base_camera."""
+    state = log.state.step
+    if log.state.terminal:
+        return []
+    gone = {*state.captured, *state.skipped_viewpoints}
+    plan = planned_poses(log, log.protocol.step(log.state.current))
+    return [(v.name, v.station, v.T_base_camera) for v in plan if v.name not in gone]
+
+
+# --- before anything has been placed ----------------------------------------------------------------------------
+
+
+def _planned(log: RunLog) -> SceneNow:
+    """One station in its base frame: where the camera was, by the drawing of its mount, and where it will be."""
+    captured = _all_captures(log)
+    to_come = _to_come(log)
+    station = to_come[0][1] if to_come else captured[-1].station if captured else ""
+    mount = nominal_T_flange_camera(log)
+    cameras: dict[str, Transform] = {}
+    if mount is not None:
+        T_flange_camera = np.array(mount)
+        mine = [c for c in captured if c.station == station and isinstance(c, ViewpointCaptured)]
+        cameras = {c.viewpoint: np.array(c.T_base_flange) @ T_flange_camera for c in mine}
+    planned = {name: T for name, there, T in to_come if there == station}
+    missing = ["Spheres and specimen: nothing has been registered with the images yet."]
+    if not station:
+        missing = ["Nothing has been planned or taken yet."]
+    known = station_of(log, station)
+    centre = None if known is None else known.layout.scene_centre_m
+    base = {} if not station else {station: np.eye(4)}
+    scene = Scene(cameras, dict.fromkeys((*cameras, *planned), station), planned=planned, bases=base, up=(0, 0, 1))
+    if centre is not None:
+        scene = replace(scene, mesh=_table(centre))
+    return SceneNow(
+        scene,
+        (),
+        f"of the robot base at {station}" if station else "",
+        "by the robot and its mount's drawing",
+        tuple(missing),
+    )
+
+
+def _table(centre_m: tuple[float, float, float]) -> SceneMesh:
+    """A square of 0.4 m where the scene is expected."""
+    offsets = 0.2 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    return SceneMesh(np.array(centre_m) + offsets, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def _all_captures(log: RunLog) -> list[Any]:
+    found = [c for step in log.protocol.steps for c in captures_of(log, step.id) if c.replaced is None]
+    return [c.payload for c in sorted(found, key=lambda c: c.seq)]
+
+
+# --- the surface --------------------------------------------------------------------------------------------------
+
+
+def with_mesh(now: SceneNow, log: RunLog, data: Path) -> Scene:
+    """The scene with its surface, decimated once and then kept in DIR/cache; coloured by the predicted error."""
+    if now.mesh is None:
+        return now.scene
+    points, triangles, _ = _surface(log, now.mesh, data)
+    error_mm = None if now.registered is None else predicted_error_mm(now.registered, points)
+    return replace(now.scene, mesh=SceneMesh(points, triangles, error_mm))
+
+
+def predicted_error_mm(registered: Registered, points_m: Array) -> Array:
+    """Standard deviation (N,) of the place of points (N, 3) of the scan in the images, 3D."""
+    placed = Alignment(np.array(registered.record["T_world_scan"]), np.array(registered.record["covariance"])[:6, :6])
+    return np.asarray(1e3 * np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2)), dtype=np.float64)
+
+
+def mesh_facts(now: SceneNow, log: RunLog, data: Path) -> MeshFacts | None:
+    """None without a surface."""
+    return None if now.mesh is None else _surface(log, now.mesh, data)[2]
+
+
+def _surface(log: RunLog, ref: ArtefactRef, data: Path) -> tuple[Array, NDArray[np.int64], MeshFacts]:
+    def make() -> bytes:
+        with np.load(log.store.artefact_path(ref.sha256, verify=True), allow_pickle=False) as mesh:
+            vertices, faces = mesh["vertices_m"], mesh["faces"]
+        points, triangles = decimated(vertices, faces)
+        size = 1e3 * (vertices.max(axis=0) - vertices.min(axis=0))
+        buffer = io.BytesIO()
+        facts = np.array([len(vertices), len(faces), len(triangles), *size], dtype=np.float64)
+        np.savez(buffer, points=points.astype(np.float32), triangles=triangles.astype(np.int32), facts=facts)
+        return buffer.getvalue()
+
+    return _load(cached(data, f"surface {ref.sha256} {FACES_SHOWN}", ".npz", make))
+
+
+@lru_cache(maxsize=4)
+def _load(path: Path) -> tuple[Array, NDArray[np.int64], MeshFacts]:
+    with np.load(path, allow_pickle=False) as kept:
+        points, triangles, facts = (
+            kept["points"].astype(np.float64),
+            kept["triangles"].astype(np.int64),
+            kept["facts"],
+        )
+    counts, size = (int(n) for n in facts[:3]), (float(v) for v in facts[3:6])
+    vertices, faces, shown = counts
+    x, y, z = size
+    return points, triangles, MeshFacts(vertices, faces, shown, (x, y, z))
+
+
+@lru_cache(maxsize=512)
+def _read(path: Path) -> dict[str, Any]:
+    """An artefact never changes under its name."""
+    data: dict[str, Any] = json.loads(path.read_bytes())
+    return {name: data[name] for name in ("station", "T_base_camera", "T_base_scan")}

@@ -1,0 +1,69 @@
+"""The scene in 3D, and the same as a table."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from fastapi import APIRouter, Depends, Path, Query, Request
+from fastapi.responses import HTMLResponse
+
+from service.core.dependence import accepted_gates
+from service.web.page.rendering import render
+from service.web.page.run_frame import run_frame
+from service.web.security.guards import requires
+from service.web.site import Here
+
+router = APIRouter(tags=["scene"])
+
+RunId = Annotated[str, Path(max_length=64)]
+Theme = Annotated[Literal["auto", "light", "dark"], Query()]
+# For documents in a sandboxed frame: an origin of its own, no cookie, no way out. plotly compiles its shaders' glue.
+FRAME_HEADERS = {
+    "Content-Security-Policy": "; ".join(
+        (
+            "sandbox allow-scripts",
+            "default-src 'none'",
+            "script-src 'self' 'unsafe-eval'",
+            "style-src 'self' 'unsafe-inline'",
+            "img-src 'self' data: blob:",
+            "base-uri 'none'",
+            "form-action 'none'",
+            "frame-ancestors 'self'",
+        )
+    )
+}
+
+
+@router.get("/runs/{run_id}/scene", name="scene", dependencies=[Depends(requires("read"))])
+def scene(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
+    """The 3D view in its frame, and everything in it as tables."""
+    from service.web.scene.tables import scene_tables  # noqa: PLC0415 - mesh and matching, not needed to start
+
+    log = site.run(run_id)
+    tables = scene_tables(log, site.data)
+    return render(
+        request,
+        "scene/scene.html.j2",
+        frame=run_frame(site, run_id),
+        run_id=run_id,
+        tables=tables,
+        depends=accepted_gates(log.protocol, log.state),
+        live=not log.state.terminal,
+    )
+
+
+@router.get("/runs/{run_id}/scene/frame", name="scene_frame", dependencies=[Depends(requires("read"))])
+def scene_frame(request: Request, site: Here, run_id: RunId, theme: Theme = "auto") -> HTMLResponse:
+    """The 3D view alone, for the sandboxed frame."""
+    from service.dataset.scene_view import figure_json, scene_figure  # noqa: PLC0415 - as above
+    from service.web.scene.data import scene_of, with_mesh  # noqa: PLC0415
+
+    log = site.run(run_id)
+    now = scene_of(log)
+    figure = scene_figure(with_mesh(now, log, site.data))
+    views = sorted(now.scene.bases)
+    response = render(
+        request, "scene/frame.html.j2", figure=figure_json(figure), theme=theme, stations=views, title="Scene in 3D"
+    )
+    response.headers.update(FRAME_HEADERS)
+    return response

@@ -1,0 +1,147 @@
+"""Guards of every route: who is signed in, what they may do, that the request is theirs, and who has control."""
+
+from __future__ import annotations
+
+from hmac import compare_digest
+from typing import Annotated, cast
+
+from fastapi import Depends, FastAPI, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from starlette.datastructures import FormData
+
+from service.people.control import Control
+from service.people.errors import NotAllowedError, NotSignedInError, ScreenLockedError
+from service.people.person import Person
+from service.people.roles import Permission
+from service.people.tries import failed_tries
+from service.web.page.errors import install_errors
+from service.web.security.shield import TRIES_WINDOW_S, Limiter, Shield
+from service.web.server.connections import Connection
+from service.web.site import Here, Site
+
+SAFE_METHODS = frozenset({"GET", "HEAD"})
+THEFT_REMEDY = "Load the page again and repeat; nothing was done"
+
+
+def install_security(app: FastAPI) -> None:
+    """Headers, limits and errors of the whole application. `app.state.site` is set before."""
+    site = cast(Site, app.state.site)
+    app.state.limiter = Limiter(site.store.clock, failed_tries(site.store, TRIES_WINDOW_S))
+    app.add_middleware(Shield, hosts=site.hosts)
+    install_errors(app)
+
+
+# --- cookies -------------------------------------------------------------------------------------------------
+
+
+def cookie_name(site: Site) -> str:
+    """Browsers accept the prefix only from a secure origin, for the whole host, and from no other host."""
+    return "__Host-orthocapture" if site.secure else "orthocapture"
+
+
+def set_cookie(response: Response, site: Site, token: str) -> None:
+    """Hand a sign-in's token to the browser, until it is closed."""
+    response.set_cookie(cookie_name(site), token, path="/", secure=site.secure, httponly=True, samesite="strict")
+
+
+def clear_cookie(response: Response, site: Site) -> None:
+    """Take it away."""
+    response.delete_cookie(cookie_name(site), path="/", secure=site.secure, httponly=True, samesite="strict")
+
+
+def token_of(request: Request, site: Site) -> str:
+    """The token that came with a request; "" for none."""
+    return request.cookies.get(cookie_name(site), "")
+
+
+# --- guards --------------------------------------------------------------------------------------------------
+
+
+class Guard:
+    """Lets a request pass when its person may; a route has exactly one."""
+
+    def __init__(self, permission: Permission, while_locked: bool | tuple[str, ...]) -> None:
+        self.permission: Permission = permission
+        self._while_locked = while_locked
+
+    async def __call__(self, request: Request, site: Here) -> None:
+        """Raises NotSignedInError, NotAllowedError, ScreenLockedError; else `request.state.person` is set."""
+        person = await run_in_threadpool(
+            site.people.person,
+            token_of(request, site),
+            idle_lock_s=site.idle_lock_s,
+            deliberate=_is_deliberate(request),
+        )
+        if person is None:
+            raise NotSignedInError("nobody is signed in on this screen", remedy="Sign in")
+        request.state.person = person
+        _keep_connection(request)
+        form = FormData()
+        if request.method not in SAFE_METHODS:
+            form = await request.form()
+            _require_own_form(request, form, person)
+        if not person.may(self.permission):
+            raise NotAllowedError(
+                f"the role {person.role} may not do this ({self.permission})",
+                where=request.url.path,
+                remedy="Ask somebody whose role allows it",
+            )
+        if person.locked and not self._passes_lock(request, form):
+            raise ScreenLockedError(
+                "this screen is locked", where=f"screen {person.screen}", remedy="Enter the PIN to go on"
+            )
+
+    def _passes_lock(self, request: Request, form: FormData) -> bool:
+        if request.method in SAFE_METHODS and self.permission == "read":
+            return True
+        if isinstance(self._while_locked, bool):
+            return self._while_locked
+        return form.get("verb") in self._while_locked
+
+
+def requires(permission: Permission, *, while_locked: bool | tuple[str, ...] = False) -> Guard:
+    """The guard of a route: `dependencies=[Depends(requires("read"))]`.
+
+    Args:
+        permission: of service.people.roles.
+        while_locked: whether a locked screen may do it too; or the values of the form field `verb` that it may do.
+    """
+    return Guard(permission, while_locked)
+
+
+def _signed(request: Request) -> Person:
+    person = getattr(request.state, "person", None)
+    if not isinstance(person, Person):
+        raise NotSignedInError("nobody is signed in on this screen", remedy="Sign in")
+    return person
+
+
+Signed = Annotated[Person, Depends(_signed)]
+
+
+def controls(run_id: str, person: Signed, site: Here) -> None:
+    """For routes that act on a run, beside their guard: this screen has control of it. Raises ControlError."""
+    Control(site.store).require(run_id, person)
+
+
+def _require_own_form(request: Request, form: FormData, person: Person) -> None:
+    given = request.headers.get("x-csrf-token") or form.get("csrf")
+    if not isinstance(given, str) or not compare_digest(given.encode(), person.csrf.encode()):
+        raise NotAllowedError(
+            "this form does not belong to the present sign-in", where=request.url.path, remedy=THEFT_REMEDY
+        )
+
+
+def _keep_connection(request: Request) -> None:
+    """It makes no room for strangers' any more."""
+    connection = getattr(request.state, "connection", None)  # none where no `Reception` stands before the application
+    if isinstance(connection, Connection):
+        connection.known = True
+
+
+def _is_deliberate(request: Request) -> bool:
+    # What the page asks for by itself (news, parts, pictures) does not keep a screen from locking.
+    if request.method not in SAFE_METHODS:
+        return True
+    headers = request.headers
+    return headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") == "document"

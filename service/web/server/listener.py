@@ -1,0 +1,83 @@
+"""The listening socket: the limits see every connection as it is accepted, before TLS and before a byte is read."""
+
+from __future__ import annotations
+
+import errno
+import resource
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+from weakref import finalize
+
+from service.web.server.connections import Connections
+
+_BACKLOG = 128  # connections that wait in the kernel
+ACCEPTED_AT_ONCE = 8  # before the event loop reads what the last ones have sent: their requests may be there already
+_EXHAUSTED = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+
+
+class Listener(socket.socket):
+    """Listens for asyncio's servers, which call `accept` until it would block."""
+
+    def __init__(self, family: socket.AddressFamily, connections: Connections) -> None:
+        super().__init__(family, socket.SOCK_STREAM)
+        self.connections = connections
+        self._exhausted = False
+
+    def listen(self, backlog: int = _BACKLOG, /) -> None:
+        """See socket. asyncio gives the number that it accepts at once, which is no reason for a short queue."""
+        super().listen(max(backlog, _BACKLOG))
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """The next connection that there is room for. Raises BlockingIOError when there is none, and OSError."""
+        if self._exhausted:
+            # asyncio tries as often as its backlog is long after an error of the system, and logs each, before the
+            # pause of a second that it makes: this ends its loop after the first.
+            self._exhausted = False
+            raise BlockingIOError
+        try:
+            plain, address = super().accept()
+        except OSError as error:
+            if error.errno in _EXHAUSTED:
+                self._exhausted = True
+                self.connections.make_room()
+            raise
+        accepted = _Accepted(plain, self.connections.limits.wait_s)
+        connection = self.connections.admit(accepted, (address[0], address[1]))
+        if connection is None:
+            accepted.close()
+            raise BlockingIOError  # for now: the event loop calls again at once while others wait
+        accepted.at_close(lambda: self.connections.leave(connection))
+        return accepted, address
+
+
+class _Accepted(socket.socket):
+    """An accepted socket that tells when it is closed."""
+
+    def __init__(self, plain: socket.socket, wait_s: float) -> None:
+        super().__init__(plain.family, plain.type, plain.proto, fileno=plain.detach())
+        self._closed_hook: Callable[[], object] = _nothing
+        if hasattr(socket, "TCP_USER_TIMEOUT"):
+            # A tablet out of reach acknowledges nothing: it is given up, and its streams with it.
+            with suppress(OSError):  # it may have been reset in the queue
+                self.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * wait_s))
+
+    def at_close(self, hook: Callable[[], object]) -> None:
+        """Call this once, when the socket is closed or was forgotten."""
+        self._closed_hook = finalize(self, hook)
+
+    def close(self) -> None:
+        """See socket."""
+        super().close()
+        self._closed_hook()
+
+
+def _nothing() -> None:
+    """Before there is something to tell."""
+
+
+def affordable_connections(wanted: int) -> int:
+    """As many as wanted, but no more than half of the files that this process may open: the rest is the store's."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return wanted if soft == resource.RLIM_INFINITY else max(1, min(wanted, soft // 2))
