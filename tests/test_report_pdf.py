@@ -13,7 +13,6 @@ import pytest
 from service.audit.record.run import read_run
 from service.audit.report.blocks import Report
 from service.audit.report.content import report_content
-from service.audit.report.output import pdf
 from service.audit.report.output.pdf import render_pdf
 from service.store.audit import verify
 from tests.support.pdf_text import fonts_of, pages_of, reader_of, root_of, tags_of
@@ -42,7 +41,7 @@ def pdf(report: Report) -> bytes:
 @pytest.fixture
 def no_dejavu(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a machine where DejaVu is not installed."""
-    monkeypatch.setattr(report_pdf, "_FONT_FOLDERS", ())
+    monkeypatch.setattr("service.audit.report.output.pdf._FONT_FOLDERS", ())
 
 
 def test_it_says_the_same_on_numbered_pages(report: Report, pdf: bytes) -> None:

@@ -55,12 +55,12 @@ def protocol(tmp_path: Path) -> Path:
 def test_differences_since_the_last_start_are_told(
     store: Store, rig: Rig, protocol: Path, clock: Clocks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(start_up, "software_versions", lambda: {"a": "1", "b": "1"})
+    monkeypatch.setattr(starts, "software_versions", lambda: {"a": "1", "b": "1"})
     first = record_start(store, rig, [protocol], "http://127.0.0.1:8000")
     assert (first.changed, first.clock_jump_s) == ({}, None)
     assert first.configuration.keys() == {str(rig.path), str(protocol)}
     clock.passed_s = 100.0
-    monkeypatch.setattr(start_up, "software_versions", lambda: {"a": "2", "c": "1"})
+    monkeypatch.setattr(starts, "software_versions", lambda: {"a": "2", "c": "1"})
     protocol.write_text("id: other\n")
     second = record_start(store, rig, [protocol], "http://127.0.0.1:8000")
     assert second.changed == {

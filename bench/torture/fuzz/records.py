@@ -145,10 +145,8 @@ def _token(data: bytes, folder: Path) -> None:
     bundle.mkdir()
     for member in MEMBERS:
         os.link(known.unpacked / member, bundle / member)
-    line = (
-        bundle_verifier.canonical({"run_id": stamp.run_id, "seq": stamp.seq, "authority": "x", "token": stamp.token})
-        + b"\n"
-    )
+    record = {"run_id": stamp.run_id, "seq": stamp.seq, "authority": "x", "token": stamp.token}
+    line = bundle_verifier.canonical(record) + b"\n"
     manifest = json.loads((bundle / "manifest.json").read_bytes())
     manifest["files"].append({"path": "timestamps.jsonl", "sha256": "0" * 64, "size_bytes": len(line)})
     (bundle / "manifest.json").unlink()
@@ -341,14 +339,15 @@ def _web(data: bytes, _: Path) -> None:
             raise MisbehavedError(f"an answer without its safety headers: {address[:60]}")
 
 
+_CHECK = "service.audit.verify.bundle_verifier:Check.run"
 _VERIFIER: dict[str, Any] = {"errors": (bundle_verifier.NotABundleError,), "says_place": False}
 _REFUSES_NOTHING: dict[str, Any] = {"errors": ()}
 
 TARGETS: tuple[Target, ...] = (
-    Target("bundle_zip", "service.audit.verify.bundle_verifier:Check.run", _zip, _zips, **_VERIFIER),
+    Target("bundle_zip", _CHECK, _zip, _zips, **_VERIFIER),
     Target(
         "bundle_member",
-        "service.audit.verify.bundle_verifier:Check.run",
+        _CHECK,
         _member,
         _members,
         JSON,

@@ -84,7 +84,7 @@ def _shown(
 ) -> dict[str, Any]:
     # The planning of viewpoints brings scipy, which the start of the service does not wait for.
     from service.web.capture import plan_drawing  # noqa: PLC0415
-    from service.web.capture import view as capture_view
+    from service.web.capture import view as capture_view  # noqa: PLC0415
     from service.web.record import planned_poses  # noqa: PLC0415
     from service.web.record.known_spheres import best_registration  # noqa: PLC0415
 

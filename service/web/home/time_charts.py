@@ -1,4 +1,4 @@
-"""One figure over time as coordinates for SVG, drawn by home/templates/time_charts.html.j2 as the other charts are."""
+"""One figure over time as coordinates for SVG, which templates/time_charts.html.j2 draws."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small charts as coordinates for SVG, drawn by calibration/templates/charts.html.j2: sharp, printable, in the theme's ink."""
+"""Small charts as coordinates for SVG, which calibration/templates/charts.html.j2 draws in the theme's ink."""
 
 from __future__ import annotations
 
