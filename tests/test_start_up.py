@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from service.audit.record import starts
 from service.audit.record.starts import record_start
 from service.core.errors import ConfigurationError
 from service.core.model import RunAborted, ServiceStarted
