@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # Some machines forbid byte code; the tests start hundreds of processes, which would all compile the program anew.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-all test-versions lint format docs bench torture-audit torture-crash torture-faults torture-fuzz soak lock clean
+.PHONY: demo test test-all test-versions lint format docs reference bench torture-audit torture-crash torture-faults torture-fuzz soak lock clean
 
 demo: $(READY)
 	$(BIN)/orthocapture demo
@@ -35,11 +35,13 @@ format: $(TOOLS)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# What docs/ holds that is made from the code: protocol schema, state diagram, ways on from every stop.
+# The pages of docs/reference that are made from the code, but for faults.md (make torture-faults).
+reference: $(TOOLS)
+	$(BIN)/python -m docs.generate
+
+# The site in build/docs; a warning is an error.
 docs: $(TOOLS)
-	$(BIN)/orthocapture protocol schema > docs/protocol.schema.json
-	$(BIN)/orthocapture protocol diagram protocols/exvivo_spine.yaml > docs/state_machine.md
-	$(BIN)/orthocapture protocol ways protocols/exvivo_spine.yaml > docs/ways_on.md
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going docs build/docs
 
 # Measurements that take long; each is a script of its own and writes to bench/results.
 bench: $(TOOLS)
@@ -58,16 +60,16 @@ torture-fuzz: $(TOOLS)
 torture-audit: $(TOOLS)
 	$(strip $(BIN)/python -m bench.torture.audit $(if $(MINUTES),--minutes $(MINUTES)) $(if $(WORK),--work $(WORK)))
 
-# Searches for faults that no single test looks for (docs/torture.md); takes most of an hour.
+# Searches for faults that no single test looks for (docs/howto/torture.md); takes most of an hour.
 torture-crash: $(TOOLS)
 	$(BIN)/python -m bench.torture.crash
 
-# Every message of every wire spoilt in every way, and what devices and disks do by themselves (docs/faults.md): hours.
+# Every message of every wire spoilt in every way, and what devices and disks do by themselves (docs/reference/faults.md): hours.
 # MINUTES=30 ends it early; ONLY='robot/rtde/*' chooses. What differs from the table is told.
 torture-faults: $(TOOLS)
 	$(strip $(BIN)/python -m bench.torture.faults $(if $(ONLY),--only '$(ONLY)') $(if $(MINUTES),--minutes $(MINUTES)))
 
-# Long and large (docs/soak.md): an hour of captures, a run of 10,000 viewpoints, many on one file, speed. Hours.
+# Long and large (docs/howto/soak.md): an hour of captures, a run of 10,000 viewpoints, many on one file, speed. Hours.
 soak: $(TOOLS)
 	$(BIN)/python -m bench.soak
 

@@ -17,7 +17,7 @@ from service.core.json_text import parse_json
 from service.core.model import Record
 from service.core.yaml_tree import NO_LINES, FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
 
-_REMEDY = "Compare it with the example in docs/your_hardware.md"
+_REMEDY = "Compare it with the example in docs/howto/your_hardware.md"
 
 if TYPE_CHECKING:  # the module brings scipy, for which a web process must not wait when it starts
     from service.core.geometry import Transform
@@ -200,7 +200,7 @@ def read_rig(path: Path) -> bytes:
         raise ConfigurationError(
             "there is no such rig file",
             where=str(path),
-            remedy="Write one as docs/your_hardware.md shows, or try a simulated one: "
+            remedy="Write one as docs/howto/your_hardware.md shows, or try a simulated one: "
             "orthocapture simulate rig --scene 7 --dir rig, then --rig rig/rig.yaml",
         ) from error
     except OSError as error:

@@ -247,7 +247,7 @@ class Station:
         except ValidationError as error:
             tree, at = self.rig.tree, ("devices", name)
             problems = [problem_of(details, tree, spec.config, at) for details in error.errors()]
-            remedy = "Compare it with the example in docs/your_hardware.md"
+            remedy = "Compare it with the example in docs/howto/your_hardware.md"
             refuse(problems, what="rig file", name=str(self.rig.path), remedy=remedy, error=ConfigurationError)
 
 

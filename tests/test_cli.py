@@ -321,7 +321,7 @@ def test_doctor_says_that_the_library_of_an_arm_is_not_installed(tmp_path: Path)
     error = json.loads(done.stdout)["devices"]["robot"]["error"]
     assert error["kind"] == "DriverMissingError"
     assert "ur-rtde" in error["what"]
-    assert "docs/installation.md" in error["remedy"]
+    assert "docs/howto/installation.md" in error["remedy"]
 
 
 def test_doctor_names_what_is_not_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

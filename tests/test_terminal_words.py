@@ -141,7 +141,7 @@ def test_a_simulator_refuses_wrong_usage_as_every_command_does(typed: list[str],
 def test_a_missing_rig_file_says_what_to_do(tmp_path: Path) -> None:
     status, words = _output("doctor", "--rig", str(tmp_path / "rig.yaml"))
     assert status == 1
-    assert "docs/your_hardware.md" in words
+    assert "docs/howto/your_hardware.md" in words
     assert "orthocapture simulate rig --scene 7 --dir rig" in words
 
 

@@ -57,7 +57,7 @@ def measured(part: str, folder: Path, options: argparse.Namespace) -> dict[str, 
 
 def report(parts: Mapping[str, dict[str, Any]]) -> str:
     """As Markdown."""
-    lines = ["# Long and large", "", "`make soak` (docs/soak.md).", ""]
+    lines = ["# Long and large", "", "`make soak` (docs/howto/soak.md).", ""]
     for part in (name for name in PARTS if name in parts):
         found = parts[part]
         on = found["machine"]

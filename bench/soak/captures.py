@@ -75,7 +75,7 @@ def protocol_of(folder: Path, planned: int, *, calibrated: bool) -> Path:
 
     When `calibrated`, the camera is calibrated before, and a registration after it is planned, which is never
     reached: so the worker has features and matches to compute for every image. The live numbers are left out: each of
-    their jobs names all the images before it, which is not linear (docs/soak.md).
+    their jobs names all the images before it, which is not linear (docs/howto/soak.md).
     """
     whole = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     steps: dict[str, dict[str, Any]] = {step["id"]: step for step in whole["steps"]}

@@ -1,1 +1,1 @@
-"""Sweeps that search for faults no single test looks for, each a `make torture-…` of its own (docs/torture.md)."""
+"""Sweeps for faults that no single test looks for, each a `make torture-…` of its own (docs/howto/torture.md)."""

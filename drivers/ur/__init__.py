@@ -50,7 +50,7 @@ def _build(config: UrConfig) -> Device:
             f"ur-rtde, the library for arms of Universal Robots, is not installed; it has no ready-made package for "
             f"Python {platform.python_version()} on {platform.system()} {platform.machine()}",
             where=config.host,
-            remedy="Use Python 3.12 or 3.11 on Linux x86_64, or build the library as docs/installation.md says",
+            remedy="Use Python 3.12 or 3.11 on Linux x86_64, or build the library as docs/howto/installation.md says",
         ) from error
     return cast("Device", module.UrRobot(config))
 

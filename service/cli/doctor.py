@@ -86,7 +86,7 @@ def doctor_command(
         print_json({"ok": healthy, "devices": devices, "data": folder, "host_clock": found_clock, "missing": missing})
     else:
         for what in missing:
-            console.print(f"[bold yellow]![/] not installed: {escape(what)} (see docs/installation.md)")
+            console.print(f"[bold yellow]![/] not installed: {escape(what)} (see docs/howto/installation.md)")
         for name, report in found.items():
             _print(name, report)
         note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"

@@ -37,7 +37,7 @@ def check_command(
             raise ProtocolError(
                 f"{len(problems)} of its numbers or names cannot be meant:\n{listed}\n",
                 where=f"{file}:{problems[0].line}",
-                remedy="Correct the measure, its unit or its limit; docs/protocol.schema.json lists the fields",
+                remedy="Correct the measure, its unit or its limit; docs/reference/steps.md lists the measures",
             )
         if json:
             steps = [{"id": s.id, "kind": s.kind, "irreversible": s.irreversible} for s in protocol.steps]

@@ -107,7 +107,9 @@ def _print_backup(made: BackupReport) -> None:
         f"{made.present} were there."
     )
     if not state.with_keys:
-        console.print("  The signing key is not in it: keep the folder keys/ elsewhere (see docs/operating.md).")
+        console.print(
+            "  The signing key is not in it: keep the folder keys/ elsewhere (see docs/howto/operating.md)."
+        )
     if state.faults:
         console.print(f"[bold red]What was copied does not verify.[/] First fault: {escape(state.faults[0])}")
         console.print("  Older backups are kept. Run: orthocapture audit verify all")

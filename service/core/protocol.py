@@ -315,7 +315,7 @@ def _validate_params(
 
 
 def _refuse(problems: list[Problem], name: str) -> NoReturn:
-    remedy = "See docs/protocol.schema.json for what a protocol may hold"
+    remedy = "See docs/reference/protocol.schema.json for what a protocol may hold"
     refuse(problems, what="protocol", name=name, remedy=remedy, error=ProtocolError)
 
 

@@ -1,4 +1,4 @@
-"""The texts of docs/protocol.schema.json and of the lifecycle page, generated; the caller writes them."""
+"""The texts of docs/reference/protocol.schema.json and of the lifecycle page, generated; the caller writes them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.core.protocol import Gate, Protocol, Step, protocol_json_schema
 
 
 def schema_text(params_models: Mapping[str, type[BaseModel]]) -> str:
-    """docs/protocol.schema.json."""
+    """docs/reference/protocol.schema.json."""
     return json.dumps(protocol_json_schema(params_models), indent=2, ensure_ascii=False) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""The text of docs/ways_on.md: what can be done about every failure of every step, as the code answers."""
+"""The text of docs/reference/ways_on.md: what can be done about every failure of every step, as the code answers."""
 
 from __future__ import annotations
 

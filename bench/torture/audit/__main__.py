@@ -2,9 +2,9 @@
 
 A small record made by the software itself; every byte of it with one bit flipped, every row and column altered,
 every roll-back, and a forger with every subset of what he can write and sign with. What is not told must stand in the
-table of docs/evidence.md, and what stands there must have been found not to be told. The changes of each sweep are
-done in a random order of a fixed seed: what a sweep that was ended early (--minutes) has done is a sample of all of
-them, and with the same --work it is continued.
+table of docs/explanation/evidence.md, and what stands there must have been found not to be told. The changes of each
+sweep are done in a random order of a fixed seed: what a sweep that was ended early (--minutes) has done is a sample
+of all of them, and with the same --work it is continued.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from bench.torture.audit.rollback import RollBacks
 from bench.torture.audit.tally import Sweep, Tallies, Tally, add_all, in_a_process
 
 RESULTS = REPOSITORY / "bench" / "results"
-DOCUMENT = REPOSITORY / "docs" / "evidence.md"
+DOCUMENT = REPOSITORY / "docs" / "explanation" / "evidence.md"
 CHUNK = 250  # changes of one process
 SWEEPS: Mapping[str, Callable[[Record], Sweep]] = {
     "edits": Edits,
@@ -201,7 +201,7 @@ def report(about: Mapping[str, Any], total: Mapping[str, Tally], documented: Map
     for kind, t in sorted(total.items()):
         cells = (kind, t.number, t.told, t.placed, t.meaningless, sum(t.untold.values()), t.noted, len(t.crashes))
         lines.append(f"| {' | '.join(str(cell) for cell in cells)} |")
-    lines += ["", "Not told, why, and what tells it from outside (docs/evidence.md):", ""]
+    lines += ["", "Not told, why, and what tells it from outside (docs/explanation/evidence.md):", ""]
     lines += ["| what | number | why | what tells it |", "|---|---|---|---|"]
     numbers: dict[str, int] = {}
     for _kind, code, number in _codes(total):

@@ -3,7 +3,7 @@
 `python -m bench.torture.faults` (or `make torture-faults`) tries every case on a small rig: the real drivers over
 their real wires, the real runner, and a simulated person who takes the first way on that the screen lists. Each case
 is judged by the same rules (bench/torture/faults/rules.py). What happened is compared with the table in
-docs/faults.md; `--record` writes that table, and the results to bench/results.
+docs/reference/faults.md; `--record` writes that table, and the results to bench/results.
 Exit status: 0 when every rule held and the table is right, 1 otherwise.
 """
 
@@ -34,7 +34,7 @@ from bench.torture.faults.table import differences, read_table, report, table
 from bench.torture.faults.trial import prepare_seed, run_in_child
 from bench.torture.faults.verdict import Verdict
 
-DOCUMENT = REPOSITORY / "docs" / "faults.md"
+DOCUMENT = REPOSITORY / "docs" / "reference" / "faults.md"
 RESULTS = REPOSITORY / "bench" / "results"
 _POLL_S = 0.02
 
@@ -116,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--sample", type=int, default=0, metavar="N", help="so many of them, drawn by --seed")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--minutes", type=float, default=0, help="begin no further case after this; 0: never")
-    parser.add_argument("--record", action="store_true", help="write docs/faults.md and bench/results")
+    parser.add_argument("--record", action="store_true", help="write docs/reference/faults.md and bench/results")
     parser.add_argument("--list", action="store_true", help="name the cases and end")
     parser.add_argument("--out", type=Path, help="write the verdicts to this file (JSON)")
     options = parser.parse_args(arguments)

@@ -1,4 +1,4 @@
-"""The table in docs/faults.md, and the results: what went wrong, what was done about it, how it ended."""
+"""The table in docs/reference/faults.md, and the results: what went wrong, what was done about it, how it ended."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _HEAD = """\
 # What happens when something goes wrong
 
 Made by `make torture-faults`, which tries each case with the real drivers and the real runner, and checks this
-table ([torture.md](torture.md)). Each row is one case: what goes wrong, what the program does about it, how the run
-ends for a person who takes the first way on that the screen lists, and the words that the person reads first (N
-stands for a figure).
+table ([torture.md](../howto/torture.md)). Each row is one case: what goes wrong, what the program does about it, how
+the run ends for a person who takes the first way on that the screen lists, and the words that the person reads first
+(N stands for a figure).
 
 What is done: *again*, the same view at once, on a device that is opened again where it had gone; *reopen*, the
 device is opened again; *retry*, the step is tried again after a wait; *skip*, a view is given up; *ask*, the run

@@ -1,0 +1,38 @@
+"""How Sphinx makes a site of the documents: `make docs`."""
+
+from __future__ import annotations
+
+from importlib.metadata import version as _version
+from typing import Any
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+from pygments.lexers.special import TextLexer
+
+project = "orthocapture"
+version = release = _version("orthocapture")
+html_title = f"orthocapture {release}"
+html_theme = "furo"
+html_static_path: list[str] = []
+html_copy_source = False
+html_show_sphinx = False
+extensions = ["myst_parser"]
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+exclude_patterns = ["generate", "screens"]
+
+
+def _math(visitor: Any, node: nodes.Element) -> None:
+    """Formulas as MathML, which browsers draw by themselves: the site fetches nothing from elsewhere."""
+    block = isinstance(node, nodes.math_block)
+    visitor.body.append(tex2mathml(node.astext(), as_block=block))
+    raise nodes.SkipNode
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx: the renderer of formulas, and a name for what GitHub draws and we show as text."""
+    app.add_html_math_renderer("mathml", (_math, None), (_math, None))
+    app.add_lexer("mermaid", TextLexer)
+
+
+html_math_renderer = "mathml"
