@@ -1,1 +1,1 @@
-"""Drivers: one file a device, behind the interfaces in drivers.interfaces."""
+"""Device drivers, one file per device, behind the interfaces in drivers.interfaces."""

@@ -1,4 +1,4 @@
-"""A device is driven by one process of this machine at a time, whatever data folder and rig file it was named in."""
+"""A lock for each device: only one process of this machine drives it, whatever data folder or rig file names it."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ _NETWORK = Path("/proc/self/ns/net")
 
 
 class DeviceLock:
-    """The sole right to a device. The system lets go of it when the process ends, however it ends."""
+    """Exclusive access to a device. The operating system releases it when the process ends, however it ends."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
 
     @classmethod
     def take(cls, address: str, name: str) -> Self:
-        """Take it.
+        """Acquire the lock of a device, without waiting.
 
         Args:
-            address: what tells the device from every other: its driver and where it is connected.
+            address: identifies the device uniquely: its driver and where it is connected.
             name: the device's name in the rig file, for messages.
 
         Raises:
-            DeviceUnavailableError: another process drives it.
+            DeviceUnavailableError: another process holds the lock.
         """
         path = _folder() / f"{hashlib.sha256(f'{_network()} {address}'.encode()).hexdigest()[:32]}.lock"
         descriptor = _open(path)
@@ -49,7 +49,7 @@ class DeviceLock:
         return cls(descriptor)
 
     def release(self) -> None:
-        """Let the next process in; releasing twice does nothing."""
+        """Release the lock; a second call has no effect."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
@@ -60,24 +60,24 @@ def _folder() -> Path:
     folder = place / "orthocapture"
     folder.mkdir(exist_ok=True)
     if folder.stat().st_uid == os.getuid():
-        folder.chmod(0o1777)  # every user of the machine
+        folder.chmod(0o1777)  # writable for every user of the machine
     return folder
 
 
 def _open(path: Path) -> int:
-    """A descriptor of the file, which every user of the machine may lock.
+    """Open the lock file, creating it for all users of the machine if needed; returns its descriptor.
 
-    It is never deleted: a process that has just opened a deleted file would have a lock of its own.
+    The file is never deleted: a process that had opened the deleted file would hold a lock of its own.
     """
     flags = os.O_RDWR | os.O_CLOEXEC
     try:
         descriptor = os.open(path, flags | os.O_CREAT | os.O_EXCL)
     except FileExistsError:
-        return os.open(path, flags)  # without O_CREAT, which Linux refuses for another user's file in such a folder
+        return os.open(path, flags)  # Linux refuses O_CREAT for another user's file in a sticky folder
     os.fchmod(descriptor, 0o666)
     return descriptor
 
 
 def _network() -> str:
-    """An address names a device within one network namespace."""
+    """The identity of this process's network namespace; the same address elsewhere is another device."""
     return os.readlink(_NETWORK) if _NETWORK.exists() else ""

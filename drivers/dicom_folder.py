@@ -1,4 +1,4 @@
-"""A CT suite, seen through the DICOM folder it delivers, and meshes segmented elsewhere that lie in it."""
+"""Driver for a CT suite, through the folder of DICOM series and segmented meshes that it delivers."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from drivers.plugin import DriverConfig, DriverSpec
 from drivers.scan_folder import free_bytes, require_folder
 
 _ARRIVING = "still arriving"
-# What pydicom, its plug-ins and Pillow raise for pixels that are cut short, damaged or of a codec that is missing.
+# What pydicom, its plug-ins and Pillow raise for pixels that are truncated, damaged or of a missing codec.
 _DECODE_ERRORS = (*PARSE_ERRORS, RuntimeError, OSError)
 
 
 class DicomFolderConfig(DriverConfig):
-    """Section of rig.yaml."""
+    """The CT suite's section in rig.yaml."""
 
     folder: Path = Field(description="where the CT suite delivers its series, in sub-folders or not")
     mesh_unit: MeshUnit = Field(default="auto", description="of segmented meshes: mm, m, or auto (from the size)")
@@ -41,14 +41,14 @@ _FileKey = tuple[Path, int, int]  # path, size, mtime in ns
 
 @dataclass(frozen=True, slots=True)
 class _Arrival:
-    """What a series consisted of, and since when this host has seen it so."""
+    """The files of a series, and since when this host has seen them unchanged."""
 
     files: frozenset[_FileKey]
     since_s: float
 
 
 class DicomFolder:
-    """drivers.interfaces.CtSource on a folder; reads, and never writes or deletes there."""
+    """drivers.interfaces.CtSource on a folder, which it reads but never changes."""
 
     def __init__(self, config: DicomFolderConfig, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._config = config
@@ -58,20 +58,20 @@ class DicomFolder:
         self._arrivals: dict[str, _Arrival] = {}
 
     def open(self) -> DeviceIdentity:
-        """Check that the folder is there and begin to observe it."""
+        """Check that the folder exists and start watching it; raises DeviceUnavailableError if it does not."""
         require_folder(self._config.folder)
         self._watch.poll()
         self.series()
         return self._identity()
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: nothing is kept open."""
 
     def report(self) -> DeviceReport:
-        """Series found, what is wrong with them, and files that are not DICOM."""
+        """Return the number of series, their problems, and the files that are not DICOM."""
         series = self.series()
         arriving = [one for one in series if any(text.startswith(_ARRIVING) for text in one.problems)]
-        # To arrive is no fault: what else is wrong with such a series may only be that it is not whole yet.
+        # A series in transfer is no fault, and its other problems may only be due to missing files.
         problems = [
             f"series {one.uid} ({one.description}): {text}"
             for one in series
@@ -92,16 +92,16 @@ class DicomFolder:
         )
 
     def series(self) -> tuple[CtSeries, ...]:
-        """All series with images, those with problems too, by UID.
+        """Return all series with images, including those with problems, sorted by UID.
 
-        A series that changed less than `stable_s` ago, as this driver observed it, has the problem "still arriving":
-        a series in transfer looks complete, and short. The age of the files says nothing, since copying may keep it
-        and the clock of a share may differ.
+        A series that this driver saw change less than `stable_s` ago has the problem "still arriving", because a
+        series in transfer looks like a complete, shorter one. The age of the files is not used, since copying may
+        preserve it and the clock of a share may differ.
         """
         require_folder(self._config.folder)
         groups: dict[str, list[SliceHeader]] = {}
         keys: dict[str, set[_FileKey]] = {}
-        unread: set[_FileKey] = set()  # perhaps the beginning of one more slice, of whatever series
+        unread: set[_FileKey] = set()  # each may be the beginning of another slice, of any series
         for key, header in self._scan().items():
             if isinstance(header, SliceHeader):
                 groups.setdefault(header.series_uid, []).append(header)
@@ -120,11 +120,11 @@ class DicomFolder:
         """Read one series into Hounsfield units.
 
         Voxel axes: i along a row of the image, j down its columns, k along their cross product, so that T_ct_voxel is
-        right-handed whatever the order of the files. The frame is DICOM's patient
-        frame (x left, y back, z head), metres.
+        right-handed whatever the order of the files. The ct frame is DICOM's patient frame (x left, y back, z head),
+        in metres.
 
         Raises:
-            UnreadableFileError: the series has problems, or a slice cannot be decoded; names slice and file.
+            UnreadableFileError: the series has problems, or a slice cannot be decoded; names the slice and the file.
         """
         headers = [self._header(path) for path in series.files]
         sound = [header for header in headers if isinstance(header, SliceHeader)]
@@ -143,12 +143,12 @@ class DicomFolder:
         return CtVolume(volume, T_ct_voxel, spacing, self._series(series.uid, ordered, ()))
 
     def segmented_meshes(self) -> tuple[ScanExport, ...]:
-        """Complete meshes in the folder (STL, PLY, OBJ), oldest first."""
+        """Return the complete segmented meshes in the folder (STL, PLY, OBJ), oldest first."""
         require_folder(self._config.folder)
         return self._watch.poll()[0]
 
     def read_mesh(self, export: ScanExport) -> ScannedMesh:
-        """Read one of them, in metres."""
+        """Read one segmented mesh, in metres; raises as drivers.mesh_file.read_mesh_file does."""
         return read_mesh_file(export.files[0], self._config.mesh_unit, export=export)
 
     def _scan(self) -> dict[_FileKey, SliceHeader | str]:
@@ -156,7 +156,7 @@ class DicomFolder:
         for path in dicom_files(self._config.folder):
             try:
                 key = _key(path)
-            except FileNotFoundError:  # renamed since the folder was listed, as transfers do at their end
+            except FileNotFoundError:  # renamed since the folder was listed, as at the end of a transfer
                 continue
             fresh[key] = self._header(path)
         self._headers = fresh
@@ -169,7 +169,7 @@ class DicomFolder:
         return (f"{_ARRIVING}: unchanged for {waited_s:.1f} s, waiting for {self._config.stable_s:g} s",)
 
     def _header(self, path: Path) -> SliceHeader | str:
-        """The header, or why there is none; read once for a file that does not change."""
+        """The header, or why it cannot be read; a file that does not change is read only once."""
         try:
             known = self._headers.get(_key(path))
         except OSError as error:
@@ -204,7 +204,7 @@ def _key(path: Path) -> _FileKey:
 
 
 def _hounsfield(header: SliceHeader) -> NDArray[np.int16]:
-    """Pixels of one slice, rescaled: (J, I)."""
+    """The pixels of one slice in Hounsfield units, (J, I). Raises UnreadableFileError."""
     try:
         dataset = read_dicom(header.path)
         stored = np.asarray(dataset.pixel_array)

@@ -1,4 +1,4 @@
-"""DICOM slice headers: reading them, and judging whether the slices of a series make a uniform volume."""
+"""Reads DICOM slice headers and checks whether the slices of a series form a uniform volume."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ PARSE_ERRORS = (
     struct.error,
     zlib.error,
 )
-_DEFLATED = "1.2.840.10008.1.2.1.99"  # the whole file compressed: what it unpacks to has no bound
-_LARGEST_PIXELS = 8192 * 8192  # of one image; a CT slice has a sixteenth
+_DEFLATED = "1.2.840.10008.1.2.1.99"  # the whole file is compressed, so its unpacked size is unbounded
+_LARGEST_PIXELS = 8192 * 8192  # per image; a CT slice has at most a sixteenth of it
 _UNCOMPRESSED = ("1.2.840.10008.1.2", "1.2.840.10008.1.2.1", "1.2.840.10008.1.2.2")
 _ORIENTATION_TOLERANCE = 1e-3
-# Positions are decimal strings of a few digits; a slice missing moves the next one by a whole spacing.
+# Positions are decimal strings of a few digits; a missing slice doubles the step.
 _SPACING_TOLERANCE = 0.02
 _POSITION_TOLERANCE_MM = 0.01
 _MAX_NAMED = 5
@@ -63,7 +63,7 @@ _MAX_NAMED = 5
 
 @dataclass(frozen=True, slots=True)
 class SliceHeader:
-    """What matters of one file; absent geometry is None, and a problem."""
+    """The relevant header fields of one file; missing geometry is None and is reported as a problem."""
 
     path: Path
     series_uid: str
@@ -84,12 +84,16 @@ class SliceHeader:
 
     @property
     def name(self) -> str:
-        """File and UID, for messages."""
+        """File name and instance UID, for messages."""
         return f"{self.path.name} ({self.instance_uid})"
 
 
 def dicom_files(folder: Path) -> list[Path]:
-    """Files in a folder and below that may be DICOM, whatever their extension; not DICOMDIR, meshes and texts."""
+    """Files in a folder and its subfolders that may be DICOM, whatever their extension.
+
+    Leaves out DICOMDIR, hidden files, meshes, images and texts. Raises DeviceUnavailableError if the folder cannot be
+    read.
+    """
     try:
         root = folder.resolve(strict=True)
         return [
@@ -110,30 +114,33 @@ def dicom_files(folder: Path) -> list[Path]:
 
 
 class _NoFurther(io.BufferedReader):
-    """A file that is never asked for more than it has left: a wrong length would set gigabytes aside first."""
+    """A file reader that caps each read at the rest of the file: a wrong length field would allocate gigabytes."""
 
     def __init__(self, raw: io.FileIO) -> None:
         super().__init__(raw)
         self._bytes = os.fstat(raw.fileno()).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """See io.BufferedReader."""
+        """Read up to `size` bytes, or all remaining ones if it is None or negative, as io.BufferedReader does."""
         left = max(self._bytes - self.tell(), 0)
         return super().read(left if size is None or size < 0 else min(size, left))
 
 
 def read_dicom(path: Path, *, header_only: bool = False) -> FileDataset:
-    """pydicom's dataset, also of a file without preamble; its warnings are about details that do not matter here."""
+    """Read a DICOM file, also one without preamble, with pydicom's warnings suppressed.
+
+    Raises OSError, or one of PARSE_ERRORS if the file is damaged or not DICOM.
+    """
     with warnings.catch_warnings(), path.open("rb", buffering=0) as raw, _NoFurther(raw) as file:
         warnings.simplefilter("ignore")
         dataset = pydicom.dcmread(file, force=True, stop_before_pixels=header_only)
-        # The elements decode when they are looked at, which warns too.
+        # Elements are decoded on access, which can warn too.
         dataset.decode()
     return dataset
 
 
 def read_header(path: Path) -> SliceHeader | str:
-    """The header of an image, or why it has none."""
+    """Read the header of a slice; returns a sentence with the reason if it cannot be read."""
     again = "export it again, or take it out of the folder"
     try:
         if _is_deflated(path):
@@ -191,7 +198,7 @@ def _numbers(dataset: FileDataset, name: str, count: int) -> tuple[float, ...] |
 
 
 def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
-    """Why these slices do not make a uniform CT volume; empty if they do."""
+    """Why these slices do not form a uniform CT volume, one text per problem; empty if they do."""
     if all(header.rows == 0 or header.columns == 0 for header in headers):
         return (f"it holds no images (modality {headers[0].modality})",)
     problems: list[str] = []
@@ -225,7 +232,7 @@ def problems_of(headers: Sequence[SliceHeader]) -> tuple[str, ...]:
 
 
 def _undecodable(syntax: str) -> bool:
-    """Whether pixels of a known transfer syntax cannot be decoded here; an unknown one is tried when it is read."""
+    """Whether no decoder is installed for a known transfer syntax; an unknown one is tried when it is read."""
     uid = UID(syntax) if re.fullmatch(r"[0-9.]+", syntax) else None
     if uid is None or not uid.is_transfer_syntax or not uid.is_compressed or uid.is_deflated:
         return False
@@ -252,7 +259,7 @@ def _shape_problems(headers: Sequence[SliceHeader]) -> list[str]:
         ("orientation", [tuple(round(x / 2e-3) for x in h.orientation or ()) for h in headers]),
     ):
         usual = Counter(keys).most_common(1)[0][0]
-        slack = 1 if what == "orientation" else 0  # rounded to 0.002: neighbours are the same
+        slack = 1 if what == "orientation" else 0  # rounded to 0.002, so adjacent values count as equal
         other = [
             header
             for header, key in zip(headers, keys, strict=True)
@@ -279,7 +286,7 @@ def _position_problems(headers: Sequence[SliceHeader]) -> list[str]:
     distinct = steps[steps > _POSITION_TOLERANCE_MM]
     if len(distinct) == 0:
         return [f"all slices at the same position: {_named(ordered)}"]
-    # The commonest step, not the mean: gaps must not move it. Of two different ones the smaller is the spacing.
+    # The median step, not the mean, which gaps would change. With only two steps the smaller one is the spacing.
     spacing = float(np.median(distinct)) if len(distinct) > 2 else float(distinct.min())
     problems: list[str] = []
     for step, before, after, at in zip(steps, ordered[:-1], ordered[1:], along[:-1], strict=True):
@@ -302,7 +309,7 @@ def _position_problems(headers: Sequence[SliceHeader]) -> list[str]:
 
 
 def _along_normal(headers: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Array]:
-    """Slices sorted along the cross product of row and column, and their places along it in mm."""
+    """The slices sorted along the slice normal (cross product of row and column), and their positions on it in mm."""
     row, column = np.array(headers[0].orientation).reshape(2, 3)
     along = np.array([header.position_mm for header in headers]) @ np.cross(row, column)
     order = np.argsort(along, kind="stable")
@@ -310,9 +317,10 @@ def _along_normal(headers: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Ar
 
 
 def arrange(headers: Sequence[SliceHeader]) -> tuple[list[SliceHeader], Transform, tuple[float, float, float]]:
-    """Slices in order of k, T_ct_voxel (4, 4) and spacing (i, j, k) in metres, of a series without problems.
+    """Return the slices in order of k, T_ct_voxel (4, 4) and the spacing (i, j, k) in metres.
 
-    The step along k is taken from the positions, so that a tilted gantry gives the shear it has.
+    The series must have no problems. The step along k is taken from the slice positions, so T_ct_voxel includes the
+    shear of a tilted gantry.
     """
     ordered, _ = _along_normal(headers)
     orientation = ordered[0].orientation or ()

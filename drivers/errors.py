@@ -1,4 +1,4 @@
-"""The DeviceError tree: vendor errors are wrapped here and stop here."""
+"""The DeviceError tree: drivers translate every vendor error into one of these."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from service.core.errors import OrthocaptureError
 
 
 class DeviceError(OrthocaptureError):
-    """Base of everything a device can do wrong; `where` names the device and its address."""
+    """Base class of all device errors; `where` names the device and its address."""
 
 
 class DeviceUnavailableError(DeviceError):
-    """Nobody answers, or the link dropped: reconnecting may help."""
+    """The device does not answer, or the link dropped. Reconnecting may help."""
 
 
 class DriverMissingError(DeviceError):
-    """The vendor's library is not installed: it has no ready-made package for this Python or this machine."""
+    """The vendor's library is not installed, because it has no wheel for this Python or this machine."""
 
 
 class DeviceTimeoutError(DeviceError):
@@ -22,19 +22,19 @@ class DeviceTimeoutError(DeviceError):
 
 
 class DeviceBusyError(DeviceError):
-    """The device asks to be left alone for a moment: the same call may succeed later."""
+    """The device is busy: the same call may succeed later."""
 
 
 class DeviceRefusedError(DeviceError):
-    """The device understood and said no (setting not available, out of range, wrong mode)."""
+    """The device rejected the request (setting not available, value out of range, wrong mode)."""
 
 
 class ReleasedElsewhereError(DeviceRefusedError):
-    """The software cannot release this camera: a person does, and its photographs come as files."""
+    """The software cannot release this camera's shutter: a person does, and its photographs arrive as files."""
 
 
 class DeviceFaultError(DeviceError):
-    """The device answers but is not fit for use (unsupported firmware, inconsistent read-back)."""
+    """The device answers but cannot be used (unsupported firmware, inconsistent read-back)."""
 
 
 class DeviceStorageFullError(DeviceError):
@@ -46,7 +46,7 @@ class SafetyStopError(DeviceError):
 
 
 class LeaveNeededError(DeviceError):
-    """Nobody has let the arm move since it was connected, or since its program ended unasked: a person confirms."""
+    """A person must confirm motion first: the arm was just connected, or its program ended unexpectedly."""
 
 
 class UnreachablePoseError(DeviceError):
@@ -54,11 +54,11 @@ class UnreachablePoseError(DeviceError):
 
 
 class StaleImageError(DeviceError):
-    """The file that arrived is not the one just taken: counter, EXIF time or hash did not advance."""
+    """The file that arrived is not from the last exposure: its counter, EXIF time or hash is not new."""
 
 
 class UnreadableFileError(DeviceError):
-    """A device file (scan, DICOM slice, photograph) is damaged, incomplete or not what it says."""
+    """A device file (scan, DICOM slice, photograph) is damaged, incomplete or of another format than it claims."""
 
 
 class IncompleteExportError(DeviceError):

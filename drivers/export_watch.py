@@ -1,4 +1,4 @@
-"""Watches a folder (often an SMB share, so by polling) for mesh exports that have stopped changing."""
+"""Watches a folder for finished mesh exports, by polling, since the folder is often an SMB share."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class _Seen:
 
 
 class ExportWatch:
-    """Complete exports of a folder.
+    """Finds the complete exports in a folder.
 
-    Size and modification time must stay as they are for `stable_s` as this host observes it: the clocks of a share
-    and of this host may differ, so the age of a file says nothing.
+    An export counts as complete when this host has seen its sizes and modification times unchanged for `stable_s`.
+    The age of a file is not used, because the clocks of the share and of this host may differ.
     """
 
     def __init__(self, folder: Path, stable_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -35,7 +35,10 @@ class ExportWatch:
         self._seen: dict[Path, _Seen] = {}
 
     def poll(self) -> tuple[tuple[ScanExport, ...], tuple[str, ...]]:
-        """Exports that are complete, oldest first, and one sentence for each that is not."""
+        """Return the complete exports, oldest first, and one sentence for each incomplete one.
+
+        Raises DeviceUnavailableError if the folder cannot be read.
+        """
         now = self._monotonic()
         present = mesh_files(self._folder)
         self._seen = {path: seen for path, seen in self._seen.items() if path in present}
@@ -46,7 +49,7 @@ class ExportWatch:
                 seen = self._observe(path, now)
             except OSError as error:
                 self._seen.pop(path, None)
-                pending.append(f"{path.name}: cannot be looked at ({error.strerror})")
+                pending.append(f"{path.name}: cannot be read ({error.strerror})")
                 continue
             waited_s = now - seen.since_s
             if seen.export is not None and waited_s >= self._stable_s:
@@ -83,7 +86,10 @@ class ExportWatch:
 
 
 def mesh_files(folder: Path) -> list[Path]:
-    """Mesh files in a folder and below it, without hidden ones and links that lead out of it, by name."""
+    """The mesh files in a folder and its subfolders, sorted, without hidden files and links that lead out of it.
+
+    Raises DeviceUnavailableError if the folder cannot be read.
+    """
     try:
         root = folder.resolve(strict=True)
         found = [

@@ -1,4 +1,4 @@
-"""Runs a driver in a supervised child process: call timeout, heartbeat, restart; native crashes stay over there."""
+"""Runs a driver in a supervised child process (call timeout, heartbeat, restart), which contains native crashes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 
 T = TypeVar("T")
 
-START_TIMEOUT_S = 60.0  # import of the driver and its vendor library on a busy machine
+START_TIMEOUT_S = 60.0  # time to import the driver and its vendor library on a busy machine
 CLOSE_TIMEOUT_S = 10.0
 PING_TIMEOUT_S = 15.0
 SELF_DESTRUCT_GRACE_S = 5.0
@@ -40,16 +40,16 @@ _LEVELS = logging.getLevelNamesMapping()
 
 
 def hosted(interface: type[T], spec_path: str, config: BaseModel, *, call_timeout_s: float, name: str) -> T:
-    """Make a stand-in with exactly the public methods of `interface`; each call runs in the driver's own process.
+    """Return a proxy with exactly the public methods of `interface`; each call runs in the driver's own process.
 
     Args:
         interface: RobotArm, Camera, … (a Protocol derived from Device).
         spec_path: entry point of the driver, "module:ATTRIBUTE" naming a DriverSpec.
-        config: the validated configuration; the child validates its JSON once more.
+        config: the validated configuration; the child validates its JSON again.
         call_timeout_s: longest time that one call may take before the child is killed.
         name: the device's name in rig.yaml, for messages and logs.
 
-    The child starts with `open()`, and again with an `open()` after it died. Methods raise errors of our tree only.
+    `open()` starts the child, and restarts it after it died. Methods raise only OrthocaptureError.
     """
     device = HostedDevice(spec_path, config, call_timeout_s=call_timeout_s, name=name)
     methods: dict[str, Any] = {"__init__": _keep_device, "__doc__": f"{interface.__name__} in a process of its own."}
@@ -80,7 +80,7 @@ def _forwarder(method: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True, slots=True)
 class _Child:
-    """A running child process and the parent's end of everything that connects to it."""
+    """A running child process, with the parent's end of its connection and of its log."""
 
     process: subprocess.Popen[str]
     line: Line
@@ -88,7 +88,7 @@ class _Child:
 
 
 class HostedDevice:
-    """The parent's side: starts the child, talks to it, kills it when it does not answer, says what became of it."""
+    """The parent's side: starts the child, calls it, kills it when it does not answer, and reports how it ended."""
 
     def __init__(
         self,
@@ -114,15 +114,18 @@ class HostedDevice:
 
     @property
     def pid(self) -> int | None:
-        """Process id of the child, None when none is running."""
+        """Process id of the child; None if none is running."""
         child = self._child
         return child.process.pid if child else None
 
     def open(self) -> DeviceIdentity:
-        """Start the child unless one is alive, and open the device in it."""
+        """Start the child unless one is alive, open the device in it and return its identity.
+
+        Raises DeviceError as `call` does, and ConfigurationError if the driver cannot be loaded.
+        """
         with self._lock:
             if self._child is not None and (self._suspect or self._child.process.poll() is not None):
-                self._bury()  # a native library that lost its link is not trusted with a second connection
+                self._bury()  # do not reconnect within a native library that has lost its link
             fresh = self._child is None
             if fresh:
                 self._start()
@@ -131,13 +134,13 @@ class HostedDevice:
             except DeviceError as error:
                 if fresh or self._child is not None:
                     raise
-                # What was left of the old connection took the child with it: a new one knows nothing of it.
+                # The rest of the old connection crashed the child; a new child starts clean.
                 _LOG.warning("%s: %s; trying once more", self._name, error)
                 self._start()
                 return cast("DeviceIdentity", self.call("open"))
 
     def close(self) -> None:
-        """Close the device and end the child; never raises for a device or child that is already gone."""
+        """Close the device and end the child; does not raise if either is already gone."""
         with self._lock:
             if self._child is None:
                 return
@@ -150,16 +153,19 @@ class HostedDevice:
         self._watch_stop.set()
 
     def call(self, method: str, *args: Any, **kwargs: Any) -> Any:
-        """Run one method of the driver in the child.
+        """Run one method of the driver in the child and return its result.
 
-        Raises what the driver raised, when it is of our tree; DeviceFaultError for any other exception;
-        DeviceTimeoutError (child killed) when no answer came in time; DeviceUnavailableError when the child is gone.
+        Raises:
+            OrthocaptureError: as raised by the driver.
+            DeviceFaultError: the driver raised any other exception.
+            DeviceTimeoutError: no answer within the call timeout; the child was killed.
+            DeviceUnavailableError: the child is not running.
         """
         with self._lock:
             return self._exchange(method, args, kwargs, self._call_timeout_s)
 
     def ping(self) -> float:
-        """Ask the child for a sign of life; returns the round trip in seconds, raises as `call` does."""
+        """Check that the child answers. Returns the round-trip time in seconds; raises as `call` does."""
         start = time.monotonic()
         with self._lock:
             self._exchange("", (), {}, PING_TIMEOUT_S)
@@ -198,7 +204,7 @@ class HostedDevice:
             if not child.line.poll(max(0.0, deadline - time.monotonic())):
                 raise TimeoutError
             sequence, ok, value = cast("tuple[int, bool, Any]", child.line.receive())
-            if sequence == self._sequence:  # anything older answers a call that was interrupted by the keyboard
+            if sequence == self._sequence:  # older answers belong to calls that Ctrl-C interrupted
                 return ok, value
 
     def _unavailable(self) -> DeviceUnavailableError:
@@ -218,7 +224,7 @@ class HostedDevice:
             stderr=subprocess.STDOUT,
             pass_fds=[theirs.fileno()],
             env={**os.environ, "PYTHONPATH": path, "PYTHONUNBUFFERED": "1"},
-            start_new_session=True,  # Ctrl-C is for the parent, which then closes the device in order
+            start_new_session=True,  # Ctrl-C must reach only the parent, which then closes the device properly
             text=True,
             errors="replace",
         )
@@ -242,7 +248,7 @@ class HostedDevice:
         child, self._child = self._child, None
         if child is None:
             return
-        child.line.close()  # the child exits at the end of its connection
+        child.line.close()  # the child exits when its connection closes
         try:
             status = child.process.wait(CLOSE_TIMEOUT_S)
         except subprocess.TimeoutExpired:
@@ -257,10 +263,10 @@ class HostedDevice:
         self._watch_stop.set()
 
     def _watch(self, stop: threading.Event) -> None:
-        """Heartbeat: find a child that died or hangs between calls, so that the log has the moment."""
+        """Ping the child between calls, so that the log shows when it died or hung."""
         while not stop.wait(self._heartbeat_s):
             if not self._lock.acquire(blocking=False):
-                continue  # a call is under way and has its own timeout
+                continue  # a call is in progress and has its own timeout
             try:
                 if not stop.is_set():
                     self._exchange("", (), {}, PING_TIMEOUT_S)
@@ -286,7 +292,7 @@ def _log_output(process: subprocess.Popen[str], name: str) -> None:
 
 
 class _Server:
-    """Runs the driver's methods one after the other in the main thread; a second thread watches the connection."""
+    """Runs the driver's methods one at a time in the main thread; a second thread reads the connection."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -296,21 +302,21 @@ class _Server:
         self._call_timeout_s = START_TIMEOUT_S
 
     def serve(self) -> None:
-        """Until the parent closes the connection or dies."""
+        """Serve requests until the parent closes the connection or dies; then exit the process."""
         threading.Thread(target=self._read, daemon=True).start()
         while (request := self._requests.get()) is not None:
             sequence, method, args, kwargs = request
-            # A vendor call may hold the GIL for ever, and the parent may be gone: the default action of
-            # SIGALRM ends this process without any help from Python.
+            # A vendor call may hold the GIL for ever while the parent is gone: the default action of SIGALRM
+            # ends this process without any help from Python.
             signal.setitimer(signal.ITIMER_REAL, self._call_timeout_s + SELF_DESTRUCT_GRACE_S)
             reply = self._answer(sequence, method, args, kwargs)
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-            with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the reader sees it and ends us
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the reader thread ends the process
                 self._connection.send_bytes(reply)
         if self._device is not None:
             self._device.close()
         logging.shutdown()
-        os._exit(0)  # without the destructors of native libraries, which may wait for a dead link
+        os._exit(0)  # skip the destructors of native libraries, which may wait for a dead link
 
     def _read(self) -> None:
         try:
@@ -350,7 +356,7 @@ class _Server:
 
 
 def load_spec(spec_path: str) -> DriverSpec:
-    """The DriverSpec behind "module:ATTRIBUTE"; ConfigurationError when there is none."""
+    """Import the DriverSpec named "module:ATTRIBUTE". Raises ConfigurationError if there is none."""
     module_name, _, attribute = spec_path.partition(":")
     try:
         spec = getattr(importlib.import_module(module_name), attribute, None)
@@ -364,7 +370,7 @@ def load_spec(spec_path: str) -> DriverSpec:
 
 
 def main() -> None:
-    """Entry point of the child: the descriptor of the connection is the only argument."""
+    """Entry point of the child; its only argument is the connection's file descriptor."""
     faulthandler.enable()
     logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(levelname)s|%(name)s: %(message)s")
     signal.signal(signal.SIGALRM, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""What the service may ask of a device, and the records that come back. Interfaces and records, nothing else."""
+"""The device interfaces (robot arm, camera, scanner, CT, light box) and the records that they return."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Transform = Array  # (4, 4), T_a_b: p_a = T_a_b @ p_b, metres
 
 @dataclass(frozen=True, slots=True)
 class DeviceIdentity:
-    """Who answered when the device was opened; goes into the evidence of a run."""
+    """The device that answered when it was opened; recorded in the evidence of a run."""
 
     kind: str  # robot, camera, scanner, ct, lightbox
     model: str
@@ -36,27 +36,27 @@ class DeviceReport:
 
     identity: DeviceIdentity
     clock_offset_s: float | None = None  # device clock minus host UTC, or minus host monotonic for an uptime clock
-    clock: Literal["utc", "uptime"] = "utc"  # uptime: it counts from power-on, and only its change means anything
+    clock: Literal["utc", "uptime"] = "utc"  # uptime: counts from power-on, so only changes of the offset matter
     free_bytes: int | None = None
     battery_fraction: float | None = None
     details: Mapping[str, str] = field(default_factory=dict[str, str])
-    problems: tuple[str, ...] = ()  # each: what is wrong and what to do
+    problems: tuple[str, ...] = ()  # each says what is wrong and what to do
 
 
 @runtime_checkable
 class Device(Protocol):
-    """What every driver offers. Methods raise drivers.errors.DeviceError and nothing else."""
+    """What every driver provides. Methods raise only drivers.errors.DeviceError."""
 
     def open(self) -> DeviceIdentity:
-        """Connect, check the version, read back who answers. Opening again reconnects."""
+        """Connect, check the version and return the device's identity. Calling it again reconnects."""
         ...
 
     def close(self) -> None:
-        """Let go of the device; never raises for a link that is already dead."""
+        """Disconnect from the device; does not raise if the link is already dead."""
         ...
 
     def report(self) -> DeviceReport:
-        """Versions, clock offset, free space and what is wrong."""
+        """Return versions, clock offset, free space and current problems."""
         ...
 
 
@@ -64,7 +64,7 @@ class Device(Protocol):
 
 
 class SafetyState(Enum):
-    """What the controller says of its safety system; only a person clears a stop."""
+    """State of the controller's safety system; only a person can clear a stop."""
 
     NORMAL = "normal"
     REDUCED = "reduced"
@@ -76,13 +76,13 @@ class SafetyState(Enum):
 
     @property
     def may_move(self) -> bool:
-        """Whether motion may be asked for."""
+        """Whether motion may be commanded in this state."""
         return self in (SafetyState.NORMAL, SafetyState.REDUCED)
 
 
 @dataclass(frozen=True, slots=True)
 class Payload:
-    """What hangs on the flange: camera, lens, mount."""
+    """The load on the flange: camera, lens and mount."""
 
     mass_kg: float
     centre_of_gravity_m: tuple[float, float, float]  # in the flange frame
@@ -97,14 +97,14 @@ class RobotSample:
     joints_rad: Array  # (6,) or (7,)
     joint_velocities_rad_s: Array
     target_velocities_rad_s: Array
-    T_base_flange: Transform  # as the controller says, tool offset removed
+    T_base_flange: Transform  # as reported by the controller, with the tool offset removed
     tcp_speed_m_s: float
     safety: SafetyState
 
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """The newest sample and the controller's modes."""
+    """The newest sample with the controller's modes."""
 
     sample: RobotSample
     robot_mode: str
@@ -129,7 +129,7 @@ class SettleCriteria:
 
 @dataclass(frozen=True, slots=True)
 class SettleReport:
-    """Whether the pose stream of the last window meets the criteria, and the figures."""
+    """Whether the last window of the pose stream meets the settle criteria, with the measured values."""
 
     settled: bool
     samples: int
@@ -139,67 +139,75 @@ class SettleReport:
     rotation_peak_to_peak_rad: float
     T_base_flange: Transform  # mean over the window
     joints_rad: Array
-    ringing_s: float = 0.0  # from the end of the commanded motion to the last sample beyond the speed limits
+    ringing_s: float = 0.0  # from the end of the commanded motion to the last sample above a speed limit
 
 
 class RobotArm(Device, Protocol):
-    """A six- or seven-axis arm. Motion is asynchronous so that `stop` always works, and needs a person's leave."""
+    """A six- or seven-axis arm.
+
+    Motion is asynchronous, so that `stop` always works, and needs a person's permission (`let_move`).
+    """
 
     def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
-        """Let the arm move, because this person has looked and confirmed; stops that are over are forgotten.
+        """Permit motion after a person has checked the arm and confirmed; clears stops that are over.
 
-        Without it nothing moves: since `open`, since a stop seen anywhere in the stream, since the controller's
-        program ended unasked. Whoever calls this has the confirmation on record; no program gives it to itself.
+        The permission is needed after `open`, after any safety stop in the stream, and after the controller's program
+        ended unexpectedly. The caller must have the person's confirmation on record.
 
         Args:
             confirmed_by: name of the person.
-            not_before_monotonic_s: host time.monotonic() at which the confirmation was not given yet.
+            not_before_monotonic_s: host time.monotonic() shortly before the person confirmed.
 
-        Raises SafetyStopError or LeaveNeededError for what happened, or still went on, after that time.
+        Raises:
+            SafetyStopError, LeaveNeededError: a stop, or an unexpected end of the program, after that time.
         """
         ...
 
     def configure(self, payload: Payload, T_flange_tcp: Transform) -> None:
-        """Set payload and tool centre point and read them back."""
+        """Set the payload and the tool centre point, and verify both by reading them back."""
         ...
 
     def state(self) -> RobotState:
-        """The newest state. Raises DeviceUnavailableError when the stream has gone stale."""
+        """Return the newest state. Raises DeviceUnavailableError if the stream is stale."""
         ...
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
-        """Samples of the ring buffer (at least the last 10 s) between two host times, oldest first.
+        """Return the buffered samples (at least the last 10 s) between two host times, oldest first.
 
-        Reading them is not looking after the arm: an arm that moves and is only watched in this way is stopped.
+        Reading samples does not count as supervising the arm: a moving arm that is only observed this way is stopped.
         """
         ...
 
     def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
-        """Joints for a flange pose, nearest to `near_rad`, asked of the controller; UnreachablePoseError if none."""
+        """Return the controller's joint solution for a flange pose that is closest to `near_rad`, in radians.
+
+        Raises UnreachablePoseError if there is none.
+        """
         ...
 
     def move_joints(self, target_rad: Array, *, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Start a joint motion and return at once.
 
-        Raises SafetyStopError when a stop is active or nobody has confirmed since one, LeaveNeededError when nobody
-        has let the arm move.
+        Raises:
+            SafetyStopError: a stop is active, or nobody has confirmed since the last one.
+            LeaveNeededError: nobody has permitted motion yet.
         """
         ...
 
     def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Start a straight motion of the flange and return at once."""
+        """Start a linear motion of the flange and return at once."""
         ...
 
     def stop(self) -> None:
-        """Decelerate to a stand-still; a software stop, never an emergency stop."""
+        """Decelerate to a standstill. This is a software stop, not an emergency stop."""
         ...
 
     def is_moving(self) -> bool:
-        """Whether the last motion is still under way. Raises what has cut it short, for then it did not arrive."""
+        """Return whether the last motion is still under way. Raises the error that interrupted it, if any."""
         ...
 
     def settle(self, criteria: SettleCriteria) -> SettleReport:
-        """Judge the pose stream of the last window; returns at once, poll it."""
+        """Judge the last window of the pose stream against the criteria. Returns at once; meant to be polled."""
         ...
 
     def set_digital_output(self, index: int, on: bool) -> None:
@@ -212,7 +220,7 @@ class RobotArm(Device, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """The settings that a protocol fixes."""
+    """The camera settings that a protocol prescribes."""
 
     aperture_f: float
     exposure_s: float
@@ -223,7 +231,7 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class CapturedFile:
-    """One undecoded file of an exposure, as it left the camera."""
+    """One file of an exposure, byte for byte as the camera wrote it."""
 
     path: Path
     camera_name: str  # DSC00004.JPG
@@ -234,7 +242,7 @@ class CapturedFile:
 
 @dataclass(frozen=True, slots=True)
 class CapturedImage:
-    """One exposure: its files and when it happened on the host's monotonic clock."""
+    """One exposure: its files, its EXIF data and its time on the host's monotonic clock."""
 
     files: tuple[CapturedFile, ...]  # JPEG first
     counter: int  # of the camera's file names; advances with each exposure
@@ -244,13 +252,13 @@ class CapturedImage:
     focal_length_mm: float
     trigger_monotonic_s: float
     arrival_monotonic_s: float
-    width: int = 0  # px; of these, 0 or "" where the file does not tell
+    width: int = 0  # px; this and the following are 0 or "" if the file does not state them
     height: int = 0
     lens_serial: str = ""
     body_serial: str = ""
     focus_distance_m: float = 0.0
-    focus_position: int | None = None  # of the focus motor, in its own steps; None where the file does not tell
-    found_at: str = ""  # path of the file that it came as; "" where it came from the camera itself
+    focus_position: int | None = None  # of the focus motor, in its own steps; None if the file does not state it
+    found_at: str = ""  # path at which the file was found; "" if it was downloaded from the camera
 
     @property
     def jpeg(self) -> CapturedFile:
@@ -262,34 +270,36 @@ class Camera(Device, Protocol):
     """A stills camera under remote control."""
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Set one by one, wait, read back; DeviceRefusedError when the read-back differs.
+        """Set each value, wait, and return what reads back; DeviceRefusedError if it differs.
 
-        Without a cable it only takes note of what a person has to dial.
+        A camera without a cable only remembers the settings, which a person then dials in.
         """
         ...
 
     def settings(self) -> CameraSettings:
-        """Read the current settings from the camera, not from a cache."""
+        """Return the current settings, read from the camera itself and not from a cache."""
         ...
 
     def capture(self, folder: Path) -> CapturedImage:
-        """Take one exposure and download its undecoded files into `folder`; StaleImageError if not new.
+        """Take one exposure and download its undecoded files into `folder`.
 
-        Raises ReleasedElsewhereError where the camera's own button is the only one.
+        Raises:
+            StaleImageError: the file that arrived is not new.
+            ReleasedElsewhereError: only the camera's own button releases its shutter.
         """
         ...
 
     def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
-        """Images that the camera's own button has released, oldest first, downloaded into `folder`.
+        """Download into `folder` the images released with the camera's own button, oldest first.
 
-        Waits up to `timeout_s` for the first one; empty when the button was not pressed. The trigger's time is that
-        of the camera's announcement, or of the file's arrival. Where images are found as files, those taken earlier
-        than `since_utc_s` (seconds since 1970) are left alone; what a camera announces is new in any case.
+        Waits up to `timeout_s` for the first one; returns an empty tuple if the button was not pressed. The trigger
+        time is when the camera announced the image, or when its file arrived. Images found as files are ignored if
+        they were taken before `since_utc_s` (seconds since 1970); images announced by the camera are always new.
         """
         ...
 
     def preview(self) -> bytes:
-        """One live-view frame, JPEG."""
+        """Return one live-view frame as JPEG bytes."""
         ...
 
 
@@ -302,7 +312,7 @@ class Mesh:
 
     vertices_m: Array  # (V, 3)
     faces: NDArray[np.int32]  # (F, 3)
-    normals: Array  # (V, 3), computed when the file had none
+    normals: Array  # (V, 3), computed if the file had none
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,28 +326,28 @@ class ScanExport:
 
 @dataclass(frozen=True, slots=True)
 class ScannedMesh:
-    """A scan as read, with what was found wrong or worth knowing about it."""
+    """A mesh read from a scan export, with its unit and its findings."""
 
     mesh: Mesh
     unit: str  # of the file: mm, m, …
-    unit_evidence: str  # why that unit is believed
+    unit_evidence: str  # how that unit was determined
     findings: Mapping[str, float]  # holes, non_manifold_edges, components, degenerate_faces, normals_computed
     source: ScanExport
 
 
 class Scanner(Device, Protocol):
-    """A hand scanner, seen through the folder into which its software exports."""
+    """A hand scanner, accessed through the folder into which its software exports."""
 
     def exports(self) -> tuple[ScanExport, ...]:
-        """Complete, stable exports, oldest first; half-written ones are not in it."""
+        """Return the complete, stable exports, oldest first, without those that are still being written."""
         ...
 
     def pending(self) -> tuple[str, ...]:
-        """What is in the folder and not complete: one sentence each, with the reason."""
+        """Return one sentence for each incomplete export in the folder, with the reason."""
         ...
 
     def read(self, export: ScanExport) -> ScannedMesh:
-        """Parse one export; UnreadableFileError or IncompleteExportError with the reason."""
+        """Read one export. Raises UnreadableFileError or IncompleteExportError with the reason."""
         ...
 
 
@@ -364,22 +374,22 @@ class CtVolume:
 
 
 class CtSource(Device, Protocol):
-    """A CT suite, seen through the DICOM folder it delivers."""
+    """A CT suite, accessed through the DICOM folder that it delivers."""
 
     def series(self) -> tuple[CtSeries, ...]:
-        """All series found, those with problems too."""
+        """Return all series found, including those with problems."""
         ...
 
     def read(self, series: CtSeries) -> CtVolume:
-        """Read one series; UnreadableFileError names gap, slice and file."""
+        """Read one series. Raises UnreadableFileError, which names the gap, the slice and the file."""
         ...
 
     def segmented_meshes(self) -> tuple[ScanExport, ...]:
-        """Meshes segmented elsewhere (Mimics STL) lying in the folder."""
+        """Return the meshes in the folder that were segmented elsewhere (e.g. Mimics STL), oldest first."""
         ...
 
     def read_mesh(self, export: ScanExport) -> ScannedMesh:
-        """Import such a mesh."""
+        """Read one segmented mesh. Raises UnreadableFileError or IncompleteExportError with the reason."""
         ...
 
 
@@ -397,7 +407,7 @@ class EnvironmentReading:
 
 
 class TowerLight(Enum):
-    """One light of a signal tower, which is seen across the room."""
+    """One light of a signal tower that can be seen across the room."""
 
     OFF = "OFF"
     WORKING = "GREEN"
@@ -406,10 +416,10 @@ class TowerLight(Enum):
 
 
 class Lightbox(Device, Protocol):
-    """Light level, temperature, shutter relay, foot pedal and signal tower."""
+    """The light and environment box: light level, temperature, shutter relay, foot pedal and signal tower."""
 
     def read(self) -> EnvironmentReading:
-        """Current light level and temperature."""
+        """Return the current light level, temperature and relay state."""
         ...
 
     def set_shutter_relay(self, closed: bool) -> None:
@@ -417,9 +427,9 @@ class Lightbox(Device, Protocol):
         ...
 
     def pedal_presses(self) -> int:
-        """Number of pedal presses since the box started; a rise is a new press."""
+        """Return the number of pedal presses since the box started; an increase means a new press."""
         ...
 
     def show_tower(self, light: TowerLight) -> bool:
-        """Switch the signal tower; False where the box has none, which is no error."""
+        """Switch the signal tower. Returns False if the box has none, which is not an error."""
         ...

@@ -1,8 +1,8 @@
-r"""The light and environment box: light level, temperature, shutter relay, foot pedal, signal tower; a serial line.
+r"""Serial driver of the light and environment box: light, temperature, shutter relay, foot pedal, signal tower.
 
 Wire: 115200 baud, 8 data bits, no parity, one stop bit, ASCII lines. The host ends its lines with LF; the box ends
-its own with LF or CR LF. One reply to each request, and each reply begins with the name of what it reports, so that a
-banner, a late reply or noise is recognised and skipped. Lines that begin with # are comments (the banner).
+its own with LF or CR LF. Each request has one reply, which begins with the name of the quantity, so that a banner, a
+late reply or noise is recognised and skipped. Lines that begin with # are comments (the banner).
 
     *IDN?        *IDN <maker>,<model>,<serial>,<firmware>
     LIGHT?       LIGHT <lux>                 decimal number, lux at the specimen
@@ -10,8 +10,8 @@ banner, a late reply or noise is recognised and skipped. Lines that begin with #
     SHUTTER?     SHUTTER <0|1>               1: relay closed
     SHUTTER 0|1  SHUTTER <0|1>               the state after switching
     PEDAL?       PEDAL <count>               presses since power-up
-    TOWER OFF|GREEN|YELLOW|RED   TOWER <what is lit>   one light of the signal tower; boxes before firmware 1.3 have
-                                                       none and answer ERR 1
+    TOWER OFF|GREEN|YELLOW|RED   TOWER <light that is on>   one light of the signal tower; boxes before firmware 1.3
+                                                            have none and answer ERR 1
     other        ERR <code> <text>           1 unknown request, 2 wrong argument, 3 sensor fault
 """
 
@@ -43,11 +43,11 @@ _LIGHTS = tuple(light.value for light in TowerLight)
 
 
 class _UnknownRequestError(DeviceRefusedError):
-    """An older box does not know the request."""
+    """The box's firmware is too old to know the request."""
 
 
 class LightboxConfig(DriverConfig):
-    """Section of rig.yaml."""
+    """The light box's section in rig.yaml."""
 
     port: str = Field(min_length=1, description="serial device, link to one, or socket://HOST:PORT")
     baudrate: int = Field(default=115200, gt=0)
@@ -55,31 +55,31 @@ class LightboxConfig(DriverConfig):
 
 
 class SerialLightbox:
-    """drivers.interfaces.Lightbox over pyserial. After a broken link the next call opens the port again."""
+    """drivers.interfaces.Lightbox over pyserial. After the link broke, the next call reopens the port."""
 
     def __init__(self, config: LightboxConfig) -> None:
         self._config = config
         self._port: serial.Serial | None = None
         self._pending = b""
-        self._has_tower = True  # until the box says otherwise
+        self._has_tower = True  # until the box refuses the request
 
     def open(self) -> DeviceIdentity:
-        """Open the port, skip what the box says unasked, and ask who it is."""
+        """Open the port and return the box's identity; skips unsolicited lines such as the banner."""
         self.close()
         self._has_tower = True
         return self._identity()
 
     def close(self) -> None:
-        """Let go of the port."""
+        """Close the port; does not raise if the link is dead."""
         port, self._port, self._pending = self._port, None, b""
         if port is not None:
             try:
                 port.close()
             except _LINK_ERRORS:
-                return  # the link is dead already, which is what was asked for
+                return  # the link is already dead
 
     def report(self) -> DeviceReport:
-        """Identity and current readings; a sensor fault is a problem, not an error."""
+        """Return the identity and the current readings; a sensor fault is listed as a problem and not raised."""
         identity = self._identity()
         details: dict[str, str] = {}
         problems: list[str] = []
@@ -91,7 +91,7 @@ class SerialLightbox:
         return DeviceReport(identity=identity, details=details, problems=tuple(problems))
 
     def read(self) -> EnvironmentReading:
-        """Light level in lux, temperature in °C, state of the relay."""
+        """Return the light level in lux, the temperature in °C and the state of the shutter relay."""
         return EnvironmentReading(
             light_lux=self._number("LIGHT"),
             temperature_c=self._number("TEMP"),
@@ -100,7 +100,7 @@ class SerialLightbox:
         )
 
     def set_shutter_relay(self, closed: bool) -> None:
-        """Switch the relay; DeviceFaultError when the box reports another state afterwards."""
+        """Switch the shutter relay. Raises DeviceFaultError if the box then reports another state."""
         if self._ask(f"SHUTTER {int(closed)}", "SHUTTER") != str(int(closed)):
             raise DeviceFaultError(
                 "the shutter relay did not switch",
@@ -109,11 +109,14 @@ class SerialLightbox:
             )
 
     def pedal_presses(self) -> int:
-        """Presses since the box was powered up."""
+        """Return the number of pedal presses since the box was powered up."""
         return int(self._number("PEDAL"))
 
     def show_tower(self, light: TowerLight) -> bool:
-        """One light of the signal tower; False where the box has none."""
+        """Switch on one light of the signal tower, or none.
+
+        Returns False if the box has no tower; raises DeviceFaultError if it shows another light than requested.
+        """
         if not self._has_tower:
             return False
         try:
@@ -151,12 +154,12 @@ class SerialLightbox:
         return float(self._ask(f"{quantity}?", quantity))
 
     def _ask(self, request: str, name: str) -> str:
-        """The value of the reply called `name`; tried again when nothing usable comes in time."""
+        """Send a request and return the value of the reply named `name`; retries if no usable reply comes in time."""
         heard = b""
         try:
             port = self._opened()
             for _ in range(_ATTEMPTS):
-                # What is in the buffer answers an earlier request, or is a banner.
+                # The buffer can hold a banner or the reply to an earlier request.
                 port.reset_input_buffer()
                 self._pending = b""
                 port.write(request.encode("ascii") + b"\n")
@@ -195,19 +198,19 @@ class SerialLightbox:
         return self._port
 
     def _line(self, port: serial.Serial, deadline_s: float) -> bytes | None:
-        """The next complete line without its end, or None when the time is over."""
+        """The next complete line without its line end; None at the deadline."""
         while b"\n" not in self._pending:
             if time.monotonic() >= deadline_s:
                 return None
             self._pending += port.read(max(1, min(port.in_waiting, _MAX_LINE)))
-            # Noise without line ends must not grow without bound; a reply is short.
+            # Replies are short: do not let noise without line ends accumulate.
             if b"\n" not in self._pending:
                 self._pending = self._pending[-_MAX_LINE:]
         line, self._pending = self._pending.split(b"\n", 1)
         return line.strip()
 
     def _value(self, line: bytes, request: str, name: str) -> str | None:
-        """The value if this line is the reply that is waited for; None for anything else."""
+        """The value if this line is the expected reply, otherwise None. Raises DeviceRefusedError for ERR."""
         if not line.isascii():
             return None
         word, _, value = line.decode("ascii").partition(" ")
@@ -222,7 +225,7 @@ class SerialLightbox:
 
 
 def _usable(name: str, value: str) -> bool:
-    """Whether a value is one that its name can have."""
+    """Whether a reply's value is valid for the quantity `name`."""
     match name:
         case "*IDN":
             return True

@@ -1,4 +1,4 @@
-"""Reads OBJ, PLY and STL into metres; completeness, unit, normals and defects are judged, nothing is repaired."""
+"""Reads OBJ, PLY and STL meshes into metres and reports completeness, unit, normals and defects; repairs nothing."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from drivers.mesh_format import check_complete, companions, file_has_normals
 
 MeshUnit = Literal["auto", "mm", "m"]
 METRES_PER_UNIT = {"mm": 1e-3, "m": 1.0}
-# Diagonal of the bounding box. To infer the unit, that of a scene with its spheres, so that centimetres or inches are
-# not taken for millimetres. A configured unit must only be credible for whatever may be scanned, of a bone
-# or a room: within a factor of a thousand, so that millimetres and metres are never both credible.
+# Plausible diagonals of the bounding box. A unit is inferred only for the size of a scene with its spheres, so that
+# centimetres or inches are not mistaken for millimetres. A configured unit must be plausible for anything between a
+# bone and a room; this range spans a factor of 1000, so that millimetres and metres are never both plausible.
 SCENE_DIAGONAL_M = (0.1, 3.0)
 OBJECT_DIAGONAL_M = (0.02, 20.0)
 MESH_SUFFIXES = (".obj", ".ply", ".stl")
 
 IntArray = NDArray[np.int64]
 
-# What trimesh and NumPy raise for a file that is not what it says; trimesh has names without values for some.
+# What trimesh and NumPy raise for a damaged file or one of another format; some are bugs of trimesh (NameError).
 PARSE_ERRORS = (
     *(ValueError, TypeError, LookupError, AttributeError, NameError, EOFError, AssertionError, ArithmeticError),
     *(RuntimeError, struct.error),
@@ -36,7 +36,7 @@ PARSE_ERRORS = (
 
 
 def export_of(path: Path) -> ScanExport:
-    """The export that this mesh file and its companions make. Raises as `mesh_format.companions` does."""
+    """Return the export formed by this mesh file and its companions. Raises as `mesh_format.companions` does."""
     stat = path.stat()
     modified = datetime.fromtimestamp(stat.st_mtime, UTC).isoformat().replace("+00:00", "Z")
     return ScanExport(name=path.name, files=(path, *companions(path)), modified_utc=modified)
@@ -47,18 +47,18 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
 
     Args:
         path: an OBJ, PLY or STL (ASCII or binary) file.
-        unit: of the file; `auto` infers it from the size of the bounding box, and `unit_evidence` says how. A
-            unit that contradicts the size is an error, never a silent scaling.
-        export: what the file belongs to; found beside the file when not given.
+        unit: of the file; `auto` infers it from the size of the bounding box, and `unit_evidence` says how. A unit
+            that contradicts the size is an error, never silently corrected.
+        export: the export that the file belongs to; found beside the file if not given.
 
     Returns:
         The mesh with bitwise equal vertices merged (STL facets, UV seams), vertex normals (V, 3) from the file or
-        area-weighted from its faces, and `findings`: vertices, faces, holes, boundary_edges, non_manifold_edges,
-        components, degenerate_faces, unreferenced_vertices, normals_computed.
+        area-weighted from its faces, and `findings`, the numbers of: vertices, faces, holes, boundary_edges,
+        non_manifold_edges, components, degenerate_faces, unreferenced_vertices; normals_computed is 0 or 1.
 
     Raises:
         IncompleteExportError: truncated, still growing, locked, or a companion is missing.
-        UnreadableFileError: no faces, coordinates not finite, indices out of range, unit not credible, not a mesh.
+        UnreadableFileError: not a mesh, no faces, coordinates not finite, indices out of range, implausible unit.
     """
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise UnreadableFileError(
@@ -98,8 +98,11 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
 
 
 def merge_equal(vertices: Array) -> tuple[IntArray, IntArray]:
-    """Indices of the first of each group of bitwise equal vertices, and for every vertex (V,) its group."""
-    # Sorting one 64-bit mix a row is several times faster than sorting rows; the comparison rules out collisions.
+    """Group bitwise equal vertices (V, 3).
+
+    Returns the index of each group's first vertex (G,), in the order of the file, and the group of each vertex (V,).
+    """
+    # Sorting one 64-bit hash per row is several times faster than sorting rows; the comparison detects collisions.
     words = np.ascontiguousarray(vertices + 0.0).view(np.uint64).reshape(-1, 3)  # + 0.0: no negative zero
     mix = words[:, 0] * np.uint64(0x9E3779B97F4A7C15)
     mix = (mix ^ (mix >> np.uint64(29)) ^ words[:, 1]) * np.uint64(0xBF58476D1CE4E5B9)
@@ -116,7 +119,7 @@ def merge_equal(vertices: Array) -> tuple[IntArray, IntArray]:
 
 
 def vertex_normals(vertices: Array, faces: IntArray) -> Array:
-    """Area-weighted unit normals (V, 3); zero where no face with an area meets the vertex."""
+    """Area-weighted unit normals (V, 3) of vertices (V, 3); zero for a vertex without a face of non-zero area."""
     p = vertices[faces]
     n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     corner = faces.ravel()
@@ -124,7 +127,7 @@ def vertex_normals(vertices: Array, faces: IntArray) -> Array:
 
 
 def mesh_findings(vertices: Array, faces: IntArray) -> dict[str, float]:
-    """Defects of an indexed mesh without duplicate vertices: see `read_mesh_file`."""
+    """Count the defects of an indexed mesh without duplicate vertices; the keys are those of `read_mesh_file`."""
     p = vertices[faces]
     cross = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     longest = np.max(np.sum((p - np.roll(p, 1, axis=1)) ** 2, axis=2), axis=1)
@@ -149,7 +152,7 @@ def mesh_findings(vertices: Array, faces: IntArray) -> dict[str, float]:
 
 
 def _components(a: IntArray, b: IntArray, n: int) -> int:
-    """Connected groups among the vertices that these edges touch."""
+    """Number of connected components of these edges, given by their end vertices `a` and `b` out of `n`."""
     if len(a) == 0:
         return 0
     graph = coo_matrix((np.ones(len(a), dtype=np.int8), (a, b)), shape=(n, n))
@@ -158,7 +161,7 @@ def _components(a: IntArray, b: IntArray, n: int) -> int:
 
 
 def _summed(index: IntArray, rows: Array, n: int) -> Array:
-    """Sum of the rows (N, 3) of each index: (n, 3)."""
+    """Sum the rows (N, 3) that share an index (N,) in 0…n-1; returns (n, 3)."""
     return np.stack([np.bincount(index, rows[:, k], n).astype(np.float64) for k in range(3)], axis=1)
 
 
@@ -167,9 +170,9 @@ def _unit_length(normals: Array) -> Array:
 
 
 def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
-    """Vertices (V, 3) in the file's unit, faces (F, 3) and the file's vertex normals, if it has sound ones."""
+    """Vertices (V, 3) in the file's unit, faces (F, 3) and the file's vertex normals, None if missing or invalid."""
     suffix = path.suffix.lower()[1:]
-    # Materials are companions that the export carries along; the geometry does not need them parsed.
+    # The geometry does not need the materials, which travel with the export as companions.
     options: dict[str, Any] = {"skip_materials": True} if suffix == "obj" else {}
     try:
         with path.open("rb") as stream:
@@ -188,7 +191,7 @@ def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
                 normals = np.array(mesh.vertex_normals, dtype=np.float64)
     except PARSE_ERRORS as error:
         raise UnreadableFileError(
-            f"this is not a {suffix.upper()} mesh that can be parsed ({error})",
+            f"the file cannot be parsed as a {suffix.upper()} mesh ({error})",
             where=str(path),
             remedy="Open it in the scanner's software and export it again",
         ) from error
@@ -222,10 +225,10 @@ def _validate(path: Path, vertices: Array, faces: IntArray) -> None:
 
 
 def credible_unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str]:
-    """The unit to believe and why, from vertices (V, 3) in the file's unit.
+    """Determine the unit of vertices (V, 3) from the size of their bounding box; returns the unit and the evidence.
 
     Raises:
-        UnreadableFileError: no unit is credible, or the configured one contradicts the size.
+        UnreadableFileError: no unit is plausible, or the configured one contradicts the size.
     """
     diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     low, high = SCENE_DIAGONAL_M if unit == "auto" else OBJECT_DIAGONAL_M
@@ -251,7 +254,7 @@ def credible_unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str
             f"the configured unit {unit} contradicts the size: the bounding box would be "
             f"{diagonal * METRES_PER_UNIT[unit]:.4g} m across, and {span}",
             where=str(path),
-            remedy=f"{advice}, if the scan is not of something else",
+            remedy=f"{advice}, unless the scan shows something else",
         )
     return unit, (
         f"configured; the bounding box is {diagonal * METRES_PER_UNIT[unit]:.4g} m across, which is credible ({span})"

@@ -1,4 +1,4 @@
-"""What tells a finished OBJ, PLY or STL file from one that is still being written, without parsing the mesh."""
+"""Tells whether an OBJ, PLY or STL file is complete or still being written, without parsing the mesh."""
 
 from __future__ import annotations
 
@@ -29,9 +29,12 @@ _COUNTS = tuple(
 
 
 def check_complete(path: Path) -> None:
-    """Raise IncompleteExportError for a file that was cut short, UnreadableFileError for one without faces.
+    """Check that a mesh file is complete and has faces.
 
-    OSError (missing, locked) is left to the caller.
+    Raises:
+        IncompleteExportError: the file is truncated.
+        UnreadableFileError: the file has no faces, or is damaged.
+        OSError: the file is missing or locked.
     """
     size = path.stat().st_size
     if size == 0:
@@ -48,12 +51,12 @@ def check_complete(path: Path) -> None:
 
 
 def file_has_normals(path: Path) -> bool:
-    """Whether a PLY or OBJ file carries vertex normals (an OBJ is judged by its first megabytes)."""
+    """Whether a PLY or OBJ file has vertex normals; an OBJ is read up to its first normal or face."""
     if path.suffix.lower() == ".ply":
         header = _ply_header(path)
         return any(element.name == "vertex" and "nx" in element.names for element in header.elements)
     with path.open("rb") as stream:
-        # Exporters write vn lines between the vertices or after them; a face with a//c refers to one.
+        # Exporters write vn lines between or after the vertices; a face with a//c refers to one.
         for line in stream:
             if line.startswith(b"vn "):
                 return True
@@ -63,11 +66,11 @@ def file_has_normals(path: Path) -> bool:
 
 
 def companions(path: Path) -> tuple[Path, ...]:
-    """The MTL file of an OBJ and the textures it names, found case-insensitively beside it.
+    """Find the MTL files of an OBJ and the textures they name, in the same folder and ignoring case.
 
     Raises:
-        IncompleteExportError: a companion is not there (yet).
-        UnreadableFileError: a name leads out of the folder.
+        IncompleteExportError: a companion is missing, perhaps only for now.
+        UnreadableFileError: a companion lies outside the folder.
     """
     if path.suffix.lower() != ".obj":
         return ()
@@ -84,7 +87,7 @@ def companions(path: Path) -> tuple[Path, ...]:
 
 
 def _texture_name(arguments: str) -> str:
-    """The file name of a map statement, behind its options (-bm 1.0 -s 1 1 1 …)."""
+    """The file name in an MTL map statement, after its options (-bm 1.0 -s 1 1 1 …)."""
     words = arguments.split()
     while words and words[0].startswith("-"):
         words.pop(0)
@@ -94,7 +97,7 @@ def _texture_name(arguments: str) -> str:
 
 
 def _beside(path: Path, name: str, named_in: Path | None = None) -> Path:
-    """The file `name` in the folder of `path` or below it, whatever the case of its letters."""
+    """Find the file `name` in the folder of `path` or its subfolders, ignoring case; raises as `companions` does."""
     source = named_in or path
     cleaned = name.strip().strip('"')
     windows, posix = PureWindowsPath(cleaned), PurePosixPath(cleaned)
@@ -140,7 +143,7 @@ class _Element:
 
     @property
     def least_bytes(self) -> int:
-        """The fewest bytes that one row can have: a face has three corners at least."""
+        """The minimum size of one row: a face has at least three corners."""
         corners = 3 if self.name == "face" else 0
         first, *rest = self.lists or [(0, 0)]
         return self.fixed_bytes + first[0] + corners * first[1] + sum(size for size, _ in rest)
@@ -197,7 +200,7 @@ def _check_ply(path: Path, size: int) -> None:
             remedy="Export a triangle mesh (faces, not strips or a point cloud)",
         )
     if header.binary:
-        # A lower bound: for a triangle mesh, which scanners write, it is the exact size.
+        # A lower bound, and the exact size for a triangle mesh, which is what scanners write.
         least = header.data_at + sum(element.count * element.least_bytes for element in header.elements)
         if size < least:
             raise IncompleteExportError(
@@ -217,7 +220,7 @@ def _check_ply(path: Path, size: int) -> None:
 
 
 def _last_row_short(path: Path, element: _Element) -> bool:
-    """Whether the last line of an ASCII PLY, which has no newline, lacks values."""
+    """Whether values are missing in the last line of an ASCII PLY that does not end with a newline."""
     words = _tail(path).splitlines()[-1].split()
     if element.lists and words and words[0].isdigit():
         return len(words) < 1 + int(words[0]) + len(element.names)
@@ -225,7 +228,7 @@ def _last_row_short(path: Path, element: _Element) -> bool:
 
 
 def _count_lines(path: Path, start: int) -> tuple[int, bool]:
-    """Lines with content behind `start`, and whether the last one ends with a newline."""
+    """The number of lines after byte `start`, and whether the last one ends with a newline."""
     lines, last = 0, b"\n"
     with path.open("rb") as stream:
         stream.seek(start)
@@ -248,7 +251,7 @@ def _tail(path: Path, size: int = 4096) -> bytes:
 def _check_stl(path: Path, size: int) -> None:
     with path.open("rb") as stream:
         head = stream.read(1024)
-    # Some binary files begin with "solid" too: the size decides first.
+    # Some binary files begin with "solid" too, so the size decides first.
     count = struct.unpack("<I", head[80:84])[0] if len(head) >= 84 else None
     expected = None if count is None else 84 + 50 * count
     text = head.lstrip()[:5].lower() == b"solid" and b"\0" not in head
@@ -278,11 +281,11 @@ def _check_stl(path: Path, size: int) -> None:
 
 
 def _check_obj(path: Path) -> None:
-    """An OBJ has no length and no end mark: judge its last line, and counts that the exporter wrote as comments."""
+    """Check an OBJ, which states no length and has no end mark, by its last line and by counts in its comments."""
     tail = _tail(path)
     last = tail.splitlines()[-1].strip() if tail.strip() else b""
-    # Some exporters write no newline at the end. Then the line must be as whole as the one of its kind before it; a
-    # number that lost its last digits does not show, so a watched folder waits until the file stays as it is.
+    # Some exporters write no final newline. The last line must then be as complete as the previous one of its kind.
+    # A number that lost its last digits is not detected, so a watched folder also waits until the file is stable.
     if not tail.endswith(b"\n") and _cut_line(tail, last):
         raise IncompleteExportError(
             f"the file ends in the middle of a line ({last[:40].decode('utf-8', 'replace')!r})",
@@ -295,7 +298,7 @@ def _check_obj(path: Path) -> None:
     for pattern in _COUNTS:
         for pair in pattern.findall(head + b"\n" + tail):
             number, what = sorted(pair)  # digits sort before letters
-            # Of several objects each may have its own count: the largest is a lower bound of all.
+            # Each of several objects may state its own count: the largest is a lower bound of the total.
             announced[what[:1].lower()] = max(int(number), announced.get(what[:1].lower(), 0))
     vertices = faces = 0
     with path.open("rb") as stream:
@@ -312,7 +315,7 @@ def _check_obj(path: Path) -> None:
             )
     if faces == 0:
         if last.startswith((b"v ", b"vn ", b"vt ")) and vertices:
-            # A point cloud and an export that has not come to its faces yet look alike.
+            # A point cloud looks like an export that has not reached its faces yet.
             raise UnreadableFileError(
                 "the file has no faces, only points",
                 where=str(path),
@@ -322,7 +325,7 @@ def _check_obj(path: Path) -> None:
 
 
 def _cut_line(tail: bytes, last: bytes) -> bool:
-    """Whether the last line, which has no newline, lacks something that the line of its kind before it has."""
+    """Whether the last line, which has no newline, is less complete than the previous line of its kind."""
     if last.startswith(b"#"):
         return False
     words = last.split()

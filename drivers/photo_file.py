@@ -1,4 +1,4 @@
-"""Photograph files of any camera: their EXIF, and whether a JPEG is whole."""
+"""Photograph files of any camera: reads their EXIF and checks that a JPEG is complete."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Any
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import CameraSettings
 
-# Without types of its own; see docs/decisions/0002-strict-typing.md.
+# The library has no types; see docs/decisions/0002-strict-typing.md.
 exiv2: Any = importlib.import_module("exiv2")
 _SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
-_LONGEST_TEXT = 500  # of a name or a time; no camera writes a tenth of it
+_LONGEST_TEXT = 500  # limit for a name or a time; cameras write less than a tenth of it
 _STANDALONE = {0x01, *range(0xD0, 0xD8)}
 
 
 @dataclass(frozen=True, slots=True)
 class ExifRecord:
-    """What a photograph says of itself; None or "" where the file does not say it."""
+    """The EXIF data of a photograph; None or "" if the file does not state a value."""
 
     path: Path
     make: str
@@ -33,18 +33,18 @@ class ExifRecord:
     iso: int | None
     focal_length_mm: float | None
     taken: str  # DateTimeOriginal[.subseconds][offset], "2026:11:21 04:39:03.482+01:00"
-    orientation: int  # 1 when absent
+    orientation: int  # 1 if absent
     width: int
     height: int
     lens_serial: str = ""
-    focus_distance_m: float | None = None  # as far as the lens tells; many do not
-    focus_mode: str = ""  # in the maker's words
-    focus_position: int | None = None  # of the lens's focus motor, in its own steps; where the body tells
+    focus_distance_m: float | None = None  # many lenses do not report it
+    focus_mode: str = ""  # in the manufacturer's words
+    focus_position: int | None = None  # of the lens's focus motor, in its own steps, if the camera reports it
 
     def settings(self, *, focus_mode: str, image_quality: str) -> CameraSettings:
-        """Aperture, time and ISO of the file with two settings that EXIF has no standard tag for.
+        """Combine aperture, exposure time and ISO of the file with two settings that have no standard EXIF tag.
 
-        Raises UnreadableFileError when one of the three is missing.
+        Raises UnreadableFileError if one of the three is missing.
         """
         if self.aperture_f is None or self.exposure_s is None or self.iso is None:
             raise UnreadableFileError(
@@ -55,7 +55,7 @@ class ExifRecord:
         return CameraSettings(self.aperture_f, self.exposure_s, self.iso, focus_mode, image_quality)
 
 
-# The library's own look-up functions crash the process on pictures without EXIF, so keys are asked for by name.
+# The library's own look-up functions crash the process on images without EXIF, so keys are looked up by name.
 _KEYS = {
     "make": ("Exif.Image.Make",),
     "model": ("Exif.Image.Model", "Exif.Image.UniqueCameraModel"),
@@ -85,7 +85,7 @@ _KEYS = {
 
 
 def read_exif(path: Path) -> ExifRecord:
-    """Read the EXIF of a photograph (JPEG, TIFF, PNG, raw). Raises UnreadableFileError if it is no picture at all."""
+    """Read the EXIF of a photograph (JPEG, TIFF, PNG, raw). Raises UnreadableFileError if it is not an image."""
     try:
         image = exiv2.ImageFactory.open(str(path))
         image.readMetadata()
@@ -126,7 +126,7 @@ def _text(exif: Any, name: str, *, in_words: bool = False) -> str:
     found = _find(exif, name)
     if found is None:
         return ""
-    # A file may hold any bytes for a text; what is no UTF-8 comes as lone surrogates, which nothing can write down.
+    # The text can be any bytes; exiv2 returns invalid UTF-8 as lone surrogates, which cannot be encoded again.
     words = (
         str(found.print() if in_words else found.toString())
         .encode("utf-8", "surrogateescape")
@@ -140,7 +140,7 @@ def _number(exif: Any, name: str) -> float | None:
     if found is None:
         return None
     numerator, denominator = found.toRational()
-    # Cameras write 0/0 for a lens that does not report.
+    # Cameras write 0/0 if the lens reports no value.
     return numerator / denominator if denominator and numerator > 0 else None
 
 
@@ -157,9 +157,9 @@ def _taken(exif: Any) -> str:
 
 
 def taken_utc_s(taken: str) -> float | None:
-    """Seconds since 1970 of a time as EXIF writes it (ExifRecord.taken); None where it is none.
+    """Parse an EXIF time (ExifRecord.taken) into seconds since 1970; None if it is not a valid time.
 
-    Without an offset from UTC it counts as this computer's local time, by which people set their cameras.
+    A time without a UTC offset is taken as this computer's local time, because people set cameras to local time.
     """
     for form in ("%Y:%m:%d %H:%M:%S.%f%z", "%Y:%m:%d %H:%M:%S%z", "%Y:%m:%d %H:%M:%S.%f", "%Y:%m:%d %H:%M:%S"):
         try:
@@ -170,10 +170,10 @@ def taken_utc_s(taken: str) -> float | None:
 
 
 def check_jpeg_complete(path: Path) -> None:
-    """Raise UnreadableFileError unless the file is a JPEG whose picture has its end marker.
+    """Raise UnreadableFileError unless the file is a JPEG whose image has its end marker.
 
-    Data after the first picture (the previews that Sony appends) are allowed. Inside compressed data FF D9 can
-    only be the end marker (ITU T.81, B.1.1.2), so a search after the first scan header decides.
+    Data after the first image (the previews that Sony appends) is allowed. Within compressed data FF D9 can only be
+    the end marker (ITU T.81, B.1.1.2), so it is enough to find it after the first scan header.
     """
     data = path.read_bytes()
     if data[:2] != bytes((0xFF, _SOI)):
@@ -205,6 +205,6 @@ def _incomplete(path: Path, what: str, size_bytes: int) -> UnreadableFileError:
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
+    """The SHA-256 of a file's bytes, in hexadecimal."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

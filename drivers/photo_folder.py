@@ -1,4 +1,4 @@
-"""A folder of photographs taken earlier: which belong together, what is left out, and why."""
+"""Lists a folder of existing photographs: which files form one exposure, and which are left out and why."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _THUMBNAIL_FOLDERS = ("thumbs", "thumbnails", ".thumbnails", "@eadir", "previews
 
 @dataclass(frozen=True, slots=True)
 class ListedFile:
-    """A file as it was when it was listed."""
+    """A file with the hash, size and modification time that it had when it was listed."""
 
     path: Path
     sha256: str
@@ -38,7 +38,7 @@ class ListedFile:
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """A JPEG, what it says of itself, and the raw files of the same exposure."""
+    """A JPEG, its EXIF data, and the raw files of the same exposure."""
 
     file: ListedFile
     exif: ExifRecord
@@ -47,7 +47,7 @@ class Photograph:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A file that is not imported, and why."""
+    """A file that is not imported, and the reason."""
 
     path: Path
     reason: str
@@ -55,7 +55,7 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True)
 class Photographs:
-    """What a folder holds. `damaged` are photographs that cannot be used as they are: an error, never left out."""
+    """The content of a folder. `damaged` photographs cannot be used: they are errors, and not simply left out."""
 
     photographs: tuple[Photograph, ...]
     left_out: tuple[LeftOut, ...]
@@ -63,13 +63,13 @@ class Photographs:
 
 
 def list_photographs(folder: Path) -> Photographs:
-    """Every photograph in a folder and below it, by name.
+    """List the photographs in a folder and its subfolders, sorted by path.
 
-    Only JPEG files as cameras write them are photographs; a raw file counts with the JPEG that has its name (of the
-    same folder if there are several), wherever it lies in the folder. Nothing is written or changed.
+    A photograph is a JPEG file as a camera wrote it. A raw file belongs to the JPEG with the same name, anywhere in
+    the folder; if there are several, to the one in the same subfolder. Nothing is written or changed.
 
     Raises:
-        DeviceUnavailableError: the folder is not there or cannot be read.
+        DeviceUnavailableError: the folder does not exist or cannot be read.
     """
     jpegs: list[Path] = []
     raws: list[Path] = []
@@ -84,7 +84,7 @@ def list_photographs(folder: Path) -> Photographs:
         elif suffix in RAW_MEDIA_TYPES:
             raws.append(path)
         else:
-            left_out.append(LeftOut(path, "no photograph: only JPEG files, with raw files beside them, are read"))
+            left_out.append(LeftOut(path, "not a photograph: only JPEG files, with raw files beside them, are read"))
     of_jpeg, alone = paired(jpegs, raws)
     left_out += [LeftOut(path, "a raw file without the JPEG of the same name; develop it first") for path in alone]
     photographs: list[Photograph] = []
@@ -100,9 +100,9 @@ def list_photographs(folder: Path) -> Photographs:
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Files in a folder and below it, by name; links that lead out of it are passed over.
+    """The files in a folder and its subfolders, sorted, without links that lead out of it.
 
-    Raises DeviceUnavailableError when the folder is not there or cannot be read.
+    Raises DeviceUnavailableError if the folder does not exist or cannot be read.
     """
     try:
         root = folder.resolve(strict=True)
@@ -114,11 +114,11 @@ def files_below(folder: Path) -> list[Path]:
 
 
 def odd(path: Path, folder: Path) -> str:
-    """Why a file is no content of the folder, by its name alone; "" for an ordinary one."""
+    """Why a file is ignored, judged by its name alone (hidden, thumbnail, system file); "" for an ordinary file."""
     name = path.name.lower()
     parents = [part.lower() for part in path.relative_to(folder).parts[:-1]]
     if name.startswith("._") or "__macosx" in parents:
-        return "what macOS keeps beside a file; holds no picture"
+        return "a metadata file of macOS; it holds no image"
     if name in _SYSTEM_FILES:
         return "a file of the operating system"
     if any(part in _THUMBNAIL_FOLDERS for part in parents):
@@ -129,7 +129,7 @@ def odd(path: Path, folder: Path) -> str:
 
 
 def listed(path: Path) -> ListedFile:
-    """A file with its hash, size and time."""
+    """Hash a file and record its size and modification time."""
     stat = path.stat()
     return ListedFile(path, sha256_of(path), stat.st_size, stat.st_mtime_ns)
 
@@ -137,10 +137,13 @@ def listed(path: Path) -> ListedFile:
 def without_duplicates(
     photographs: Sequence[Photograph], seen: dict[str, Path]
 ) -> tuple[list[Photograph], list[LeftOut]]:
-    """Photographs whose bytes are not in `seen` yet, and the others; adds to `seen` (hash → first file)."""
+    """Separate photographs from byte-identical copies; returns those kept and those left out.
+
+    `seen` maps the SHA-256 of each photograph to its first file, and is extended.
+    """
     kept: list[Photograph] = []
     left_out: list[LeftOut] = []
-    # Of a file and its copies (`DSC1.JPG`, `DSC1 (1).JPG`) the one with the shortest name is the file.
+    # Of a file and its copies (`DSC1.JPG`, `DSC1 (1).JPG`) the one with the shortest name is the original.
     for photograph in sorted(photographs, key=lambda p: (len(p.file.path.name), p.file.path)):
         first = seen.setdefault(photograph.file.sha256, photograph.file.path)
         if first == photograph.file.path:
@@ -151,13 +154,13 @@ def without_duplicates(
 
 
 def usual_size(photographs: Iterable[Photograph]) -> tuple[int, int] | None:
-    """Width and height of most photographs, of the larger one where they are even; None for none."""
+    """The most frequent width and height; the larger one if two are equally frequent, None without photographs."""
     counts = Counter((photograph.exif.width, photograph.exif.height) for photograph in photographs)
     return max(counts, key=lambda size: (counts[size], size), default=None)
 
 
 def of_size(photographs: Sequence[Photograph], size: tuple[int, int]) -> tuple[list[Photograph], list[LeftOut]]:
-    """Photographs of this width and height, and the others."""
+    """Separate photographs of this width and height from the others; returns those kept and those left out."""
     kept = [p for p in photographs if (p.exif.width, p.exif.height) == size]
     left_out = [
         LeftOut(p.file.path, f"{p.exif.width} × {p.exif.height} px, most are {size[0]} × {size[1]}")
@@ -168,7 +171,7 @@ def of_size(photographs: Sequence[Photograph], size: tuple[int, int]) -> tuple[l
 
 
 def paired(jpegs: Sequence[Path], raws: Sequence[Path]) -> tuple[dict[Path, list[Path]], list[Path]]:
-    """The raw files of each JPEG, and those that belong to none."""
+    """Match raw files to JPEGs by name; returns the raw files of each JPEG, and those without a JPEG."""
     by_stem: dict[str, list[Path]] = {}
     for jpeg in jpegs:
         by_stem.setdefault(jpeg.stem.lower(), []).append(jpeg)

@@ -1,4 +1,4 @@
-"""A camera without a cable: its photographs come as files into a folder, from a card or sent by the camera."""
+"""Driver for a camera without a cable, whose photographs arrive as files in a folder (memory card or transfer)."""
 
 from __future__ import annotations
 
@@ -25,39 +25,39 @@ from drivers.photo_file import ExifRecord, check_jpeg_complete, read_exif, sha25
 from drivers.photo_folder import JPEG_SUFFIXES, RAW_MEDIA_TYPES, files_below, odd, paired
 from drivers.plugin import DriverConfig, DriverSpec
 
-_LOOK_S = 0.2  # between two looks at the folder
+_LOOK_S = 0.2  # interval between two polls of the folder
 _COUNTER = re.compile(r"(\d+)$")
 
 
 class PhotoWatchConfig(DriverConfig):
-    """Section of rig.yaml."""
+    """The camera's section in rig.yaml."""
 
     folder: Path = Field(description="where the card appears, or where the camera sends its files; may come later")
     stable_s: float = Field(default=2.0, ge=0, description="how long a file must stay unchanged; 10 s on a share")
-    stalled_s: float = Field(default=60.0, gt=0, description="after this a file that is cut off counts as damaged")
-    clock_ahead_s: float = Field(default=0.0, description="camera's clock minus this computer's; negative: slow")
+    stalled_s: float = Field(default=60.0, gt=0, description="after this time an incomplete file counts as damaged")
+    clock_ahead_s: float = Field(default=0.0, description="camera clock minus this computer's; negative: it is slow")
 
 
 @dataclass(slots=True)
 class _Seen:
-    """A file as it was at the last look."""
+    """The state of a file at the last poll."""
 
     size_bytes: int
     modified_ns: int
-    since_s: float  # unchanged since, on this host's monotonic clock
-    from_start: bool  # it lay there when the folder was first looked at
-    exif: ExifRecord | None = None  # of a JPEG that tells when it was taken
-    taken_s: float = 0.0  # seconds since 1970, by this host's clock
-    whole: bool = False
-    trouble: UnreadableFileError | None = None  # why it cannot be used as it is
-    done: bool = False  # handed over, or reported
+    since_s: float  # unchanged since this time, on the host's monotonic clock
+    from_start: bool  # it was in the folder at the first poll
+    exif: ExifRecord | None = None  # of a JPEG that could be read
+    taken_s: float = 0.0  # seconds since 1970, by the host's clock
+    whole: bool = False  # the JPEG is complete
+    trouble: UnreadableFileError | None = None  # why it cannot be used
+    done: bool = False  # returned or reported
 
 
 class PhotoWatch:
-    """drivers.interfaces.Camera on a folder; polls, reads, and never writes or deletes there.
+    """drivers.interfaces.Camera on a folder, which it polls and reads but never changes.
 
-    A photograph is handed over once for each opening, by its content. As long as any file still arrives all wait, so
-    that those of a card come in the order in which they were taken.
+    Each photograph, identified by its content, is returned once per `open`. While any file is still arriving, none is
+    returned, so that the photographs of a card come in the order in which they were taken.
     """
 
     def __init__(self, config: PhotoWatchConfig, monotonic: Callable[[], float] = time.monotonic) -> None:
@@ -73,7 +73,7 @@ class PhotoWatch:
     # --- every device -----------------------------------------------------------------------------------
 
     def open(self) -> DeviceIdentity:
-        """Begin to observe the folder, which may not be there yet: a card is put in later."""
+        """Start watching the folder, which need not exist yet: a card can be inserted later."""
         self._seen.clear()
         self._given.clear()
         self._observing = False
@@ -82,10 +82,10 @@ class PhotoWatch:
         return self._identity()
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: nothing is kept open."""
 
     def report(self) -> DeviceReport:
-        """Where photographs are awaited, and how many files lie there."""
+        """Return the watched folder and the number of files in it."""
         folder = self._config.folder
         there = folder.is_dir()
         return DeviceReport(
@@ -98,20 +98,20 @@ class PhotoWatch:
     # --- what only a camera on a cable can do -----------------------------------------------------------------
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Take note of what is wanted, which a person dials; each file tells what the camera was set to."""
+        """Remember the settings, which a person dials in; each file's EXIF shows what the camera was set to."""
         self._wanted = settings
         return settings
 
     def settings(self) -> CameraSettings:
-        """Raises DeviceRefusedError: nobody can ask the camera."""
+        """Raise DeviceRefusedError: the camera cannot be asked for its settings."""
         raise self._refusal("this camera cannot be asked for its settings: its photographs come as files")
 
     def preview(self) -> bytes:
-        """Raises DeviceRefusedError: nobody sees what the camera sees."""
+        """Raise DeviceRefusedError: the camera has no live view."""
         raise self._refusal("this camera has no live view on the screen: its photographs come as files")
 
     def capture(self, folder: Path) -> CapturedImage:
-        """Raises ReleasedElsewhereError: its own button is the only one that it has."""
+        """Raise ReleasedElsewhereError: only the camera's own button releases its shutter."""
         raise ReleasedElsewhereError(
             "the software cannot release this camera: its photographs come as files",
             where=str(self._config.folder),
@@ -121,10 +121,14 @@ class PhotoWatch:
     # --- photographs ------------------------------------------------------------------------------------------
 
     def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
-        """See drivers.interfaces.Camera. Their order is that of the times in their EXIF.
+        """Copy new photographs into `folder` and return them in the order of their EXIF times.
 
-        Raises UnreadableFileError once for each file that cannot be used; StaleImageError once for photographs that
-        have come since the folder is observed and say that they were taken earlier than `since_utc_s`.
+        Waits up to `timeout_s` for the first one. Photographs taken before `since_utc_s` (seconds since 1970) are
+        ignored.
+
+        Raises:
+            UnreadableFileError: once for each file that cannot be used.
+            StaleImageError: once for photographs that arrived since `open` but were taken before `since_utc_s`.
         """
         deadline_s = self._monotonic() + timeout_s
         while True:
@@ -140,18 +144,18 @@ class PhotoWatch:
             time.sleep(min(_LOOK_S, left_s))
 
     def _observe(self) -> None:
-        """Look at the folder: which files are there, and since when they are as they are."""
+        """Poll the folder: update which files it holds and since when they are unchanged."""
         root, now_s = self._config.folder, self._monotonic()
         try:
             paths = [path for path in files_below(root) if _is_photograph(path) and not odd(path, root)]
         except DeviceUnavailableError:
-            paths = []  # the card is in the camera
+            paths = []  # the card is still in the camera
         before, self._seen = self._seen, {}
         for path in paths:
             try:
                 stat = path.stat()
             except OSError:
-                continue  # gone between two looks
+                continue  # it has gone since the folder was listed
             seen = before.get(path)
             if seen is None or (seen.size_bytes, seen.modified_ns) != (stat.st_size, stat.st_mtime_ns):
                 from_start = not self._observing if seen is None else seen.from_start
@@ -161,7 +165,7 @@ class PhotoWatch:
         self._raws, self._alone = paired(jpegs, [path for path in self._seen if not _is_jpeg(path)])
 
     def _arrives(self, path: Path, since_utc_s: float) -> bool:
-        """Whether something of this file is still to come."""
+        """Whether this photograph is still arriving: its file changes, is incomplete, or lacks its raw file."""
         seen = self._seen[path]
         waited_s = self._monotonic() - seen.since_s
         if seen.done:
@@ -180,7 +184,7 @@ class PhotoWatch:
         return True
 
     def _read(self, path: Path, seen: _Seen, since_utc_s: float) -> None:
-        """What a JPEG that has stopped changing says of itself; of one that is too old only when it was taken."""
+        """Read the EXIF of a JPEG that has stopped changing, and check the file unless it is older than wanted."""
         try:
             seen.exif = read_exif(path)
             taken_s = taken_utc_s(seen.exif.taken)
@@ -208,7 +212,7 @@ class PhotoWatch:
         return seen.exif is not None and seen.taken_s < since_utc_s
 
     def _hand_over(self, folder: Path, since_utc_s: float) -> tuple[CapturedImage, ...]:
-        """Copies of all that can be used, by the time at which they were taken."""
+        """Copy all usable photographs, in the order in which they were taken."""
         ready = [
             (seen.taken_s, path)
             for path, seen in self._seen.items()
@@ -218,13 +222,13 @@ class PhotoWatch:
         return tuple(image for image in images if image is not None)
 
     def _copied(self, path: Path, folder: Path) -> CapturedImage | None:
-        """The files of one photograph; None for bytes that were handed over before, and where the card was pulled."""
+        """Copy the files of one photograph; None if it was returned before, or the card was removed meanwhile."""
         seen = self._seen[path]
         assert seen.exif is not None
         try:
             files = tuple(_copy(one, folder, self._seen[one]) for one in (path, *self._raws.get(path, ())))
         except OSError:
-            seen.since_s = self._monotonic()  # looked at again once it has stayed as it is for a while
+            seen.since_s = self._monotonic()  # retried once it has been stable again
             return None
         seen.done = True
         if files[0].sha256 in self._given:
@@ -302,7 +306,7 @@ class PhotoWatch:
 
 
 def _copy(path: Path, folder: Path, seen: _Seen) -> CapturedFile:
-    """Raises OSError when the file is not as it was seen."""
+    """Copy a file into `folder`. Raises OSError if it has changed since it was seen."""
     target = folder / path.name
     shutil.copyfile(path, target)
     stat = path.stat()

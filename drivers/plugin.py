@@ -1,4 +1,4 @@
-"""How a driver announces itself: one DriverSpec behind an entry point of the group `orthocapture.drivers`."""
+"""How a driver registers: a DriverSpec behind an entry point of the group `orthocapture.drivers`."""
 
 from __future__ import annotations
 
@@ -12,22 +12,25 @@ from drivers.interfaces import Device
 
 
 class DriverConfig(BaseModel):
-    """Base of a driver's section in rig.yaml."""
+    """Base class of a driver's section in rig.yaml."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     @property
     def longest_call_s(self) -> float:
-        """Time that one call may take by this configuration, where that may exceed the driver's usual time."""
+        """Longest time that one call may take with this configuration, if it exceeds the driver's usual timeout."""
         return 0.0
 
 
 @runtime_checkable
 class NeedsHeartbeat(Protocol):
-    """A hosted driver that must know at every moment that the program which uses it is alive."""
+    """A hosted driver that must know at all times that the program using it is alive."""
 
     def heartbeat(self, sent_monotonic_s: float) -> None:
-        """A sign of life, sent at that host time; called in a thread of its own, and must return at once."""
+        """Receive a heartbeat that was sent at this host time.monotonic().
+
+        Called from a separate thread; must return at once.
+        """
         ...
 
 
@@ -38,9 +41,9 @@ class DriverSpec:
     Attributes:
         kind: robot, camera, scanner, ct or lightbox.
         config: the pydantic model of the driver's section in rig.yaml (without the key `driver`).
-        build: makes the driver object from a validated config; connects to nothing yet.
-        hosted: whether the driver must run in a supervised child process (native libraries).
-        call_timeout_s: longest time that one call may take before the child is restarted; a config may ask for more.
+        build: creates the driver object from a validated config, without connecting.
+        hosted: whether the driver must run in a supervised child process (for native libraries).
+        call_timeout_s: longest time that one call may take before the child is killed; a config may ask for more.
     """
 
     kind: str

@@ -1,4 +1,4 @@
-"""Reads point clouds (PLY without faces, or text: x y z, with normals or colours) in metres."""
+"""Reads point clouds (PLY without faces, or text with x y z and optional normals or colours) into metres."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class PointCloud:
 
     Attributes:
         points_m: (N, 3).
-        normals: (N, 3) unit, or None when the file has none.
+        normals: (N, 3) unit vectors, or None if the file has none.
         unit: of the file.
-        unit_evidence: why that unit is believed.
+        unit_evidence: how that unit was determined.
     """
 
     points_m: Array
@@ -34,7 +34,7 @@ class PointCloud:
 
 
 def is_point_cloud(path: Path) -> bool:
-    """Whether a file holds points and no faces, by its name or its PLY header."""
+    """Whether a file holds points without faces, judged by its extension or its PLY header."""
     if path.suffix.lower() in TEXT_SUFFIXES:
         return True
     if path.suffix.lower() != ".ply":
@@ -45,25 +45,26 @@ def is_point_cloud(path: Path) -> bool:
             if words[:2] == [b"element", b"face"]:
                 return words[2:3] == [b"0"]
             if words[:2] == [b"element", b"tristrips"]:
-                return False  # a mesh, of a kind that is not read
+                return False  # a mesh, but of an unsupported kind
             if words[:1] == [b"end_header"]:
                 return True
     return False
 
 
 def read_point_cloud(path: Path, unit: MeshUnit = "auto") -> PointCloud:
-    """Read a point cloud.
+    """Read a point cloud, in metres.
 
-    Text has one point a line, x y z, and after it a normal of length 1 if there is one; other columns are ignored.
+    A text file has one point per line: x y z, then an optional unit normal as the last three columns. Other columns
+    are ignored. `unit` is that of the file; `auto` infers it from the size of the bounding box.
 
     Raises:
-        UnreadableFileError: not such a file, coordinates that are not finite, or a unit that is not credible.
+        UnreadableFileError: not a point cloud, coordinates that are not finite, or an implausible unit.
     """
     try:
         points, normals = _text(path) if path.suffix.lower() in TEXT_SUFFIXES else _ply(path)
     except (OSError, *PARSE_ERRORS) as error:
         raise UnreadableFileError(
-            f"this is not a point cloud that can be parsed ({error})",
+            f"the file cannot be parsed as a point cloud ({error})",
             where=str(path),
             remedy="Export points as PLY, or as text with x y z in each line",
         ) from error
@@ -79,7 +80,7 @@ def _text(path: Path) -> tuple[Array, Array | None]:
     with path.open(encoding="utf-8-sig") as stream:
         first = stream.readline()
     separator = "," if "," in first else ";" if ";" in first else None
-    # A header line, or the number of points alone (.pts).
+    # The first line can be a header, or only the number of points (.pts).
     words = first.replace(",", " ").replace(";", " ").split()
     skipped = 0 if len(words) >= 3 and _is_number(words[0]) else 1
     table = np.loadtxt(
@@ -111,7 +112,7 @@ def _ply(path: Path) -> tuple[Array, Array | None]:
 
 
 def _unit_normals(columns: Array | None) -> Array | None:
-    """Columns that are unit normals; others (colours, intensities) are not."""
+    """The columns (N, 3) as normals if nearly all are unit vectors; None if not (colours, intensities)."""
     if columns is None:
         return None
     length = np.linalg.norm(columns, axis=1)

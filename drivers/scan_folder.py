@@ -1,4 +1,4 @@
-"""The hand scanner, seen through the folder into which its software exports OBJ, PLY or STL."""
+"""Driver for a hand scanner, through the folder into which its software exports OBJ, PLY or STL files."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from drivers.plugin import DriverConfig, DriverSpec
 
 
 class ScanFolderConfig(DriverConfig):
-    """Section of rig.yaml."""
+    """The scanner's section in rig.yaml."""
 
     folder: Path = Field(description="where the scanner's software exports to")
     unit: MeshUnit = Field(default="auto", description="of the exported coordinates: mm, m, or auto (from the size)")
-    only: str = Field(default="", description="file name of the one export that counts; empty: all of them")
+    only: str = Field(default="", description="file name of the only export to use; empty: use all exports")
     stable_s: float = Field(default=10.0, ge=0, description="how long an export must stay unchanged; 10 s on a share")
 
 
 class ScanFolder:
-    """drivers.interfaces.Scanner on a folder; polls, reads, and never writes or deletes there."""
+    """drivers.interfaces.Scanner on a folder, which it polls and reads but never changes."""
 
     def __init__(self, config: ScanFolderConfig) -> None:
         self._config = config
         self._watch = ExportWatch(config.folder, config.stable_s)
 
     def open(self) -> DeviceIdentity:
-        """Check that the folder is there and begin to observe it."""
+        """Check that the folder exists and start watching it; raises DeviceUnavailableError if it does not."""
         require_folder(self._config.folder)
         self._watch.poll()
         return self._identity()
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: nothing is kept open."""
 
     def report(self) -> DeviceReport:
-        """Free space, number of exports, and what is pending."""
+        """Return the free space, the number of exports, and the incomplete ones as problems."""
         require_folder(self._config.folder)
         exports, pending = self._watch.poll()
         return DeviceReport(
@@ -56,21 +56,24 @@ class ScanFolder:
         )
 
     def exports(self) -> tuple[ScanExport, ...]:
-        """Complete exports that stayed unchanged for `stable_s` of this driver's observation, oldest first."""
+        """Return the complete exports that this driver has seen unchanged for `stable_s`, oldest first."""
         require_folder(self._config.folder)
         return tuple(one for one in self._watch.poll()[0] if self._config.only in ("", one.name))
 
     def pending(self) -> tuple[str, ...]:
-        """What is in the folder and cannot be taken yet, with the reason."""
+        """Return one sentence for each export that cannot be used yet, with the reason."""
         require_folder(self._config.folder)
         return self._watch.poll()[1]
 
     def read(self, export: ScanExport) -> ScannedMesh:
-        """Parse one export, in metres; errors as drivers.mesh_file.read_mesh_file."""
+        """Read one export, in metres.
+
+        Raises IncompleteExportError if a file of it has gone, and otherwise as drivers.mesh_file.read_mesh_file does.
+        """
         for path in export.files:
             if not path.is_file():
                 raise IncompleteExportError(
-                    "a file of the export has gone", where=str(path), remedy="Export the scan again and let it lie"
+                    "a file of the export is missing", where=str(path), remedy="Export the scan again and keep it"
                 )
         return read_mesh_file(export.files[0], self._config.unit, export=export)
 
@@ -87,7 +90,7 @@ class ScanFolder:
 
 
 def require_folder(folder: Path) -> None:
-    """Raise DeviceUnavailableError unless the folder is there."""
+    """Raise DeviceUnavailableError unless the folder exists."""
     if not folder.is_dir():
         raise DeviceUnavailableError(
             "there is no such folder",
@@ -97,7 +100,7 @@ def require_folder(folder: Path) -> None:
 
 
 def free_bytes(folder: Path) -> int | None:
-    """Free space where the folder lies; None where the file system does not tell."""
+    """Free space of the folder's file system in bytes; None if it does not report any."""
     try:
         return shutil.disk_usage(folder).free
     except OSError:

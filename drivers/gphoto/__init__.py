@@ -1,4 +1,4 @@
-"""Still cameras through libgphoto2 over USB or PTP/IP; written for the Sony Alpha 7R V."""
+"""Driver for still cameras through libgphoto2, over USB or PTP/IP; written for the Sony Alpha 7R V."""
 
 from __future__ import annotations
 

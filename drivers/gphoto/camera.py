@@ -1,4 +1,4 @@
-"""The camera driver: settings with read-back, exposures whose files must be new and whole, live view, health."""
+"""The gphoto camera driver: settings with read-back, exposures with checked files, live view and health report."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ _LOG = logging.getLogger(__name__)
 SET_ATTEMPTS, BUSY_ATTEMPTS = 3, 5
 READ_BACK_TIMEOUT_S = 2.0
 PREVIEW_PATIENCE_S = 15.0
-LEAST_FREE_BYTES = 200_000_000  # one RAW+JPEG of 61 megapixels
+LEAST_FREE_BYTES = 200_000_000  # room for one RAW+JPEG exposure of 61 megapixels
 MEDIA_TYPES = {".JPG": "image/jpeg", ".JPEG": "image/jpeg", ".ARW": "image/x-sony-arw"}
 _NAME = re.compile(r"(?:capt_)?(?P<stem>[A-Za-z_]*?(?P<counter>\d+))(?P<suffix>\.\w+)$")
 
 
 class GphotoConfig(DriverConfig):
-    """A camera in rig.yaml: `port` is ptpip:HOST:PORT:PORT, usb:BUS,DEVICE, or empty for the only one on USB."""
+    """A camera in rig.yaml: `port` is ptpip:HOST:PORT:PORT, usb:BUS,DEVICE, or empty for the only camera on USB."""
 
     port: str = ""
-    model: str = ""  # part of the name, to choose among several on USB
+    model: str = ""  # part of the model name, to choose among several cameras on USB
     capture_target: Literal["computer", "card", "both"] = "computer"
     capture_timeout_s: float = 40.0
 
     @property
     def longest_call_s(self) -> float:
-        """An exposure, and a minute to fetch its files."""
+        """Time for an exposure, plus a minute to download its files."""
         return self.capture_timeout_s + 60.0
 
 
 class GphotoCamera:
-    """Implements drivers.interfaces.Camera. Blocking; to be run in a process of its own by drivers.host."""
+    """drivers.interfaces.Camera over libgphoto2. Its calls block, so drivers.host runs it in a process of its own."""
 
     def __init__(self, config: GphotoConfig) -> None:
         self._config = config
@@ -59,12 +59,12 @@ class GphotoCamera:
         self._last: CapturedImage | None = None
         self._hashes: set[str] = set()
         self._clock_offset_s: float | None = None
-        self._announced: list[AddedFile] = []  # while something else was asked of the camera; not fetched yet
+        self._announced: list[AddedFile] = []  # files announced during other calls and not downloaded yet
 
     # --- every device -----------------------------------------------------------------------------------
 
     def open(self) -> DeviceIdentity:
-        """Connect (again), set where files go, read back who answers."""
+        """Connect or reconnect, set the capture target and return the camera's identity."""
         self._link.open()
         self._announced.clear()
         self._set(words.TARGET, words.TARGET_CODES[self._config.capture_target])
@@ -80,11 +80,11 @@ class GphotoCamera:
         return self._identity
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Disconnect from the camera; does not raise if the link is dead."""
         self._link.close()
 
     def report(self) -> DeviceReport:
-        """Battery, free space, mode dial; the clock offset is that of the last exposure's EXIF time."""
+        """Return battery, free space and settings; the clock offset comes from the EXIF time of the last exposure."""
         if self._identity is None:
             raise DeviceUnavailableError("The camera is not open", where=self._link.where, remedy="Open it first")
         self._refresh()
@@ -93,7 +93,7 @@ class GphotoCamera:
         program = self._link.value("expprogram")
         problems: list[str] = []
         if battery is not None and battery < 20:
-            problems.append(f"Battery at {battery:g} %: change it, or feed the camera from the mains")
+            problems.append(f"Battery at {battery:g} %: change it, or use mains power")
         if program != "M":
             problems.append(f"Exposure program is {program}: turn the mode dial to M")
         if free is not None and free < LEAST_FREE_BYTES:
@@ -111,7 +111,10 @@ class GphotoCamera:
     # --- settings -----------------------------------------------------------------------------------------
 
     def apply(self, settings: CameraSettings) -> CameraSettings:
-        """Set one by one from the live choice lists and read back; DeviceRefusedError when it does not hold."""
+        """Set each value to one that the camera currently offers, and return what reads back.
+
+        Raises DeviceRefusedError if the camera does not offer a value or does not keep it.
+        """
         self._refresh()
         self._apply_word(words.QUALITY, settings.image_quality)
         self._apply_word(words.FOCUS, settings.focus_mode)
@@ -121,7 +124,7 @@ class GphotoCamera:
         return self.settings()
 
     def settings(self) -> CameraSettings:
-        """What the camera is set to now: events are drained first, which empties libgphoto2's 2 s cache."""
+        """Return the camera's current settings; drains events first, which clears libgphoto2's 2 s cache."""
         self._refresh()
         return CameraSettings(
             aperture_f=self._number(words.F_NUMBER),
@@ -136,7 +139,7 @@ class GphotoCamera:
         number = words.number_of(word)
         if number is None:
             raise DeviceRefusedError(
-                f"The camera reports {name} {word!r}, which is no number",
+                f"The camera reports {name} {word!r}, which is not a number",
                 where=self._link.where,
                 remedy="Turn the mode dial to M; check that the lens is locked in place",
             )
@@ -179,14 +182,21 @@ class GphotoCamera:
     # --- exposures -----------------------------------------------------------------------------------------
 
     def capture(self, folder: Path) -> CapturedImage:
-        """One exposure, its undecoded files in `folder`.
+        """Take one exposure and download its undecoded files into `folder`.
 
-        `exif` has aperture, time and ISO of the file; focus mode and quality, for which EXIF has no standard tag, are
-        the camera's settings. Raises StaleImageError, UnreadableFileError, DeviceStorageFullError and link errors.
+        In `exif`, aperture, exposure time and ISO come from the file; focus mode and quality, for which EXIF has no
+        standard tag, come from the camera's settings.
+
+        Raises:
+            StaleImageError: a file that is not new.
+            UnreadableFileError: a file that is incomplete or damaged.
+            DeviceStorageFullError: no space left in the camera.
+            DeviceTimeoutError: files that did not arrive in time.
+            DeviceRefusedError, DeviceBusyError, DeviceUnavailableError: the shutter was not released.
         """
         self._refresh()
         for left in self._announced:
-            _LOG.warning("%s was still in the camera and is not part of this exposure", left.name)
+            _LOG.warning("%s is left over from before and does not belong to this exposure", left.name)
         self._announced.clear()
         quality = words.quality_of(self._link.value(words.QUALITY))
         focus = self._link.value(words.FOCUS)
@@ -196,7 +206,11 @@ class GphotoCamera:
         return self._image(added, folder, trigger_s, quality, focus)
 
     def released_images(self, folder: Path, timeout_s: float, since_utc_s: float = 0.0) -> tuple[CapturedImage, ...]:
-        """See drivers.interfaces.Camera. Files come as events; RAW and JPEG of one exposure together."""
+        """Download into `folder` the exposures released with the camera's button, oldest first.
+
+        Waits up to `timeout_s` for the first one. The camera announces files as events; RAW and JPEG of one exposure
+        form one image. `since_utc_s` is not needed, because announced files are always new.
+        """
         deadline_s = time.monotonic() + timeout_s
         images: list[CapturedImage] = []
         while True:
@@ -211,7 +225,7 @@ class GphotoCamera:
                 return tuple(images)
 
     def _released(self, folder: Path) -> CapturedImage:
-        """The exposure whose file was announced first."""
+        """Collect and download the exposure whose file was announced first."""
         announced_s = time.monotonic()
         quality = words.quality_of(self._link.value(words.QUALITY))
         focus = self._link.value(words.FOCUS)
@@ -221,13 +235,13 @@ class GphotoCamera:
         return self._image(added, folder, announced_s, quality, focus)
 
     def _refresh(self) -> None:
-        """Drain events, so that values are read anew; files that they announce wait for `released_images`."""
+        """Drain events, so that values are read afresh; keeps announced files for `released_images`."""
         self._announced += self._link.refresh()
 
     def _image(
         self, added: list[AddedFile], folder: Path, trigger_s: float, quality: str, focus: str
     ) -> CapturedImage:
-        """Download the files of one exposure and make sure that they are new."""
+        """Download the files of one exposure and check that they are new."""
         arrival_s = time.monotonic()
         stems = {_parse(one.name)[0] for one in added}
         if len(stems) != 1:
@@ -275,7 +289,7 @@ class GphotoCamera:
                     raise
                 time.sleep(0.2 * attempt)
             except DeviceUnavailableError as error:
-                # Full store, wrong mode and lost link all come as -1: the camera is asked which.
+                # A full store, a wrong mode and a lost link all give -1: ask the camera which it is.
                 self._check_space()
                 raise DeviceRefusedError(
                     f"The camera answers but did not release the shutter: {error.what}",
@@ -335,7 +349,7 @@ class GphotoCamera:
             return
         if image.counter == last.counter:
             raise self._stale(f"The file counter stayed at {name}")
-        # The counter of file names starts again after 9999.
+        # The counter in file names restarts after 9999.
         if image.counter < last.counter and (image.counter - last.counter) % 10000 > 100:
             raise self._stale(f"The file counter went back from {last.files[0].camera_name} to {name}")
         if image.exif_time <= last.exif_time:
@@ -347,12 +361,12 @@ class GphotoCamera:
     # --- live view -----------------------------------------------------------------------------------------
 
     def preview(self) -> bytes:
-        """One live-view frame, JPEG; a busy camera is asked again for a few seconds."""
+        """Return one live-view frame as JPEG bytes; retries for some seconds while the camera is busy."""
         deadline = time.monotonic() + PREVIEW_PATIENCE_S
         while True:
             try:
                 frame = self._link.call("Fetching a live-view frame", lambda camera: camera.capture_preview())
-                # The frame owns the memory: a name for it keeps it alive until the bytes are copied.
+                # The frame owns the memory: the variable keeps it alive until the bytes are copied.
                 return bytes(memoryview(frame.get_data_and_size()))
             except DeviceBusyError:
                 if time.monotonic() > deadline:
@@ -361,7 +375,7 @@ class GphotoCamera:
 
 
 def _parse(name: str) -> tuple[str, int, str]:
-    """Stem, counter and suffix of a camera's file name; libgphoto2 puts capt_ before those from the memory."""
+    """Stem, counter and suffix of a camera's file name; libgphoto2 prefixes files from its memory with capt_."""
     match = _NAME.match(name)
     if match is None:
         raise StaleImageError(f"The file name {name} has no counter", where="camera", remedy="Repeat the exposure")
@@ -369,7 +383,7 @@ def _parse(name: str) -> tuple[str, int, str]:
 
 
 def _clock_offset_s(taken: str, trigger_monotonic_s: float) -> float | None:
-    """Camera clock minus host UTC at the release; None when EXIF lacks the offset from UTC."""
+    """Camera clock minus host UTC when the shutter was released; None if the EXIF time lacks its UTC offset."""
     try:
         stamp = datetime.strptime(taken, "%Y:%m:%d %H:%M:%S.%f%z")
     except ValueError:

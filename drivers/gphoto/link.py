@@ -1,4 +1,4 @@
-"""The connection to libgphoto2: versions, ports, error codes, single widgets, events, recovery of descriptor 0."""
+"""The connection to libgphoto2: version check, ports, error codes, single widgets, events, file descriptor 0."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _UNAVAILABLE = "Check cable and power, then open the camera again; re-plug it if
 
 
 def check_library_version(version: str) -> None:
-    """Raise DeviceFaultError for a libgphoto2 that is known to break the Alpha 7R V, or that is too old for it."""
+    """Raise DeviceFaultError for a libgphoto2 that is known not to work with the Alpha 7R V, or is too old for it."""
     try:
         numbers = tuple(int(part) for part in version.split(".")[:3])
     except ValueError as error:
@@ -61,18 +61,21 @@ def check_library_version(version: str) -> None:
 
 
 def library_version() -> str:
-    """Version of libgphoto2 that is loaded."""
+    """The version of the loaded libgphoto2, such as 2.5.34."""
     return str(gp.gp_library_version(gp.GP_VERSION_SHORT)[0])
 
 
 def translate(error: Any, doing: str, where: str) -> DeviceError:
-    """The DeviceError for a libgphoto2 error code; −1 says nothing, so it counts as a lost link."""
+    """Return the DeviceError for a libgphoto2 error; the unspecific code −1 counts as a lost link."""
     kind, remedy = _ERRORS.get(int(error.code), (DeviceUnavailableError, _UNAVAILABLE))
     return kind(f"{doing} failed: {error.string} ({error.code})", where=where, remedy=remedy)
 
 
 def keep_descriptor_zero() -> None:
-    """Put /dev/null back on descriptor 0: every exit of a PTP/IP camera closes it, whatever it is by then."""
+    """Reopen file descriptor 0 on /dev/null if it is closed.
+
+    libgphoto2 closes descriptor 0 whenever it exits a PTP/IP camera, whatever the descriptor is used for.
+    """
     try:
         os.fstat(0)
     except OSError:
@@ -91,7 +94,7 @@ class AddedFile:
 
 
 class Link:
-    """One libgphoto2 camera; every method raises DeviceError."""
+    """One libgphoto2 camera; its methods raise only DeviceError."""
 
     def __init__(self, port: str, model: str) -> None:
         self.where = f"camera at {port or 'USB'}"
@@ -100,7 +103,7 @@ class Link:
         self._camera: Gphoto | None = None
 
     def open(self) -> None:
-        """Connect, with back-off: bodies need a moment after a lost session."""
+        """Connect, with back-off, because cameras need a moment after a lost session."""
         check_library_version(library_version())
         self.close()
         for attempt in range(1, OPEN_ATTEMPTS + 1):
@@ -131,7 +134,7 @@ class Link:
                 )
             model, port = found[0]
         else:
-            # Without the second port libgphoto2 sends the event connection to 15740, whatever the first one says.
+            # Without the second port libgphoto2 opens its event connection on 15740, whatever the first port is.
             parts = self._port.split(":")
             port = f"{self._port}:{parts[2]}" if len(parts) == 3 else self._port
             model = PTPIP_MODEL
@@ -147,7 +150,7 @@ class Link:
         return (self._port in ("", "usb", "usb:") or port == self._port) and self._model in name
 
     def close(self) -> None:
-        """Let go; a dead link is only logged."""
+        """Disconnect; an error is logged and not raised."""
         camera, self._camera = self._camera, None
         if camera is None:
             return
@@ -159,7 +162,7 @@ class Link:
         keep_descriptor_zero()
 
     def call(self, doing: str, function: Callable[[Gphoto], T]) -> T:
-        """Run a function on the camera, errors translated."""
+        """Run a function on the camera and translate its errors; `doing` says what it does, for messages."""
         if self._camera is None:
             raise DeviceUnavailableError("The camera is not open", where=self.where, remedy="Open it first")
         try:
@@ -168,7 +171,7 @@ class Link:
             raise translate(error, doing, self.where) from error
 
     def refresh(self, wait_ms: int = 1) -> list[AddedFile]:
-        """Drain waiting events, which also makes libgphoto2 read all properties anew; returns announced files."""
+        """Drain pending events, which also makes libgphoto2 reread all properties; returns the announced files."""
         added: list[AddedFile] = []
         while True:
             event, data = self.next_event(wait_ms)
@@ -178,11 +181,11 @@ class Link:
                 added.append(AddedFile(str(data.folder), str(data.name)))
 
     def next_event(self, wait_ms: int) -> tuple[int, Any]:
-        """The next event of the camera or GP_EVENT_TIMEOUT."""
+        """Wait for the next event of the camera; returns its type, or GP_EVENT_TIMEOUT, and its data."""
         return self.call("Waiting for the camera", lambda camera: camera.wait_for_event(wait_ms))
 
     def value(self, name: str) -> str:
-        """Value of one widget; DeviceRefusedError when the camera has no such setting."""
+        """Return the value of one widget. Raises DeviceRefusedError if the camera has no such setting."""
 
         def read(camera: Gphoto) -> str:
             return str(camera.get_single_config(name).get_value())
@@ -190,7 +193,7 @@ class Link:
         return self.call(f"Reading the setting {name}", read)
 
     def choices(self, name: str) -> tuple[str, ...]:
-        """What the camera offers for a widget now; empty for free text and ranges."""
+        """Return the values that the camera currently offers for a widget; empty for free text and ranges."""
 
         def read(camera: Gphoto) -> tuple[str, ...]:
             widget = camera.get_single_config(name)
@@ -201,7 +204,7 @@ class Link:
         return self.call(f"Reading the choices of {name}", read)
 
     def put(self, name: str, value: str) -> None:
-        """Send one widget alone: a refusal is silent when the whole tree is sent."""
+        """Set a single widget, because libgphoto2 reports no refusal when the whole tree is sent."""
 
         def write(camera: Gphoto) -> None:
             widget = camera.get_single_config(name)
@@ -211,7 +214,7 @@ class Link:
         self.call(f"Setting {name} to {value}", write)
 
     def free_bytes(self) -> int | None:
-        """Free space of the camera's stores; None for a body that lists none (usual in PC Remote mode)."""
+        """Free space of the camera's storage in bytes; None if the camera lists none (usual in PC Remote mode)."""
         stores = self.call("Reading the free space", lambda camera: list(camera.get_storageinfo()))
         known = [int(store.freekbytes) * 1024 for store in stores if store.fields & gp.GP_STORAGEINFO_FREESPACEKBYTES]
         return sum(known) if known else None

@@ -1,4 +1,4 @@
-"""From a protocol's camera settings to the words that a live choice list offers, and back."""
+"""Translates a protocol's camera settings to the words that the camera's choice lists offer, and back."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ F_NUMBER, SHUTTER, ISO, FOCUS, QUALITY, TARGET = (
     "imagequality",
     "d222",
 )
-RELATIVE_TOLERANCE = 0.01  # neighbouring thirds of a stop differ by 12 % and more
+RELATIVE_TOLERANCE = 0.01  # adjacent thirds of a stop differ by at least 12 %
 TARGET_CODES = {"computer": "1", "card": "16", "both": "17"}
-# On a body in mode 2 the finer words come in place of the plain ones.
+# A camera in mode 2 offers the finer words instead of the plain ones.
 _QUALITY_WORDS = {
     "JPEG": ("JPEG", "Extra Fine", "X.Fine", "Fine"),
     "RAW": ("RAW",),
@@ -26,7 +26,7 @@ _QUALITY_WORDS = {
 
 
 def number_of(word: str) -> float | None:
-    """The number in "f/22", "1/15", "32/10", "100"; None for Bulb, Auto ISO and the like."""
+    """Parse "f/22", "1/15", "32/10" or "100" as a number; None for Bulb, Auto ISO and the like."""
     try:
         return float(Fraction(word.removeprefix("f/").strip()))
     except (ValueError, ZeroDivisionError):
@@ -34,7 +34,7 @@ def number_of(word: str) -> float | None:
 
 
 def choose_number(name: str, wanted: float, offered: Sequence[str], where: str) -> str:
-    """The offered word for a number. Raises DeviceRefusedError that names the neighbours."""
+    """Return the offered word for a number. Raises DeviceRefusedError, which names the nearest offered values."""
     numbers = [(word, number) for word in offered if (number := number_of(word)) is not None]
     if not numbers:
         raise DeviceRefusedError(
@@ -53,7 +53,7 @@ def choose_number(name: str, wanted: float, offered: Sequence[str], where: str) 
 
 
 def choose_word(name: str, wanted: str, offered: Sequence[str], where: str) -> str:
-    """The offered word for a named setting. Raises DeviceRefusedError with the list."""
+    """Return the offered word for a named setting. Raises DeviceRefusedError, which lists the offered ones."""
     for word in _QUALITY_WORDS.get(wanted, (wanted,)) if name == QUALITY else (wanted,):
         if word in offered:
             return word
@@ -65,7 +65,7 @@ def choose_word(name: str, wanted: str, offered: Sequence[str], where: str) -> s
 
 
 def quality_of(word: str) -> str:
-    """JPEG, RAW or RAW+JPEG for the camera's own word."""
+    """Map the camera's own word for image quality to JPEG, RAW or RAW+JPEG."""
     if word.startswith("RAW+"):
         return "RAW+JPEG"
     return "RAW" if word.startswith("RAW") else "JPEG"

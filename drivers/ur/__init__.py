@@ -1,4 +1,4 @@
-"""Universal Robots arms through ur_rtde: configuration and entry point; the library loads in the child only."""
+"""Universal Robots arms over ur_rtde: configuration and entry point. Only the child process loads the library."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class UrConfig(DriverConfig):
         default=0.2,
         ge=0.1,
         le=1.0,
-        description="without a sign of life of the program that drives the arm for so long, its controller stops it",
+        description="time without a heartbeat of the program that drives the arm after which the controller stops it",
     )
     unattended_s: float = Field(
         default=5.0,
         gt=0,
-        description="the same where that program lives but does not look at the moving arm (it may store an image)",
+        description="the same for a program that is alive but does not query the moving arm (it may store an image)",
     )
 
 

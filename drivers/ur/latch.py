@@ -1,4 +1,4 @@
-"""What keeps an arm from being moved until a person lets it: a latch that no program takes off by itself."""
+"""The motion latch: after opening and after every stop the arm stays locked until a person permits motion."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _LOOK = "Look for the cause, and whether anybody is in reach; the arm moves on a
 
 @dataclass(frozen=True, slots=True)
 class _Held:
-    """Why the arm is held, and until when that went on (host time.monotonic())."""
+    """Why the arm is held, and when that was last seen (host time.monotonic())."""
 
     what: str
     last_s: float
 
 
 class Latch:
-    """Holds the arm from the moment it is opened, and again after every stop; safe to use from several threads.
+    """Holds the arm from the moment it is opened, and again after every stop; thread-safe.
 
-    It is set from what the controller streams, so a stop that came and was released while nobody asked counts too.
+    It follows the controller's stream, so it also latches a stop that came and went between two calls.
     """
 
     def __init__(self, where: str) -> None:
@@ -33,15 +33,15 @@ class Latch:
         self._lock = threading.Lock()
         self._let_by = ""
         self._stop: _Held | None = None  # of the safety system
-        self._ended: _Held | None = None  # of the controller's program, which nobody here had asked to end
+        self._ended: _Held | None = None  # the controller's program ended without this driver asking for it
 
     def close(self) -> None:
-        """Take back the leave: what is opened anew needs a new one."""
+        """Revoke the permission; opening the arm again needs a new one."""
         with self._lock:
             self._let_by = ""
 
     def see(self, safety: SafetyState, at_s: float) -> None:
-        """Note one sample of the stream."""
+        """Latch the arm if this sample of the stream shows a stop; `at_s` is its host time.monotonic()."""
         if safety.may_move:
             return
         with self._lock:
@@ -50,13 +50,16 @@ class Latch:
             self._stop = _Held(_name(safety), at_s)
 
     def end(self, what: str) -> None:
-        """Note that the controller's program ended unasked: `what` says so in a sentence."""
+        """Latch the arm because the controller's program ended unexpectedly; `what` is a sentence that says so."""
         with self._lock:
             _LOG.warning("%s: %s; nothing moves until a person confirms", self._where, what)
             self._ended = _Held(what, time.monotonic())
 
     def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
-        """Forget what was over by then. Raises SafetyStopError, LeaveNeededError for what was not."""
+        """Permit motion and clear stops that were over at `not_before_monotonic_s` (host time.monotonic()).
+
+        Raises SafetyStopError or LeaveNeededError for a stop seen after that time.
+        """
         with self._lock:
             for held in (self._stop, self._ended):
                 if held is not None and held.last_s > not_before_monotonic_s:
@@ -66,13 +69,13 @@ class Latch:
 
     @property
     def stop(self) -> DeviceError | None:
-        """The stop, or the end of the program, that nobody has confirmed since."""
+        """The stop, or unexpected end of the program, that nobody has confirmed yet; None if there is none."""
         with self._lock:
             return None if self._stop is None and self._ended is None else self._error()
 
     @property
     def hold(self) -> DeviceError | None:
-        """What keeps the arm from being moved: `stop`, or that nobody has let it move yet."""
+        """Why the arm may not move: `stop`, or that nobody has permitted motion yet; None if it may."""
         with self._lock:
             return None if self._let_by and self._stop is None and self._ended is None else self._error()
 

@@ -1,4 +1,4 @@
-"""Reaching a controller: probes that cannot hang, what its dashboard says, the vendor's exceptions wrapped."""
+"""Connecting to a controller: probes with a timeout, facts from its dashboard, and wrapped vendor exceptions."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 VENDOR_ERRORS = (RuntimeError, ValueError, TypeError)
 _LONGEST_SERIAL = 20
-_LONGEST_LINE = 1000  # of the dashboard's answers: none of them is a tenth as long
+_LONGEST_LINE = 1000  # limit for dashboard answers, which are less than a tenth as long
 _REMEDY = "Check that this address is that of a Universal Robots controller, then restart it"
-MINIMUM_VERSION = {3: (3, 15), 5: (5, 10)}  # get_inverse_kin_has_solution() came with these
+MINIMUM_VERSION = {3: (3, 15), 5: (5, 10)}  # the first with get_inverse_kin_has_solution()
 
 
 @dataclass(frozen=True, slots=True)
 class ControllerFacts:
-    """What the dashboard says of a controller."""
+    """What the dashboard reports about a controller."""
 
     model: str
     serial: str
@@ -36,7 +36,12 @@ class ControllerFacts:
 
 @contextlib.contextmanager
 def vendor(where: str, doing: str) -> Generator[None]:
-    """Turn the vendor library's exceptions into DeviceUnavailableError."""
+    """Translate the vendor library's exceptions into DeviceUnavailableError.
+
+    Args:
+        where: address of the controller, for the message.
+        doing: what is being attempted, as in "reading the state".
+    """
     try:
         yield
     except VENDOR_ERRORS as error:
@@ -46,9 +51,9 @@ def vendor(where: str, doing: str) -> Generator[None]:
 
 
 def probe(host: str, timeout_s: float) -> None:
-    """Make sure that all three servers answer: the vendor's constructors wait for ever on a mute one.
+    """Check that all three servers answer, because the vendor's constructors wait for ever on a silent one.
 
-    Raises DeviceUnavailableError naming the port that refuses or keeps silent.
+    Raises DeviceUnavailableError, which names the port that refuses the connection or does not answer.
     """
     _ask(host, RTDE_PORT, struct.pack(">HBH", 5, ord("V"), 2), timeout_s, "RTDE")
     _ask(host, DASHBOARD_PORT, b"", timeout_s, "dashboard")
@@ -79,8 +84,8 @@ def _ask(host: str, port: int, question: bytes | None, timeout_s: float, name: s
 
 
 def connect_dashboard(host: str) -> library.Dashboard:
-    """A connected dashboard client."""
-    # Imported here: what this module reads of a controller needs no vendor's library.
+    """Return a connected dashboard client. Raises DeviceUnavailableError."""
+    # Imported here, so that the rest of this module works without the vendor's library.
     from drivers.ur import vendor as library  # noqa: PLC0415
 
     client = library.dashboard(host)
@@ -90,7 +95,11 @@ def connect_dashboard(host: str) -> library.Dashboard:
 
 
 def read_facts(dashboard: library.Dashboard, host: str, timeout_s: float) -> ControllerFacts:
-    """Version, serial number and model. Raises DeviceFaultError for software that is too old."""
+    """Read the model, serial number, software version and control mode.
+
+    Raises DeviceFaultError if the software is too old or an answer makes no sense, DeviceUnavailableError if the
+    dashboard fails.
+    """
     with vendor(host, "reading the version"):
         software = dashboard.polyscopeVersion()
     match = re.search(r"([0-9]{1,3})\.([0-9]{1,3})", software)
@@ -104,7 +113,7 @@ def read_facts(dashboard: library.Dashboard, host: str, timeout_s: float) -> Con
             where=host,
             remedy=f"Update the controller to {minimum[0]}.{minimum[1]} or later",
         )
-    # The vendor's client refuses these two questions for a CB3, which answers them all the same.
+    # The vendor's client refuses to ask a CB3 these two questions, although the CB3 answers them.
     serial, model = _questions(host, "get serial number", "get robot model", timeout_s=timeout_s)
     if not (serial.isascii() and serial.isdigit() and len(serial) <= _LONGEST_SERIAL):
         raise DeviceFaultError(f"the controller names no serial number: {serial!r}", where=host, remedy=_REMEDY)

@@ -1,4 +1,4 @@
-"""RobotArm over ur_rtde: receive, control, io and dashboard; runs in the child of drivers.host."""
+"""The RobotArm driver over ur_rtde (receive, control, io and dashboard); runs in the child of drivers.host."""
 
 from __future__ import annotations
 
@@ -68,18 +68,18 @@ VARIABLES = (
     "actual_digital_output_bits",
 )
 READ_BACK_S = 1.0
-TOOL_CHANGE_S = 0.05  # of the controller's clock, for a new tool to show in the stream
-LONGEST_RINGING_S = 10.0  # after a motion; how far back its end is looked for
-MOTION_START_S = 0.06  # for the target velocity to show in the stream
+TOOL_CHANGE_S = 0.05  # by the controller's clock, until a new tool shows in the stream
+LONGEST_RINGING_S = 10.0  # how far back the end of the last motion is searched for
+MOTION_START_S = 0.06  # until the target velocity of a new motion shows in the stream
 _RESTART = "Restart the controller; see the log of the pendant if it happens again"
-_SET_ELSEWHERE = "Look on the pendant whether another program sets it, end that, then try again"
+_SET_ELSEWHERE = "Check on the pendant whether another program sets it, end that program, then try again"
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
 
 
 class UrRobot:
-    """One arm. Motions are asynchronous: only so can `stop` interrupt them and the watchdog be kicked meanwhile."""
+    """One arm. Motions are asynchronous, so that `stop` can interrupt them and the watchdog is kicked meanwhile."""
 
     def __init__(self, config: UrConfig) -> None:
         self._config = config
@@ -100,17 +100,21 @@ class UrRobot:
             newest=self._newest,
         )
         self._script = ControlScript(config, self._latch, self._watchdog)
-        self._tool_read = 0  # the sending of the script after which the tool was read
+        self._tool_read = 0  # value of ControlScript.sent when the tool was last read
 
     # --- device ------------------------------------------------------------------------------------------
 
     def open(self) -> DeviceIdentity:
-        """Connect; the arm can be watched, but moves after `let_move`, and never in a safety stop."""
+        """Connect and return the controller's identity.
+
+        The arm can then be observed; it moves only after `let_move`, and never during a safety stop. Raises
+        DeviceUnavailableError, and DeviceFaultError if the controller's software is too old.
+        """
         self.close()
         probe(self._config.host, self._config.connect_timeout_s)
         self._dashboard = dashboard = connect_dashboard(self._config.host)
         self._facts = facts = read_facts(dashboard, self._where, self._config.connect_timeout_s)
-        # A script of an earlier client in another register range would block the control constructor for minutes.
+        # An earlier client's script in another register range would block the control constructor for minutes.
         with vendor(self._where, "stopping the running program"):
             dashboard.stop()
         variables = [*VARIABLES, *(["payload"] if facts.version >= (5, 6) else [])]
@@ -126,15 +130,15 @@ class UrRobot:
         with vendor(self._where, "connecting the input/output interface"):
             self._io = library.input_output(self._config.host)
         if not (self._obstacle() or self._latch.stop):
-            self._perform("starting the control script", lambda _: None)  # which sends it and reads the tool
+            self._perform("starting the control script", lambda _: None)  # sends the script and reads the tool
         return self._identity()
 
     def heartbeat(self, sent_monotonic_s: float) -> None:
-        """See drivers.plugin.NeedsHeartbeat."""
+        """Pass a heartbeat, sent at this host time.monotonic(), on to the watchdog."""
         self._watchdog.beat(sent_monotonic_s)
 
     def close(self) -> None:
-        """End a motion that is under way, then the script and the connections; a dead link is no error."""
+        """Stop any motion, then end the script and the connections; does not raise if the link is dead."""
         self._latch.close()
         stream = self._stream
         alive = stream is not None and stream.alive
@@ -156,7 +160,7 @@ class UrRobot:
         self._io = self._receive = self._dashboard = None
 
     def report(self) -> DeviceReport:
-        """Versions, clock offset, and what keeps the arm from moving."""
+        """Return versions, clock offset, and what prevents the arm from moving."""
         state = self.state()
         problems: list[str] = []
         if obstacle := self._obstacle() or self._latch.stop:
@@ -192,7 +196,10 @@ class UrRobot:
     # --- arm -----------------------------------------------------------------------------------------------
 
     def let_move(self, confirmed_by: str, not_before_monotonic_s: float) -> None:
-        """See RobotArm."""
+        """Permit motion after a person's confirmation; clears stops over by `not_before_monotonic_s`.
+
+        Raises SafetyStopError or LeaveNeededError if a stop is active or was seen after that time.
+        """
         sample = self._streaming().next()
         if not sample.safety.may_move:
             raise self._safety_error(sample)
@@ -200,7 +207,10 @@ class UrRobot:
         self._watchdog.arrive()
 
     def configure(self, payload: Payload, T_flange_tcp: Transform) -> None:
-        """See RobotArm. DeviceRefusedError when not taken, DeviceFaultError when read back differently."""
+        """Set the payload and the tool centre point (4, 4, metres) and verify both by reading them back.
+
+        Raises DeviceRefusedError if the controller rejects them, DeviceFaultError if they read back differently.
+        """
         pose = to_rotation_vector(np.asarray(T_flange_tcp, dtype=np.float64))
 
         def set_both(control: library.Control) -> None:
@@ -211,7 +221,7 @@ class UrRobot:
             self._read_tool(control)
 
         self._perform("setting payload and tool", set_both)
-        # The stream runs behind the answer: poses of the former tool are still under way.
+        # The stream lags behind the answer: poses of the previous tool can still arrive.
         settled_s = self._streaming().latest().controller_time_s + TOOL_CHANGE_S
         while self._streaming().next().controller_time_s < settled_s:
             pass
@@ -230,7 +240,7 @@ class UrRobot:
             )
 
     def state(self) -> RobotState:
-        """See RobotArm."""
+        """Return the newest sample with the controller's modes. Raises DeviceUnavailableError if it is stale."""
         self._watchdog.attend()
         sample = self._streaming().latest()
         receive = _opened(self._receive, self._where)
@@ -244,11 +254,15 @@ class UrRobot:
             )
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
-        """See RobotArm."""
+        """Return the buffered samples between two host times, oldest first; does not count as supervising the arm."""
         return self._streaming().between(start_monotonic_s, end_monotonic_s)
 
     def solve_ik(self, T_base_flange: Transform, near_rad: Array) -> Array:
-        """See RobotArm. Asks first whether there is a solution: an unreachable pose kills the control script."""
+        """Return the controller's joint solution (6,), in radians, for a flange pose, closest to `near_rad`.
+
+        Checks first that a solution exists, because an unreachable pose would end the control script. Raises
+        UnreachablePoseError if there is none, or if it lies beyond the safety limits.
+        """
         near = _joints(near_rad, self._where)
 
         def ask(control: library.Control) -> list[float]:
@@ -277,12 +291,18 @@ class UrRobot:
         return np.asarray(self._perform("inverse kinematics", ask), dtype=np.float64)
 
     def move_joints(self, target_rad: Array, *, speed_rad_s: float, acceleration_rad_s2: float) -> None:
-        """See RobotArm."""
+        """Start a joint motion to `target_rad` (6,) and return at once.
+
+        Raises SafetyStopError, LeaveNeededError, or DeviceRefusedError if the controller does not start it.
+        """
         target = _joints(target_rad, self._where)
         self._begin("joint motion", lambda control: control.moveJ(target, speed_rad_s, acceleration_rad_s2, True))
 
     def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """See RobotArm."""
+        """Start a linear motion of the flange to `T_base_flange` (4, 4, metres) and return at once.
+
+        Raises SafetyStopError, LeaveNeededError, or DeviceRefusedError if the controller does not start it.
+        """
 
         def start(control: library.Control) -> bool:
             pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
@@ -291,21 +311,28 @@ class UrRobot:
         self._begin("linear motion", start)
 
     def stop(self) -> None:
-        """See RobotArm. Returns when the arm stands; without a running script the dashboard stops the program."""
+        """Decelerate and return when the arm stands still; without a running script, stop the program by dashboard.
+
+        Raises DeviceTimeoutError if the arm does not come to rest.
+        """
         with vendor(self._where, "stopping the motion"):
             self._watchdog.look()
             if not self._script.stop_motion(self._driven_next):
                 _opened(self._dashboard, self._where).stop()
 
     def is_moving(self) -> bool:
-        """See RobotArm."""
+        """Return whether the last motion is still under way.
+
+        Raises the SafetyStopError or LeaveNeededError that interrupted it, or DeviceUnavailableError if the stream is
+        stale.
+        """
         self._watchdog.attend()
         if self._driven(self._streaming().latest()) or time.monotonic() - self._motion_started_s < MOTION_START_S:
             return True
         if self._script.moves():
             return True
-        # On a link that has just died the newest sample is one from before the motion, and no program seems to
-        # run: only a sample that arrives from now on proves that the arm is at rest.
+        # If the link has just died, the newest sample may predate the motion, and no program appears to run: only a
+        # sample that arrives from now on proves that the arm is at rest.
         if self._driven(self._streaming().next()):
             return True
         if self._watchdog.moving:
@@ -317,7 +344,7 @@ class UrRobot:
         return False
 
     def _driven(self, sample: RobotSample) -> bool:
-        """Whether the controller drives the arm in this sample. Raises SafetyStopError when a stop has ended it."""
+        """Whether the controller drives the arm in this sample. Raises SafetyStopError if it shows a stop."""
         if not sample.safety.may_move:
             raise self._safety_error(sample)
         return driven(sample)
@@ -326,7 +353,7 @@ class UrRobot:
         return driven(self._streaming().next())
 
     def settle(self, criteria: SettleCriteria) -> SettleReport:
-        """See RobotArm."""
+        """Judge the last window of the pose stream against the criteria. Returns at once; meant to be polled."""
         self._watchdog.attend()
         stream = self._streaming()
         now_s = stream.latest().monotonic_s
@@ -337,7 +364,7 @@ class UrRobot:
         return dataclasses.replace(report, ringing_s=ringing_s(recent, criteria))
 
     def set_digital_output(self, index: int, on: bool) -> None:
-        """See RobotArm."""
+        """Switch a standard digital output (0 to 7) and verify it by reading it back."""
         if not 0 <= index <= 7:
             raise DeviceRefusedError(
                 f"there is no standard digital output {index}", where=self._where, remedy="Choose one of 0 to 7"
@@ -356,14 +383,14 @@ class UrRobot:
         return _opened(self._stream, self._where)
 
     def _newest(self) -> RobotSample | None:
-        stream = self._stream  # another thread closes it
+        stream = self._stream  # another thread may set it to None
         return stream.newest() if stream is not None else None
 
     def _read_sample(self) -> RobotSample | None:
         receive = self._receive
         if receive is None:
             return None
-        # Getters lock one by one: take the set again when a new package arrived in between.
+        # Each getter locks separately: read the set again if a new package arrived in between.
         for _ in range(3):
             before_s = receive.getTimestamp()
             if before_s == self._controller_time_s:
@@ -388,7 +415,7 @@ class UrRobot:
         )
 
     def _obstacle(self) -> DeviceError | None:
-        """What keeps the arm from moving; only a person removes it."""
+        """What prevents the arm from moving until a person resolves it; None if nothing does."""
         state = self.state()
         if not state.sample.safety.may_move:
             return self._safety_error(state.sample)
@@ -401,7 +428,7 @@ class UrRobot:
         return None
 
     def _taken_remote(self, facts: ControllerFacts) -> bool:
-        """Whether somebody has turned the key to Remote since the controller was asked last."""
+        """Whether somebody has switched the pendant to Remote since the last query."""
         with vendor(self._where, "asking for remote control"):
             remote = _opened(self._dashboard, self._where).isInRemoteControl()
         self._facts = dataclasses.replace(facts, remote_control=remote)
@@ -420,7 +447,7 @@ class UrRobot:
             yield control
 
     def _perform(self, doing: str, commands: Callable[[library.Control], T]) -> T:
-        """Give commands that move nothing; once more where the script lapsed meanwhile, as the watchdog says."""
+        """Give commands that move nothing; retry once if the script lapsed meanwhile (see Watchdog.lapsed)."""
         try:
             with self._commanding(doing, self._obstacle() or self._latch.stop) as control:
                 return commands(control)
@@ -451,7 +478,7 @@ class UrRobot:
             raise self._refusal(f"the controller did not start the {what}")
 
     def _refusal(self, what: str) -> DeviceError:
-        """The reason behind a call that just returned False: a lost link (raised), a stop, or a plain no."""
+        """Why a call just returned False: a stop or a refusal. Raises DeviceUnavailableError for a lost link."""
         self._streaming().next()
         self._watchdog.excuse()
         if stop := self._obstacle() or self._latch.stop:

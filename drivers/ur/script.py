@@ -1,4 +1,4 @@
-"""The control interface: its script on the controller, watched from its start to its end, and commands to it."""
+"""The control interface: sends the control script to the controller, supervises it and gives it commands."""
 
 from __future__ import annotations
 
@@ -22,18 +22,26 @@ _LOG = logging.getLogger(__name__)
 
 
 class ControlScript:
-    """Connected by its first command; sent again after it ended, unless the latch holds the arm."""
+    """The control script on the controller.
+
+    The first command connects and sends it. It is sent again after it ended, unless the latch holds the arm.
+    """
 
     def __init__(self, config: UrConfig, latch: Latch, watchdog: Watchdog) -> None:
         self._config, self._where = config, config.host
         self._latch, self._watchdog = latch, watchdog
         self._control: library.Control | None = None
-        self._abandoned: list[library.Control] = []  # kept from their destructors
-        self.sent = 0  # how often the script was sent
+        self._abandoned: list[library.Control] = []  # kept so that their destructors never run
+        self.sent = 0  # number of times the script was sent
 
     @contextlib.contextmanager
     def commanding(self, doing: str, hold: DeviceError | None) -> Generator[library.Control]:
-        """The interface with its script running, for commands; raises `hold` instead."""
+        """Yield the control interface with its script running, for commands.
+
+        Args:
+            doing: what the commands do, for error messages.
+            hold: why the arm may not be commanded; raised if not None.
+        """
         with self._watchdog.commanding():
             if hold is not None:
                 raise hold
@@ -42,7 +50,7 @@ class ControlScript:
                 yield control
 
     def _connect(self) -> library.Control:
-        """Connect, which sends the script."""
+        """Connect to the controller, which also sends the script."""
         with self._watchdog.commanding(), vendor(self._where, "starting the control script"):
             self._control = control = library.control(self._config.host, STREAM_HZ)
             self.sent += 1
@@ -69,11 +77,11 @@ class ControlScript:
 
     @property
     def connected(self) -> bool:
-        """Whether it has been connected."""
+        """Whether the control interface has been connected."""
         return self._control is not None
 
     def moves(self) -> bool:
-        """Whether the script reports a motion under way."""
+        """Whether the script reports a motion in progress."""
         control = self._control
         with vendor(self._where, "asking for the motion's progress"):
             return (
@@ -83,19 +91,25 @@ class ControlScript:
             )
 
     def stop_motion(self, sees_driven: Callable[[], bool]) -> bool:
-        """Stop a motion and wait until the arm stands; False when the script does not run."""
+        """Stop the motion and wait until the arm stands still.
+
+        Args:
+            sees_driven: whether the newest sample shows the controller driving the arm.
+
+        Returns False if the script does not run; raises DeviceTimeoutError if the arm does not come to rest.
+        """
         control = self._control
         with self._watchdog.commanding():
             if control is None or not control.isConnected() or not control.isProgramRunning():
                 return False
             control.stopJ(self._config.stop_deceleration_rad_s2, True)
-        # The watchdog is kicked while the arm slows down, which a call that waits for its end would prevent.
+        # Asynchronous, since a blocking call would prevent watchdog kicks while the arm decelerates.
         wait(lambda: not sees_driven(), STOP_S, "the arm to stand still", self._where)
         self._watchdog.arrive()
         return True
 
     def end(self) -> None:
-        """End the script and the connection, once the arm stands. Raises the vendor's errors."""
+        """End the script and the connection; the arm must stand still. Raises the vendor's errors."""
         control, self._control = self._control, None
         self._watchdog.release()
         if control is not None:
@@ -104,7 +118,7 @@ class ControlScript:
             control.disconnect()
 
     def abandon(self) -> None:
-        """Let go of a dead link: its calls wait for ever, or crash."""
+        """Drop a dead link without calling it: its calls would hang or crash."""
         control, self._control = self._control, None
         self._watchdog.release()
         if control is not None:
@@ -112,13 +126,13 @@ class ControlScript:
 
 
 def wait(done: Callable[[], bool], timeout_s: float, what: str, where: str) -> None:
-    """Poll until it is done. Raises DeviceTimeoutError."""
+    """Poll `done` until it is true; raises DeviceTimeoutError with `what` and `where` after `timeout_s`."""
     deadline_s = time.monotonic() + timeout_s
     while not done():
         if time.monotonic() > deadline_s:
             raise DeviceTimeoutError(
                 f"waited {timeout_s:g} s for {what}",
                 where=where,
-                remedy="Look at the pendant for what keeps the controller from it, then try again",
+                remedy="Check the pendant for the reason, then try again",
             )
         time.sleep(0.01)

@@ -1,4 +1,4 @@
-"""The controller's pose stream: a sampling thread, a ring buffer in time, and the judgement of standing still."""
+"""The controller's pose stream: a sampling thread, a ring buffer, and the judgement whether the arm has settled."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotSample, SafetyState, SettleCriteria, SettleReport
 from drivers.stillness import pose_spread
 
-BUFFER_S = 300.0  # an image's pose is looked up once its files have arrived, which takes a while for 60 megapixels
+BUFFER_S = 300.0  # an image's pose is looked up after its files arrived, which takes a while at 60 megapixels
 STREAM_HZ = 125.0
 POLL_S = 0.004
-STALL_S = 0.25  # without a look: this process itself stood still
-MINIMUM_COVERAGE = 0.8  # of the settle window by samples
-TARGET_AT_REST_RAD_S = 1e-9  # the controller's target velocity, beyond which it drives the arm
+STALL_S = 0.25  # a longer gap between two polls means that this process itself was suspended
+MINIMUM_COVERAGE = 0.8  # fraction of the settle window that samples must cover
+TARGET_AT_REST_RAD_S = 1e-9  # above this target velocity the controller drives the arm
 
 _LOG = logging.getLogger(__name__)
 
 
 def safety_state(bits: int) -> SafetyState:
-    """The state behind the controller's safety_status_bits, the gravest first (RTDE guide)."""
+    """Decode the controller's safety_status_bits (RTDE guide); the gravest state wins."""
     for mask, state in (
         (1 << 9 | 1 << 8, SafetyState.FAULT),  # fault, violation
         (1 << 7 | 1 << 6 | 1 << 5, SafetyState.EMERGENCY_STOP),
@@ -44,8 +44,12 @@ def safety_state(bits: int) -> SafetyState:
 class PoseStream:
     """Polls a source of samples in its own thread and keeps the last BUFFER_S seconds.
 
-    `read` returns the newest sample, or None while the controller's clock has not advanced: the vendor's getters go
-    on returning old data when the link is dead. Whatever of `vendor_errors` it raises ends the stream.
+    Args:
+        read: returns the newest sample, or None while the controller's clock has not advanced, since the vendor's
+            getters keep returning old data when the link is dead.
+        stale_after_s: age of the newest sample above which the stream counts as dead.
+        where: address of the controller, for messages.
+        vendor_errors: exceptions of `read` that end the stream.
     """
 
     def __init__(
@@ -62,29 +66,29 @@ class PoseStream:
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._death = ""
-        self._looked_s = self._looking_since_s = -float("inf")  # the newest look; from when on without a pause
+        self._looked_s = self._looking_since_s = -float("inf")  # time of the last poll; start of gapless polling
         self._thread = threading.Thread(target=self._run, name="ur pose stream", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread."""
+        """Stop the sampling thread."""
         self._stop.set()
         self._thread.join(5.0)
 
     @property
     def alive(self) -> bool:
-        """Whether samples come in."""
+        """Whether the stream is alive, i.e. its newest sample is not stale."""
         return self.newest() is not None
 
     def newest(self) -> RobotSample | None:
-        """The newest sample, None when it is too old; does not wait."""
+        """Return the newest sample, or None if it is stale; does not wait."""
         with self._lock:
             newest = self._samples[-1] if self._samples else None
         fresh = newest is not None and time.monotonic() - newest.monotonic_s <= self._stale_after_s
         return newest if fresh else None
 
     def latest(self) -> RobotSample:
-        """The newest sample. Raises DeviceUnavailableError when it is too old."""
+        """Return the newest sample. Raises DeviceUnavailableError if it is stale."""
         deadline_s = time.monotonic() + self._stale_after_s
         while True:
             with self._lock:
@@ -103,31 +107,31 @@ class PoseStream:
             time.sleep(POLL_S)
 
     def _not_looking(self, now_s: float) -> bool:
-        """Whether this process has stood still: then the age of a sample says nothing of the link."""
+        """Whether this process was suspended, so that the age of a sample says nothing about the link."""
         return now_s - self._looked_s > STALL_S or now_s - self._looking_since_s <= self._stale_after_s
 
     def next(self) -> RobotSample:
-        """A sample that arrives from now on. Raises DeviceUnavailableError when none does."""
+        """Wait for a sample that arrives after this call. Raises DeviceUnavailableError if none does."""
         now_s = time.monotonic()
         while (sample := self.latest()).monotonic_s <= now_s:
             time.sleep(POLL_S)
         return sample
 
     def between(self, start_s: float, end_s: float) -> tuple[RobotSample, ...]:
-        """Samples that arrived between two host times, oldest first."""
+        """Return the samples that arrived between two host times (time.monotonic()), oldest first."""
         with self._lock:
-            # From the newest backwards: what is asked for is nearly always recent, and the buffer is long.
+            # Search from the newest backwards: the buffer is long, and callers nearly always want recent samples.
             recent = takewhile(lambda s: s.monotonic_s >= start_s, reversed(self._samples))
             found = [s for s in recent if s.monotonic_s <= end_s]
         return tuple(reversed(found))
 
     def clear(self) -> None:
-        """Forget everything, since the tool offset behind the flange poses changed on the way."""
+        """Discard all samples, because the tool offset behind their flange poses has changed."""
         with self._lock:
             self._samples.clear()
 
     def clock_offset_s(self) -> float:
-        """Controller time minus host monotonic time; the least delayed sample of the last seconds decides."""
+        """Return controller time minus host monotonic time, from the least delayed sample of the last 5 s."""
         self.latest()
         with self._lock:
             recent = list(self._samples)[-int(5 * STREAM_HZ) :]
@@ -154,7 +158,7 @@ class PoseStream:
 
 
 def judge(samples: Sequence[RobotSample], criteria: SettleCriteria) -> SettleReport:
-    """Whether an arm stood still over `samples`, which should span criteria.window_s; see drivers.stillness."""
+    """Judge whether the arm stood still over `samples`, which should span criteria.window_s (drivers.stillness)."""
     spread = pose_spread(samples)
     joint_speed = float(max(np.max(np.abs(s.joint_velocities_rad_s)) for s in samples))
     tcp_speed = max(s.tcp_speed_m_s for s in samples)
@@ -179,9 +183,9 @@ def judge(samples: Sequence[RobotSample], criteria: SettleCriteria) -> SettleRep
 
 
 def ringing_s(samples: Sequence[RobotSample], criteria: SettleCriteria) -> float:
-    """How long the arm went on swinging after the controller's target had come to rest, in seconds.
+    """Return how long the arm kept oscillating after the commanded motion had ended, in seconds.
 
-    0 where `samples`, oldest first, do not reach back to a commanded motion.
+    Returns 0 if `samples`, oldest first, do not reach back to a commanded motion.
     """
     last_loud_s: float | None = None
     for sample in reversed(samples):
@@ -196,5 +200,5 @@ def ringing_s(samples: Sequence[RobotSample], criteria: SettleCriteria) -> float
 
 
 def driven(sample: RobotSample) -> bool:
-    """Whether the controller drives the arm in this sample."""
+    """Whether the controller drives the arm in this sample, i.e. any target joint velocity is not zero."""
     return bool(np.any(np.abs(sample.target_velocities_rad_s) > TARGET_AT_REST_RAD_S))

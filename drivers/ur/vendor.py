@@ -1,4 +1,4 @@
-"""The part of ur_rtde that the driver uses, typed: the library itself ships no types."""
+"""Types for the part of ur_rtde that the driver uses; the library itself ships none."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import rtde_receive
 
 
 class Connection(Protocol):
-    """What the four interfaces share."""
+    """The methods that all four interfaces share."""
 
     def isConnected(self) -> bool: ...  # noqa: D102 - the vendor's names and meanings
     def disconnect(self) -> None: ...  # noqa: D102
@@ -56,7 +56,7 @@ class AsyncStatus(Protocol):
 
 
 class Control(Connection, Protocol):
-    """rtde_control.RTDEControlInterface; calls return False where they fail."""
+    """rtde_control.RTDEControlInterface; its calls return False on failure."""
 
     def isProgramRunning(self) -> bool: ...  # noqa: D102
     def reuploadScript(self) -> bool: ...  # noqa: D102
@@ -76,22 +76,25 @@ class Control(Connection, Protocol):
 
 
 def dashboard(host: str) -> Dashboard:
-    """A dashboard client that is not connected yet."""
+    """Create a dashboard client without connecting it."""
     return cast("Dashboard", dashboard_client.DashboardClient(host))
 
 
 def receive(host: str, frequency_hz: float, variables: list[str]) -> Receive:
-    """Connect and stream these output fields."""
+    """Connect the receive interface and stream these RTDE output fields. Raises RuntimeError."""
     return cast("Receive", rtde_receive.RTDEReceiveInterface(host, frequency_hz, variables))
 
 
 def input_output(host: str) -> InputOutput:
-    """Connect."""
+    """Connect the input/output interface. Raises RuntimeError."""
     return cast("InputOutput", rtde_io.RTDEIOInterface(host))
 
 
 def control(host: str, frequency_hz: float) -> Control:
-    """Connect and start the control script, without claiming the registers of an external force sensor."""
+    """Connect the control interface and start its script, without the registers of an external force sensor.
+
+    Raises RuntimeError.
+    """
     interface = rtde_control.RTDEControlInterface
     flags = interface.FLAG_UPLOAD_SCRIPT | interface.FLAG_NO_EXT_FT
     return cast("Control", interface(host, frequency_hz, flags))

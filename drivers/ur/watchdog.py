@@ -1,8 +1,7 @@
-"""Hands the runner's heartbeat on to the controller's own watchdog, which ends the program when it stays away.
+"""Forwards the runner's heartbeat to the controller's own watchdog, which stops the arm when the heartbeat ends.
 
-Each beat of the program that uses the arm becomes one kick; there is no clock of the driver in between. So whatever
-dies or stands still, that program, this process or the network between, the kicks end with it, and the controller
-stops its program and the arm without anybody's help.
+Each heartbeat of the program that uses the arm becomes one kick; the driver adds no timer of its own. If that
+program, this process or the network dies or hangs, the kicks end, and the controller stops the arm by itself.
 """
 
 from __future__ import annotations
@@ -19,17 +18,21 @@ from drivers.ur.latch import Latch
 from drivers.ur.link import VENDOR_ERRORS
 from drivers.ur.stream import driven
 
-LATE = 0.8  # of the watchdog's time: a longer gap between two kicks explains that it ended the program
-LAPSE_S = 2.0  # longest gap that counts as a busy machine, where the arm stood
-NEWS_S = 1.0  # after a gap, for what the controller did meanwhile to arrive here
+LATE = 0.8  # fraction of the watchdog's timeout; a longer gap between kicks explains why the program ended
+LAPSE_S = 2.0  # longest gap that counts as a busy machine if the arm stood still
+NEWS_S = 1.0  # time after a gap for the controller's reaction to become visible here
 
 _LOG = logging.getLogger(__name__)
 
 
 class Watchdog:
-    """Kicks the watchdog of the control script, in a thread, once for each beat.
+    """Kicks the watchdog of the control script from a thread, once per heartbeat.
 
-    `newest` gives the newest sample of the arm, None where the stream is dead.
+    Args:
+        latch: told when the control script ended unexpectedly.
+        watchdog_s: timeout of the controller's watchdog.
+        unattended_s: time after which the kicks stop for a moving arm whose state nobody has queried.
+        newest: returns the newest sample of the arm, or None if the stream is dead.
     """
 
     def __init__(
@@ -42,28 +45,28 @@ class Watchdog:
         self._control: library.Control | None = None
         self._beaten = threading.Event()
         self._beat_s = self._kicked_s = self._attended_s = self._gap_end_s = -float("inf")
-        self._gap_s = 0.0  # the newest one that was too long, and when it ended
+        self._gap_s = 0.0  # the last gap that was too long; it ended at _gap_end_s
         self._moving = False
         self._left_alone = self._lapsed = False
         threading.Thread(target=self._run, name="ur watchdog", daemon=True).start()
 
     def beat(self, sent_monotonic_s: float) -> None:
-        """A sign of life of the program that uses the arm, sent then."""
+        """Receive a heartbeat of the program that uses the arm, with the host time.monotonic() of its sending."""
         self._beat_s = sent_monotonic_s
         self._beaten.set()
 
     @contextlib.contextmanager
     def commanding(self) -> Generator[None]:
-        """Give the control interface commands inside: a kick between a command and its answer loses the answer.
+        """Block kicks while the control interface is given commands: a kick before the answer would lose the answer.
 
-        A command is a kick as well, since it writes the same register.
+        A command counts as a kick too, because it writes the same register.
         """
         with self._commands:
             yield
             self._note_kick()
 
     def guard(self, control: library.Control) -> None:
-        """Watch the control script that runs now, unless it is watched already. Raises the vendor's errors."""
+        """Start the watchdog of the running control script, unless it runs already. Raises the vendor's errors."""
         with self._commands:
             if self._control is not None:
                 return
@@ -74,13 +77,13 @@ class Watchdog:
             self._lapsed = False
 
     def release(self) -> None:
-        """The script is about to be ended on purpose."""
+        """Stop guarding the script, because it is about to be ended on purpose."""
         with self._commands:
             self._control = None
             self._moving = False
 
     def excuse(self) -> None:
-        """A command has just failed: a script that ended with it died of it, unless its watchdog was late."""
+        """Handle a failed command: if the script ended, the command caused it, unless the kicks came late."""
         with self._commands:
             control = self._control
             if control is None or control.isProgramRunning():
@@ -90,25 +93,28 @@ class Watchdog:
             self.release()
 
     def begin(self) -> None:
-        """A motion is about to begin."""
+        """Note that a motion is about to begin."""
         self.attend()
         self._moving = True
 
     def arrive(self) -> None:
-        """The motion has ended as it should."""
+        """Note that the motion has ended normally."""
         self._moving = False
 
     @property
     def moving(self) -> bool:
-        """Whether a motion was begun whose end nobody has seen."""
+        """Whether a motion was started whose end has not been observed yet."""
         return self._moving
 
     def attend(self) -> None:
-        """Somebody has just looked at the arm: the main loop of the program that uses it is alive too."""
+        """Note that the program has queried the arm, so its main loop is alive too."""
         self._attended_s = time.monotonic()
 
     def look(self) -> None:
-        """Find out whether the script that is guarded has ended, and why. Raises the vendor's errors."""
+        """Check whether the guarded script has ended, and why; latches the arm if it ended unexpectedly.
+
+        Raises the vendor's errors.
+        """
         with self._commands:
             control = self._control
             if control is None or control.isProgramRunning():
@@ -129,7 +135,7 @@ class Watchdog:
             self._latch.end(what)
 
     def lapsed(self) -> bool:
-        """Whether the script has ended, while the arm stood, because this machine was busy for a moment.
+        """Whether the script ended while the arm stood still, because this machine was briefly busy.
 
         Raises the vendor's errors.
         """
@@ -141,7 +147,7 @@ class Watchdog:
         while True:
             self._beaten.wait()
             self._beaten.clear()
-            # Somebody who gives a command kicks by that; the next beat comes soon.
+            # A command in progress is a kick too, and the next beat comes soon.
             if self._commands.acquire(timeout=self._watchdog_s / 4):
                 try:
                     self._kick()
@@ -152,7 +158,7 @@ class Watchdog:
 
     def _kick(self) -> None:
         control, sample, now_s = self._control, self._newest(), time.monotonic()
-        # On a dead link the vendor's calls wait for ever; beats that waited in a queue are no signs of life.
+        # On a dead link the vendor's calls hang; a beat that waited in a queue does not prove life.
         if control is None or sample is None or now_s - self._beat_s > self._watchdog_s or not control.isConnected():
             return
         self.look()
@@ -170,6 +176,6 @@ class Watchdog:
         self._kicked_s = now_s
 
     def _unkicked_s(self) -> float:
-        """How long there was no kick; also before the newest one, when its effect may not be known here yet."""
+        """Seconds without a kick, or the length of a recent gap whose effect may not be visible here yet."""
         now_s = time.monotonic()
         return max(now_s - self._kicked_s, self._gap_s if now_s - self._gap_end_s < NEWS_S else 0.0)
