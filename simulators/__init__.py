@@ -1,1 +1,4 @@
-"""Simulators: the other end of each wire, in processes of their own; they import neither drivers nor service."""
+"""Simulated devices, each the other end of a real wire in its own process.
+
+They import neither drivers nor service.
+"""

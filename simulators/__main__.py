@@ -1,4 +1,4 @@
-"""The simulators' command line: `python -m simulators NAME …` prints one ready line and serves until SIGTERM."""
+"""Command line of the simulators: `python -m simulators NAME …` prints one ready line and serves until SIGTERM."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from simulators.serve import SimulatorError
 
 
 class SimulatorModule(Protocol):
-    """What each simulator's module or package offers."""
+    """The functions that each simulator's module or package provides."""
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Declare its options."""
+        """Declare the simulator's options."""
         ...
 
     def serve(self, args: argparse.Namespace) -> None:
-        """Announce and serve until SIGTERM."""
+        """Start, print the ready line and serve until SIGTERM."""
         ...
 
 
@@ -40,7 +40,7 @@ SIMULATORS = {
 
 
 def _load(name: str) -> SimulatorModule:
-    # Imported when asked for: most of them need half a second of libraries that the others do not.
+    # Imported on demand: most simulators need half a second of imports that the others do not.
     return cast(SimulatorModule, importlib.import_module(SIMULATORS[name][0]))
 
 
@@ -56,13 +56,13 @@ def _parser(chosen: str | None) -> argparse.ArgumentParser:
 
 
 def _described(name: str) -> dict[str, object]:
-    """The simulators, or the options of one, as plain data: for a command line that shows them in its own way."""
+    """Return all simulators, or the options of one, as plain data, for other command lines to present."""
     if name not in SIMULATORS:
         return {"simulators": {known: what for known, (_, what) in SIMULATORS.items()}}
     options = argparse.ArgumentParser(add_help=False, conflict_handler="resolve")
     _common(options)
     _load(name).add_arguments(options)
-    # Without a public list of its options, argparse leaves only this one.
+    # argparse has no public list of a parser's options.
     actions: list[argparse.Action] = options._actions
     return {
         "what": SIMULATORS[name][1],
@@ -91,8 +91,8 @@ def _common(command: argparse.ArgumentParser) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one simulator; 0 after SIGTERM, 1 with a reason on stderr, 2 for wrong usage."""
-    # Linear algebra in one thread: its threads wait for one another where many processes share the cores.
+    """Run one simulator. Returns 0 after SIGTERM, 1 with the reason on stderr, 2 for wrong usage."""
+    # One thread for linear algebra: its threads block one another when many processes share the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _keep_freed_memory()
     words = list(sys.argv[1:] if argv is None else argv)
@@ -119,7 +119,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _keep_freed_memory() -> None:
-    """Rendering makes and frees arrays of megabytes by the thousand; glibc would give each back to the system."""
+    """Keep freed memory: rendering allocates thousands of large arrays, and glibc would return each to the OS."""
     with suppress(OSError, AttributeError):
         libc = ctypes.CDLL("libc.so.6")
         for option, value in ((-3, 32 << 20), (-1, 1 << 30)):  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD of malloc.h

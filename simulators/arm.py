@@ -1,4 +1,4 @@
-"""Where the simulated arm's flange really is: forward kinematics with errors in the DH parameters."""
+"""The simulated arm's true flange pose: forward kinematics with errors in the DH parameters and the gears."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ _ALPHA_RAD = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class ArmErrors:
-    """What a real arm has and its controller does not know."""
+    """Errors of the real arm that its controller does not know."""
 
-    dh_deltas: Array  # (6, 4) added to a, d (metres), alpha, theta (radians): as built, not as drawn
-    wave_rad: Array  # (6,) amplitude of each gear's transmission error, periodic in the joint's angle
-    wave_number: Array  # (6,) periods a revolution
+    dh_deltas: Array  # (6, 4) added to a, d (metres), alpha, theta (radians): as-built minus nominal
+    wave_rad: Array  # (6,) amplitude of each gear's transmission error, which is periodic in the joint angle
+    wave_number: Array  # (6,) periods per revolution
     wave_phase_rad: Array  # (6,)
 
     def scaled(self, dh: float, wave: float) -> ArmErrors:
-        """The same errors, larger or smaller."""
+        """Return these errors with the DH errors and the gear errors scaled."""
         return dataclasses.replace(self, dh_deltas=self.dh_deltas * dh, wave_rad=self.wave_rad * wave)
 
 
 def perturbed_forward(q: Array, errors: ArmErrors) -> Array:
-    """T_base_flange (4, 4) at joints q (6,) as the controller reads them."""
+    """Return the true T_base_flange (4, 4) at joints q (6,) in radians, as the controller reads them."""
     T_base_link = np.eye(4)
     true_q = q + errors.wave_rad * np.sin(errors.wave_number * q + errors.wave_phase_rad)
     nominal = np.stack([ARM_MODEL.a_m, ARM_MODEL.d_m, _ALPHA_RAD, true_q], axis=1)

@@ -1,4 +1,4 @@
-"""A CT suite: scans the scene and writes the DICOM series, in a patient frame of its own."""
+"""A simulated CT suite: scans the scene and writes a DICOM series, in a patient frame of its own."""
 
 from __future__ import annotations
 
@@ -41,7 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def serve(args: argparse.Namespace) -> None:
-    """Write a series and announce; without --once go on until SIGTERM, with another series at each SIGUSR1."""
+    """Write a series and print the ready line.
+
+    Without --once serve until SIGTERM, with another series at each SIGUSR1.
+    """
     termination = Termination(with_parent=args.with_parent)
     asked = False
 
@@ -63,9 +66,9 @@ def serve(args: argparse.Namespace) -> None:
 
 
 def true_frames(seed: int) -> tuple[Array, Array]:
-    """T_world_ct of the patient frame, and T_world_gantry whose axes are those of the image grid."""
+    """Return T_world_ct (patient frame) and T_world_gantry (axes of the image grid), both (4, 4)."""
     rng = np.random.default_rng([seed, 0xC7])
-    # The board lies in the gantry a little askew, and the patient frame is what the scanner makes of it.
+    # The board lies slightly askew in the gantry, and the scanner defines the patient frame.
     T_world_gantry = from_euler(rng.uniform(-0.10, 0.10, 3) * [1.0, 1.0, 3.0], np.zeros(3))
     T_ct_gantry = from_euler(rng.uniform(-np.pi, np.pi, 3), rng.uniform(-0.3, 0.3, 3))
     return T_world_gantry @ inverse(T_ct_gantry), T_world_gantry
@@ -100,10 +103,10 @@ def write_series(
     implicit: bool = False,
     faults: FaultPlan,
 ) -> None:
-    """Write one file a slice of volume (K, J, I); T_ct_grid is rigid, its origin the centre of voxel (0, 0, 0).
+    """Write volume (K, J, I) as one DICOM file per slice.
 
-    Faults of the device `ct`, on `slice`: drop (a gap), truncate, corrupt, duplicate, tilt, disk_full;
-    on `series`: localiser.
+    `T_ct_grid` is rigid, with its origin at the centre of voxel (0, 0, 0). Faults of the device `ct`: on `slice` drop
+    (a gap), truncate, corrupt, duplicate, tilt, disk_full; on `series` localiser.
     """
     common = _common(volume.shape, grid, T_ct_grid, series)
     syntax = ImplicitVRLittleEndian if implicit else ExplicitVRLittleEndian
@@ -132,7 +135,7 @@ def write_series(
 
 
 def _common(shape: tuple[int, ...], grid: Grid, T_ct_grid: Array, series: str) -> Dataset:
-    """What all slices share."""
+    """The elements that all slices share."""
     common = Dataset()
     common.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
     common.SOPClassUID = CTImageStorage
@@ -162,7 +165,7 @@ def _common(shape: tuple[int, ...], grid: Grid, T_ct_grid: Array, series: str) -
 
 
 def _decimal(value: float) -> str:
-    """A DICOM decimal string: at most 16 characters."""
+    """Format a number as a DICOM decimal string, of at most 16 characters."""
     return f"{value:.10f}"[:16]
 
 

@@ -1,4 +1,4 @@
-"""Hounsfield volumes of the scene: columns cast through its closed solids, so that partial volumes are right."""
+"""Hounsfield volumes of the scene, from rays cast through its closed solids, which gives correct partial volumes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from simulators.world import RADIUS_M, Scene
 AIR, WOOD, TISSUE, BONE, PLASTIC, STEEL = -1000.0, -480.0, 50.0, 650.0, 150.0, 3000.0
 HOUNSFIELD = {"specimen": TISSUE, "board": WOOD, "post": WOOD, "steel": STEEL}
 NOISE_HU = 15.0
-BLUR_VOXELS = 0.55  # of the scanner's point spread, as a Gaussian sigma
+BLUR_VOXELS = 0.55  # Gaussian sigma of the scanner's point spread
 MARGIN_VOXELS = 8
-_SUBRAY_PITCH_M = 0.27e-3  # lateral antialiasing; along the ray it is exact
-_MOST_SUBRAYS = 3  # a side: what more would show drowns in the noise
-_ROWS = 24  # rows J computed together
-_HALO = 3  # rows that the blur needs beside them
-_RESTART_M = 2e-6  # past a hit, to find the next
+_SUBRAY_PITCH_M = 0.27e-3  # lateral antialiasing; along the ray the coverage is exact
+_MOST_SUBRAYS = 3  # per side; more would not be visible above the noise
+_ROWS = 24  # rows J computed at a time
+_HALO = 3  # additional rows on each side that the blur needs
+_RESTART_M = 2e-6  # offset past a hit when searching for the next one
 
 
 Box = tuple[slice, slice, slice]
@@ -31,7 +31,7 @@ Box = tuple[slice, slice, slice]
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Voxel centres: p_world = T_world_grid @ (voxel_m * (i, j, k)); rays run along k."""
+    """A grid of voxel centres p_world = T_world_grid @ (voxel_m * (i, j, k)); rays run along k."""
 
     T_world_grid: Array
     voxel_m: float
@@ -39,7 +39,7 @@ class Grid:
 
 
 def grid_around(scene: Scene, T_world_gantry: Array, voxel_m: float, *, control_spheres: bool) -> Grid:
-    """The smallest grid along the gantry's axes that holds the scene with a margin of air."""
+    """Return the smallest grid along the gantry's axes that contains the scene with a margin of air."""
     vertices, _ = scene.solid_mesh(control_spheres)
     p = apply(inverse(T_world_gantry), vertices)
     low = p.min(axis=0) - MARGIN_VOXELS * voxel_m
@@ -50,7 +50,7 @@ def grid_around(scene: Scene, T_world_gantry: Array, voxel_m: float, *, control_
 
 
 class _Solid:
-    """One closed part under embree, in the grid's frame."""
+    """One closed part in an embree scene, in the frame of the grid."""
 
     def __init__(self, part: Part, grid: Grid) -> None:
         self.hounsfield = HOUNSFIELD[part.material]
@@ -62,7 +62,7 @@ class _Solid:
         self._vertices = p
 
     def coverage(self, grid: Grid, first_row: int, rows: int) -> tuple[Box, Array32] | None:
-        """The box of voxels (slices k, j, i) of these rows that the solid can touch, and the fraction inside."""
+        """Box of voxels (slices k, j, i) of these rows that the solid can touch, and each one's fraction inside."""
         h = grid.voxel_m
         low = np.maximum(np.floor(self.low / h).astype(int) - 1 - [0, first_row, 0], 0)
         high = np.ceil(self.high / h).astype(int) + 2 - [0, first_row, 0]
@@ -87,7 +87,7 @@ class _Solid:
             hit = face >= 0
             origins, cell, face = origins[hit], cell[hit], face[hit]
             z = self._depth(origins, face)
-            # Voxel k spans k - 0.5 to k + 0.5: the one that is entered gets the rest of its length, later ones all.
+            # Voxel k spans k - 0.5 to k + 0.5: the voxel of entry gets the rest of its length, later ones are full.
             u = np.clip(z / h + 0.5 - low[2], 0.0, n_k)
             k = u.astype(np.int64)
             sign = np.where(self._entering[face], 1.0, -1.0)
@@ -101,7 +101,7 @@ class _Solid:
         return box, np.clip(inside, 0.0, 1.0, out=inside)
 
     def _depth(self, origins: Array32, face: NDArray[np.int32]) -> Array:
-        """z where vertical rays meet their faces, in double precision."""
+        """Depth z at which vertical rays hit their faces, in double precision."""
         p = self._vertices[face]
         n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
         nz = np.where(np.abs(n[:, 2]) < 1e-18, 1e-18, n[:, 2])
@@ -110,7 +110,10 @@ class _Solid:
 
 
 def voxelise(scene: Scene, grid: Grid, *, control_spheres: bool) -> NDArray[np.int16]:
-    """The scene in Hounsfield units (K, J, I), with point spread and noise; later parts displace earlier ones."""
+    """Voxelise the scene in Hounsfield units (K, J, I), with point spread and noise.
+
+    Later parts displace earlier ones.
+    """
     K, J, width = grid.shape
     out = np.empty(grid.shape, dtype=np.int16)
     order = {"board": 0, "posts": 1, "specimen": 2, "wires": 3}
@@ -140,12 +143,12 @@ def voxelise(scene: Scene, grid: Grid, *, control_spheres: bool) -> NDArray[np.i
 
 
 def _fill(slab: Array32, inside: Array32, hounsfield: float | Array32) -> None:
-    """Let `inside` of each voxel be of this material."""
+    """Blend a material into the slab by the fraction `inside` of each voxel."""
     slab += inside * (hounsfield - slab)
 
 
 def _add_sphere(slab: Array32, grid: Grid, first_row: int, centre: Array) -> None:
-    """A plastic sphere, from its signed distance: exact for a voxel that its surface cuts almost flat."""
+    """Add a plastic sphere from its signed distance, which is accurate even where its surface grazes a voxel."""
     h = grid.voxel_m
     reach = RADIUS_M + 2 * h
     low = np.maximum(np.floor((centre - reach) / h).astype(int) - [0, first_row, 0], 0)
@@ -165,7 +168,7 @@ def _add_sphere(slab: Array32, grid: Grid, first_row: int, centre: Array) -> Non
 
 
 def _bone(scene: Scene, grid: Grid, origin: NDArray[np.int64], inside: Array32) -> Array32:
-    """Bone or not, in a box at voxel `origin` (i, j, k): vertebral bodies, and processes in the wound."""
+    """Hounsfield values of bone or soft tissue in a box at voxel `origin` (i, j, k)."""
     bone = np.zeros(inside.shape, dtype=np.float32)
     k, j, i = np.nonzero(inside > 0.02)
     if len(k) == 0:
@@ -189,7 +192,7 @@ def _bone(scene: Scene, grid: Grid, origin: NDArray[np.int64], inside: Array32) 
 
 
 def _blurred(slab: Array32) -> Array32:
-    """Gaussian blur of BLUR_VOXELS along all three axes."""
+    """Apply a Gaussian blur of BLUR_VOXELS along all three axes."""
     K, rows, width = slab.shape
     kernel = cv2.getGaussianKernel(2 * _HALO + 1, BLUR_VOXELS, cv2.CV_32F)
     one = np.ones((1, 1), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""FaultPlan: which message to which simulated device goes wrong, and how."""
+"""FaultPlan: which message of which simulated device fails, and how."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ ANY = "*"
 
 
 class Fault(BaseModel):
-    """One planned fault: the `nth` (from 1) message `on` to `device`, and the `times` - 1 after it."""
+    """One planned fault of the `nth` (from 1) message `on` of `device`, and of the `times` - 1 messages after it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     device: str
-    on: str = Field(description="name of the message or operation; * counts every message of the device")
+    on: str = Field(description="name of the message or operation; * matches every message of the device")
     kind: str = Field(
         description="drop, stall, truncate, corrupt, reject, protective_stop, disk_full, smear, black, …"
     )
@@ -30,7 +30,7 @@ class Fault(BaseModel):
     )
 
     def due(self, count: int) -> bool:
-        """Whether the count-th (from 1) matching message is one of those to go wrong."""
+        """Whether the count-th (from 1) matching message is to fail."""
         return self.nth <= count < self.nth + self.times
 
 
@@ -38,7 +38,7 @@ _FAULTS = TypeAdapter(tuple[Fault, ...])
 
 
 class FaultPlan:
-    """The faults of a simulator, with its own counters; safe to use from several threads."""
+    """The faults of a simulator, with their message counters; thread-safe."""
 
     def __init__(self, faults: tuple[Fault, ...] = ()) -> None:
         self.faults = faults
@@ -47,14 +47,14 @@ class FaultPlan:
 
     @classmethod
     def parse(cls, text: str) -> FaultPlan:
-        """Read a JSON list of faults, or the file of that name. Raises SimulatorError naming what is wrong."""
+        """Parse a JSON list of faults, or read the file of that name. Raises SimulatorError naming the mistake."""
         source = text.strip()
         if not source:
             return cls()
         if not source.startswith(("[", "{")):
             try:
                 source = Path(source).read_text(encoding="utf-8").strip()
-            except (OSError, ValueError) as error:  # ValueError: no such path can be, or no text is in it
+            except (OSError, ValueError) as error:  # ValueError: an impossible path, or a file that is not text
                 why = getattr(error, "strerror", None) or error
                 raise SimulatorError(f"the fault plan {text[:80]!a} cannot be read: {why}") from error
         if source.startswith("{"):
@@ -67,15 +67,15 @@ class FaultPlan:
             raise SimulatorError(f"the fault plan is wrong at {field or 'its start'!a}: {first['msg']}") from error
 
     def to_json(self) -> str:
-        """The plan as parse() reads it (counters are not part of it)."""
+        """Return the plan as JSON that parse() reads; counters are not included."""
         return _FAULTS.dump_json(self.faults).decode()
 
     def for_device(self, *devices: str) -> FaultPlan:
-        """A fresh plan with the faults of these devices only."""
+        """Return a new plan with the faults of these devices only."""
         return FaultPlan(tuple(fault for fault in self.faults if fault.device in devices))
 
     def check(self, device: str, message: str) -> Fault | None:
-        """Count this message and return the fault due for it; None means that all goes well."""
+        """Count this message and return the fault that is due for it, or None."""
         with self._lock:
             self._counts[device, message] += 1
             self._counts[device, ANY] += 1

@@ -1,4 +1,4 @@
-"""Rigid transforms as (4, 4) float64, named T_a_b: p_a = T_a_b @ p_b, for the simulators."""
+"""Rigid transforms for the simulators, as (4, 4) float64 named T_a_b: p_a = T_a_b @ p_b."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Json = dict[str, Any]
 
 
 def transform(rotation: Array, translation_m: Array) -> Array:
-    """T_a_b from the rotation (3, 3) of b's axes in a and the position of b's origin in a (3,)."""
+    """Build T_a_b from the rotation (3, 3) of b's axes in a, and the position (3,) of b's origin in a."""
     T = np.eye(4)
     T[:3, :3] = rotation
     T[:3, 3] = translation_m
@@ -25,12 +25,12 @@ def transform(rotation: Array, translation_m: Array) -> Array:
 
 
 def from_euler(xyz_rad: Array, translation_m: Array) -> Array:
-    """T_a_b from rotations about the fixed x, y and z axes, in this order, and a position."""
+    """Build T_a_b from rotations about the fixed x, y and z axes, in this order, and a position (3,)."""
     return transform(Rotation.from_euler("xyz", xyz_rad).as_matrix(), translation_m)
 
 
 def inverse(T_a_b: Array) -> Array:
-    """T_b_a, exactly rigid."""
+    """Invert a rigid transform; the result is exactly rigid."""
     R = T_a_b[:3, :3]
     return transform(R.T, -R.T @ T_a_b[:3, 3])
 
@@ -41,7 +41,7 @@ def apply(T_a_b: Array, points_b: Array) -> Array:
 
 
 def look_at(eye: Array, target: Array, up: Array) -> Array:
-    """T_world_camera (x right, y down, z forward) at `eye`, looking at `target`, image top towards `up`."""
+    """Build T_world_camera (x right, y down, z forward) at `eye`, looking at `target`, image top towards `up`."""
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross(z, up)
     x /= np.linalg.norm(x)
@@ -49,6 +49,6 @@ def look_at(eye: Array, target: Array, up: Array) -> Array:
 
 
 def smoothstep(low: float, high: float, x: Array) -> Array:
-    """0 below `low`, 1 above `high`, cubic between (low > high falls)."""
+    """Smooth step: 0 below `low`, 1 above `high`, cubic between (falling if low > high)."""
     t = np.clip((x - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)

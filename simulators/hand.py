@@ -1,4 +1,4 @@
-"""A simulated technician who holds the camera: does what the words on the screen say, as well as a person does."""
+"""A simulated technician who holds the camera and follows the words on the screen, about as well as a person does."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import numpy as np
 from simulators.geometry import Array, from_euler
 
 Kind = Literal["steady", "usual", "clumsy"]
-#: How often something goes wrong: every so many presses of the button; 0: never.
+#: A mishap happens every so many presses of the button; 0: never.
 MISHAP_EVERY: Mapping[Kind, int] = {"steady": 0, "usual": 4, "clumsy": 2}
-#: What goes wrong, one after the other.
+#: The mishaps, in the order in which they happen.
 MISHAPS = ("blurred", "half_way", "finger", "settings", "repeated")
-_TREMOR_M, _TREMOR_RAD = 0.012, np.radians(1.2)  # how near a person brings a camera to where it is wanted
+_TREMOR_M, _TREMOR_RAD = 0.012, np.radians(1.2)  # accuracy with which a person brings a camera to a pose
 _REACTION_S = 0.15
-_FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # looks along y, its top up
+_FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # looks along y, top up
 _OVERHEAD = re.compile(r"(\d+) cm above")
 _MOVE = re.compile(r"(\d+) cm (to the right|to the left|forward|back|higher|lower)")
 _TURN = re.compile(r"(turn|tilt|lean) (\d+)° (to the left|to the right|up|down)")
@@ -36,7 +36,7 @@ _DIRECTIONS = {
 
 @dataclass(frozen=True, slots=True)
 class Grip:
-    """How the camera is held: where in the world (3,), turned about the vertical, leaned right, tilted down."""
+    """Pose of the held camera: position (3,) in the world, turn about the vertical, lean to the right, tilt down."""
 
     position_m: Array
     turn_rad: float = 0.0
@@ -44,15 +44,18 @@ class Grip:
     tilt_rad: float = np.pi / 2
 
     def T_world_camera(self) -> Array:
-        """(4, 4)."""
-        # Tilted first, then leaned, then turned: the order of rotations about fixed axes.
+        """The pose T_world_camera (4, 4)."""
+        # Tilt first, then lean, then turn: the order of rotations about fixed axes.
         held = from_euler(np.array([-self.tilt_rad, self.lean_rad, self.turn_rad]), self.position_m)
         held[:3, :3] = held[:3, :3] @ _FORWARD
         return held
 
 
 def follow(words: str, grip: Grip, above_m: Array, share: float = 1.0) -> Grip:
-    """The grip after `share` of what the words ask for; `above_m` (3,) is the middle of what is photographed."""
+    """Return the grip after `share` of the requested motion.
+
+    `above_m` (3,) is the centre of the photographed object.
+    """
     overhead = _OVERHEAD.search(words)
     if overhead is not None:
         height = np.array([0.0, 0.0, int(overhead.group(1)) / 100])
@@ -76,20 +79,20 @@ def follow(words: str, grip: Grip, above_m: Array, share: float = 1.0) -> Grip:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """What happens around one press of the button."""
+    """What happens during one press of the button."""
 
-    shake: tuple[float, float] = (0.0, 0.0)  # of the picture while the shutter is open, parts of its width
+    shake: tuple[float, float] = (0.0, 0.0)  # image motion during the exposure, as fractions of its width
     finger: bool = False
-    iso: int = 0  # to which the dial was turned by accident; 0: left alone
+    iso: int = 0  # the value to which the dial was turned by accident; 0: not turned
 
 
 @dataclass
 class Hand:
-    """Acts on the world when it reads where to go next; everything else on the screen it leaves unread."""
+    """Acts on the world when it reads where to go next, and ignores all other words on the screen."""
 
     kind: Kind
     seed: int
-    hold: Callable[[Array], None]  # the camera is now at this T_world_camera
+    hold: Callable[[Array], None]  # called with the new T_world_camera
     press: Callable[[Press], None]
     above_m: Array
     grip: Grip = field(init=False)
@@ -101,7 +104,7 @@ class Hand:
         self.grip = Grip(self.above_m + np.array([0.0, -0.1, 0.7]))
 
     def read(self, words: str) -> None:
-        """Words that say where to go next, or to take the photograph now; returns at once."""
+        """React to words that say where to go next, or to take the photograph now; returns at once."""
         if words.startswith("next: "):
             threading.Thread(target=self.do, args=(words,), daemon=True).start()
         elif words.startswith("take the photograph now"):
@@ -113,7 +116,7 @@ class Hand:
             self.presses += 1
             rng = np.random.default_rng([self.seed, 0x4A4D, self.presses])
             mishap = self._mishap()
-            # Tremor is about where the words lead: the hand does not wander off by itself.
+            # The tremor is added to the requested pose, so the hand does not drift.
             share = 0.0 if mishap == "repeated" else 0.5 if mishap == "half_way" else 1.0
             wanted = follow(words, self.grip, self.above_m, share)
             shaken = rng.normal(0.0, 1.0, 6)
@@ -144,5 +147,5 @@ class Hand:
         return mishap
 
     def report(self) -> dict[str, Any]:
-        """What went wrong so far, for the truth file."""
+        """Return the mishaps so far, for the truth file."""
         return {"presses": self.presses, "mishaps": list(self.mishaps)}

@@ -1,4 +1,4 @@
-"""What a hand does to a picture: it shakes the camera during the exposure, or a finger comes before the lens."""
+"""Effects of a hand on an image: camera shake during the exposure, or a finger in front of the lens."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SKIN = (205, 150, 125)  # RGB
 
 
 def hand_in_picture(picture: Bytes, view: Mapping[str, Any]) -> Bytes:
-    """The picture (H, W, 3) with what the world's view says of the hand."""
+    """Apply the hand's effects, as given by the world's view, to a picture (H, W, 3)."""
     hand = view.get("hand") or {}
     out = _finger(picture) if hand.get("finger") else picture
     dx, dy = (float(part) * picture.shape[1] for part in hand.get("shake", (0.0, 0.0)))
@@ -22,7 +22,7 @@ def hand_in_picture(picture: Bytes, view: Mapping[str, Any]) -> Bytes:
 
 
 def _shaken(picture: Bytes, dx: float, dy: float) -> Bytes:
-    """Smeared along (dx, dy) pixels at constant speed."""
+    """Smear the picture along (dx, dy) pixels, at constant speed."""
     reach = int(np.ceil(max(abs(dx), abs(dy)) / 2)) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
     for t in np.linspace(-0.5, 0.5, 8 * reach):
@@ -31,7 +31,7 @@ def _shaken(picture: Bytes, dx: float, dy: float) -> Bytes:
 
 
 def _finger(picture: Bytes) -> Bytes:
-    """A finger tip out of focus over the right third."""
+    """Draw a finger tip, out of focus, over the right third of the picture."""
     height, width = picture.shape[:2]
     mask = np.zeros((height, width), dtype=np.float32)
     centre, axes = (round(1.02 * width), round(0.6 * height)), (round(0.48 * width), round(0.45 * height))

@@ -14,7 +14,7 @@ FULL_WIDTH, FULL_HEIGHT = 9504, 6336
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """In pixels of an image of width × height; pixel centres lie at integer coordinates."""
+    """Camera intrinsics in pixels of a width × height image; pixel centres lie at integer coordinates."""
 
     width: int
     height: int
@@ -28,11 +28,11 @@ class Intrinsics:
     p2: float
 
     def to_json(self) -> dict[str, float | int]:
-        """The fields by name, as camera.json has them."""
+        """Return the fields by name, as in camera.json."""
         return dataclasses.asdict(self)
 
     def scaled(self, width: int) -> Intrinsics:
-        """The same lens at another image width; the height keeps the sensor's 3:2."""
+        """Return the same lens at another image width; the height keeps the sensor's 3:2."""
         height = round(width * FULL_HEIGHT / FULL_WIDTH)
         sx, sy = width / self.width, height / self.height
         return dataclasses.replace(
@@ -46,13 +46,13 @@ class Intrinsics:
         )
 
     def project(self, points_camera: Array) -> Array:
-        """Pixels (..., 2) of points (..., 3) in the camera frame."""
+        """Project points (..., 3) in the camera frame to pixels (..., 2)."""
         x, y = (points_camera[..., k] / points_camera[..., 2] for k in (0, 1))
         xd, yd = self._distort(x, y)
         return np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=-1)
 
     def rays(self, pixels: Array) -> Array:
-        """Directions (..., 3) with z = 1 in the camera frame that fall on these pixels (..., 2), to 1e-12."""
+        """Return ray directions (..., 3) with z = 1 in the camera frame for pixels (..., 2), accurate to 1e-12."""
         xd = (pixels[..., 0] - self.cx) / self.fx
         yd = (pixels[..., 1] - self.cy) / self.fy
         x, y = xd, yd

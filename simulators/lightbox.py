@@ -1,4 +1,4 @@
-"""The light and environment box at the other end of a serial line: a pseudo-terminal with its ASCII protocol."""
+"""The simulated light and environment box: its ASCII protocol on a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def serve(args: argparse.Namespace) -> None:
-    """Serve until SIGTERM; each SIGUSR1 is a press of the pedal."""
+    """Serve until SIGTERM; each SIGUSR1 is one press of the pedal."""
     termination = Termination(with_parent=args.with_parent)
     box = Lightbox(args.faults, World(args.world) if args.world else None, args.link, tower=not args.without_tower)
 
@@ -52,7 +52,7 @@ def serve(args: argparse.Namespace) -> None:
 
 
 class World:
-    """What the rig says of light, temperature and pedal; kept for a moment, asked again when the link was lost."""
+    """Light, temperature and pedal as the rig reports them, cached for a moment; reconnects after a lost link."""
 
     def __init__(self, address: str) -> None:
         host, _, port = address.rpartition(":")
@@ -63,7 +63,7 @@ class World:
         self._asked_s = -1.0
 
     def view(self) -> dict[str, float]:
-        """light_lux, temperature_c, pedal_presses; the last known when the world does not answer."""
+        """Return light_lux, temperature_c and pedal_presses; the last known values if the world does not answer."""
         if time.monotonic() - self._asked_s > 0.05:
             try:
                 with socket.create_connection(self._address, timeout=1.0) as link, link.makefile("rb") as lines:
@@ -78,7 +78,7 @@ class World:
 
 
 class Lightbox:
-    """State of the box and its end of the line."""
+    """The state of the box and its end of the serial line."""
 
     def __init__(self, faults: FaultPlan, world: World | None, link: Path | None, *, tower: bool = True) -> None:
         self._faults = faults
@@ -91,9 +91,9 @@ class Lightbox:
         self._tower = "OFF" if tower else None
 
     def plug_in(self) -> str:
-        """Make the pseudo-terminal and its link, say the banner; returns the path of the terminal."""
+        """Create the pseudo-terminal and its link and send the banner; returns the path of the terminal."""
         master, slave = os.openpty()
-        # The slave stays open here, so that the terminal lives on while no client holds it.
+        # The slave stays open here, so that the terminal survives while no client holds it.
         tty.setraw(slave)
         name = os.ttyname(slave)
         os.set_blocking(master, False)
@@ -108,7 +108,7 @@ class Lightbox:
         return name
 
     def unplug(self) -> None:
-        """Pull the cable: the terminal vanishes."""
+        """Simulate a pulled cable: the terminal disappears."""
         if self._ends is None:
             return
         for end in self._ends:
@@ -118,11 +118,11 @@ class Lightbox:
             self._link.unlink()
 
     def press_pedal(self) -> None:
-        """One press, in stand-alone use."""
+        """Press the pedal once, without a rig."""
         self._pressed += 1
 
     def serve_once(self, timeout_s: float) -> None:
-        """Answer what comes within the time."""
+        """Answer the requests that arrive within `timeout_s`."""
         if self._ends is None:
             return
         master = self._ends[0]
@@ -147,13 +147,13 @@ class Lightbox:
         self._send(answer)
 
     def _send(self, data: bytes) -> None:
-        """What a client does not fetch is lost, as on any line without flow control."""
+        """Send bytes; what the client does not read is lost, as on any line without flow control."""
         if self._ends is not None:
             with suppress(BlockingIOError):
                 os.write(self._ends[0], data)
 
     def _spoiled(self, fault: Fault, answer: bytes) -> bool:
-        """Let the fault happen; whether the answer is done with."""
+        """Apply the fault; returns whether it replaces the answer."""
         seconds = float(fault.value) if isinstance(fault.value, (int, float)) else 0.5
         match fault.kind:
             case "drop":

@@ -1,4 +1,4 @@
-"""Light at the vertices of the scene: soft shadow of a surgical lamp, and how much of the room each vertex sees."""
+"""Light at the scene's vertices: the soft shadow of a surgical lamp, and the share of the room each vertex sees."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ ROOM_SAMPLES = 28
 
 
 class Caster:
-    """Rays against a fixed triangle mesh."""
+    """Casts rays against a fixed triangle mesh."""
 
     def __init__(self, vertices: Array, faces: Ints) -> None:
         self._scene = EmbreeScene()
         self._mesh = TriangleMesh(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
 
     def blocked(self, origins: Array32, directions: Array32) -> Bools:
-        """Whether each ray (N, 3) meets something within the length of its direction."""
-        # embreex knows no segments: cast and compare the distance with the direction's length, which is 1.
+        """Whether each ray (N, 3) hits something within the length of its direction."""
+        # embreex cannot cast segments: compare the hit distance with the direction's length, which is 1.
         hit = self._scene.run(origins, directions, query="INTERSECT", output=True)
         return (hit["primID"] >= 0) & (hit["tfar"] < 1.0)
 
     def first(self, origins: Array32, directions: Array32) -> tuple[Ints, Array32, Array32, Array32]:
-        """Face (-1 for none), distance in lengths of the direction, and barycentric u, v of the first hit (N,)."""
+        """Face (-1: none), distance in lengths of the direction, and barycentric u, v of each first hit (N,)."""
         hit = self._scene.run(origins, directions, query="INTERSECT", output=True)
         return hit["primID"].astype(np.int64), hit["tfar"], hit["u"], hit["v"]
 
 
 def disk(samples: int) -> Array:
-    """Evenly spread points (samples, 2) in the unit disk (Vogel's spiral)."""
+    """Return evenly distributed points (samples, 2) in the unit disk (Vogel's spiral)."""
     k = np.arange(samples)
     radius, angle = np.sqrt((k + 0.5) / samples), k * np.pi * (3.0 - np.sqrt(5.0))
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
 def blocked_rays(caster: Caster, vertices: Array, normals: Array, lamp_m: Array) -> Bools:
-    """(LAMP_SAMPLES + ROOM_SAMPLES, V): whether something stands between a vertex and that part of lamp or room."""
+    """Whether something occludes each sample of lamp and room, per vertex: (LAMP_SAMPLES + ROOM_SAMPLES, V)."""
     start = (vertices + 4e-4 * normals).astype(np.float32)
     towards_lamp = (
         (lamp_m + np.array([dx, dy, 0.0]) - vertices).astype(np.float32)
         for dx, dy in LAMP_RADIUS_M * disk(LAMP_SAMPLES)
     )
-    # Reach of the occlusion: 0.25 m.
+    # Ambient occlusion reaches 0.25 m.
     towards_room = (
         np.ascontiguousarray(np.broadcast_to((0.25 * direction).astype(np.float32), start.shape))
         for direction in _room()
@@ -57,7 +57,7 @@ def blocked_rays(caster: Caster, vertices: Array, normals: Array, lamp_m: Array)
 
 
 def vertex_light(blocked: Bools, vertices: Array, normals: Array, lamp_m: Array) -> Array32:
-    """(V, 2): lamp (visibility × cosine × distance law, 1 in the middle of the board) and room (openness, 0..1)."""
+    """Return (V, 2): lamp (visibility × cosine × distance law, 1 at the board's centre) and room (openness, 0…1)."""
     to_lamp = lamp_m - vertices
     distance = np.linalg.norm(to_lamp, axis=1)
     cosine = np.maximum(0.0, np.sum(to_lamp * normals, axis=1) / distance)
@@ -72,7 +72,7 @@ def vertex_light(blocked: Bools, vertices: Array, normals: Array, lamp_m: Array)
 
 
 def _room() -> list[Array]:
-    """Directions (3,) over the upper half space."""
+    """Unit directions (3,) over the upper hemisphere."""
     rng = np.random.default_rng(0)
     directions: list[Array] = []
     for x, y in disk(ROOM_SAMPLES):

@@ -1,4 +1,4 @@
-"""Noise images for textures: lattice noise whose features do not depend on the resolution it is drawn at."""
+"""Lattice noise for textures, with features that do not depend on the resolution at which it is drawn."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from simulators.geometry import Array32
 
 
 class Noise:
-    """Noise of one texture of rows × columns texels that covers extent_m (rows, columns) metres."""
+    """Noise of one texture with `shape` (rows, columns) texels covering `extent_m` (rows, columns) metres."""
 
     def __init__(self, seed: int, shape: tuple[int, int], extent_m: tuple[float, float]) -> None:
         self.shape = shape
@@ -17,7 +17,7 @@ class Noise:
         self._seed = seed
 
     def field(self, name: int, cell_m: float, stretch: float = 1.0) -> Array32:
-        """About N(0, 1) with features of `cell_m`, `stretch` times as long along the rows' direction (axis 0)."""
+        """Return noise of about N(0, 1) with features of `cell_m`, `stretch` times as long along axis 0."""
         rows = max(2, round(self.extent_m[0] / (cell_m * stretch)))
         columns = max(2, round(self.extent_m[1] / cell_m))
         lattice = np.random.default_rng([self._seed, name]).standard_normal((rows, columns), dtype=np.float32)
@@ -26,7 +26,10 @@ class Noise:
         return np.asarray(out, dtype=np.float32)
 
     def octaves(self, name: int, cell_m: float, count: int, gain: float = 0.6, stretch: float = 1.0) -> Array32:
-        """`count` fields, each of half the size and `gain` times the height of the one before; unit-ish variance."""
+        """Sum `count` fields, each with half the feature size and `gain` times the amplitude of the last.
+
+        About unit variance.
+        """
         total = np.zeros(self.shape, dtype=np.float32)
         power = 0.0
         for k in range(count):
@@ -36,17 +39,17 @@ class Noise:
         return total / np.float32(np.sqrt(power) * 0.8)
 
     def rng(self, name: int) -> np.random.Generator:
-        """A generator for strokes and spots, the same at every resolution."""
+        """Return a generator for strokes and spots that is the same at every resolution."""
         return np.random.default_rng([self._seed, name, 1])
 
 
 def ramp(low: float, high: float, x: Array32) -> Array32:
-    """0 below `low`, 1 above `high`, cubic between."""
+    """Smooth ramp: 0 below `low`, 1 above `high`, cubic between."""
     t = np.clip((x - np.float32(low)) / np.float32(high - low), 0.0, 1.0)
     return t * t * (np.float32(3.0) - 2.0 * t)
 
 
 def mixed(base: Array32, colour: tuple[float, float, float], weight: Array32) -> Array32:
-    """base (H, W, 3) blended to a linear colour by weight (H, W)."""
+    """Blend base (H, W, 3) towards a linear colour by weight (H, W)."""
     w = weight[..., None]
     return base + w * (np.array(colour, dtype=np.float32) - base)

@@ -1,4 +1,4 @@
-"""What is drawn exactly, by coverage and not by samples: the marker spheres and the calibration board."""
+"""Draws the marker spheres and the calibration board with exact pixel coverage instead of sampling."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ _SUBSAMPLES = 64
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Rows of an image in the making: linear colour (H, W, 3), depth (H, W), rays (H, W, 3) in the camera frame."""
+    """Rows of an image being rendered: linear colour (H, W, 3), depth (H, W), rays (H, W, 3) in the camera frame."""
 
     colour: Array32
     depth: Array32
     rays: Array
     T_world_camera: Array
     intrinsics: Intrinsics
-    top: int  # image row of the first row
+    top: int  # image row of this frame's first row
 
 
 def half_plane_coverage(distance_px: Array, normal_u: Array, normal_v: Array) -> Array:
-    """Share of a pixel (unit square) inside a straight edge, 0..1.
+    """Return the fraction (0…1) of a unit-square pixel on the inner side of a straight edge.
 
-    `distance_px` is the signed distance of its centre from the edge, positive inside; (normal_u, normal_v) the
-    edge's unit normal. Exact: the integral of the trapezoid that is a square's section perpendicular to the normal.
+    `distance_px` is the signed distance of the pixel centre from the edge, positive inside; (normal_u, normal_v) is
+    the edge's unit normal. Exact: the integral of the trapezoid that is a square's section perpendicular to the
+    normal.
     """
     a, b = np.abs(normal_u), np.abs(normal_v)
     big, small = np.maximum(a, b), np.minimum(a, b)
@@ -45,7 +46,7 @@ def half_plane_coverage(distance_px: Array, normal_u: Array, normal_v: Array) ->
 
 
 def draw_sphere(frame: Frame, centre_camera: Array, centre_world: Array, radius_m: float, lamp_m: Array) -> None:
-    """Draw a matte sphere where nothing stands before it; its outline is exact to a few thousandths of a pixel."""
+    """Draw a matte sphere unless something occludes it; its outline is exact to a few thousandths of a pixel."""
     box = _box(frame, centre_camera, radius_m)
     if box is None:
         return
@@ -53,18 +54,18 @@ def draw_sphere(frame: Frame, centre_camera: Array, centre_world: Array, radius_
     d = frame.rays[rows, columns]
     along = d @ centre_camera
     across = np.linalg.norm(np.cross(d, centre_camera), axis=-1)
-    # Angle inside the outline: nearly linear in pixels, so its gradient turns it into a distance.
+    # Angle inside the outline: nearly linear in pixels, so dividing by its gradient gives a distance.
     inside = np.arcsin(radius_m / np.linalg.norm(centre_camera)) - np.arctan2(across, along)
     g_row, g_column = np.gradient(inside)
     slope = np.maximum(np.hypot(g_row, g_column), 1e-15)
     cover = half_plane_coverage(inside / slope, g_column / slope, g_row / slope)
-    # At the centre the angle has no gradient; all pixels well inside are covered.
+    # At the centre the angle has no gradient, but all pixels well inside are covered.
     cover = np.where(inside > 4.0 / frame.intrinsics.fx, 1.0, cover)
     dd = np.sum(d * d, axis=-1)
     cc = float(centre_camera @ centre_camera)
     root = np.sqrt(np.maximum(along**2 - dd * (cc - radius_m**2), 0.0))
     t = (along - root) / dd
-    # At the outline the ray touches; beyond it the nearest point of the ray stands for the touching point.
+    # At the outline the ray is tangent; beyond it use the point of the ray closest to the centre.
     hit = d * t[..., None] - centre_camera
     normal = (hit / np.linalg.norm(hit, axis=-1, keepdims=True)) @ frame.T_world_camera[:3, :3].T
     colour = _matte(normal, centre_world, radius_m, lamp_m)
@@ -88,12 +89,12 @@ def _box(frame: Frame, centre_camera: Array, radius_m: float) -> tuple[slice, sl
 
 
 def _matte(normal: Array, centre_world: Array, radius_m: float, lamp_m: Array) -> Array32:
-    """Linear colour of a printed sphere at unit normals (…, 3), world."""
+    """Linear colour of a printed sphere at unit normals (…, 3) in the world frame."""
     place = centre_world + radius_m * normal
     to_lamp = lamp_m - place
     distance = np.linalg.norm(to_lamp, axis=-1, keepdims=True)
     cosine = np.sum(normal * to_lamp / distance, axis=-1)
-    # The lamp is a disk: the terminator is soft over its angular radius of about 0.12.
+    # The lamp is a disk: the terminator is softened over its angular radius of about 0.12.
     lamp = np.where(cosine > 0.12, cosine, np.maximum(cosine + 0.12, 0.0) ** 2 / 0.48)
     lamp = lamp * (np.linalg.norm(lamp_m) / distance[..., 0]) ** 2
     room = 0.80 + 0.45 * normal[..., 2]
@@ -106,13 +107,13 @@ def _matte(normal: Array, centre_world: Array, radius_m: float, lamp_m: Array) -
 
 
 def draw_calibration_board(frame: Frame, T_world_board: Array, lamp_m: Array) -> None:
-    """Draw the checkerboard (it lies above everything else); pixels that an edge crosses are sampled 64 times."""
+    """Draw the checkerboard, which lies above everything else; pixels on its edges are sampled 64 times."""
     T_camera_world = np.linalg.inv(frame.T_world_camera)
     T_camera_board = T_camera_world @ T_world_board
     R, origin = T_camera_board[:3, :3], T_camera_board[:3, 3]
     t = (origin @ R[:, 2]) / (frame.rays @ R[:, 2])
     place = frame.rays * t[..., None] - origin
-    # In squares, from the outer corner of the pattern.
+    # In units of squares, from the outer corner of the pattern.
     x, y = place @ R[:, 0] / BOARD_SQUARE_M + 1.0, place @ R[:, 1] / BOARD_SQUARE_M + 1.0
     margin = MARGIN_M / BOARD_SQUARE_M
     outer = np.maximum(
@@ -126,7 +127,7 @@ def draw_calibration_board(frame: Frame, T_world_board: Array, lamp_m: Array) ->
     near = (np.abs(x - np.round(x)) < step_x) | (np.abs(y - np.round(y)) < step_y)
     near |= np.abs(outer - margin) < np.maximum(step_x, step_y)
     edge = np.flatnonzero(near & touched)
-    # R2 sequence: each sample has a row and a column of its own, so edges along the grid are no special case.
+    # R2 sequence: no two samples share a row or column, so edges along the grid are not a special case.
     k = np.arange(_SUBSAMPLES)[:, None]
     sub = (0.5 + k * [0.7548776662466927, 0.5698402909980532]) % 1.0 - 0.5
     sub -= sub.mean(axis=0)
@@ -151,7 +152,7 @@ def draw_calibration_board(frame: Frame, T_world_board: Array, lamp_m: Array) ->
 
 
 def _pattern(x: Array, y: Array) -> Array:
-    """1 on white squares and the margin, 0 on black ones; x and y in squares."""
+    """1 on white squares and the margin, 0 on black squares; x and y in units of squares."""
     columns, rows = BOARD_SQUARES
     on = (x >= 0) & (x < columns) & (y >= 0) & (y < rows)
     return np.where(on, (np.floor(x) + np.floor(y)) % 2, 1.0)

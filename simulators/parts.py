@@ -1,4 +1,4 @@
-"""Closed triangle meshes with texture coordinates: the solids that the scene is made of."""
+"""The solids of the scene: closed triangle meshes with texture coordinates."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from simulators.geometry import Array, Ints
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One piece of the scene, in world metres: vertices (V, 3), outward faces (F, 3), texture coordinates (V, 2)."""
+    """One solid of the scene, in world metres: vertices (V, 3), outward faces (F, 3), texture coordinates (V, 2)."""
 
     name: str
     material: str
@@ -21,7 +21,7 @@ class Part:
 
 
 def joined(name: str, material: str, parts: list[Part]) -> Part:
-    """One part from several of the same material."""
+    """Merge several parts of the same material into one."""
     offsets = np.cumsum([0, *(len(part.vertices_m) for part in parts[:-1])])
     return Part(
         name,
@@ -33,14 +33,14 @@ def joined(name: str, material: str, parts: list[Part]) -> Part:
 
 
 def grid_faces(rows: int, columns: int) -> Ints:
-    """Faces (2 (rows-1) (columns-1), 3) of a row-major grid of vertices, normals along d/drow × d/dcolumn."""
+    """Return the faces (2 (rows-1) (columns-1), 3) of a row-major vertex grid, normals along d/drow × d/dcolumn."""
     i = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
     a, b, c, d = (x.ravel() for x in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 def vertex_normals(vertices: Array, faces: Ints) -> Array:
-    """Unit normals (V, 3), area-weighted."""
+    """Return area-weighted unit normals (V, 3)."""
     p = vertices[faces]
     n = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     out = np.stack([np.bincount(faces.ravel(), np.repeat(n[:, k], 3), len(vertices)) for k in range(3)], axis=1)
@@ -50,7 +50,7 @@ def vertex_normals(vertices: Array, faces: Ints) -> Array:
 def cylinder(
     start_m: Array, end_m: Array, radius_m: float, sides: int, rings: int, v_range: tuple[float, float]
 ) -> Part:
-    """A capped cylinder; u runs around, v along within `v_range`."""
+    """Build a capped cylinder; texture u runs around it, v along it within `v_range`."""
     axis = end_m - start_m
     z = axis / np.linalg.norm(axis)
     x = np.cross(z, [1.0, 0.0, 0.0] if abs(z[0]) < 0.9 else [0.0, 1.0, 0.0])
@@ -60,7 +60,7 @@ def cylinder(
     t = np.linspace(0.0, 1.0, rings + 1)
     circle = radius_m * (np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * y)
     wall = start_m + t[None, :, None] * axis + circle[:, None, :]
-    # The seam repeats its vertices for the texture; bitwise equality keeps the solid closed after merging.
+    # The seam repeats vertices for the texture; bitwise equality keeps the solid closed after merging.
     wall[-1] = wall[0]
     uv = np.stack(
         np.broadcast_arrays(angle[:, None] / (2 * np.pi), v_range[0] + t * (v_range[1] - v_range[0])), axis=-1
@@ -79,7 +79,7 @@ def cylinder(
 
 
 def sphere_mesh(centre_m: Array, radius_m: float, subdivisions: int = 4) -> Part:
-    """A subdivided octahedron whose vertices lie on the sphere: 8 · 4^n faces."""
+    """Build a sphere by subdividing an octahedron: 8 · 4^n faces, with all vertices on the sphere."""
     v = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=np.float64)
     f = np.array(
         [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]], dtype=np.int64
@@ -97,21 +97,21 @@ def sphere_mesh(centre_m: Array, radius_m: float, subdivisions: int = 4) -> Part
 
 
 def box(low_m: Array, high_m: Array, cell_m: float) -> Part:
-    """A closed box whose top is a grid of about `cell_m`, since light is kept at vertices; uv is (x, y)."""
+    """Build a closed box whose top is a grid of about `cell_m`, because light is stored at vertices; uv is (x, y)."""
     nx, ny = (max(1, round(float(s) / cell_m)) for s in (high_m - low_m)[:2])
     x, y = np.linspace(low_m[0], high_m[0], nx + 1), np.linspace(low_m[1], high_m[1], ny + 1)
     gx, gy = np.meshgrid(x, y, indexing="ij")
     top = np.stack([gx, gy, np.full_like(gx, high_m[2])], axis=-1).reshape(-1, 3)
     uv = (top[:, :2] - low_m[:2]) / (high_m - low_m)[:2]
     index = np.arange((nx + 1) * (ny + 1), dtype=np.int64).reshape(nx + 1, ny + 1)
-    # Round the rim with the interior on the left: +x at low y, +y at high x, -x, -y.
+    # Go around the rim with the interior on the left: +x at low y, +y at high x, -x, -y.
     rim = np.concatenate([index[:-1, 0], index[-1, :-1], index[:0:-1, -1], index[0, :0:-1]])
     n, m = len(top), len(rim)
     upper, below = top[rim].copy(), top[rim].copy()
     below[:, 2] = low_m[2]
     u, w = np.arange(m) + n, np.arange(m) + n + m
     un, wn = np.roll(u, -1), np.roll(w, -1)
-    # Side walls have vertices of their own (same positions as the rim), so that normals stay crisp.
+    # The side walls have their own vertices (at the rim's positions), so that edges stay sharp.
     walls = np.concatenate([np.stack([w, wn, un], axis=1), np.stack([w, un, u], axis=1)])
     centre = np.array([[*((low_m + high_m) / 2)[:2], low_m[2]]])
     floor = np.stack([np.full(m, n + 2 * m), np.roll(w, -1), w], axis=1)

@@ -1,4 +1,4 @@
-"""What spoils a picture before it reaches the sensor: a smeared lens, a shake, no light, a cloth in the way."""
+"""Faults that spoil a picture before it reaches the sensor: smeared lens, shake, no light, a cloth in the way."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ import numpy as np
 from simulators.faults import Fault
 from simulators.geometry import Bytes
 
-# Kinds of faults of the message `image`: `smear` lasts until somebody cleans the lens; `blur`, `black` and `covered`
-# last one picture. `value` is σ over the picture's width (smear, blur), or the share of the width under the cloth.
+# Fault kinds of the message `image`: `smear` lasts until somebody cleans the lens; `blur`, `black` and `covered` last
+# one picture. `value` is σ as a fraction of the picture's width (smear, blur), or the fraction of it that is covered.
 _BLUR, _COVERED = 0.004, 0.5
 _CLOTH = (60, 105, 120)  # RGB of a surgical drape
 
 
 class Lens:
-    """The front of the lens: who touches it smears it, and so it stays until it is cleaned. Safe in any thread."""
+    """The front of the lens: a smear stays until somebody cleans it. Thread-safe."""
 
     def __init__(self) -> None:
-        self._smear = 0.0  # σ over the width of the picture
+        self._smear = 0.0  # σ as a fraction of the picture's width
         self._cleanings = 0
         self._lock = threading.Lock()
 
     def picture(self, picture: Bytes, fault: Fault | None, view: Mapping[str, Any]) -> Bytes:
-        """The picture (H, W, 3) as it passes the lens, given the fault that is due and how often it was cleaned."""
+        """Return the picture (H, W, 3) seen through the lens, given the due fault and the world's view."""
         kind = fault.kind if fault is not None else ""
         value = fault.value if fault is not None else None
         share = float(value) if isinstance(value, int | float) else None
@@ -50,7 +50,7 @@ def _blurred(picture: Bytes, share: float) -> Bytes:
 
 
 def _covered(picture: Bytes, share: float) -> Bytes:
-    """A cloth with folds over the left part of the picture, its edge uneven."""
+    """Cover the left part of the picture with a folded cloth with an uneven edge."""
     height, width = picture.shape[:2]
     x, y = np.arange(width, dtype=np.float32)[None, :], np.arange(height, dtype=np.float32)[:, None]
     edge = width * share + 0.02 * width * np.sin(9.0 * y / height)

@@ -1,4 +1,4 @@
-"""What the camera sees: ray casting of the scene with exact outlines, lens distortion, exposure and photon noise."""
+"""Renders what the camera sees: ray casting with exact outlines, lens distortion, exposure and photon noise."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from simulators.world import NOMINAL_LUX, RADIUS_M, Moved, Scene
 
 TILE_PIXELS = 500_000
 MOST_KEPT_RAYS = 16_000_000  # 24 bytes each
-HALO = 4  # rows beyond a tile, so that edges and the lens' blur do not see its border
-_TEXTURES = ((800, 512), (1400, 1024), (2601, 2048))  # image width below which so many texels suffice
+HALO = 4  # additional rows of a tile, so that edge detection and lens blur do not see its border
+_TEXTURES = ((800, 512), (1400, 1024), (2601, 2048))  # texture size that suffices below this image width
 PREVIEW_WIDTH = 640
 FULL_WELL_E, READ_NOISE_E = 40_000.0, 4.0
 BLUR_PX = 0.42
@@ -29,7 +29,7 @@ _SUB = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)], dtype=np.float
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What stands before the lens, as the world's `view` answers it."""
+    """What the camera sees: the parsed answer to the world's `view` request."""
 
     T_world_camera: Array
     intrinsics: Intrinsics
@@ -42,7 +42,7 @@ class View:
 
     @classmethod
     def from_json(cls, view: Mapping[str, Any], width: int) -> View:
-        """From the world's answer, for images of this width."""
+        """Parse the world's answer, for images of this width."""
         scene = view["scene"]
         board = scene.get("board")
         return cls(
@@ -58,7 +58,7 @@ class View:
 
 
 class Renderer:
-    """Renders views at one image width; holds the textures and the light of one scene."""
+    """Renders views at one image width; caches the textures and the light of one scene."""
 
     def __init__(self, image_width: int) -> None:
         self.image_width = image_width
@@ -67,15 +67,18 @@ class Renderer:
         self._rays: tuple[Intrinsics, Array] | None = None
 
     def render(self, view: Mapping[str, Any], camera_settings: Mapping[str, float], seed: int) -> Bytes:
-        """RGB (H, W, 3) of the view; `camera_settings` are exposure_s, iso, aperture_f; `seed` is the noise's."""
+        """Render a view as RGB (H, W, 3).
+
+        `camera_settings` are exposure_s, iso and aperture_f; `seed` is that of the noise.
+        """
         return self._rendered(View.from_json(view, self.image_width), camera_settings, seed)
 
     def preview(self, view: Mapping[str, Any]) -> Bytes:
-        """A small RGB frame at the reference exposure, as live view shows."""
+        """Render a small RGB frame at the reference exposure, for live view."""
         return self._rendered(View.from_json(view, min(PREVIEW_WIDTH, self.image_width)), REFERENCE, 0)
 
     def surfaces(self, seed: int, moved: Moved = ()) -> Surfaces:
-        """The scene's surfaces, built at the first call for a seed, and again when a sphere was moved."""
+        """The surfaces of this seed's scene; built on first use, and again if a sphere was moved."""
         now = None if self._surfaces is None else (self._surfaces.scene.seed, self._surfaces.scene.moved)
         if self._surfaces is None or now != (seed, moved):
             self._surfaces = Surfaces(Scene.generate(seed, moved), self._texture_size)
@@ -88,7 +91,7 @@ class Renderer:
         gain *= (
             settings["exposure_s"] / REFERENCE["exposure_s"] * (REFERENCE["aperture_f"] / settings["aperture_f"]) ** 2
         )
-        electrons = gain * FULL_WELL_E  # per unit of linear colour, before the ISO amplifies
+        electrons = gain * FULL_WELL_E  # per unit of linear colour, before ISO amplification
         amplification = settings["iso"] / REFERENCE["iso"] / FULL_WELL_E
         rng = np.random.default_rng([view.seed, seed])
         image = np.empty((lens.height, lens.width, 3), dtype=np.uint8)
@@ -103,7 +106,7 @@ class Renderer:
         return image
 
     def _linear(self, surfaces: Surfaces, view: View, top: int, bottom: int) -> Array32:
-        """Linear colour (rows, W, 3) of the rows top..bottom."""
+        """Linear colour (rows, W, 3) of the image rows top…bottom."""
         rays = self._ray_rows(view.intrinsics, top, bottom)
         R, eye = view.T_world_camera[:3, :3], view.T_world_camera[:3, 3]
         world = (rays @ R.T).astype(np.float32)
@@ -147,7 +150,7 @@ class Renderer:
         frame.colour.reshape(-1, 3)[at] = total / np.float32(len(_SUB))
 
     def _ray_rows(self, lens: Intrinsics, top: int, bottom: int) -> Array:
-        """Rays (rows, W, 3) of pixel centres, camera frame."""
+        """Rays (rows, W, 3) of the pixel centres, in the camera frame."""
         if lens.width * lens.height > MOST_KEPT_RAYS:
             return _pixel_rays(lens, top, bottom)
         if self._rays is None or self._rays[0] != lens:
@@ -167,7 +170,7 @@ def _pixel_rays(lens: Intrinsics, top: int, bottom: int) -> Array:
 
 
 def _edges(depth: Array32, material: Bytes) -> Bools:
-    """Pixels (H, W) where the mesh's outline or a crease crosses: depth bends, or the material changes."""
+    """Pixels (H, W) crossed by an outline or a crease: the depth changes abruptly, or the material changes."""
     bend = np.abs(cv2.Laplacian(np.minimum(depth, 10.0), cv2.CV_32F)) > np.float32(0.004)
     change = cv2.morphologyEx(material, cv2.MORPH_GRADIENT, np.ones((2, 2), np.uint8)) > 0
     return bend | change
@@ -186,6 +189,6 @@ _SRGB = _srgb_table()
 
 
 def _srgb(linear: Array32) -> Bytes:
-    """sRGB bytes of linear colour in 0..1, clipped."""
+    """Convert linear colour to sRGB bytes, clipped to 0…1."""
     index = np.clip(linear * np.float32(_SRGB_STEPS) + np.float32(0.5), 0, _SRGB_STEPS).astype(np.uint16)
     return _SRGB[index]

@@ -1,4 +1,4 @@
-"""The whole rig: every simulator as a child process around one scene, and the rig file that the service reads."""
+"""The simulated rig: every simulator as a child process around one scene, and the rig.yaml for the service."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from simulators.ur_controller.kinematics import inverse as solve_joints
 from simulators.world import SCENE_CENTRE_M, STATIONS, Scene, nominal_hand_eye
 
 _ELBOW_UP = np.array([1.4, -1.6, 1.9, -1.9, -1.57, 0.0])
-_TAPE_SIGMA_M = 0.003  # a technician measures the scene's centre with a tape
+_TAPE_SIGMA_M = 0.003  # accuracy with which a technician measures the scene's centre with a tape
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("--scene", type=int, required=True, metavar="SEED", help="seed of the scene")
     parser.add_argument("--dir", type=Path, required=True, help="folder for rig.yaml, CT, scans, truth and logs")
-    parser.add_argument("--image-width", type=int, default=1536, metavar="W", help="of the photographs")
+    parser.add_argument("--image-width", type=int, default=1536, metavar="W", help="image width of the photographs")
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="the arm takes 1/N of its time")
     parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels")
     parser.add_argument("--version", default="5.12", help="of Polyscope")
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def serve(args: argparse.Namespace) -> None:
-    """Start everything, announce, serve until SIGTERM."""
+    """Start everything, print the ready line and serve until SIGTERM."""
     if args.without_cable and not args.hand:
         raise SimulatorError("--without-cable is for a camera that a person holds: add --hand")
     termination = Termination(with_parent=args.with_parent)
@@ -71,8 +71,8 @@ class _Rig:
         scene = Scene.generate(args.scene)
         self.arms = () if args.hand else ("robot",) if args.arms == 1 else ("robot_1", "robot_2")
         self.children: dict[str, subprocess.Popen[str]] = {}
-        self._words: dict[str, tuple[str, ...]] = {}  # with which each of them was started
-        self._ready: dict[str, dict[str, Any]] = {}  # what each has said then
+        self._words: dict[str, tuple[str, ...]] = {}  # command line with which each was started
+        self._ready: dict[str, dict[str, Any]] = {}  # ready line of each
         self.world = World(scene, args.image_width, self.arms, _start_joints(scene), camera_held=bool(args.hand))
         self.hand = args.hand and Hand(
             args.hand, args.scene, self.world.hold, self.world.press_shutter, SCENE_CENTRE_M.copy()
@@ -83,13 +83,13 @@ class _Rig:
 
     @property
     def scene(self) -> Scene:
-        """The scene as it is now."""
+        """The scene in its current state."""
         return self.world.scene
 
     # --- life ---
 
     def start(self) -> None:
-        # First of all: stop() waits for the server's loop, and would wait for ever for one that never began.
+        # Start this first: stop() waits for the server's loop, and would wait for ever if the loop had never begun.
         threading.Thread(target=self.server.serve_forever, daemon=True).start()
         try:
             for name in ("ct", "scans", "photographs", "logs"):
@@ -137,7 +137,7 @@ class _Rig:
         self.server.server_close()
 
     def _watch(self) -> None:
-        """A rig with a dead device is of no use: end, and say so in the log."""
+        """End the rig when a device has died, since it is of no use then, and report it on stderr."""
         while not self.termination.wait(1.0):
             for name, process in self.children.items():
                 if process.poll() is not None and not self.termination.is_set():
@@ -149,7 +149,7 @@ class _Rig:
                     break
 
     def _revive(self, name: str) -> None:
-        """The device at the same address: an arm stands where it stood, a camera counts its files on."""
+        """Restart a device at the same address: an arm with its last joints, a camera with its file counter."""
         words = list(self._words[name])
         if name in self.arms:
             joints = ",".join(f"{q:.6f}" for q in self.world.joints_rad(name))
@@ -158,8 +158,8 @@ class _Rig:
             log = self.folder / "truth_exposures.jsonl"
             taken = len(log.read_text().splitlines()) if log.exists() else 0
             port = self._ready[name]["gphoto_port"].rpartition(":")[2]
-            words += ["--port", port, "--first-counter", str(taken + 1)]  # these count instead of the first ones
-        with suppress(SimulatorError):  # it is tried again
+            words += ["--port", port, "--first-counter", str(taken + 1)]  # these override the first ones
+        with suppress(SimulatorError):  # it is retried
             self._child(name, *words)
 
     def _child(self, name: str, *words: str) -> dict[str, Any]:
@@ -212,12 +212,12 @@ class _Rig:
         return {"driver": "gphoto", "port": gphoto_port, "capture_timeout_s": self._exposure_s()}
 
     def _exposure_s(self) -> float:
-        """How long a picture may take: this camera computes what it sees, up to some seconds a megapixel."""
+        """Longest time that one picture may take, since this camera renders it: up to some seconds per megapixel."""
         megapixels = self.args.image_width**2 * 2 / 3 / 1e6
         return round(40.0 + 4.0 * megapixels, 0)
 
     def _lens(self) -> dict[str, Any]:
-        """As engraved on the lens and stated by the camera's maker; the true lens differs by a percent or so."""
+        """Nominal lens data, as engraved on the lens; the true lens differs by about a percent."""
         lens = self.scene.camera_intrinsics(self.args.image_width)
         return {"focal_length_mm": 50.0, "sensor_width_mm": 35.7, "image_px": [lens.width, lens.height]}
 
@@ -270,7 +270,7 @@ class _Rig:
                 return self.world.act(request)
 
     def _deliver(self, simulator: str, folder: str, options: list[str]) -> dict[str, Any]:
-        """Let the scanner or the CT make one export of the scene as it is now."""
+        """Let the scanner or the CT deliver one export of the scene in its current state."""
         spheres = "--control-spheres" if self.world.control_spheres else "--no-control-spheres"
         command = [
             sys.executable, "-m", "simulators", simulator, "--scene", str(self.scene.seed), "--once", "--with-parent",
@@ -292,7 +292,7 @@ class _Rig:
 
 
 def _start_joints(scene: Scene) -> Array:
-    """The camera above the scene at station 1, looking down."""
+    """Joints at which the camera is above the scene at station 1, looking down."""
     eye = SCENE_CENTRE_M + np.array([0.0, -0.1, 0.62])
     T_world_camera = look_at(eye, SCENE_CENTRE_M, np.array([0.0, 1.0, 0.0]))
     T_base_flange = inverse(scene.T_world_base[STATIONS[0]]) @ T_world_camera @ inverse(nominal_hand_eye())

@@ -1,4 +1,4 @@
-"""The state of the simulated laboratory and its control socket: where the arm is, what lies where, who acts."""
+"""The state of the simulated laboratory (arms, spheres, lights, camera) and its control socket."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from simulators.hand import Press
 from simulators.world import RADIUS_M, STATIONS, Scene
 
 # Where the technician holds the camera: nearly above the scene, so that no sphere hides another; and, for a further
-# photograph, on the side of one of that picture's edges, as high as lets every sphere be in the picture.
+# photograph, beyond one edge of that image, high enough for every sphere to be visible.
 _HELD_EYES_M = {
     "above": (0.06, -0.17, 0.78),
     "left": (-0.36, -0.06, 0.74),
@@ -28,20 +28,20 @@ _SCENE_M = np.array([0.0, 0.0, 0.05])
 HELD_CAMERAS = {
     side: look_at(np.array(eye), _SCENE_M, np.array([0.0, 1.0, 0.0])) for side, eye in _HELD_EYES_M.items()
 }
-_POINTED_AT = 1.5  # radii around a sphere's centre in the picture: who points there means this sphere
-_HEIGHTS_M = (0.028, 0.150)  # of a sphere's centre on the posts that there are
-_TABLE_M = (0.215, 0.150)  # half: posts stand on the board
-_ROOM_M = 2.3 * RADIUS_M  # between two centres
+_POINTED_AT = 1.5  # in radii around a sphere's centre in the image: pointing within it means this sphere
+_HEIGHTS_M = (0.028, 0.150)  # heights of a sphere's centre on the available posts
+_TABLE_M = (0.215, 0.150)  # half the extent of the board, on which the posts stand
+_ROOM_M = 2.3 * RADIUS_M  # minimum distance between two centres
 
 _LONGEST_WAIT_S = 1.0
-_LONGEST_REQUEST = 1 << 20  # bytes; what is longer is cut, and no JSON any more
+_LONGEST_REQUEST = 1 << 20  # bytes; a longer request is truncated and then is not valid JSON
 
 Act = Callable[[Mapping[str, Any]], dict[str, Any]]
 
 
 @dataclass
 class World:
-    """What changes in the laboratory. Every method may be called from any thread."""
+    """The changing state of the laboratory; thread-safe."""
 
     scene: Scene
     image_width: int
@@ -54,8 +54,8 @@ class World:
     lens_cleanings: int = 0
     pedal_presses: int = 0
     camera_held: bool = False  # in the technician's hands, instead of on the arm
-    T_world_held: Array = field(default_factory=HELD_CAMERAS["above"].copy)  # where he holds it
-    shutter_presses: int = 0  # of the camera's own button
+    T_world_held: Array = field(default_factory=HELD_CAMERAS["above"].copy)  # where it is held
+    shutter_presses: int = 0  # number of presses of the camera's own button
     press: Press = field(default_factory=Press)  # the last one
     station: str = STATIONS[0]
     _joints: dict[str, Array] = field(default_factory=dict[str, Array])
@@ -66,22 +66,22 @@ class World:
         self._pressed = threading.Condition(self._lock)
 
     def arm_moved(self, arm: str, q: Array) -> None:
-        """A controller says where its joints are (6,)."""
+        """Update the joints (6,), in radians, of an arm's controller."""
         with self._lock:
             self._joints[arm] = q
 
     def joints_rad(self, arm: str) -> Array:
-        """Where a controller has said that its joints are (6,); where they are at first."""
+        """Return the joints (6,) last reported by a controller, initially the start joints."""
         with self._lock:
             return self._joints.get(arm, self.start_joints_rad)
 
     @property
     def camera_arm(self) -> str:
-        """The arm that carries the camera: with two, the one at the present station."""
+        """The arm that carries the camera: if there are two, the one at the current station."""
         return self.arms[STATIONS.index(self.station) % len(self.arms)]
 
     def view(self) -> dict[str, Any]:
-        """What the camera sees now, and what the light box measures."""
+        """Return what the camera sees now and what the light box measures, as JSON data."""
         with self._lock:
             board = self.scene.board_placement(self.board_placements) if self.board_placed else None
             camera = self.T_world_held
@@ -107,25 +107,28 @@ class World:
             }
 
     def hold(self, T_world_camera: Array) -> None:
-        """The technician holds the camera there."""
+        """Hold the camera at this pose."""
         with self._lock:
             self.T_world_held = T_world_camera
 
     def press_shutter(self, press: Press) -> None:
-        """The technician presses the camera's own button."""
+        """Press the camera's own button."""
         with self._pressed:
             self.press = press
             self.shutter_presses += 1
             self._pressed.notify_all()
 
     def await_shutter(self, after: int) -> dict[str, Any]:
-        """Answers once the button was pressed more than `after` times, or after a while; what else was touched."""
+        """Wait until the button was pressed more than `after` times, or for a moment.
+
+        Returns the count and the last press.
+        """
         with self._pressed:
             self._pressed.wait_for(lambda: self.shutter_presses > after, timeout=_LONGEST_WAIT_S)
             return {"shutter_presses": self.shutter_presses, "iso": self.press.iso}
 
     def act(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """The technician's hands, as far as they only change the scene."""
+        """Carry out an action of the technician's hands that only changes the scene."""
         action = request.get("action")
         with self._lock:
             match action:
@@ -171,9 +174,10 @@ class World:
         return {"ok": True}
 
     def _move_sphere(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Follow an arrow in the picture of the held camera: the sphere that it begins at goes along the table.
+        """Follow an arrow drawn in the held camera's image: move the sphere at its start along the table.
 
-        `from` and `to` are parts (2,) of the picture's width and height, `higher_m` is how much higher it is to be.
+        `from` and `to` (2,) are fractions of the image's width and height; `higher_m` is the change of the sphere's
+        height.
         """
         if not self.camera_held:
             return {"ok": False, "error": "there is no picture to point at: the camera is on the arm"}
@@ -210,7 +214,7 @@ class WorldServer(socketserver.ThreadingTCPServer):
 
     @property
     def address(self) -> str:
-        """HOST:PORT."""
+        """The address as HOST:PORT."""
         host, port = self.server_address[:2]
         return f"{host!s}:{port}"
 
@@ -225,7 +229,7 @@ class _Client(socketserver.StreamRequestHandler):
                 if answer is not None:
                     self.wfile.write(json.dumps(answer).encode() + b"\n")
         except (ConnectionError, TimeoutError):
-            return  # the other side ended; nothing of the world depends on it
+            return  # the client disconnected; the world does not depend on it
 
 
 def _answer(server: WorldServer, line: bytes) -> dict[str, Any] | None:

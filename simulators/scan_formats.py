@@ -1,4 +1,4 @@
-"""Scan files as a scanner's software writes them: binary PLY and STL, OBJ with material and texture."""
+"""Encodes scans as a scanner's software writes them: binary PLY and STL, OBJ with material and texture."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from simulators.geometry import Array, Ints
 
 
 def encode(kind: str, name: str, vertices: Array, faces: Ints, normals: Array | None) -> list[tuple[str, bytes]]:
-    """Names and contents of the files of an export, the mesh first; vertices (V, 3) in the file's unit."""
+    """Return the names and contents of an export's files, the mesh first; vertices (V, 3) are in the file's unit."""
     if kind == "ply":
         return [(name, _ply(vertices, faces, normals))]
     if kind == "stl":
@@ -20,7 +20,7 @@ def encode(kind: str, name: str, vertices: Array, faces: Ints, normals: Array | 
     material = f"newmtl surface\nKd 0.8 0.8 0.8\nmap_Kd {stem}_0.png\n".encode()
     return [
         (name, _obj(stem, vertices, faces, normals)),
-        # The case differs from what the OBJ and MTL files say, as it does on file systems that ignore it.
+        # Upper and lower case differ from what the OBJ and MTL files say, as on case-insensitive file systems.
         (f"{stem}.MTL", material),
         (f"{stem}_0.PNG", _texture()),
     ]
@@ -64,7 +64,7 @@ def _obj(stem: str, vertices: Array, faces: Ints, normals: Array | None) -> byte
 
 
 def _rows(form: str, rows: Array | Ints) -> str:
-    """All rows in one format; in blocks, since one format string for all would be as long as the file."""
+    """Format all rows, in blocks, because a single format string would be as long as the file."""
     return "".join(
         (form * len(block)) % tuple(block.ravel().tolist()) for block in np.array_split(rows, len(rows) // 50_000 + 1)
     )

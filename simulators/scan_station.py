@@ -1,4 +1,4 @@
-"""A hand scanner's station: exports the scene as a scanner sweeping above it sees it, in a frame of its own."""
+"""A simulated hand scanner: exports the scene as seen by a scanner sweeping above it, in a frame of its own."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ from simulators.world import RADIUS_M, Scene, parse_moved
 log = logging.getLogger(__name__)
 
 NOISE_M = 0.05e-3
-GLOSSY_NOISE_M = 0.12e-3  # wet tissue and steel without spray
+GLOSSY_NOISE_M = 0.12e-3  # wet tissue and steel without scanning spray
 SCANNER_POSES = 42
-BASELINE_M = 0.06  # between projector and camera: both must see a point
+BASELINE_M = 0.06  # between projector and camera; a point must be visible from both
 _COARSE_LEVEL = 4  # sphere subdivisions at which visibility is tested
 
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """What the scanner's software holds before it exports: scan frame, metres."""
+    """A scan as the scanner's software holds it before export: in the scan frame, in metres."""
 
     vertices_m: Array
     faces: Ints
@@ -63,7 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def serve(args: argparse.Namespace) -> None:
-    """Export once and announce; without --once go on until SIGTERM, with another export at each SIGUSR1."""
+    """Export once and print the ready line.
+
+    Without --once serve until SIGTERM, with another export at each SIGUSR1.
+    """
     termination = Termination(with_parent=args.with_parent)
     asked = False
 
@@ -84,7 +87,7 @@ def serve(args: argparse.Namespace) -> None:
 
 
 def scan_scene(scene: Scene, *, spray: bool, control_spheres: bool, spacing_m: float, nth: int = 1) -> Scan:
-    """The scan of a scene: visible surface with noise, in the frame of this `nth` scan."""
+    """Simulate the `nth` scan of a scene: the visible surface with noise, in that scan's own frame."""
     rng = np.random.default_rng([scene.seed, 0x5CA4, nth])
     T_world_scan = transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.3, 0.3, 3))
     centres = [*scene.registration_m, *(scene.control_m if control_spheres else ())]
@@ -104,7 +107,7 @@ def scan_scene(scene: Scene, *, spray: bool, control_spheres: bool, spacing_m: f
 
 
 def _seen_counts(parts: list[Part]) -> list[tuple[Array, Array]]:
-    """For each part, per vertex: number of scanner poses that see it, and the best cosine of incidence."""
+    """For each part and vertex: the number of scanner poses that see it, and the best cosine of incidence."""
     offsets = np.cumsum([0, *(len(part.vertices_m) for part in parts)])
     vertices = np.concatenate([part.vertices_m for part in parts])
     faces = np.concatenate([part.faces + offset for part, offset in zip(parts, offsets[:-1], strict=True)])
@@ -131,7 +134,7 @@ def _seen_counts(parts: list[Part]) -> list[tuple[Array, Array]]:
 
 
 def _sweep() -> Iterator[tuple[Array, Array]]:
-    """Positions of the hand-held scanner in the world, and the direction from its projector to its camera."""
+    """The scanner's positions in the world during the sweep, and the direction from its projector to its camera."""
     for i in range(SCANNER_POSES):
         # A Fibonacci spiral over a dome, down to 15° above the table.
         sine = 1.0 - (i + 0.5) / SCANNER_POSES * 0.75
@@ -152,11 +155,11 @@ def _observed(
     *,
     glossy: bool,
 ) -> tuple[Array, Ints, Array]:
-    """Vertices, faces and normals of a part as scanned: finer mesh, unseen surface missing, noisy."""
-    # Glossy surface is lost where it is seen obliquely or seldom.
+    """Return vertices, faces and normals of a part as scanned: refined, without its unseen surface, and noisy."""
+    # A glossy surface is lost where it is seen at grazing angles or rarely.
     score = np.minimum(count / (7.0 if glossy else 2.5), np.maximum(best_cosine, 0.0) / (0.62 if glossy else 0.35))
     vertices, faces = part.vertices_m, part.faces
-    # Vertices that the solid repeats at its seams would open the scan along them.
+    # Merge the solid's repeated vertices at its seams, which would otherwise open the scan.
     _, first, index = np.unique(np.round(vertices, 9), axis=0, return_index=True, return_inverse=True)
     score = _maximum_over(index.reshape(-1), score, len(first))
     vertices, faces = vertices[first], index.reshape(-1)[faces]
@@ -168,7 +171,7 @@ def _observed(
     if centre_m is not None:
         ray = vertices - centre_m
         vertices = centre_m + RADIUS_M * ray / np.linalg.norm(ray, axis=1, keepdims=True)
-    # A ragged rim: the threshold wanders from place to place.
+    # The threshold varies from place to place, which gives ragged rims.
     wobble = _correlated(rng, faces, len(vertices), 12) * (0.25 if glossy else 0.06)
     kept = (score + wobble > 1.0)[faces].all(axis=1)
     used, compact = np.unique(faces[kept], return_inverse=True)
@@ -187,7 +190,7 @@ def _maximum_over(index: Ints, values: Array, n: int) -> Array:
 
 
 def _subdivided(vertices: Array, faces: Ints, score: Array) -> tuple[Array, Ints, Array]:
-    """Each face split in four at the middles of its edges; the score is interpolated."""
+    """Split each face in four at its edge midpoints; the score is interpolated."""
     n = len(vertices)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     keys, index = np.unique(edges[:, 0] * n + edges[:, 1], return_inverse=True)
@@ -200,7 +203,7 @@ def _subdivided(vertices: Array, faces: Ints, score: Array) -> tuple[Array, Ints
 
 
 def _correlated(rng: np.random.Generator, faces: Ints, n: int, rounds: int) -> Array:
-    """Noise (n,) of unit variance, averaged `rounds` times with the neighbours on the mesh."""
+    """Noise (n,) of unit variance, averaged `rounds` times over the neighbours on the mesh."""
     values = rng.standard_normal(n)
     if len(faces) == 0:
         return values
@@ -241,7 +244,7 @@ def _export(scene: Scene, args: argparse.Namespace, *, announce_it: bool) -> Non
 
 
 def _write_progressively(path: Path, data: bytes, fault: Fault | None) -> None:
-    """As the scanner's software writes: for a moment the file is there and not complete."""
+    """Write a file as the scanner's software does: for a moment it exists but is incomplete."""
     kind = fault.kind if fault else ""
     value = float(fault.value) if fault is not None and isinstance(fault.value, (int, float)) else None
     if kind == "truncate":

@@ -1,4 +1,4 @@
-"""What every simulator process shares: the ready line, SIGTERM, ending with its parent, its error."""
+"""Shared by all simulator processes: the ready line, SIGTERM, ending with the parent, and the error type."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ Json = None | bool | int | float | str | list["Json"] | dict[str, "Json"]
 
 
 class SimulatorError(Exception):
-    """A simulator cannot start or go on; the message says why. Simulators do not share the service's error tree."""
+    """A simulator cannot start or continue, and the message says why. Separate from the service's error tree."""
 
 
 def announce(**fields: object) -> None:
-    """Write the one ready line (JSON, `"ready": true` first) to stdout."""
+    """Write the ready line (JSON, with `"ready": true` first) to stdout."""
     sys.stdout.write(json.dumps({"ready": True, **fields}) + "\n")
     sys.stdout.flush()
 
 
 class Termination:
-    """Set by SIGTERM or SIGINT, or, if asked to, by the death of the parent process. Create it in the main thread."""
+    """Set by SIGTERM or SIGINT and, on request, by the death of the parent process. Create it in the main thread."""
 
     def __init__(self, *, with_parent: bool = False) -> None:
         self._event = threading.Event()
@@ -46,7 +46,7 @@ class Termination:
         return self._event.is_set()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Block until the process should end (True) or the time is over (False)."""
+        """Block until the process should end (returns True) or the timeout expires (returns False)."""
         remaining_s = float("inf") if timeout_s is None else timeout_s
         while not self.is_set():
             if remaining_s <= 0:

@@ -1,4 +1,4 @@
-"""The specimen: a piece of a pig's back with an incision held open, and the vertebrae at its bottom."""
+"""The specimen: a piece of a pig's back with a retracted incision and the vertebrae at its bottom."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEVEL_SPACING_M = 0.034
 
 
 def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cells: float) -> Array:
-    """Band-limited noise of unit variance (shape) with about `cells` features along the first axis."""
+    """Return band-limited noise of unit variance with about `cells` features along the first axis."""
     sigma = shape[0] / cells / 2.5
     coarse = max(1, int(sigma / 2))
     small = tuple(n // coarse + 4 for n in shape)
@@ -34,7 +34,7 @@ def smooth_noise(rng: np.random.Generator, shape: tuple[int, int], cells: float)
 
 @dataclass(frozen=True, slots=True)
 class Anatomy:
-    """The fields that shape the surface, as functions of x (along the spine) and y (across), in metres."""
+    """The functions that shape the surface, of x (along the spine) and y (across), in metres."""
 
     phase_m: float
     bend_m: float
@@ -54,11 +54,11 @@ class Anatomy:
         return np.maximum(1e-4, INCISION_HALF_WIDTH_M * s**0.62 * (1.0 + 0.07 * np.sin(47.0 * x + 1.0)))
 
     def incision(self, x: Array, y: Array) -> Array:
-        """Distance from the midline as a fraction of the incision's half width: below 1 is inside."""
+        """Distance from the midline as a fraction of the incision's half width; below 1 is inside the incision."""
         return np.abs(y - self.midline(x)) / self.opening(x)
 
     def vertebrae(self, x: Array, y: Array) -> Array:
-        """Height of bone above the wound's floor: spinous processes, laminae, facet joints."""
+        """Height of the bone above the floor of the incision: spinous processes, laminae, facet joints."""
         d = y - self.midline(x)
         level = (x - self.phase_m) / LEVEL_SPACING_M
         s = (level - np.round(level)) * LEVEL_SPACING_M
@@ -70,12 +70,12 @@ class Anatomy:
         return np.maximum(np.maximum(spinous, lamina), facet)
 
     def height(self, x: Array, y: Array) -> Array:
-        """Surface height above the board without the fine relief."""
+        """Height of the surface above the board, without the fine relief."""
         w = self.half_width(x)
         crest = HEIGHT_M * (1.0 - 0.10 * (x / HALF_LENGTH_M) ** 4)
         body = crest * np.clip(1.0 - np.abs(y / w) ** 2.8, 0.0, 1.0) ** 0.55
         t = self.incision(x, y)
-        # Depth fades towards the incision's ends; the lip is rolled up by the retraction.
+        # The depth fades towards the incision's ends; the retraction rolls up its lip.
         ramp = smoothstep(0.0, 0.7, 1.0 - np.abs(x / INCISION_HALF_LENGTH_M))
         lip = 0.0045 * np.exp(-(((t - 1.13) / 0.13) ** 2)) * ramp
         inside = smoothstep(1.03, 0.68, t)
@@ -92,7 +92,7 @@ class Specimen:
 
     @classmethod
     def generate(cls, rng: np.random.Generator, n_x: int = 320, n_y: int = 220) -> Specimen:
-        """Deterministic for a generator state; about 2 n_x n_y faces."""
+        """Generate a specimen of about 2 n_x n_y faces; deterministic for a given generator state."""
         anatomy = Anatomy(
             phase_m=float(rng.uniform(-0.008, 0.008)),
             bend_m=float(rng.uniform(-0.006, 0.006)),
@@ -102,7 +102,7 @@ class Specimen:
         fine = np.linspace(-1.0, 1.0, 8 * n_y)
         grid = np.empty((n_x, n_y, 3))
         for i, xi in enumerate(x):
-            # Vertices at equal arc length of the cross-section, so that steep walls are as finely meshed as the top.
+            # Vertices at equal arc length of the cross-section, so that steep walls are meshed as finely as the top.
             y = fine * anatomy.half_width(np.full(1, xi))
             z = anatomy.height(np.full_like(y, xi), y)
             arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(y), np.diff(z)))])
@@ -111,14 +111,14 @@ class Specimen:
         return cls(anatomy, _with_relief(rng, anatomy, grid))
 
     def part(self) -> Part:
-        """The closed solid, its top mapped to uv (0..1 along x, 0..1 along the arc)."""
+        """Return the closed solid, with its top mapped to uv (0…1 along x, 0…1 along the arc)."""
         n_x, n_y = self.grid_m.shape[:2]
         u, v = np.meshgrid((np.arange(n_x) + 0.5) / n_x, (np.arange(n_y) + 0.5) / n_y, indexing="ij")
         vertices = self.grid_m.reshape(-1, 3)
         top = Part("top", "specimen", vertices, grid_faces(n_x, n_y), np.stack([u, v], axis=-1).reshape(-1, 2))
         index = np.arange(n_x * n_y, dtype=np.int64).reshape(n_x, n_y)
         ends = [self._end(index[0, ::-1], u=0.004), self._end(index[-1], u=0.996)]
-        # The base repeats the rim's vertices; it is never seen, so its texture does not matter.
+        # The base repeats the rim's vertices; it is never visible, so its texture does not matter.
         left, right = index[:, 0], index[:, -1]
         a, b, c, d = left[:-1], left[1:], right[1:], right[:-1]
         base = np.concatenate([np.stack([a, c, b], axis=1), np.stack([a, d, c], axis=1)])
@@ -126,7 +126,7 @@ class Specimen:
         return joined("specimen", "specimen", [closed, *ends])
 
     def _end(self, rim: Ints, u: float) -> Part:
-        """A cut end as rings from the rim to its middle, so that light can be kept at its vertices."""
+        """A cut end as rings from the rim to its centre, because light is stored at vertices."""
         p = self.grid_m.reshape(-1, 3)[np.append(rim, rim[0])]
         middle = (p[0] + p[-2]) / 2 + [0.0, 0.0, 0.02]
         fractions = np.linspace(0.0, 1.0, 24)
@@ -138,15 +138,15 @@ class Specimen:
 
 
 def _with_relief(rng: np.random.Generator, anatomy: Anatomy, grid: Array) -> Array:
-    """Displace the grid along z (and the wound's walls across) by lumps, muscle bundles and skin folds."""
+    """Displace the grid along z, and the incision's walls sideways, by lumps, muscle bundles and skin folds."""
     shape = (grid.shape[0], grid.shape[1])
     x, y, z = (grid[..., k] for k in range(3))
     t = anatomy.incision(x, y)
-    rim = np.clip(z / 0.02, 0.0, 1.0)  # nothing moves where the specimen meets the board
+    rim = np.clip(z / 0.02, 0.0, 1.0)  # zero where the specimen touches the board
     ends = smoothstep(0.0, 0.02, HALF_LENGTH_M - np.abs(x)) * 0.8 + 0.2
     lumps = 0.0022 * smooth_noise(rng, shape, 7) + 0.0007 * smooth_noise(rng, shape, 22)
     wall = smoothstep(1.15, 0.95, t) * smoothstep(0.45, 0.62, t)
-    # Muscle bundles run along the wall, a little oblique.
+    # Muscle bundles run along the wall, slightly oblique.
     phase = 900.0 * z + 60.0 * x + 2.0 * smooth_noise(rng, shape, 9)
     bundles = smooth_noise(rng, shape, 45) * 0.0008 + 0.0010 * np.sin(phase)
     deep = smoothstep(0.7, 0.5, t)

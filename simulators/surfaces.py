@@ -1,4 +1,4 @@
-"""The scene as the renderer casts it: one mesh, filtered textures, light at the vertices."""
+"""The scene's surfaces for the renderer: one mesh with filtered textures and light at the vertices."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _REMAP_COLUMNS = 4096
 
 @dataclass(frozen=True, slots=True)
 class Shaded:
-    """What rays met: linear colour (N, 3), distance in lengths of the ray (N,), material (N,; 255 for none)."""
+    """Shading of ray hits: linear colour (N, 3), distance in lengths of the ray (N,), material (N,; 255 for none)."""
 
     colour: Array32
     depth: Array32
@@ -43,7 +43,7 @@ class Shaded:
 
 
 class MipMap:
-    """A texture at halved sizes, sampled with the level that fits the pixel's footprint."""
+    """A texture at successively halved sizes, sampled at the level that fits the pixel's footprint."""
 
     def __init__(self, texture: Texture) -> None:
         self.texel_m = texture.texel_m
@@ -54,7 +54,7 @@ class MipMap:
             self._levels.append(np.asarray(half, dtype=np.float32))
 
     def sample(self, uv: Array32, footprint_m: Array32) -> Array32:
-        """(N, 4) at uv (N, 2) for pixels that cover footprint_m (N,)."""
+        """Sample the texture at uv (N, 2) for pixels that cover footprint_m (N,); returns (N, 4)."""
         if len(self._levels) == 1:
             return _bilinear(self._levels[0], uv)
         level = np.log2(np.maximum(footprint_m / np.float32(self.texel_m), 1.0))
@@ -73,7 +73,7 @@ class MipMap:
 def _bilinear(texels: Array32, uv: Array32) -> Array32:
     h, w = texels.shape[:2]
     n = len(uv)
-    # remap takes images of at most 32767 rows and columns: fold the list into rows.
+    # remap takes images of at most 32767 rows and columns: fold the list into several rows.
     columns = min(n, _REMAP_COLUMNS)
     padded = -(-n // columns) * columns
     row, column = np.zeros(padded, dtype=np.float32), np.zeros(padded, dtype=np.float32)
@@ -87,7 +87,7 @@ def _bilinear(texels: Array32, uv: Array32) -> Array32:
 
 
 class Surfaces:
-    """Everything but the spheres' faces and the calibration board."""
+    """All surfaces except the spheres' faces and the calibration board."""
 
     def __init__(self, scene: Scene, texture_size: int) -> None:
         self.scene = scene
@@ -123,7 +123,7 @@ class Surfaces:
         self._ripple = np.ascontiguousarray(slopes * np.float32(0.16))
 
     def light(self, control: bool) -> Array32:
-        """Lamp and room light at the vertices (V, 2), with the shadows of the spheres that are there."""
+        """Light of lamp and room at the vertices (V, 2), with the shadows of the spheres that are present."""
         if control not in self._light:
             blocked = self._shadow
             if control:
@@ -133,7 +133,7 @@ class Surfaces:
 
     @cached_property
     def _shadow(self) -> Bools:
-        """Where shadow falls without the control spheres; that of theirs is added to it."""
+        """Occlusion without the control spheres; theirs is added to it."""
         return self._blocked_by([*self._parts, *_spheres(self.scene.registration_m)])
 
     def _blocked_by(self, parts: list[Part]) -> Bools:
@@ -141,7 +141,10 @@ class Surfaces:
         return blocked_rays(Caster(solid.vertices_m, solid.faces), self._vertices, self._normals, self.scene.lamp_m)
 
     def shade(self, eye: Array, directions: Array32, pixel_rad: float, *, control: bool, spray: bool) -> Shaded:
-        """Cast rays (N, 3), of unit depth along the camera axis, from `eye`, world; pixel_rad is a pixel angle."""
+        """Cast rays (N, 3) of unit depth along the camera axis from `eye` (world).
+
+        `pixel_rad` is the angle of a pixel.
+        """
         n = len(directions)
         start = np.ascontiguousarray(np.broadcast_to(eye.astype(np.float32), (n, 3)))
         face, depth, u, v = self._caster.first(start, directions)
@@ -160,7 +163,7 @@ class Surfaces:
         ray = directions.take(hit, axis=0)
         length = np.sqrt(np.einsum("ij,ij->i", ray, ray))
         cosine = np.abs(np.einsum("ij,ij->i", ray, self._face_normal.take(f, axis=0))) / length
-        # Between the footprint's two axes: sharper than isotropic filtering, and still without crawling.
+        # Between the footprint's two axes: sharper than isotropic filtering, and without aliasing.
         footprint = np.float32(pixel_rad) * depth[hit] * np.minimum(1.0 / np.sqrt(np.maximum(cosine, 0.06)), 3.0)
         texel = self._sampled(material[hit], uv, footprint.astype(np.float32))
         if spray:
@@ -195,12 +198,12 @@ class Surfaces:
         uv: Array32,
         lamp: Array32,
     ) -> None:
-        """Add the lamp's highlights (Blinn-Phong) where the surface is wet or steel."""
+        """Add specular highlights of the lamp (Blinn-Phong) on wet tissue and steel."""
         at = np.flatnonzero((gloss > 0.12) & (lamp > 0.02))
         if len(at) == 0:
             return
         normal = _interpolated(self._normals32, corners[at], weights[at])
-        # There and back again: the ripples do not repeat seamlessly.
+        # Mirrored repetition, because the ripples do not tile seamlessly.
         tiled = np.abs((uv[at] * np.float32(16.0)) % np.float32(2.0) - np.float32(1.0))
         normal[:, :2] += _bilinear(self._ripple, tiled)[:, :2]
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -214,7 +217,7 @@ class Surfaces:
 
 
 def _interpolated(values: Array32, corners: Ints, weights: Array32) -> Array32:
-    """Values (V, k) at barycentric weights (N, 3) of corners (N, 3)."""
+    """Interpolate values (V, k) at corners (N, 3) with barycentric weights (N, 3)."""
     out = values.take(corners[:, 0], axis=0)
     out *= weights[:, :1]
     for k in (1, 2):
@@ -225,7 +228,7 @@ def _interpolated(values: Array32, corners: Ints, weights: Array32) -> Array32:
 
 
 def drape_part(scene: Scene) -> Part:
-    """The draped table under the board: a gently creased sheet, finer in the middle where it is seen."""
+    """Build the draped table under the board: a gently creased sheet, finer in its visible centre."""
     core = np.linspace(-0.55, 0.55, 181)
     outside = np.linspace(0.55, DRAPE_HALF_M, 26)[1:]
     axis = np.concatenate([-outside[::-1], core, outside])

@@ -1,4 +1,4 @@
-"""Albedo of everything in the scene (linear light), with its relief shaded in, and the gloss of wet tissue."""
+"""Textures of the scene: linear albedo with shaded relief, and the gloss of wet tissue."""
 
 from __future__ import annotations
 
@@ -13,20 +13,23 @@ from simulators.specimen import HALF_LENGTH_M
 from simulators.world import BOARD_HALF_M, Scene
 
 DRAPE_HALF_M = 1.3
-_DRAPE_CORE = 0.30  # the middle ± this fraction of the texture covers ± DRAPE_CORE_M at full resolution
+_DRAPE_CORE = 0.30  # the centre ± this fraction of the texture covers ± DRAPE_CORE_M at full resolution
 DRAPE_CORE_M = 0.42
 
 
 @dataclass(frozen=True, slots=True)
 class Texture:
-    """texels (H, W, 4) float32: linear albedo and gloss; row along u, column along v; size of a texel in metres."""
+    """A texture of texels (H, W, 4) float32, linear albedo and gloss, with the size of a texel in metres.
+
+    Rows run along u, columns along v.
+    """
 
     texels: Array32
     texel_m: float
 
 
 def drape_coordinate(metres: Array) -> Array:
-    """Texture coordinate 0..1 of a position on the drape: even in the middle, coarser outside."""
+    """Texture coordinate 0…1 of a position on the drape: uniform in the centre, coarser outside."""
     a = np.abs(metres)
     slope = (0.5 - _DRAPE_CORE) / (DRAPE_HALF_M - DRAPE_CORE_M)
     t = np.where(a < DRAPE_CORE_M, a * _DRAPE_CORE / DRAPE_CORE_M, _DRAPE_CORE + (a - DRAPE_CORE_M) * slope)
@@ -34,7 +37,7 @@ def drape_coordinate(metres: Array) -> Array:
 
 
 def specimen_texture(scene: Scene, size: int) -> Texture:
-    """Skin, fat, muscle, bone and blood by the anatomy's coordinates."""
+    """Skin, fat, muscle, bone and blood, placed by the anatomy's coordinates."""
     anatomy = scene.specimen.anatomy
     length, arc = 2 * HALF_LENGTH_M, 0.30
     noise = Noise(scene.seed * 7 + 1, (size, size), (length, arc))
@@ -74,7 +77,7 @@ def specimen_texture(scene: Scene, size: int) -> Texture:
     colour += (bone - colour) * (is_bone * (1 - ramp(0.6, 0.75, t)))[..., None]
     pool = ramp(0.3, 1.3, noise.octaves(17, 0.014, 5)) * (1 - ramp(0.65, 0.9, t)) * (1 - 0.8 * is_bone)
     colour = mixed(colour, (0.13, 0.008, 0.008), 0.85 * pool)
-    # The cut ends (columns of texels next to u = 0 and 1) show muscle, fat and skin like the wound does.
+    # The cut ends (columns of texels next to u = 0 and 1) show muscle, fat and skin as the incision does.
     end = np.minimum(np.arange(size), np.arange(size)[::-1])[:, None] < 0.0015 * size
     colour = np.where(end[..., None], muscle, colour)
     relief = (
@@ -128,7 +131,7 @@ def board_texture(scene: Scene, size: int) -> Texture:
 
 
 def drape_texture(scene: Scene, size: int) -> Texture:
-    """Blue-green surgical drape: weave, lint, creases, stains and the maker's print."""
+    """Blue-green surgical drape: weave, lint, creases, stains and the manufacturer's print."""
     extent = DRAPE_CORE_M / _DRAPE_CORE
     noise = Noise(scene.seed * 7 + 3, (size, size), (extent, extent))
     colour = np.empty((size, size, 3), dtype=np.float32)
@@ -149,7 +152,7 @@ def drape_texture(scene: Scene, size: int) -> Texture:
 
 
 def post_texture(scene: Scene, size: int) -> Texture:
-    """Turned beech: u around, v the posts one after the other."""
+    """Turned beech: u runs around a post, v along the posts one after another."""
     noise = Noise(scene.seed * 7 + 4, (size, size), (0.0314, 0.6))
     colour = np.empty((size, size, 3), dtype=np.float32)
     colour[:] = (0.50, 0.34, 0.19)
@@ -173,7 +176,7 @@ def _packed(colour: Array32, gloss: Array32) -> Array32:
 
 
 def _relief_shading(height_m: Array32, du_m: float, dv_m: float) -> Array32:
-    """How much a lamp high at the side brightens and darkens a relief (H, W) in metres: N'·L / N·L."""
+    """Shading factor of a relief (H, W) in metres under a lamp high at one side: N'·L / N·L."""
     slope_u = np.gradient(height_m, axis=0) / np.float32(du_m)
     slope_v = np.gradient(height_m, axis=1) / np.float32(dv_m)
     return np.clip(1.0 - 0.45 * slope_u + 0.6 * slope_v, 0.45, 1.6).astype(np.float32)
@@ -197,7 +200,7 @@ def _strokes(noise: Noise, name: int, count: int, low_m: float, high_m: float, s
 
 
 def _text(canvas: Bytes, words: str, at: tuple[float, float], height: float) -> None:
-    """Draw words from the baseline's left end `at` (column, row), letters of `height`: fractions of the size."""
+    """Draw words with their baseline starting `at` (column, row); `at` and `height` are fractions of the size."""
     size = canvas.shape[0]
     scale = height * size / 22.0
     thick = max(1, round(0.13 * height * size))
@@ -206,12 +209,12 @@ def _text(canvas: Bytes, words: str, at: tuple[float, float], height: float) -> 
 
 
 def _as_seen(canvas: Bytes) -> Array32:
-    """Turn what was drawn with x to the right and y down into rows along u = +x and columns along v = +y."""
+    """Rotate a canvas drawn with x to the right and y down into rows along u = +x and columns along v = +y."""
     return np.ascontiguousarray(canvas[::-1].T).astype(np.float32) / np.float32(255.0)
 
 
 def _stamp(size: int, seed: int) -> Array32:
-    """The meat inspection's oval stamps on the skin (H, W), 0..1."""
+    """The oval stamps of the meat inspection on the skin (H, W), 0…1."""
     canvas = np.zeros((size, size), dtype=np.uint8)
     thick = max(1, size // 500)
     for column, row, tilt in ((0.20, 0.17, 12.0), (0.72, 0.85, -20.0), (0.50, 0.12, 4.0)):
@@ -223,7 +226,7 @@ def _stamp(size: int, seed: int) -> Array32:
 
 
 def _labels(size: int, extent_m: tuple[float, float], seed: int) -> tuple[Array32, Array32]:
-    """Ink and paper (H, W), 0..1, of rulers along the board's rim and stuck-on labels."""
+    """Ink and paper (H, W), 0…1, of rulers along the board's rim and of labels."""
     ink, paper = np.zeros((size, size), dtype=np.uint8), np.zeros((size, size), dtype=np.uint8)
     for mm in range(10, round(extent_m[0] * 1000) - 10):
         at = round(mm * 1e-3 / extent_m[0] * size)
@@ -268,7 +271,7 @@ def _labels(size: int, extent_m: tuple[float, float], seed: int) -> tuple[Array3
 
 
 def _print(size: int, seed: int) -> Array32:
-    """The drape's printed lines of words (H, W), 0..1."""
+    """The drape's printed text (H, W), 0…1."""
     canvas = np.zeros((size, size), dtype=np.uint8)
     rng = np.random.default_rng([seed, 6])
     for k, row in enumerate(np.arange(0.03, 1.0, 0.075)):

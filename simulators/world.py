@@ -1,4 +1,4 @@
-"""The one scene: specimen, spheres, table, stations and the true geometry of arm, hand-eye and camera."""
+"""The simulated scene: specimen, spheres, table, stations and the true geometry of arm, hand-eye and camera."""
 
 from __future__ import annotations
 
@@ -27,32 +27,32 @@ SCENE_CENTRE_M = np.array([0.0, 0.0, 0.05])
 STATIONS = ("station_1", "station_2")
 NOMINAL_LUX = 45_000.0
 
-Moved = tuple[tuple[int, float, float, float], ...]  # registration spheres: index and centre (m, world)
+Moved = tuple[tuple[int, float, float, float], ...]  # moved registration spheres: index and centre (m, world)
 
 
 def parse_moved(text: str) -> Moved:
-    """What `--moved` takes: JSON [[index, x, y, z], …]."""
+    """Parse the value of `--moved`: JSON [[index, x, y, z], …]."""
     return tuple((int(index), float(x), float(y), float(z)) for index, x, y, z in json.loads(text))
 
 
 def nominal_hand_eye() -> Array:
-    """T_flange_camera as the mount's drawing has it: the camera looks along the flange's z, its top towards -y."""
+    """Nominal T_flange_camera from the mount's drawing: the camera looks along the flange's z, its top towards -y."""
     return from_euler(np.zeros(3), np.array([0.0, -0.055, 0.095]))
 
 
 @dataclass(frozen=True)
 class Scene:
-    """All that is true in the simulated laboratory. World: z up, origin at the centre of the wooden board's top."""
+    """The ground truth of the simulated laboratory. World: z up, origin at the centre of the wooden board's top."""
 
     seed: int
     specimen: Specimen
     registration_m: Array  # (10, 3)
     control_m: Array  # (3, 3)
-    foot_m: Array  # (10, 3) where the registration spheres' posts stand
+    foot_m: Array  # (10, 3) feet of the registration spheres' posts
     T_flange_camera: Array
     arm: ArmErrors
     T_world_base: dict[str, Array]
-    lens: Intrinsics  # full size
+    lens: Intrinsics  # at full resolution
     lamp_m: Array
     light_lux: float
     temperature_c: float
@@ -65,14 +65,14 @@ class Scene:
 
     @classmethod
     def generate(cls, seed: int, moved: Moved = ()) -> Scene:
-        """The scene of this seed, the same on every machine and in every process, with spheres moved elsewhere."""
+        """Generate this seed's scene, identical on every machine and in every process, with some spheres moved."""
         scene = cls._as_set_up(seed)
         for index, *centre in moved:
             scene = scene.with_sphere_at(int(index), np.array(centre))
         return scene
 
     def with_sphere_at(self, index: int, centre_m: Array) -> Scene:
-        """A registration sphere on its post at another place, centre (3,) in the world."""
+        """Return the scene with a registration sphere, on its post, moved to a centre (3,) in the world."""
         centres, feet = self.registration_m.copy(), self.foot_m.copy()
         feet[index, :2] += centre_m[:2] - centres[index, :2]
         centres[index] = centre_m
@@ -104,14 +104,14 @@ class Scene:
             temperature_c=float(rng.uniform(20.5, 22.5)),
         )
 
-    # What is there
+    # What the scene contains
     def sphere_centres_m(self, control: bool) -> Array:
-        """(3, 3) control or (10, 3) registration spheres, world."""
+        """Centres of the control (3, 3) or registration (10, 3) spheres, world frame."""
         return self.control_m if control else self.registration_m
 
     @cached_property
     def fixed_parts(self) -> tuple[Part, ...]:
-        """Specimen, wooden board, posts and K-wires: closed solids that touch or overlap a little where they meet."""
+        """Specimen, wooden board, posts and K-wires: closed solids that touch or slightly overlap."""
         hx, hy = BOARD_HALF_M
         low, high = np.array([-hx, -hy, -BOARD_THICKNESS_M]), np.array([hx, hy, 0.0])
         wood = box(low, high, cell_m=0.0025)
@@ -121,14 +121,14 @@ class Scene:
         return (self.specimen.part(), board, posts, wires)
 
     def parts(self, control_spheres: bool) -> tuple[Part, ...]:
-        """fixed_parts and the spheres, each sphere a part of its own (its vertices lie on the true sphere)."""
+        """fixed_parts and the spheres; each sphere is a part of its own, with its vertices on the true sphere."""
         centres = [*self.registration_m, *(self.control_m if control_spheres else ())]
         return (*self.fixed_parts, *(sphere_mesh(centre, RADIUS_M, 5) for centre in centres))
 
     def solid_mesh(self, control_spheres: bool) -> tuple[Array, Ints]:
         """Vertices (V, 3) in metres and outward faces (F, 3) of all parts: what a scanner or CT sees.
 
-        The parts are closed and overlap where they meet: a point is inside where any of them has it inside.
+        The parts are closed and may overlap: a point is inside the scene if it is inside any part.
         """
         parts = self.parts(control_spheres)
         offsets = np.cumsum([0, *(len(part.vertices_m) for part in parts[:-1])])
@@ -137,15 +137,15 @@ class Scene:
 
     # Where the camera is
     def camera_intrinsics(self, width: int) -> Intrinsics:
-        """The true lens at this image width."""
+        """The true intrinsics at this image width."""
         return self.lens.scaled(width)
 
     def nominal_flange(self, q: Array) -> Array:
-        """T_base_flange as the controller computes it from its encoders (6,) in radians."""
+        """T_base_flange as the controller computes it from its encoders (6,), in radians."""
         return forward(ARM_MODEL, q)
 
     def true_flange(self, q: Array, station: str) -> Array:
-        """T_world_flange where the flange really is: perturbed kinematics, and 0.02 mm of repeatability."""
+        """The true T_world_flange: perturbed kinematics plus 0.02 mm of repeatability."""
         digest = hashlib.sha256(np.round(q, 5).tobytes() + str(self.seed).encode()).digest()
         noise = np.random.default_rng(int.from_bytes(digest[:8], "big")).standard_normal(3)
         T_base_flange = perturbed_forward(q, self.arm)
@@ -153,14 +153,14 @@ class Scene:
         return self.T_world_base[station] @ T_base_flange
 
     def true_camera(self, q: Array, station: str) -> Array:
-        """T_world_camera at joints q (6,)."""
+        """The true T_world_camera at joints q (6,)."""
         return self.true_flange(q, station) @ self.T_flange_camera
 
     def board_placement(self, nth: int) -> Array:
-        """T_world_board of the calibration board's n-th placement: over the scene, tilted a little.
+        """T_world_board of the calibration board's n-th placement: above the scene, slightly tilted.
 
-        The board's frame: origin at the first inner corner, x along the 23 corners, y along the 16, z into the table
-        (towards where the camera looks), squares of 15 mm.
+        Board frame: origin at the first inner corner, x along the 23 corners, y along the 16, z into the table (the
+        camera's viewing direction), squares of 15 mm.
         """
         rng = np.random.default_rng([self.seed, 0xB0A2D, nth])
         tilt = np.radians(rng.uniform(1.0, 4.0, 2)) * rng.choice([-1.0, 1.0], 2)
@@ -175,7 +175,7 @@ class Scene:
         return cylinder(foot - [0.0, 0.0, 0.004], top, POST_RADIUS_M, 24, 24, (index / 10, (index + 0.97) / 10))
 
     def _wires(self) -> list[tuple[Array, Array]]:
-        """Four that pin the specimen to the board, and six that hold the incision open; start and end points."""
+        """Start and end points of ten K-wires: four pin the specimen to the board, six hold the incision open."""
         rng = np.random.default_rng([self.seed, 0x3172E5])
         grid = self.specimen.grid_m
         wires: list[tuple[Array, Array]] = []
@@ -197,7 +197,7 @@ class Scene:
 
 
 def _registration_spheres(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Centres and feet (10, 3) of the spheres around the specimen: uneven spacing, a few different heights."""
+    """Centres and feet (10, 3) of the spheres around the specimen, at uneven spacing and a few different heights."""
     layout = np.array(
         [
             (-0.128, -0.122, 0.052), (-0.012, -0.132, 0.098), (0.098, -0.121, 0.034), (0.186, -0.088, 0.080),
@@ -213,7 +213,7 @@ def _registration_spheres(rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 def _control_spheres(rng: np.random.Generator, specimen: Specimen) -> Array:
-    """Centres (3, 3): two on top of the specimen, one in the incision, each pressed 1.5 mm into what carries it."""
+    """Centres (3, 3): two spheres on top of the specimen and one in the incision, each pressed in by 1.5 mm."""
     anatomy = specimen.anatomy
     x = np.array([-0.098, 0.028, 0.104]) + rng.uniform(-0.006, 0.006, 3)
     y = anatomy.midline(x) + np.array([0.056, -0.002, -0.052])
@@ -229,10 +229,10 @@ def _control_spheres(rng: np.random.Generator, specimen: Specimen) -> Array:
 
 
 def _arm_errors(rng: np.random.Generator) -> ArmErrors:
-    """Geometry as built (0.5 mm rms at the flange over the work space) and gear errors (another 0.5 mm rms).
+    """As-built geometry (0.5 mm rms at the flange over the work space) plus gear errors (another 0.5 mm rms).
 
-    A calibration of hand-eye and base takes up most of the former. The latter changes from viewpoint to viewpoint:
-    poses of such an arm are good to about half a millimetre, whatever is calibrated.
+    Hand-eye and base calibration absorb most of the former. The latter changes from viewpoint to viewpoint, so poses
+    of such an arm are good to about half a millimetre after any hand-eye calibration.
     """
     sigma = np.array([0.10e-3, 0.10e-3, np.radians(0.006), np.radians(0.022)])
     drawn = ArmErrors(
@@ -241,13 +241,13 @@ def _arm_errors(rng: np.random.Generator) -> ArmErrors:
         wave_number=rng.integers(3, 9, 6).astype(np.float64),
         wave_phase_rad=rng.uniform(0.0, 2 * np.pi, 6),
     )
-    # An unlucky draw would be a perfect or a broken arm.
+    # Normalised, because a random draw could be a perfect or a broken arm.
     geometry, gears = drawn.scaled(1.0, 0.0), drawn.scaled(0.0, 1.0)
     return drawn.scaled(0.5e-3 / _rms_error_m(geometry), 0.5e-3 / _rms_error_m(gears))
 
 
 def _rms_error_m(errors: ArmErrors) -> float:
-    """Root mean square of the flange's displacement over the work space of a capture."""
+    """RMS displacement of the flange over the work space of a capture, in metres."""
     q = np.random.default_rng(1).uniform(-1.0, 1.0, (60, 6)) * [0.5, 0.35, 0.35, 0.4, 0.4, 1.0]
     q += [1.57, -1.5, 1.9, -2.0, -1.57, 0.0]
     shift = [perturbed_forward(row, errors)[:3, 3] - forward(ARM_MODEL, row)[:3, 3] for row in q]

@@ -1,4 +1,4 @@
-"""Simulated Sony ILCE-7RM5 over PTP/IP: its options, and its service until SIGTERM."""
+"""A simulated Sony ILCE-7RM5 over PTP/IP: command-line options and main loop."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _source(args: argparse.Namespace) -> ImageSource:
 
 
 def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event) -> None:
-    """Release whenever somebody in the world presses the body's own button."""
+    """Release the shutter whenever somebody in the world presses the camera's own button."""
     presses: int | None = None
     while not stop.is_set():
         try:
@@ -56,7 +56,7 @@ def _attend_button(source: WorldSource, body: CameraBody, stop: threading.Event)
 
 
 def serve(args: argparse.Namespace) -> None:
-    """Announce the address and serve until SIGTERM."""
+    """Print the ready line and serve until SIGTERM."""
     termination = Termination(with_parent=args.with_parent)
     options = BodyOptions(args.fast, args.first_counter, args.exposures_log, args.announce, args.send_to)
     source, stop = _source(args), threading.Event()

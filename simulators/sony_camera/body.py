@@ -1,4 +1,4 @@
-"""The camera behind the wire: buttons, exposures that take their time, files waiting to be fetched, the card."""
+"""The camera behind the wire: buttons, exposures that take real time, files waiting for download, and the card."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from simulators.sony_camera.properties import (
 from simulators.sony_camera.scene import ImageSource, Moment
 
 FORMAT_JPEG, FORMAT_ARW = 0x3801, 0xB101
-HANDLING_S = 0.2  # shutter lag, read-out and processing of a real body
+HANDLING_S = 0.2  # shutter lag, read-out and processing of a real camera
 CARD_BYTES = 128_000_000_000
 FOCUSED, NOT_FOCUSED = 2, 1
 TRANSFER_PAUSE_S = 0.3
@@ -52,7 +52,7 @@ class BusyError(Exception):
 
 
 class CardFullError(Exception):
-    """No space for another picture."""
+    """The card has no space for another picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,17 +69,17 @@ class CameraFile:
 
 @dataclass(frozen=True, slots=True)
 class BodyOptions:
-    """How this body behaves."""
+    """Options of the simulated camera's behaviour."""
 
-    fast: bool = False  # no exposure time, no handling time
+    fast: bool = False  # neither exposure time nor handling time
     first_counter: int = 1
     exposures_log: Path | None = None
-    announce: str = "both"  # event, property, both: how the client learns of a file
-    send_to: Path | None = None  # wireless transfer: files go into this folder, no client fetches them
+    announce: str = "both"  # event, property or both: how the client learns of a new file
+    send_to: Path | None = None  # wireless transfer: files are written into this folder instead of being downloaded
 
 
 class CameraBody:
-    """State that outlives connections. `on_object` is called once for each file that becomes ready."""
+    """The camera's state, which outlives connections. `on_object` is called once for each file that becomes ready."""
 
     def __init__(self, source: ImageSource, faults: FaultPlan, options: BodyOptions) -> None:
         self.properties = PropertyTable()
@@ -97,19 +97,19 @@ class CameraBody:
         self._exposing = threading.Event()
         self._log_lock = threading.Lock()
         if options.send_to is not None:
-            # Nobody can set this body from outside: a technician has dialled what a protocol asks for.
+            # Nobody can set this camera remotely: a technician has dialled in what a protocol asks for.
             for code, value in DIALLED.items():
                 self.properties.put(code, value)
 
     @property
     def exposing(self) -> bool:
-        """Whether an exposure is under way."""
+        """Whether an exposure is in progress."""
         return self._exposing.is_set()
 
     def button(self, code: int, state: int) -> None:
-        """Half or full press (2) and release (1), or a step of the focus as a signed 16-bit number.
+        """Handle a half or full press (2), a release (1), or a focus step given as a signed 16-bit number.
 
-        Raises BusyError or CardFullError on a full press, NotWritableError for a step in autofocus.
+        Raises BusyError or CardFullError for a full press, NotWritableError for a focus step in autofocus.
         """
         if code == Code.HALF_PRESS:
             self._half_pressed = state == _PRESSED
@@ -126,9 +126,9 @@ class CameraBody:
         self.properties.put(Code.FOCAL_POSITION, min(100, max(0, position)))
 
     def press(self, iso: int = 0) -> None:
-        """The button on the body, perhaps after somebody turned the ISO dial; a busy or full body ignores it."""
+        """Press the camera's own button, perhaps after the ISO dial was turned; ignored while busy or full."""
         if self.options.send_to is not None:
-            self.properties.put(Code.ISO, iso or DIALLED[Code.ISO])  # told that it is wrong, he turns it back
+            self.properties.put(Code.ISO, iso or DIALLED[Code.ISO])  # a mistake is corrected before the next exposure
         elif iso:
             self.properties.put(Code.ISO, iso)
         try:
@@ -233,19 +233,19 @@ class CameraBody:
         self.properties.put(Code.OBJECTS_IN_MEMORY, 0x8000 + waiting if waiting else 0)
 
     def next_file(self) -> CameraFile | None:
-        """The file that GetObjectInfo on FFFFC001 describes."""
+        """The file that GetObjectInfo on FFFFC001 describes, or None."""
         with self._lock:
             return self._waiting[0] if self._waiting else None
 
     def pop_file(self) -> CameraFile | None:
-        """The same file, which is then gone from the memory."""
+        """Remove and return that file."""
         with self._lock:
             file = self._waiting.popleft() if self._waiting else None
             self._count()
             return file
 
     def live_view(self) -> bytes:
-        """A frame of live view: offset and size of the JPEG, padding, JPEG."""
+        """A live-view frame: offset and size of the JPEG, padding, JPEG."""
         picture = cv2.cvtColor(self._source.preview(), cv2.COLOR_RGB2BGR)
         done, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
         if not done:
@@ -257,7 +257,7 @@ class CameraBody:
 
 
 def send(files: Sequence[CameraFile], folder: Path) -> None:
-    """As a camera's wireless transfer writes files: under their final names, bit by bit."""
+    """Write files as a camera's wireless transfer does: under their final names, piece by piece."""
     for file in files:
         with (folder / file.name).open("wb") as stream:
             half = len(file.data) // 2

@@ -1,4 +1,4 @@
-"""Bytes of PTP/IP: packets on the two sockets, and the PTP datasets that travel in them."""
+"""PTP/IP as bytes: packets on the two sockets, and the PTP datasets in them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 HEADER_BYTES = 8
-MAX_PACKET_BYTES = 1 << 26  # of a client, which sends settings and no pictures
+MAX_PACKET_BYTES = 1 << 26  # limit for a client, which sends settings and no pictures
 DATA_CHUNK_BYTES = 1 << 20
 
 
 class CodecError(Exception):
-    """Bytes that are no PTP/IP packet or no such dataset."""
+    """The bytes are not a valid PTP/IP packet or dataset."""
 
 
 class PacketType(IntEnum):
@@ -37,7 +37,7 @@ class PacketType(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class InitCommand:
-    """First packet on the command socket."""
+    """The first packet on the command socket."""
 
     guid: bytes
     name: str
@@ -46,7 +46,7 @@ class InitCommand:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One operation; `sends_data` when the client's data phase follows."""
+    """One operation request; `sends_data` is true if a data phase of the client follows."""
 
     operation: int
     transaction: int
@@ -55,12 +55,12 @@ class Request:
 
 
 def packet(kind: PacketType, body: bytes = b"") -> bytes:
-    """A whole packet: length (header included), type, body."""
+    """Build a packet: length (including the header), type, body."""
     return struct.pack("<II", HEADER_BYTES + len(body), kind) + body
 
 
 def parse_header(header: bytes) -> tuple[PacketType, int]:
-    """Type and number of body bytes to come. Raises CodecError."""
+    """Parse a packet header; returns the type and the number of body bytes. Raises CodecError."""
     if len(header) != HEADER_BYTES:
         raise CodecError(f"a packet header has 8 bytes, not {len(header)}")
     length, kind = struct.unpack("<II", header)
@@ -73,7 +73,7 @@ def parse_header(header: bytes) -> tuple[PacketType, int]:
 
 
 def parse_init_command(body: bytes) -> InitCommand:
-    """GUID, zero-terminated UTF-16 name, version. Raises CodecError."""
+    """Parse the GUID, the zero-terminated UTF-16 name and the version. Raises CodecError."""
     if len(body) < 16 + 2 + 4:
         raise CodecError(f"Init_Command_Request of {len(body)} bytes is too short")
     name = body[16:-4].decode("utf-16-le", errors="replace").rstrip("\0")
@@ -81,20 +81,20 @@ def parse_init_command(body: bytes) -> InitCommand:
 
 
 def init_command_ack(session: int, guid: bytes, name: str) -> bytes:
-    """The camera's answer on the command socket."""
+    """Build the camera's answer on the command socket."""
     body = struct.pack("<I", session) + guid + (name + "\0").encode("utf-16-le") + struct.pack("<I", 0x00010000)
     return packet(PacketType.INIT_COMMAND_ACK, body)
 
 
 def parse_init_event(body: bytes) -> int:
-    """Session number with which the event socket joins its command socket."""
+    """Parse the session number with which the event socket joins its command socket. Raises CodecError."""
     if len(body) < 4:
         raise CodecError("Init_Event_Request without a session number")
     return int(struct.unpack_from("<I", body)[0])
 
 
 def parse_request(body: bytes) -> Request:
-    """One operation request. Raises CodecError."""
+    """Parse an operation request. Raises CodecError."""
     if len(body) < 10 or (len(body) - 10) % 4 or len(body) > 10 + 5 * 4:
         raise CodecError(f"an operation request of {len(body)} bytes is impossible")
     phase, operation, transaction = struct.unpack_from("<IHI", body)
@@ -103,27 +103,30 @@ def parse_request(body: bytes) -> Request:
 
 
 def parse_start_data(body: bytes) -> int:
-    """Announced number of bytes; the client fills the low 32 bits only, so the rest is ignored."""
+    """Parse the announced number of bytes; the client sets only its low 32 bits. Raises CodecError."""
     if len(body) < 12:
         raise CodecError("Start_Data without a length")
     return int(struct.unpack_from("<IQ", body)[1]) & 0xFFFFFFFF
 
 
 def response(code: int, transaction: int, parameters: Sequence[int] = ()) -> bytes:
-    """The end of a transaction."""
+    """Build the operation response that ends a transaction."""
     body = struct.pack(f"<HI{len(parameters)}I", code, transaction, *parameters)
     return packet(PacketType.OPERATION_RESPONSE, body)
 
 
 def event(code: int, transaction: int, parameters: Sequence[int] = ()) -> bytes:
-    """An event packet for the event socket."""
+    """Build a packet for the event socket."""
     return packet(PacketType.EVENT, struct.pack(f"<HI{len(parameters)}I", code, transaction, *parameters))
 
 
 def data_packets(
     transaction: int, payload: bytes, announced: int | None = None, chunk_bytes: int = DATA_CHUNK_BYTES
 ) -> Iterator[bytes]:
-    """Start_Data, Data…, End_Data for a payload; `announced` differs from its length only in a planned fault."""
+    """Yield Start_Data, Data…, End_Data for a payload.
+
+    `announced` differs from its length only in a planned fault.
+    """
     total = len(payload) if announced is None else announced
     yield packet(PacketType.START_DATA, struct.pack("<IQ", transaction, total))
     view = memoryview(payload)
@@ -138,7 +141,7 @@ def data_packets(
 
 
 def string(text: str) -> bytes:
-    """A PTP string: number of characters with the final zero, UTF-16; an empty one is a single zero byte."""
+    """Encode a PTP string: number of characters including the final zero, then UTF-16; a zero byte if empty."""
     if not text:
         return b"\0"
     encoded = (text + "\0").encode("utf-16-le")
@@ -148,18 +151,18 @@ def string(text: str) -> bytes:
 
 
 def array_u16(values: Sequence[int]) -> bytes:
-    """u32 count, then the values."""
+    """Encode an array: u32 count, then the u16 values."""
     return struct.pack(f"<I{len(values)}H", len(values), *values)
 
 
 def array_u32(values: Sequence[int]) -> bytes:
-    """u32 count, then the values."""
+    """Encode an array: u32 count, then the u32 values."""
     return struct.pack(f"<I{len(values)}I", len(values), *values)
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Identity and abilities: the answer to GetDeviceInfo."""
+    """The camera's identity and supported operations: the answer to GetDeviceInfo."""
 
     manufacturer: str
     model: str
@@ -173,7 +176,7 @@ class DeviceInfo:
     vendor_description: str = "Sony PTP Extensions"
 
     def encode(self) -> bytes:
-        """The DeviceInfo dataset (PIMA 15740, 5.5.1)."""
+        """Encode the DeviceInfo dataset (PIMA 15740, 5.5.1)."""
         return b"".join(
             (
                 struct.pack("<HIH", 100, self.vendor_extension, 100),
@@ -194,7 +197,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True, slots=True)
 class ObjectInfo:
-    """What GetObjectInfo says of a file; `size_bytes` must equal what GetObject sends."""
+    """The answer to GetObjectInfo; `size_bytes` must equal the length of what GetObject sends."""
 
     storage: int
     format: int
@@ -205,7 +208,7 @@ class ObjectInfo:
     captured: str  # YYYYMMDDThhmmss
 
     def encode(self) -> bytes:
-        """The ObjectInfo dataset (PIMA 15740, 5.3.1)."""
+        """Encode the ObjectInfo dataset (PIMA 15740, 5.3.1)."""
         return b"".join(
             (
                 struct.pack("<IHHI", self.storage, self.format, 0, self.size_bytes),
@@ -221,13 +224,13 @@ class ObjectInfo:
 
 @dataclass(frozen=True, slots=True)
 class StorageInfo:
-    """Space on the card."""
+    """The storage space of the card."""
 
     capacity_bytes: int
     free_bytes: int
     free_images: int
 
     def encode(self) -> bytes:
-        """The StorageInfo dataset (PIMA 15740, 5.6.1): removable RAM, DCF, read-write."""
+        """Encode the StorageInfo dataset (PIMA 15740, 5.6.1): removable RAM, DCF, read-write."""
         head = struct.pack("<HHHQQI", 4, 3, 0, self.capacity_bytes, self.free_bytes, self.free_images)
         return head + string("CFexpress Type A") + string("")

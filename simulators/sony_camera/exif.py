@@ -1,4 +1,4 @@
-"""Camera files: a JPEG with the EXIF of an ILCE-7RM5, and a small raw file beside it."""
+"""Encodes the camera's files: a JPEG with the EXIF of an ILCE-7RM5, and a small raw file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from simulators.serve import SimulatorError
 from simulators.sony_camera.properties import ExposureSettings
 
-exiv2: Any = importlib.import_module("exiv2")  # a library without types of its own
+exiv2: Any = importlib.import_module("exiv2")  # the library has no types
 MAKE, MODEL, LENS = "SONY", "ILCE-7RM5", "FE 24-70mm F2.8 GM"
 BODY_SERIAL, FIRMWARE = "05318008", "ILCE-7RM5 v3.00"
 FOCAL_LENGTH_MM = 50
@@ -30,15 +30,15 @@ _LEVELS = {
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """What a file says about its exposure."""
+    """The exposure data written into a file's EXIF."""
 
     settings: ExposureSettings
     counter: int
-    taken: datetime  # with a time zone
+    taken: datetime  # with time zone
 
 
 def encode_jpeg(picture: NDArray[np.uint8], shot: Shot) -> bytes:
-    """JPEG bytes of an RGB picture (H, W, 3), with EXIF."""
+    """Encode an RGB picture (H, W, 3) as JPEG with EXIF."""
     quality, sampling = _LEVELS[shot.settings.jpeg_quality]
     options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
     done, encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), options)
@@ -87,11 +87,11 @@ def _with_exif(file: bytes, width: int, height: int, shot: Shot) -> bytes:
 
 
 def encode_raw(picture: NDArray[np.uint8], shot: Shot) -> bytes:
-    """A file in the manner of an ARW: TIFF header, camera tags, an RGGB mosaic of 14 bits in 16, a quarter wide.
+    """Encode a file similar to an ARW: TIFF header, camera tags, a 14-bit RGGB mosaic in 16 bits, a quarter as wide.
 
-    It is no real ARW: no Sony maker notes, no tiled lossless compression, no embedded preview, no black level or
-    white-balance tags, and a sixteenth of the pixels. It is a valid TIFF with the CFA tags of TIFF/EP, enough to
-    travel through a capture and be paired, hashed and recognised.
+    It is not a real ARW: it has no Sony maker notes, no tiled lossless compression, no embedded preview, no black
+    level or white-balance tags, and a sixteenth of the pixels. It is a valid TIFF with the CFA tags of TIFF/EP, which
+    is enough for a capture to pair, hash and recognise it.
     """
     small = cv2.resize(picture, (picture.shape[1] // 8 * 2, picture.shape[0] // 8 * 2), interpolation=cv2.INTER_AREA)
     linear = ((small / 255.0) ** 2.2 * 16383.0).astype("<u2")

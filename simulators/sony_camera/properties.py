@@ -1,4 +1,4 @@
-"""The property table of an ILCE-7RM5 in protocol 3.00: codes, types, choices, current values."""
+"""The property table of an ILCE-7RM5 (protocol 3.00): codes, types, choices and current values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _FORMATS = {1: "<b", 2: "<B", 3: "<h", 4: "<H", 5: "<i", 6: "<I"}
 
 
 class Code(IntEnum):
-    """Property codes; those from D2C1 on are controls, which have no value to read."""
+    """Property codes; those from D2C1 on are controls, which cannot be read."""
 
     COMPRESSION = 0x5004
     WHITE_BALANCE = 0x5005
@@ -35,7 +35,7 @@ class Code(IntEnum):
     HALF_PRESS = 0xD2C1
     FULL_PRESS = 0xD2C2
     FOCUS_STEP = 0xD2D1
-    FOCUS_REST = 0xD2D2  # what libgphoto2 sends for a step of nothing
+    FOCUS_REST = 0xD2D2  # libgphoto2 sends this for a step of zero
 
 
 CONTROLS = (Code.HALF_PRESS, Code.FULL_PRESS, Code.FOCUS_STEP, Code.FOCUS_REST)
@@ -45,7 +45,7 @@ TARGET_COMPUTER, TARGET_CARD, TARGET_BOTH = 1, 16, 17
 
 
 class Enabled(IntEnum):
-    """The entry's sixth byte."""
+    """The sixth byte of an entry: whether the property can be set."""
 
     GREY = 0
     ON = 1
@@ -53,16 +53,16 @@ class Enabled(IntEnum):
 
 
 class RefusedValueError(Exception):
-    """A value that the camera does not offer."""
+    """The camera does not offer this value."""
 
 
 class NotWritableError(Exception):
-    """A property that cannot be set, or that does not exist."""
+    """The property cannot be set, or does not exist."""
 
 
 @dataclass(slots=True)
 class CameraProperty:
-    """One entry of the table; `choices` empty means no form, `limits` is (least, greatest, step)."""
+    """One entry of the table; empty `choices` means no form, `limits` is (minimum, maximum, step)."""
 
     code: Code
     datatype: int
@@ -76,18 +76,21 @@ class CameraProperty:
         self.default = self.value
 
     def pack(self, value: int) -> bytes:
-        """One value in the property's type."""
+        """Encode a value in the property's type."""
         return struct.pack(_FORMATS[self.datatype], value)
 
     def unpack(self, data: bytes) -> int:
-        """A value from the client, which sends 4 bytes for some 2-byte types: the first ones count."""
+        """Decode a value from the client, which sends 4 bytes for some 2-byte types; only the first ones count."""
         layout = _FORMATS[self.datatype]
         if len(data) < struct.calcsize(layout):
             raise RefusedValueError(f"{self.code.name}: {len(data)} bytes are no value")
         return int(struct.unpack_from(layout, data)[0])
 
     def encode(self) -> bytes:
-        """Code, type, get/set, enabled, default, current, form; in 3.00 the list of an enumeration comes twice."""
+        """Encode the entry: code, type, get/set, enabled, default, current, form.
+
+        In protocol 3.00 the list of an enumeration is repeated.
+        """
         settable = self.enabled is Enabled.ON
         head = struct.pack("<HHBB", self.code, self.datatype, settable, self.enabled)
         head += self.pack(self.default) + self.pack(self.value)
@@ -110,7 +113,7 @@ class CameraProperty:
 
 
 def shutter_code(numerator: int, denominator: int) -> int:
-    """Exposure time as the camera writes it: numerator in the high word, denominator in the low one."""
+    """Encode an exposure time as the camera does: numerator in the high word, denominator in the low word."""
     return numerator << 16 | denominator
 
 
@@ -127,7 +130,7 @@ _U8, _I16, _U16, _U32, _I8 = 2, 3, 4, 6, 1
 
 
 def initial_properties() -> list[CameraProperty]:
-    """The table as the camera wakes up: dial on M, autofocus, JPEG Fine, files to the computer."""
+    """The table after power-on: dial on M, autofocus, JPEG Fine, files to the computer."""
     return [
         CameraProperty(Code.WHITE_BALANCE, _U16, 4, _WHITE_BALANCE),
         CameraProperty(Code.F_NUMBER, _U16, 800, _APERTURES),
@@ -151,7 +154,7 @@ def initial_properties() -> list[CameraProperty]:
 
 @dataclass(frozen=True, slots=True)
 class ExposureSettings:
-    """The values that an exposure was taken with."""
+    """The settings with which an exposure was taken."""
 
     aperture_f: float
     exposure_s: float
@@ -164,30 +167,30 @@ class ExposureSettings:
 
 
 class PropertyTable:
-    """All properties behind one lock; read by the command thread, written by it and by the exposure."""
+    """All properties behind one lock; used by the command thread and the exposure thread."""
 
     def __init__(self) -> None:
         self._entries = {entry.code: entry for entry in initial_properties()}
         self._lock = threading.Lock()
 
     def codes(self) -> tuple[int, ...]:
-        """Codes in the table's order."""
+        """The property codes in the table's order."""
         return tuple(self._entries)
 
     def encode_all(self) -> bytes:
-        """The answer to 9209: 8-byte count, then every entry."""
+        """Encode the answer to 9209: 8-byte count, then all entries."""
         with self._lock:
             entries = [entry.encode() for entry in self._entries.values()]
         return struct.pack("<Q", len(entries)) + b"".join(entries)
 
     def extension_info(self) -> bytes:
-        """The answer to 9202: version, codes of the properties, codes of the controls."""
+        """Encode the answer to 9202: version, codes of the properties, codes of the controls."""
         codes = self.codes()
         listing = struct.pack(f"<HI{len(codes)}H", PROTOCOL_VERSION, len(codes), *codes)
         return listing + struct.pack(f"<I{len(CONTROLS)}H", len(CONTROLS), *CONTROLS)
 
     def set_from_client(self, code: int, data: bytes) -> None:
-        """What operation 9205 does. Raises NotWritableError or RefusedValueError."""
+        """Set a value as operation 9205 does. Raises NotWritableError or RefusedValueError."""
         with self._lock:
             try:
                 entry = self._entries[Code(code)]
@@ -196,17 +199,17 @@ class PropertyTable:
             entry.accept(entry.unpack(data))
 
     def put(self, code: Code, value: int) -> None:
-        """The camera itself changes a value (focus status, objects in memory, battery)."""
+        """Change a value from inside the camera (focus status, objects in memory, battery)."""
         with self._lock:
             self._entries[code].value = value
 
     def value(self, code: Code) -> int:
-        """Current raw value."""
+        """The current raw value."""
         with self._lock:
             return self._entries[code].value
 
     def exposure_settings(self) -> ExposureSettings:
-        """What the next exposure will be taken with."""
+        """The settings with which the next exposure will be taken."""
         shutter = self.value(Code.SHUTTER_SPEED)
         numerator, denominator = shutter >> 16, shutter & 0xFFFF
         return ExposureSettings(

@@ -1,4 +1,4 @@
-"""What each PTP operation does to the camera and what it answers; knows nothing of sockets."""
+"""Carries out PTP operations on the camera and builds their answers, without sockets."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _CODES: dict[type[Exception], int] = {
     SimulatorError: GENERAL_ERROR,
     NotReadyError: DEVICE_BUSY,
 }
-# A real body takes milliseconds to answer a poll while it exposes; the client asks as often as it is answered.
+# A real camera takes milliseconds to answer a poll during an exposure; the client polls as fast as it is answered.
 _POLL_WHILE_EXPOSING_S = 0.005
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """The answer: response code, its parameters, a data phase; `wire_fault` is for the socket to carry out."""
+    """The answer: response code, its parameters, a data phase; the socket carries out `wire_fault`."""
 
     code: int = OK
     parameters: tuple[int, ...] = ()
@@ -49,7 +49,7 @@ class Reply:
 
 
 class Responder:
-    """One session's operations on the camera body."""
+    """One session's operations on the camera."""
 
     def __init__(self, body: CameraBody, faults: FaultPlan) -> None:
         self._body = body
@@ -72,7 +72,10 @@ class Responder:
         }
 
     def handle(self, request: codec.Request, data: bytes) -> Reply:
-        """Carry out one operation. Planned faults of the kinds busy, disk_full, reject, error and ignore act here."""
+        """Carry out one operation.
+
+        Planned faults of the kinds busy, disk_full, reject, error and ignore take effect here.
+        """
         known = self._operations.get(request.operation)
         if known is None:
             return Reply(NOT_SUPPORTED)
@@ -89,7 +92,7 @@ class Responder:
         return Reply(reply.code, reply.parameters, reply.data, fault)
 
     def _message(self, name: str, request: codec.Request, data: bytes) -> str:
-        """Name that a fault plan uses: presses of the shutter and live-view frames have names of their own."""
+        """The name of a message in fault plans: shutter presses and live-view frames have their own names."""
         first = request.parameters[0] if request.parameters else 0
         if name == "button" and first == Code.FULL_PRESS and data[:1] == b"\x02":
             return "shutter"
@@ -131,7 +134,7 @@ class Responder:
         return Reply(parameters=(0,))
 
     def _object_handles(self, request: codec.Request, data: bytes) -> Reply:
-        # In PC Remote mode the card's files are not listed; only the fictitious handles exist.
+        # In PC Remote mode the card's files are not listed; only the pseudo handles exist.
         del request, data
         return Reply(data=codec.array_u32(()))
 

@@ -1,4 +1,4 @@
-"""Where the simulated camera's pictures come from: the rig's world, picture files, or a built-in still life."""
+"""Sources of the simulated camera's pictures: the rig's world, picture files, or a built-in still life."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from simulators.serve import SimulatorError
 from simulators.sony_camera.properties import ExposureSettings
 
 Rgb = NDArray[np.uint8]  # (H, W, 3)
-_REFERENCE = (22.0, 1.0 / 15.0, 100.0)  # f-number, seconds, ISO at which a grey card comes out grey
+_REFERENCE = (22.0, 1.0 / 15.0, 100.0)  # f-number, seconds and ISO at which a grey card is rendered mid-grey
 
 
-_PREVIEW_PATIENCE_S = 1.0  # libgphoto2 gives up after 2.5 s of silence
+_PREVIEW_PATIENCE_S = 1.0  # libgphoto2 gives up after 2.5 s without an answer
 _LOG = logging.getLogger(__name__)
 
 
 class NotReadyError(SimulatorError):
-    """The renderer is at work on something else, or still being built."""
+    """The renderer is busy or still being built."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """What lay before the lens when the shutter opened; develop() may take its time afterwards."""
+    """What was in front of the lens when the shutter opened; develop() may take longer."""
 
     counter: int
     T_world_camera: list[list[float]] | None
@@ -42,18 +42,18 @@ class Moment:
 
 
 class ImageSource(Protocol):
-    """Supplies pictures; freeze() is quick and is called at the exposure, develop() renders."""
+    """Supplies pictures: freeze() is fast and called at the exposure, develop() renders."""
 
     def freeze(self, counter: int) -> Moment:
         """Record what the camera sees now."""
         ...
 
     def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
-        """The picture of that moment, (H, W, 3) RGB."""
+        """Render the picture of that moment as (H, W, 3) RGB."""
         ...
 
     def preview(self) -> Rgb:
-        """A small live-view frame."""
+        """Return a small live-view frame as (H, W, 3) RGB."""
         ...
 
 
@@ -64,7 +64,7 @@ def exposure_gain(settings: ExposureSettings) -> float:
 
 
 def expose(picture: Rgb, gain: float) -> Rgb:
-    """The same picture with `gain` times the light, through a gamma of 2.2."""
+    """Return the picture with `gain` times the light, through a gamma of 2.2."""
     if abs(gain - 1.0) < 0.02:
         return picture
     linear = (np.arange(256) / 255.0) ** 2.2 * gain
@@ -73,7 +73,7 @@ def expose(picture: Rgb, gain: float) -> Rgb:
 
 
 class StillLife:
-    """A procedural picture: a lit bowl of fruit-like discs on a grained table, with the counter in a corner."""
+    """A procedural picture: disks like fruit in a bowl on a grained table, with the file counter in one corner."""
 
     def __init__(self, image_width: int) -> None:
         self._size = (image_width, round(image_width * 2 / 3))
@@ -99,7 +99,7 @@ class StillLife:
         return (np.clip(noisy, 0.0, 1.0) ** (1 / 2.2) * 255.0).astype(np.uint8)
 
     def _full_size(self) -> Rgb:
-        # Painted at a moderate size: sixty megapixels of arithmetic would outlast the client's patience.
+        # Drawn at a moderate size: rendering sixty megapixels would take longer than the client waits.
         width, height = self._size
         painted_width = min(width, 1536)
         painted = self._picture(painted_width, round(painted_width * 2 / 3))
@@ -108,11 +108,11 @@ class StillLife:
         return cast(Rgb, cv2.resize(painted, (width, height), interpolation=cv2.INTER_CUBIC))
 
     def freeze(self, counter: int) -> Moment:
-        """The still life stands still; only the counter changes."""
+        """Record the counter; nothing else changes in a still life."""
         return Moment(counter, None, {})
 
     def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
-        """The scene at the settings' brightness, with the counter's digits."""
+        """Return the picture with the settings' brightness and the counter's digits."""
         if self._plain is None:
             self._plain = self._full_size()
         picture = expose(self._plain, exposure_gain(settings)).copy()
@@ -123,12 +123,12 @@ class StillLife:
         return picture
 
     def preview(self) -> Rgb:
-        """A frame of 640 × 424."""
+        """Return a frame of 640 × 424."""
         return self._picture(640, 424)
 
 
 class PictureFiles:
-    """Pictures from files, in turn, scaled to the image width where one is asked for."""
+    """Pictures from files in turn, scaled to the image width if one is given."""
 
     def __init__(self, files: list[Path], image_width: int | None) -> None:
         self._files = files
@@ -148,15 +148,15 @@ class PictureFiles:
         return cast(Rgb, picture)
 
     def freeze(self, counter: int) -> Moment:
-        """Files do not move."""
+        """Record the counter, which selects the file."""
         return Moment(counter, None, {})
 
     def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
-        """The counter's file, lit as the settings say."""
+        """Return the counter's file with the settings' brightness."""
         return expose(self._load(moment.counter), exposure_gain(settings))
 
     def preview(self) -> Rgb:
-        """The first file, small."""
+        """Return the first file at a small size."""
         picture = self._load(1)
         return cast(Rgb, cv2.resize(picture, (640, round(640 * picture.shape[0] / picture.shape[1]))))
 
@@ -168,7 +168,7 @@ class _Renderer(Protocol):
 
 
 class WorldSource:
-    """What the rig's world shows: the pose at the moment of exposure, rendered."""
+    """Pictures of the rig's world, rendered for the camera pose at the moment of exposure."""
 
     def __init__(self, address: str, image_width: int, timeout_s: float = 10.0) -> None:
         host, _, port = address.rpartition(":")
@@ -178,12 +178,12 @@ class WorldSource:
         self._width = image_width
         self._timeout_s = timeout_s
         self._built: _Renderer | None = None
-        self._rendering = threading.Lock()  # live view and an exposure come from two threads
+        self._rendering = threading.Lock()  # live view and exposures use different threads
 
     @property
     def _renderer(self) -> _Renderer:
         if self._built is None:
-            # Imported when first needed: ray casting is heavy, and pictures from files do without it.
+            # Imported on demand: ray casting is slow to import, and picture files do not need it.
             self._built = cast(_Renderer, importlib.import_module("simulators.render").Renderer(self._width))
         return self._built
 
@@ -210,19 +210,19 @@ class WorldSource:
         return cast("dict[str, Any]", answer)
 
     def freeze(self, counter: int) -> Moment:
-        """Ask the world what is before the lens now."""
+        """Ask the world what is in front of the lens now."""
         view = self._view()
         return Moment(counter, view["T_world_camera"], view)
 
     def develop(self, moment: Moment, settings: ExposureSettings) -> Rgb:
-        """Render that view."""
+        """Render the recorded view."""
         lens = {"aperture_f": settings.aperture_f, "exposure_s": settings.exposure_s, "iso": float(settings.iso)}
         with self._rendering:
             picture = self._renderer.render(moment.view, lens, moment.counter)
         return hand_in_picture(picture, moment.view)
 
     def preview(self) -> Rgb:
-        """Render a small frame of now."""
+        """Render a small frame of the current view."""
         view = self._view()
         if not self._rendering.acquire(timeout=_PREVIEW_PATIENCE_S):
             raise NotReadyError("the renderer is busy")
@@ -232,9 +232,9 @@ class WorldSource:
             self._rendering.release()
 
     def await_press(self, after: int) -> tuple[int, int]:
-        """Presses of the body's button so far, and the ISO to which the dial was turned before the last (0: not).
+        """Wait until the body's button was pressed more than `after` times, or for a second.
 
-        Answers once there were more than `after`, or after a second.
+        Returns the number of presses, and the ISO to which the dial was turned before the last one (0: not turned).
         """
         answer = self._ask({"op": "shutter", "after": after})
         if "shutter_presses" not in answer:
@@ -242,9 +242,9 @@ class WorldSource:
         return int(answer["shutter_presses"]), int(answer["iso"])
 
     def warm_up(self, stop: threading.Event, interval_s: float = 0.5) -> None:
-        """Build the renderer's scene as soon as the world answers, and anew when a sphere was moved.
+        """Build the renderer's scene as soon as the world answers, and again after a sphere was moved.
 
-        So no client waits for it.
+        This spares the clients the wait.
         """
         built: object = None
         while not stop.is_set():

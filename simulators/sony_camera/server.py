@@ -1,4 +1,4 @@
-"""The sockets of the simulated camera: a command and an event connection for one client at a time."""
+"""The sockets of the simulated camera: one command and one event connection, for one client at a time."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _LOG = logging.getLogger(__name__)
 
 
 class LinkClosedError(Exception):
-    """The client went away, or a planned fault cut the line."""
+    """The client disconnected, or a planned fault cut the connection."""
 
 
 def _receive(link: socket.socket, count: int) -> bytes:
     parts = bytearray()
     while len(parts) < count:
-        # Linux forgets quick acknowledgement after each use; without it every set waits 40 ms for the client's Nagle.
+        # Linux resets TCP_QUICKACK after each use; without it, the client's Nagle algorithm costs 40 ms per set.
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         part = link.recv(min(count - len(parts), 1 << 20))
         if not part:
@@ -43,7 +43,7 @@ def _receive_packet(link: socket.socket) -> tuple[PacketType, bytes]:
 
 
 class _Session:
-    """One command connection and the event connection that joined it."""
+    """A command connection and the event connection that joined it."""
 
     def __init__(self, number: int, command: socket.socket) -> None:
         self.number = number
@@ -65,7 +65,7 @@ class _Session:
                     link.close()
 
     def reset(self) -> None:
-        """Cut the line with RST instead of FIN."""
+        """Close the connection with RST instead of FIN."""
         for link in (self.command, self.event):
             if link is not None:
                 link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
@@ -74,7 +74,7 @@ class _Session:
 
 
 class CameraServer:
-    """Listens, pairs connections, serves operations. Use as a context manager."""
+    """Listens, pairs the connections and serves operations. A context manager."""
 
     def __init__(self, host: str, port: int, body: CameraBody, faults: FaultPlan) -> None:
         self._body = body
@@ -143,7 +143,7 @@ class CameraServer:
             return
         session.event = link
         link.sendall(codec.packet(PacketType.INIT_EVENT_ACK))
-        # Probe requests may come on this socket; nothing else is expected from the client.
+        # Probe requests may arrive on this socket; nothing else is expected from the client.
         while True:
             kind, _ = _receive_packet(link)
             if kind is PacketType.PROBE_REQUEST:
@@ -156,7 +156,7 @@ class CameraServer:
             link.close()
             return
         with self._lock:
-            # A client that comes back after a crash takes the place of its dead predecessor.
+            # A client that reconnects after a crash replaces its dead predecessor.
             previous, session = self._session, _Session(self._next_number, link)
             self._session, self._next_number = session, self._next_number + 1
         if previous is not None:
@@ -191,7 +191,7 @@ class CameraServer:
             raise codec.CodecError(f"{kind.name} where data should start")
         announced, data = codec.parse_start_data(body), bytearray()
         if announced == 0:
-            return b""  # libgphoto2 sends no End_Data behind the announcement of nothing
+            return b""  # libgphoto2 sends no End_Data after announcing zero bytes
         while True:
             kind, body = _receive_packet(link)
             if kind not in (PacketType.DATA, PacketType.END_DATA):

@@ -1,4 +1,4 @@
-"""A Universal Robots controller on its real wires: RTDE 30004, dashboard 29999, script port 30003."""
+"""A simulated Universal Robots controller on its real ports: RTDE 30004, dashboard 29999, script 30003."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def serve(args: argparse.Namespace) -> None:
-    """Listen, announce, serve until SIGTERM; SIGUSR1 turns the pendant's key. Raises SimulatorError."""
+    """Listen, print the ready line and serve until SIGTERM; SIGUSR1 switches to remote control.
+
+    Raises SimulatorError.
+    """
     termination = Termination(with_parent=args.with_parent)
     model = MODELS[args.model]
     controller = Controller(

@@ -1,4 +1,4 @@
-"""The client library's control script, recognised and emulated: its command loop over registers."""
+"""Emulates the client library's control script, recognised by its text: a command loop over registers."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ _LOG = logging.getLogger(__name__)
 
 READY, DONE = 1, 2
 JOG_STOP_M_S2 = 1.2
-LEVER_M = 0.5  # of the arm, by which rates of the tool become rates of the joints
+LEVER_M = 0.5  # of the arm, to convert accelerations of the tool to those of the joints
 _RUNNING_BIT = 1 << 15
 _NUMBERS = r"\[([^\]]*)\]"
 _LEG = re.compile(rf"\b(movej|movel|movep)\s*\(\s*(p?){_NUMBERS}\s*,([^)]*)\)")
 _OPTION = re.compile(r"\b([avr])\s*=\s*([-+0-9.eE]+)")
 
 
-class StopProgram(Exception):  # noqa: N818 - it is no error: the script returns
-    """The program ends."""
+class StopProgram(Exception):  # noqa: N818 - not an error: the script returns
+    """The program ends; the message says why."""
 
 
 class ControlProgram:
-    """The command loop of the control script: reads a command from registers, acts, reports ready and done."""
+    """The script's command loop: reads a command from the registers, executes it, reports ready and done."""
 
     def __init__(self, controller: Controller, text: str) -> None:
         self._c = controller
@@ -38,11 +38,11 @@ class ControlProgram:
         self._int = _offset(text, "reg_offset_int")
         self._path = _path_of(text)
         self._executing = 0
-        self._blocking = False  # the loop waits for the motion
+        self._blocking = False  # the loop waits for the motion to end
         self._async = False  # a motion thread reports its progress
         self._writes = self._operations = 0
-        self._watchdog_s = 0.0  # longest time between two writes of the command register; 0: not watched
-        self._told: set[int] = set()  # commands that the log was told to be without effect
+        self._watchdog_s = 0.0  # longest time between two writes of the command register; 0: no watchdog
+        self._told: set[int] = set()  # commands that were logged as having no effect
         self._handlers = self._table()
         self._progress(-1)
 
@@ -77,7 +77,7 @@ class ControlProgram:
     # --- loop --------------------------------------------------------------------------------------------
 
     def step(self) -> None:
-        """One cycle. Raises StopProgram when the script ends."""
+        """Run one cycle. Raises StopProgram when the script ends."""
         written_s = self._c.int_written_s[self._int]
         if 0.0 < self._watchdog_s < self._c.time_s - written_s:
             raise StopProgram(f"watchdog: nothing written for {self._c.time_s - written_s:.3f} s")
@@ -140,10 +140,10 @@ class ControlProgram:
             15: self._stop_now,
             16: self._stop_now,
             17: self._payload,
-            18: _nothing,  # nobody pushes the arm: it stands
+            18: _nothing,  # nobody pushes the arm: it stays in place
             19: _nothing,
             24: lambda: self._servo(self._solve(self._vector(0), self._c.target_q)),
-            25: lambda: self._answer(False),  # nothing ever touches it
+            25: lambda: self._answer(False),  # there is never any contact
             26: lambda: self._out([self._c.step_s]),
             27: lambda: self._out(self._c.joints_ago(self._in_int(1))),
             28: lambda: self._out(self._c.target_tcp_pose),
@@ -194,7 +194,7 @@ class ControlProgram:
         self._matrix(np.zeros((count, 1)))
 
     def _matrix(self, numbers: Array) -> None:
-        """Column by column, into the lower registers and then the last twelve. Brought by 5.23."""
+        """Write a matrix column by column, into the lower registers and then the last twelve (since 5.23)."""
         for register, value in zip(_NEW_REGISTERS, numbers.T.ravel(), strict=False):
             self._c.outputs.doubles[register] = float(value)
         self._c.generation += 1
@@ -213,7 +213,7 @@ class ControlProgram:
     def _solve(self, pose: Array, near: Array) -> Array:
         q = self._c.inverse(pose, near)
         if q is None:
-            raise MotionError("inverse kinematics finds no solution")  # a real script dies of it too
+            raise MotionError("inverse kinematics finds no solution")  # this ends a real script too
         return q
 
     def _move_joints(self, goal: Array) -> None:
@@ -260,7 +260,7 @@ class ControlProgram:
             raise StopProgram("the controller does not allow motion")
 
     def _jog(self) -> None:
-        """Speed along the axes of the base, of the tool, or of a frame of one's own (registers 6 to 13)."""
+        """Jog along the axes of the base, the tool or a given frame (registers 6 to 13)."""
         feature = round(self._in(6))
         pose = self._c.tcp_pose if feature == 1 else self._vector(8) if feature == 2 else np.zeros(6)
         R = kinematics.from_pose(pose)[:3, :3]
@@ -268,12 +268,12 @@ class ControlProgram:
         self._keep_speed(np.concatenate([R @ speed[:3], R @ speed[3:]]), self._in(7), tool=True)
 
     def _move_until_contact(self) -> None:
-        """Nothing ever touches the arm: it goes on until it can no further, and stops protectively."""
+        """Move until contact, which never comes: the arm goes to its limit and stops protectively."""
         self._keep_speed(self._vector(0), self._in(12), tool=True)
         self._blocking = True
 
     def _servo_along(self) -> None:
-        """servoC on a straight line, without reporting its end."""
+        """servoC along a straight line, without reporting its end."""
         c = self._c
         goal, tool = kinematics.from_pose(self._vector(0)), kinematics.from_pose(c.tcp_pose_m)
         line = MoveL(c.model, c.target_q, goal, tool, speed=self._in(6), acceleration=self._in(7))
@@ -288,7 +288,7 @@ class ControlProgram:
             raise StopProgram("the controller does not allow motion")
 
     def _stop_now(self) -> None:
-        # stopL's rate is the tool's, in m/s².
+        # stopL's deceleration is that of the tool, in m/s².
         self._decelerate(self._in(0) / (LEVER_M if self._executing == 33 else 1.0))
 
     def _decelerate(self, deceleration: float) -> None:
@@ -315,9 +315,9 @@ class ControlProgram:
         self._c.payload_inertia = [self._in(i) for i in range(4, 10)]
 
 
-# Done every cycle for as long as the command stays in the register.
+# Executed every cycle while the command stays in the register.
 _STREAMED = frozenset((6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71))
-# Taken as done without effect; asked for numbers, the arm answers zeros.
+# Reported as done without effect; queries are answered with zeros.
 _NOT_SIMULATED = {
     6: "force mode",
     7: "the end of force mode",
@@ -331,21 +331,21 @@ _NOT_SIMULATED = {
     67: "the mass matrix",
     68: "Coriolis and centrifugal torques",
 }
-_NEW_REGISTERS = (*range(24), *range(36, 48))  # where matrices go, column by column
+_NEW_REGISTERS = (*range(24), *range(36, 48))  # for matrices, column by column
 
 
 def _nothing() -> None:
-    """Done at once."""
+    """Do nothing; done at once."""
 
 
 def _offset(text: str, name: str) -> int:
-    # The client writes the number behind the comment that follows, on the next line.
+    # The client writes the number on the next line, after a comment.
     match = re.search(rf"{name}\s*=\s*(?:#[^\n]*\n\s*)?(\d+)", text)
     return int(match.group(1)) if match else 0
 
 
 def _path_of(text: str) -> list[tuple[bool, bool, Array, float, float]]:
-    """Way points that the client wrote into the script: straight?, is a pose?, target, speed, acceleration."""
+    """Parse the way points in the script: whether straight, whether a pose, target, speed, acceleration."""
     match = re.search(r"def exec_move_path\(\):(.*?)\n\s*end\b", text, re.DOTALL)
     path: list[tuple[bool, bool, Array, float, float]] = []
     for verb, pose, numbers, rest in _LEG.findall(match.group(1) if match else ""):

@@ -1,4 +1,4 @@
-"""The controller's state: modes, safety, joints, registers, inputs and outputs, advanced cycle by cycle."""
+"""The controller's state (modes, safety, joints, registers, inputs and outputs), advanced cycle by cycle."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _LOG = logging.getLogger(__name__)
 
 PROTECTIVE_UNLOCK_S = 5.0
 LONGEST_CYCLE_S = 0.02
-HISTORY_CYCLES = 4096  # of joints that programs may ask for
-RING_FREQUENCY_HZ, RING_DECAY_S, RING_AMPLITUDE_S2 = 12.0, 0.06, 4e-5  # the arm swings a little when it stops
+HISTORY_CYCLES = 4096  # of joint history that programs may query
+RING_FREQUENCY_HZ, RING_DECAY_S, RING_AMPLITUDE_S2 = 12.0, 0.06, 4e-5  # the arm oscillates slightly when it stops
 
 
 class RobotMode(IntEnum):
@@ -66,7 +66,10 @@ class Registers:
 
 
 class Controller:
-    """One controller with its arm. Time is in seconds since start-up; `speed_up` shortens motions and waiting."""
+    """One controller with its arm.
+
+    Time is in seconds since start-up; `speed_up` shortens motions and waits.
+    """
 
     def __init__(
         self,
@@ -88,11 +91,11 @@ class Controller:
         self.runtime = Runtime.STOPPED
         self.program_name = ""
         self.inputs, self.outputs = Registers(), Registers()
-        self.int_written_s = [0.0] * 48  # when a client last wrote each of the integer inputs
+        self.int_written_s = [0.0] * 48  # time at which a client last wrote each integer input
         self.payload_kg, self.payload_cog_m, self.payload_inertia = 0.0, [0.0] * 3, [0.0] * 6
         self.tcp_pose_m = np.zeros(6)
         self.speed_fraction = 1.0
-        self.local = False  # the pendant's key: nobody commands from outside
+        self.local = False  # local control: no remote commands
         self.digital_outputs = 0
         self.analog_outputs = [0.0, 0.0]
         self.operational_since_s = 0.0
@@ -102,23 +105,23 @@ class Controller:
         self.tcp_pose, self.target_tcp_pose = np.zeros(6), np.zeros(6)
         self.tcp_speed = np.zeros(6)
         self._history: deque[Array] = deque([joints.copy()], maxlen=HISTORY_CYCLES)
-        self.generation = 0  # rises whenever anything but the clock changed
+        self.generation = 0  # increases whenever anything but the clock changes
         self.motion: Motion | None = None
         self._stopped_at_s = -math.inf
         self._button_released_s = -math.inf
         self._pending_fault: tuple[float, Fault] | None = None
-        self.stream_fault: Fault | None = None  # for the server: a motion that takes the stream with it
+        self.stream_fault: Fault | None = None  # for the server: a motion that also breaks the stream
         self._ring: tuple[float, Array] | None = None
         self._place_tool()
 
     # --- cycle -------------------------------------------------------------------------------------------
 
     def advance(self, dt_s: float) -> None:
-        """Move on by dt_s of real time."""
+        """Advance by dt_s of real time."""
         self.time_s += dt_s
         if (lost_s := dt_s - LONGEST_CYCLE_S) > 0:
-            # A controller keeps its cycle. Where this process did not get its turn, what clients wrote meanwhile is
-            # still unread, and must not seem late.
+            # A real controller keeps its cycle time. If this process was not scheduled, clients' writes are still
+            # unread, but must not count as late.
             self.int_written_s = [at_s + lost_s for at_s in self.int_written_s]
         if self._pending_fault is not None and self.time_s >= self._pending_fault[0]:
             fault, self._pending_fault = self._pending_fault[1], None
@@ -178,21 +181,21 @@ class Controller:
 
     @property
     def may_move(self) -> bool:
-        """Brakes released and no stop active."""
+        """Whether the brakes are released and no stop is active."""
         return self.robot_mode is RobotMode.RUNNING and self.safety in (SafetyMode.NORMAL, SafetyMode.REDUCED)
 
     @property
     def planned_qd(self) -> Array:
-        """Joint velocities as the motion has them, before speed slider and speed-up."""
+        """Joint velocities (6,) of the motion, before the speed slider and `speed_up`."""
         return self.motion.qd if self.motion is not None else np.zeros(6)
 
     @property
     def steady(self) -> bool:
-        """is_steady(): the target stands still; it sees nothing of the arm's swinging."""
+        """is_steady(): whether the target stands still; the arm's oscillation is not considered."""
         return self.motion is None
 
     def start(self, motion: Motion) -> bool:
-        """Begin a motion, replacing the present one; False when a fault plan refuses it."""
+        """Begin a motion, replacing the current one; False if a fault plan refuses it."""
         fault = self.faults.check(self.device, "move")
         if fault is not None and fault.kind == "reject":
             return False
@@ -206,12 +209,12 @@ class Controller:
         return True
 
     def replace(self, motion: Motion) -> None:
-        """Change the present motion (stop, new speed target): not counted as a motion by fault plans."""
+        """Change the current motion (stop, new speed target); fault plans do not count this as a motion."""
         self.motion = motion
         self._ring = None
 
     def halt(self) -> None:
-        """Stand still within this cycle."""
+        """Stop within this cycle."""
         self.motion = None
         if np.any(self.target_qd):
             self._ring = (self.time_s, -RING_AMPLITUDE_S2 * 5 * np.sign(self.target_qd))
@@ -220,12 +223,12 @@ class Controller:
         self._place_tool()
 
     def set_tcp(self, pose: Array) -> None:
-        """Tool centre point in the flange frame, as a pose."""
+        """Set the tool centre point, as a pose (6,) in the flange frame."""
         self.tcp_pose_m = pose.copy()
         self._place_tool()
 
     def set_payload(self, mass_kg: float, cog_m: list[float]) -> bool:
-        """Mass and centre of gravity; False beyond the model's rating."""
+        """Set the mass and the centre of gravity; False if they exceed the model's rating."""
         if not 0.0 <= mass_kg <= self.model.payload_kg:
             return False
         self.payload_kg, self.payload_cog_m = mass_kg, cog_m
@@ -233,38 +236,38 @@ class Controller:
         return True
 
     def within_limits(self, q: Array) -> bool:
-        """All joints within ±360°."""
+        """Whether all joints are within ±360°."""
         return bool(np.all(np.isfinite(q)) and np.max(np.abs(q)) <= kinematics.JOINT_LIMIT_RAD + 1e-9)
 
     def joints_ago(self, cycles: int) -> Array:
-        """Measured joints so many cycles ago, the oldest known at most."""
+        """Measured joints (6,) that many cycles ago, or the oldest known ones."""
         return self._history[-1 - min(max(cycles, 0), len(self._history) - 1)]
 
     def jacobian(self, q: Array) -> Array:
-        """Of the tool centre point in the base frame (6, 6), for joints q."""
+        """Jacobian (6, 6) of the tool centre point in the base frame at joints q (6,)."""
         chain = kinematics.frames(self.model, q)
         return kinematics.jacobian(chain, (chain[6] @ kinematics.from_pose(self.tcp_pose_m))[:3, 3])
 
     def jacobian_rate(self) -> Array:
-        """Its time derivative (6, 6) at the present joint speeds, by a central difference."""
+        """Time derivative (6, 6) of the Jacobian at the current joint speeds, by a central difference."""
         step = 1e-5
         ahead, behind = self.actual_q + step * self.actual_qd, self.actual_q - step * self.actual_qd
         return (self.jacobian(ahead) - self.jacobian(behind)) / (2 * step)
 
     def inverse(self, pose: Array, near: Array) -> Array | None:
-        """Joints that bring the tool centre point to a pose."""
+        """Joints (6,) that bring the tool centre point to a pose, closest to `near`; None if unreachable."""
         T = kinematics.from_pose(pose) @ kinematics.rigid_inverse(kinematics.from_pose(self.tcp_pose_m))
         return kinematics.inverse(self.model, T, near)
 
     # --- safety --------------------------------------------------------------------------------------------
 
     def protective_stop(self, why: str) -> None:
-        """Stop at once; the program dies; a person has to unlock."""
+        """Stop at once and end the program; a person must unlock the arm."""
         _LOG.warning("protective stop: %s", why)
         self._stop(SafetyMode.PROTECTIVE_STOP)
 
     def emergency_stop(self, fault: Fault | None = None) -> None:
-        """Stop and cut the power; the button is released after the fault's value in seconds (2)."""
+        """Stop and cut the power; the button is released after the fault's value in seconds (default 2)."""
         hold_s = float(fault.value) if fault is not None and isinstance(fault.value, (int, float)) else 2.0
         _LOG.warning("emergency stop")
         self._stop(SafetyMode.ROBOT_EMERGENCY_STOP)
@@ -278,7 +281,7 @@ class Controller:
         self.generation += 1
 
     def unlock_protective_stop(self) -> bool:
-        """Possible 5 s after the stop; True when unlocked."""
+        """Release a protective stop, possible 5 s after it; returns whether it was released."""
         if self.safety is not SafetyMode.PROTECTIVE_STOP:
             return True
         if self.time_s - self._stopped_at_s < PROTECTIVE_UNLOCK_S / self.speed_up:
@@ -288,7 +291,7 @@ class Controller:
         return True
 
     def power_on(self) -> None:
-        """Power without brakes released. Ends an emergency stop when its button was released."""
+        """Switch the power on without releasing the brakes. Clears an emergency stop whose button was released."""
         if self.safety is SafetyMode.ROBOT_EMERGENCY_STOP:
             if self.time_s < self._button_released_s:
                 return
@@ -298,13 +301,13 @@ class Controller:
         self.generation += 1
 
     def power_off(self) -> None:
-        """Brakes on, power off, program dead."""
+        """Apply the brakes, switch the power off and end the program."""
         self.halt()
         self.robot_mode, self.runtime = RobotMode.POWER_OFF, Runtime.STOPPED
         self.generation += 1
 
     def brake_release(self) -> None:
-        """To RUNNING, powering on if need be."""
+        """Release the brakes, switching the power on if needed; the mode becomes RUNNING."""
         self.power_on()
         if self.robot_mode is RobotMode.IDLE:
             self.robot_mode = RobotMode.RUNNING
@@ -313,7 +316,7 @@ class Controller:
     # --- RTDE fields -----------------------------------------------------------------------------------------
 
     def apply(self, written: dict[str, tuple[float, ...]]) -> None:
-        """Take the fields of a client's data package."""
+        """Apply the fields of a client's data package."""
         for name, value in written.items():
             if name.startswith("input_int_register_"):
                 self.inputs.ints[int(name[19:])] = int(value[0])
@@ -333,7 +336,7 @@ class Controller:
         self.generation += 1
 
     def values(self) -> dict[str, tuple[float, ...]]:
-        """The present numbers of the fields that are not zero throughout; registers are looked up apart."""
+        """The current values of all fields that are not constantly zero, without the registers."""
         powered = self.robot_mode in (RobotMode.IDLE, RobotMode.RUNNING)
         joint_mode = 253 if self.robot_mode is RobotMode.RUNNING else 255 if powered else 239
         return {

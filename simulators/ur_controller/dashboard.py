@@ -1,4 +1,4 @@
-"""The dashboard server's commands: one line in, one line out, as Polyscope words them."""
+"""The dashboard server's commands: one line in, one line out, in Polyscope's words."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _REMOTE_ONLY = ("power on", "brake release", "play", "unlock protective stop")
 
 
 class Dashboard:
-    """Answers one client's lines. Every program file (.urp) that is asked for exists; it runs until it is stopped."""
+    """Answers one client's lines. Every requested program file (.urp) exists and runs until it is stopped."""
 
     def __init__(self, controller: Controller, interpreter: Interpreter) -> None:
         self._controller = controller
         self._interpreter = interpreter
 
     def answer(self, line: str) -> str:
-        """The reply to one line, without its line end."""
+        """Return the reply to one line, without its line end."""
         command = " ".join(line.strip().split())
         word = command.lower()
         if word in _FIXED:

@@ -1,4 +1,4 @@
-"""The RTDE fields of a controller: names, types and the software version that brought each."""
+"""The RTDE fields of a controller: names, types and the software version that introduced each."""
 
 from __future__ import annotations
 
@@ -90,12 +90,12 @@ INPUTS: dict[str, str] = {
 
 
 def register_count(version: Version) -> int:
-    """Integer and double registers of each direction: the upper 24 came with 3.9 and 5.3."""
+    """Number of integer and double registers per direction: the upper 24 were added in 3.9 and 5.3."""
     return 48 if version >= ((3, 9) if version[0] < 5 else (5, 3)) else 24
 
 
 def outputs(version: Version) -> dict[str, str]:
-    """Name → type of everything that this version can stream."""
+    """Name → type of all fields that this version can stream."""
     table: dict[str, str] = dict.fromkeys(VECTORS_6, "VECTOR6D")
     table |= dict.fromkeys(DOUBLES, "DOUBLE")
     table |= dict.fromkeys(UINT32S, "UINT32")
@@ -119,7 +119,7 @@ def outputs(version: Version) -> dict[str, str]:
 
 
 def inputs(version: Version) -> dict[str, str]:
-    """Name → type of everything that a client may write."""
+    """Name → type of all fields that a client may write."""
     table = dict(INPUTS)
     for i in range(register_count(version)):
         table[f"input_int_register_{i}"] = "INT32"

@@ -1,4 +1,4 @@
-"""Kinematics of the Universal Robots models: DH forward, Jacobian, analytic inverse nearest to a posture."""
+"""Kinematics of Universal Robots arms: DH forward kinematics, Jacobian, and analytic inverse kinematics."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SIN_ALPHA = (1.0, 0.0, 0.0, 1.0, -1.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A robot model: its DH parameters in metres (the maker's published nominal values) and its ratings."""
+    """A robot model: its nominal DH parameters (metres, as published by the manufacturer) and its ratings."""
 
     name: str
     a_m: tuple[float, float, float, float, float, float]
@@ -50,7 +50,7 @@ MODELS = {
 
 
 def frames(model: Model, q: Array) -> list[Array]:
-    """T_base_0 … T_base_6 (4, 4) along the chain for joints q (6,) in radians; the last one is the flange."""
+    """Return T_base_0 … T_base_6 (4, 4) along the chain at joints q (6,) in radians; the last one is the flange."""
     chain = [np.eye(4)]
     for i in range(6):
         chain.append(chain[-1] @ _link(model, i, float(q[i])))
@@ -58,7 +58,7 @@ def frames(model: Model, q: Array) -> list[Array]:
 
 
 def _link(model: Model, i: int, angle: float) -> Array:
-    """T_i_(i+1) of the DH table."""
+    """T_i_(i+1) of the DH table, (4, 4)."""
     c, s = math.cos(angle), math.sin(angle)
     ca, sa, a = _COS_ALPHA[i], _SIN_ALPHA[i], model.a_m[i]
     return np.array(
@@ -67,12 +67,12 @@ def _link(model: Model, i: int, angle: float) -> Array:
 
 
 def forward(model: Model, q: Array) -> Array:
-    """T_base_flange (4, 4)."""
+    """Return T_base_flange (4, 4) at joints q (6,) in radians."""
     return frames(model, q)[6]
 
 
 def jacobian(chain: list[Array], point: Array) -> Array:
-    """Geometric Jacobian (6, 6) of a point (3,) that moves with the flange: linear rows, then angular."""
+    """Return the geometric Jacobian (6, 6) of a point (3,) fixed to the flange: linear rows, then angular rows."""
     J = np.empty((6, 6))
     for i in range(6):
         z, p = chain[i][:3, 2], chain[i][:3, 3]
@@ -86,21 +86,24 @@ def _cross(a: Array, b: Array) -> tuple[float, float, float]:  # np.cross costs 
 
 
 def inverse(model: Model, T_base_flange: Array, near: Array) -> Array | None:
-    """Joints (6,) that reach the pose, nearest to `near` within ±360°; None when no posture reaches it."""
+    """Return the joints (6,) that reach the pose, closest to `near` and within ±360°; None if it is unreachable."""
     best: Array | None = None
     best_distance = math.inf
     for candidate in _postures(model, T_base_flange, near):
         q = candidate + 2 * math.pi * np.round((near - candidate) / (2 * math.pi))
         q = np.where(q > JOINT_LIMIT_RAD, q - 2 * math.pi, np.where(q < -JOINT_LIMIT_RAD, q + 2 * math.pi, q))
         distance = float(np.sum((q - near) ** 2))
-        # An arc cosine near its end loses half the digits: Newton's steps give them back, or expose a wrong branch.
+        # An arc cosine near ±1 loses half the digits: Newton steps restore them, or expose a wrong branch.
         if distance < best_distance and (refined := follow(model, T_base_flange, q)) is not None:
             best, best_distance = refined, distance
     return best
 
 
 def follow(model: Model, T_base_flange: Array, q: Array) -> Array | None:
-    """Joints (6,) of the same posture as `q` that reach a pose close by, by Newton's method; None if it diverges."""
+    """Return the joints (6,) of the same posture as `q` that reach a nearby pose, by Newton's method.
+
+    Returns None if it diverges.
+    """
     for _ in range(8):
         chain = frames(model, q)
         T = chain[6]
@@ -120,7 +123,7 @@ def follow(model: Model, T_base_flange: Array, q: Array) -> Array | None:
 
 
 def _postures(model: Model, T: Array, near: Array) -> Iterator[Array]:
-    """The up to eight postures: shoulder left or right, wrist up or down, elbow up or down.
+    """Yield the up to eight postures: shoulder left or right, wrist up or down, elbow up or down.
 
     Source: the geometric solution of K. P. Hawkins, "Analytic Inverse Kinematics for the Universal Robots
     UR-5/UR-10 Arms", Georgia Institute of Technology, 2013, with signs for the DH table above.
@@ -139,7 +142,7 @@ def _postures(model: Model, T: Array, near: Array) -> Iterator[Array]:
             continue
         for q5 in (side * math.acos(max(-1.0, min(1.0, cosine5))) for side in (1, -1)):
             s5 = math.sin(q5)
-            if abs(s5) < 1e-9:  # the last axis is parallel to axes 2 to 4: any angle will do
+            if abs(s5) < 1e-9:  # the last axis is parallel to axes 2 to 4: any angle is a solution
                 q6 = float(near[5])
             else:
                 q6 = math.atan2((-T[0, 1] * s1 + T[1, 1] * c1) / s5, (T[0, 0] * s1 - T[1, 0] * c1) / s5)
@@ -158,7 +161,7 @@ def _postures(model: Model, T: Array, near: Array) -> Iterator[Array]:
 
 
 def rotation(vector: Array) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector (3,), Rodrigues."""
+    """Rotation matrix (3, 3) of a rotation vector (3,), by Rodrigues' formula."""
     angle = math.sqrt(float(vector @ vector))
     if angle < 1e-12:
         return np.eye(3)
@@ -168,7 +171,7 @@ def rotation(vector: Array) -> Array:
 
 
 def rotation_vector(R: Array) -> Array:
-    """Rotation vector (3,), angle in 0..pi, of a rotation matrix (3, 3)."""
+    """Rotation vector (3,), with an angle in 0…π, of a rotation matrix (3, 3)."""
     w = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine = 0.5 * math.sqrt(float(w @ w))
     cosine = 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0)
@@ -177,7 +180,7 @@ def rotation_vector(R: Array) -> Array:
         return 0.5 * w
     if cosine > 0 or sine > 1e-4:
         return w * (0.5 * angle / sine)
-    # Near a half turn: the axis from the largest column of R + 1.
+    # Near a half turn: take the axis from the largest column of R + 1.
     B = 0.5 * (R + R.T) + np.eye(3) * -cosine
     column = B[:, int(np.argmax(np.diag(B)))]
     axis = column / np.linalg.norm(column)
@@ -185,7 +188,7 @@ def rotation_vector(R: Array) -> Array:
 
 
 def from_pose(pose: Array) -> Array:
-    """T (4, 4) of a pose (6,)."""
+    """Transform (4, 4) of a pose (6,)."""
     T = np.eye(4)
     T[:3, :3] = rotation(np.asarray(pose[3:6], dtype=np.float64))
     T[:3, 3] = pose[:3]
@@ -193,12 +196,12 @@ def from_pose(pose: Array) -> Array:
 
 
 def to_pose(T: Array) -> Array:
-    """Pose (6,) of T (4, 4)."""
+    """Pose (6,) of a transform (4, 4)."""
     return np.concatenate([T[:3, 3], rotation_vector(T[:3, :3])])
 
 
 def rigid_inverse(T: Array) -> Array:
-    """Inverse of a rigid transform."""
+    """Inverse of a rigid transform (4, 4)."""
     out = np.eye(4)
     out[:3, :3] = T[:3, :3].T
     out[:3, 3] = -T[:3, :3].T @ T[:3, 3]

@@ -1,4 +1,4 @@
-"""Motions of the arm as objects that advance in time: trapezoids in joint and tool space, speed, servo and stop."""
+"""Motions of the arm that advance in time: trapezoidal in joint or tool space, speed, servo and stop."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from simulators.ur_controller import kinematics
 from simulators.ur_controller.kinematics import Array, Model
 
-MAX_JOINT_SPEED_RAD_S = 6.3  # twice what the fastest joints are rated for
-MAX_JOINT_STEP_RAD = 0.35  # in one cycle of a straight motion: the posture flipped
+MAX_JOINT_SPEED_RAD_S = 6.3  # twice the rating of the fastest joints
+MAX_JOINT_STEP_RAD = 0.35  # within one cycle of a straight motion; more means that the posture has flipped
 
 
 class MotionError(Exception):
@@ -20,7 +20,7 @@ class MotionError(Exception):
 
 
 class Motion(Protocol):
-    """A motion under way; after `advance` the fields hold the new state of the joints."""
+    """A motion in progress; after `advance` its fields hold the new state of the joints."""
 
     q: Array
     qd: Array
@@ -29,12 +29,12 @@ class Motion(Protocol):
     waypoint: int
 
     def advance(self, dt_s: float) -> None:
-        """Move on by dt_s. Raises MotionError."""
+        """Advance by dt_s. Raises MotionError."""
         ...
 
 
 class Trapezoid:
-    """Path parameter from 0 to `length` with limited speed and acceleration, from and to rest."""
+    """A path parameter from 0 to `length`, starting and ending at rest, with limited speed and acceleration."""
 
     def __init__(self, length: float, speed: float, acceleration: float) -> None:
         speed, acceleration = max(abs(speed), 1e-6), max(abs(acceleration), 1e-6)
@@ -58,7 +58,7 @@ class Trapezoid:
 
 
 class MoveJ:
-    """All joints start and arrive together; speed and acceleration are those of the joint with the longest way."""
+    """A joint motion: all joints start and arrive together; the limits apply to the joint with the longest way."""
 
     def __init__(self, q0: Array, q1: Array, speed: float, acceleration: float) -> None:
         self.q, self.qd, self.qdd = q0.copy(), np.zeros(6), np.zeros(6)
@@ -71,7 +71,7 @@ class MoveJ:
         self._t = 0.0
 
     def advance(self, dt_s: float) -> None:
-        """See Motion."""
+        """Advance by dt_s."""
         self._t += dt_s
         s, v, a = self._profile.at(self._t)
         self.done = self._t >= self._profile.duration
@@ -80,7 +80,7 @@ class MoveJ:
 
 
 class MoveL:
-    """The tool runs straight; its orientation turns about one axis; joints follow by inverse kinematics."""
+    """A linear motion: the tool moves straight and turns about one axis; joints follow by inverse kinematics."""
 
     def __init__(
         self, model: Model, q0: Array, T_base_tcp: Array, T_flange_tcp: Array, *, speed: float, acceleration: float
@@ -94,7 +94,7 @@ class MoveL:
         self._T_tcp_flange = kinematics.rigid_inverse(T_flange_tcp)
         self._turn = kinematics.rotation_vector(self._start[:3, :3].T @ T_base_tcp[:3, :3])
         distance = float(np.linalg.norm(T_base_tcp[:3, 3] - self._start[:3, 3]))
-        # Timed by its length, unless it is mostly a turn: 0.25 m of path counts as one radian.
+        # Timed by its length, unless it is mostly a rotation: one radian counts as 0.25 m.
         length = max(distance, 0.25 * float(np.linalg.norm(self._turn)))
         self._profile = Trapezoid(length, speed, acceleration)
         self._t = 0.0
@@ -102,7 +102,7 @@ class MoveL:
             raise MotionError("the goal of the straight motion is out of reach")
 
     def advance(self, dt_s: float) -> None:
-        """See Motion."""
+        """Advance by dt_s. Raises MotionError at a singularity or out of reach."""
         self._t += dt_s
         s, _, _ = self._profile.at(self._t)
         fraction = s / self._profile.length if self._profile.length > 0 else 1.0
@@ -122,7 +122,7 @@ class MoveL:
 
 
 class Stop:
-    """Decelerate all joints together to rest."""
+    """Decelerates all joints together to rest."""
 
     def __init__(self, q: Array, qd: Array, deceleration: float) -> None:
         self.q, self.qd = q.copy(), qd.copy()
@@ -133,7 +133,7 @@ class Stop:
         self.qdd = -qd / self._left if self._left > 0 else np.zeros(6)
 
     def advance(self, dt_s: float) -> None:
-        """See Motion."""
+        """Advance by dt_s."""
         dt = min(dt_s, self._left)
         self.q = self.q + self.qd * dt + 0.5 * self.qdd * dt * dt
         self.qd = self.qd + self.qdd * dt
@@ -144,7 +144,10 @@ class Stop:
 
 
 class Speed:
-    """Keep joint or tool velocities: speedJ, speedL, jog. A tool velocity is turned into joints each cycle."""
+    """Keeps joint or tool velocities (speedJ, speedL, jog).
+
+    A tool velocity is converted to joint velocities in each cycle.
+    """
 
     def __init__(
         self,
@@ -164,7 +167,7 @@ class Speed:
         self.target, self.acceleration = target, acceleration
 
     def advance(self, dt_s: float) -> None:
-        """See Motion."""
+        """Advance by dt_s. Raises MotionError at a singularity or if a joint would be too fast."""
         goal = self.target
         if self._tool:
             chain = kinematics.frames(self._model, self.q)
@@ -174,7 +177,7 @@ class Speed:
             goal = np.linalg.solve(J, self.target)
             if np.max(np.abs(goal)) > MAX_JOINT_SPEED_RAD_S:
                 raise MotionError("the tool velocity asks too much of a joint")
-        # speedL's acceleration is the tool's; joints get a generous share of it.
+        # speedL's acceleration is that of the tool; joints get a generous multiple of it.
         step = max(self.acceleration, 1e-6) * dt_s * (4.0 if self._tool else 1.0)
         qd = self.qd + np.clip(goal - self.qd, -step, step)
         self.qdd = (qd - self.qd) / dt_s
@@ -182,7 +185,7 @@ class Speed:
 
 
 class Servo:
-    """Follow a stream of joint targets with limited speed: servoJ and servoL."""
+    """Follows a stream of joint targets with limited speed: servoJ and servoL."""
 
     def __init__(self, q: Array, qd: Array, target: Array, lookahead_s: float) -> None:
         self.q, self.qd, self.qdd = q.copy(), qd.copy(), np.zeros(6)
@@ -191,14 +194,14 @@ class Servo:
         self.target, self._lag_s = target, min(max(lookahead_s, 0.03), 0.2)
 
     def advance(self, dt_s: float) -> None:
-        """See Motion."""
+        """Advance by dt_s."""
         qd = np.clip((self.target - self.q) / self._lag_s, -3.14, 3.14)
         self.qdd = (qd - self.qd) / dt_s
         self.q, self.qd = self.q + qd * dt_s, qd
 
 
 class Path:
-    """Way points one after the other, each reached at rest (blending is not modelled); `waypoint` counts them."""
+    """Way points, each reached at rest (blending is not modelled); `waypoint` counts them."""
 
     def __init__(self, q0: Array, legs: Sequence[Callable[[Array], Motion]]) -> None:
         self.q, self.qd, self.qdd = q0.copy(), np.zeros(6), np.zeros(6)
@@ -208,7 +211,7 @@ class Path:
         self._leg: Motion | None = None
 
     def advance(self, dt_s: float) -> None:
-        """See Motion."""
+        """Advance by dt_s. Raises MotionError."""
         if self._leg is None:
             self._leg = self._legs[self.waypoint](self.q)
         self._leg.advance(dt_s)

@@ -1,4 +1,4 @@
-"""Programs that arrive on the script port or are started from the pendant, and the one that runs."""
+"""Programs from the script port or the pendant, and the interpreter that runs one of them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from simulators.ur_controller.motion import Stop
 
 _LOG = logging.getLogger(__name__)
 _WRITE = re.compile(r"\bwrite_output_integer_register\(\s*(\d+)\s*(?:\+\s*(\d+)\s*)?,\s*(-?\d+)\s*\)")
-_SCRIPT_ERRORS = (ValueError, IndexError, ArithmeticError)  # of a text that is no such program
+_SCRIPT_ERRORS = (ValueError, IndexError, ArithmeticError)  # raised for a text that is not a valid program
 _LONGEST_SCRIPT = 1 << 20  # characters
-_OTHER_S = 0.1  # that a program which is not interpreted is seen to run
+_OTHER_S = 0.1  # time for which an uninterpreted program appears to run
 
 
 class ScriptReader:
-    """Cuts the text that arrives on the script port into programs: an `end` in column 0 closes one."""
+    """Splits the text from the script port into programs: `end` in column 0 closes one."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
@@ -25,7 +25,7 @@ class ScriptReader:
         self._rest = ""
 
     def feed(self, data: bytes) -> list[str]:
-        """Add bytes; returns the programs that are complete."""
+        """Add bytes; returns the programs that are now complete."""
         programs: list[str] = []
         *lines, rest = (self._rest + data.decode("utf-8", "replace")).split("\n")
         self._rest = rest[-_LONGEST_SCRIPT:]
@@ -48,7 +48,7 @@ class ScriptReader:
 
 
 class OtherProgram:
-    """Any other script: nothing of it is carried out but the integers that it writes, one a cycle; then it ends."""
+    """Any other script: only its writes to integer registers are executed, one per cycle; then it ends."""
 
     def __init__(self, controller: Controller, text: str) -> None:
         match = re.match(r"(?:def|sec)\s+(\w+)", text)
@@ -58,7 +58,7 @@ class OtherProgram:
         self._writes = [(int(at) + int(more or 0), _int32(value)) for at, more, value in _WRITE.findall(text)]
 
     def step(self) -> None:
-        """See ControlProgram."""
+        """Run one cycle. Raises StopProgram at the end of the script."""
         if self._writes:
             at, value = self._writes.pop(0)
             self._c.outputs.ints[at] = value
@@ -72,17 +72,17 @@ def _int32(digits: str) -> int:
 
 
 class PendantProgram:
-    """A program file that was loaded and started by the dashboard: it runs until it is stopped."""
+    """A program file loaded and started by the dashboard: it runs until it is stopped."""
 
     def __init__(self, name: str) -> None:
         self.name = name
 
     def step(self) -> None:
-        """See ControlProgram."""
+        """Run one cycle, which does nothing."""
 
 
 class Interpreter:
-    """The one program that runs; `loaded` names the program file that the pendant has open."""
+    """Runs at most one program; `loaded` is the program file that is open on the pendant."""
 
     def __init__(self, controller: Controller) -> None:
         self._c = controller
@@ -90,7 +90,7 @@ class Interpreter:
         self.loaded = ""
 
     def load(self, text: str) -> None:
-        """Start a program in place of the present one, if the robot may move."""
+        """Start a program in place of the current one, if the robot may move."""
         self.stop()
         if not self._c.may_move:
             _LOG.info("program ignored: %s, %s", self._c.robot_mode.name, self._c.safety.name)
@@ -98,13 +98,13 @@ class Interpreter:
         known = "reg_offset_int" in text
         try:
             program = ControlProgram(self._c, text) if known else OtherProgram(self._c, text)
-        except _SCRIPT_ERRORS as error:  # as a controller that cannot compile it
+        except _SCRIPT_ERRORS as error:  # as on a controller that cannot compile it
             _LOG.warning("program refused: %s", error)
             return
         self._run(program)
 
     def play(self) -> bool:
-        """Start the loaded program file, or go on with a paused program; False where that is not possible."""
+        """Start the loaded program file or resume a paused program; False if neither is possible."""
         if not self._c.may_move:
             return False
         if self._c.runtime is Runtime.PAUSED and self._program is not None:
@@ -116,7 +116,7 @@ class Interpreter:
         return True
 
     def pause(self) -> bool:
-        """Hold the program that runs, and the arm; False when none does."""
+        """Pause the running program and the arm; False if no program runs."""
         if self._program is None or self._c.runtime is not Runtime.PLAYING:
             return False
         self._c.runtime = Runtime.PAUSED
@@ -130,10 +130,10 @@ class Interpreter:
         self._c.generation += 1
 
     def step(self) -> None:
-        """One cycle of the program, if one runs."""
+        """Run one cycle of the program, if one is running."""
         if self._program is None or self._c.runtime is Runtime.PAUSED:
             return
-        if self._c.runtime is not Runtime.PLAYING:  # a safety stop killed it
+        if self._c.runtime is not Runtime.PLAYING:  # a safety stop ended it
             self._program = None
             return
         try:
@@ -141,12 +141,12 @@ class Interpreter:
         except StopProgram as end:
             _LOG.info("program %s ends: %s", self._program.name, end)
             self.stop()
-        except _SCRIPT_ERRORS as error:  # as a controller, which ends a program at its first runtime error
+        except _SCRIPT_ERRORS as error:  # like a controller, which ends a program at its first runtime error
             _LOG.warning("program %s fails: %s", self._program.name, error)
             self.stop()
 
     def stop(self) -> None:
-        """Kill the program; the arm stops."""
+        """End the program; the arm stops."""
         self._program = None
         if self._c.motion is not None:
             self._c.replace(Stop(self._c.target_q, self._c.planned_qd, 4.0))

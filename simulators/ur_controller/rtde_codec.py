@@ -1,4 +1,4 @@
-"""RTDE frames as bytes, apart from sockets: u16 size with header, u8 type, payload; everything big-endian."""
+"""RTDE frames as bytes, without sockets: u16 size including the header, u8 type, payload; all big-endian."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PAUSE = ord("P")
 PROTOCOL_VERSION = 2
 HEADER = struct.Struct(">HB")
 
-# Field types of the RTDE guide and how each is packed.
+# Field types of the RTDE guide and their struct formats.
 FORMATS = {
     "BOOL": "?",
     "UINT8": "B",
@@ -34,22 +34,22 @@ LENGTHS = {name: int(code[0]) if len(code) > 1 else 1 for name, code in FORMATS.
 
 
 class FrameError(ValueError):
-    """The bytes are no RTDE frame; the connection cannot be resynchronised."""
+    """The bytes are not an RTDE frame; the connection cannot be resynchronised."""
 
 
 def frame(kind: int, payload: bytes = b"") -> bytes:
-    """One frame."""
+    """Build one frame."""
     return HEADER.pack(HEADER.size + len(payload), kind) + payload
 
 
 class FrameReader:
-    """Cuts a byte stream into frames."""
+    """Splits a byte stream into frames."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[tuple[int, bytes]]:
-        """Add bytes; yields (type, payload) of every frame that is complete. Raises FrameError."""
+        """Add bytes; yields (type, payload) of each complete frame. Raises FrameError."""
         self._buffer += data
         while len(self._buffer) >= HEADER.size:
             size, kind = HEADER.unpack_from(self._buffer)
@@ -63,7 +63,7 @@ class FrameReader:
 
 
 class Recipe:
-    """An ordered choice of fields: packs and unpacks the data packages that carry it."""
+    """An ordered selection of fields, which packs and unpacks their data packages."""
 
     def __init__(self, number: int, names: Sequence[str], types: Sequence[str]) -> None:
         self.number = number
@@ -74,13 +74,13 @@ class Recipe:
         self._head = HEADER.pack(HEADER.size + self._struct.size, DATA_PACKAGE)
 
     def pack(self, flat: Sequence[float]) -> bytes:
-        """A whole data package from the fields' numbers, vectors laid flat."""
+        """Build a data package from the fields' numbers, with vectors flattened."""
         return self._head + self._struct.pack(self.number, *flat)
 
     def unpack(self, payload: bytes) -> dict[str, tuple[float, ...]]:
-        """Field name → numbers, of a payload that begins with the recipe's number.
+        """Unpack a payload that begins with the recipe's number into field name → numbers.
 
-        Bytes beyond the recipe are left unread: ur_rtde sends such packages. Raises FrameError for a short one.
+        Extra bytes are ignored, because ur_rtde sends such packages. Raises FrameError if the payload is too short.
         """
         if len(payload) < self._struct.size:
             raise FrameError(f"recipe {self.number} takes {self._struct.size} bytes, not {len(payload)}")
@@ -94,7 +94,7 @@ class Recipe:
 
 
 def parse_setup_outputs(payload: bytes) -> tuple[float, list[str]]:
-    """Frequency in Hz and field names of a set-up of outputs (protocol version 2)."""
+    """Parse the frequency in Hz and the field names of an output set-up (protocol version 2). Raises FrameError."""
     if len(payload) < 8:
         raise FrameError("set-up of outputs without a frequency")
     (frequency_hz,) = struct.unpack_from(">d", payload)
@@ -102,10 +102,10 @@ def parse_setup_outputs(payload: bytes) -> tuple[float, list[str]]:
 
 
 def parse_names(payload: bytes) -> list[str]:
-    """Comma-separated field names."""
+    """Parse comma-separated field names."""
     return [name.strip() for name in payload.decode("ascii", "replace").split(",") if name.strip()]
 
 
 def setup_reply(kind: int, number: int, types: Sequence[str]) -> bytes:
-    """Answer to a set-up: the recipe's number (0: refused) and one type, NOT_FOUND or IN_USE for each field."""
+    """Build the answer to a set-up: the recipe's number (0: refused), and a type, NOT_FOUND or IN_USE per field."""
     return frame(kind, bytes([number]) + ",".join(types).encode())

@@ -1,4 +1,4 @@
-"""Sockets of the controller: RTDE, dashboard and script port in one thread, and the link to the world."""
+"""The controller's sockets (RTDE, dashboard and script port) in one thread, and its link to the world."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _LOG = logging.getLogger(__name__)
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 MAX_BACKLOG_BYTES = 1 << 18  # a client that does not read loses data packages beyond this
-MOST_RECIPES = 255  # a recipe's number is one byte
+MOST_RECIPES = 255  # the recipe number is one byte
 LONGEST_LINE = 1 << 16
 WORLD_MOVING_S, WORLD_STILL_S = 0.016, 0.1
 
 
 class Link:
-    """One accepted connection with its unsent bytes."""
+    """An accepted connection with its unsent bytes."""
 
     def __init__(self, connection: socket.socket) -> None:
         self.socket = connection
@@ -36,13 +36,13 @@ class Link:
         self.muted_until_s = 0.0
 
     def send(self, data: bytes) -> None:
-        """Send now or when the peer reads on."""
+        """Send now, or later when the peer reads again."""
         if not self.dead and time.monotonic() >= self.muted_until_s:
             self.out += data
             self.flush()
 
     def flush(self) -> None:
-        """Send what waits."""
+        """Send the queued bytes, as far as the peer reads."""
         try:
             while self.out:
                 del self.out[: self.socket.send(self.out)]
@@ -52,7 +52,7 @@ class Link:
             self.dead = True
 
     def receive(self, data: bytes) -> None:
-        """Handle bytes of the peer."""
+        """Handle bytes from the peer."""
         raise NotImplementedError
 
 
@@ -72,7 +72,7 @@ class RtdeLink(Link):
         self._timestamp_at: int | None = None
 
     def receive(self, data: bytes) -> None:
-        """Frames."""
+        """Handle RTDE frames."""
         try:
             for kind, payload in self._reader.feed(data):
                 if not self._server.faulty(self, f"rtde_{chr(kind)}"):
@@ -104,7 +104,7 @@ class RtdeLink(Link):
     def _apply(self, recipe: codec.Recipe, payload: bytes) -> None:
         try:
             written = recipe.unpack(payload)
-        except codec.FrameError as error:  # the frame itself was whole: the link goes on
+        except codec.FrameError as error:  # the frame itself was complete, so the link stays open
             _LOG.warning("data package left out: %s", error)
             return
         self._server.controller.apply(written)
@@ -140,16 +140,16 @@ class RtdeLink(Link):
 
     @property
     def only_receives(self) -> bool:
-        """Whether the client has asked for outputs and never for an input."""
+        """Whether the client has set up outputs but no inputs."""
         return self._output is not None and not self._inputs
 
     @property
     def streaming(self) -> bool:
-        """Whether data packages are wanted and the client reads them."""
+        """Whether the client wants data packages and reads them."""
         return self._streaming and not self.dead and len(self.out) < MAX_BACKLOG_BYTES
 
     def stream(self, now_s: float) -> None:
-        """Send a data package when one is due."""
+        """Send a data package if one is due."""
         if self._output is None or now_s < self._next_s - 0.0005:
             return
         self._next_s = max(self._next_s + self._every_s, now_s - self._every_s)
@@ -165,7 +165,7 @@ class RtdeLink(Link):
                 raise SimulatorError("timestamp without a place")
             data = self._output.pack(flat)
             self._packed = (controller.generation, data)
-        if self._timestamp_at is not None:  # a robot at rest sends the same bytes but for the clock
+        if self._timestamp_at is not None:  # the bytes of a robot at rest differ only in the timestamp
             at = self._timestamp_at
             data = data[:at] + struct.pack(">d", controller.time_s) + data[at + 8 :]
         self.send(data)
@@ -183,7 +183,7 @@ class LineLink(Link):
             self.send(f"{WELCOME}\n".encode())
 
     def receive(self, data: bytes) -> None:
-        """Lines."""
+        """Handle complete lines."""
         *lines, rest = (self._rest + data).split(b"\n")
         self._rest = rest[-LONGEST_LINE:]
         for raw in lines:
@@ -204,7 +204,7 @@ class ScriptLink(Link):
         self._reader = ScriptReader()
 
     def receive(self, data: bytes) -> None:
-        """Script text."""
+        """Handle script text."""
         for program in self._reader.feed(data):
             if self._server.controller.local:
                 _LOG.warning("a program was left out: the controller is in local control")
@@ -213,7 +213,7 @@ class ScriptLink(Link):
 
 
 class WorldLink:
-    """Tells the world where the arm is; reconnects by itself and never waits."""
+    """Reports the arm's joints to the world; reconnects by itself and never blocks."""
 
     def __init__(self, address: tuple[str, int], arm: str) -> None:
         self._address, self._arm = address, arm
@@ -222,7 +222,7 @@ class WorldLink:
         self._generation = -1
 
     def push(self, controller: Controller, now_s: float) -> None:
-        """Send the joints when they changed, and now and then when not."""
+        """Send the joints if they changed, and otherwise now and then."""
         moving = controller.generation != self._generation
         if now_s < self._next_s - (WORLD_STILL_S - WORLD_MOVING_S if moving else 0.0):
             return
@@ -240,7 +240,7 @@ class WorldLink:
             self._next_s = now_s + 1.0
 
     def close(self) -> None:
-        """Let go."""
+        """Close the connection."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -257,7 +257,7 @@ class Server:
         self.owners: dict[str, Link] = {}
         self._world = world
         self._links: list[Link] = []
-        # select() takes microseconds; epoll's milliseconds are as long as half a cycle.
+        # select() waits in microseconds; epoll's milliseconds are half a cycle long.
         self._selector = selectors.SelectSelector()
         self._stalled_until_s = 0.0
         self._values: tuple[int, dict[str, tuple[float, ...]]] = (-1, {})
@@ -281,13 +281,13 @@ class Server:
     # --- what links ask ------------------------------------------------------------------------------------
 
     def values(self) -> dict[str, tuple[float, ...]]:
-        """Field values of this cycle, computed once for all clients."""
+        """The field values of this cycle, computed once for all clients."""
         if self._values[0] != self.controller.generation:
             self._values = (self.controller.generation, self.controller.values())
         return self._values[1] | {"timestamp": (self.controller.time_s,)}
 
     def register(self, name: str) -> tuple[float, ...] | None:
-        """The value of a register field."""
+        """The value of a register field; None if there is no such register."""
         direction, _, rest = name.partition("_")
         if direction not in ("output", "input") or "_register_" not in rest:
             return None
@@ -296,7 +296,7 @@ class Server:
         return (registers.ints[int(index)],) if kind == "int" else (registers.doubles[int(index)],)
 
     def faulty(self, link: Link, message: str) -> bool:
-        """Whether the fault plan spoils this message: dropped link, silence, or a refusal."""
+        """Whether the fault plan spoils this message: by a dropped link, silence or a refusal."""
         fault = self.controller.faults.check(self.controller.device, message)
         if fault is None:
             return False
@@ -327,7 +327,7 @@ class Server:
             self.interpreter.step()
             self.controller.advance(now_s - last_s)
             last_s = now_s
-            # A motion that ended is seen by its program in the same cycle.
+            # The program must see the end of a motion in the same cycle.
             self.interpreter.step()
             self._stream(now_s)
             if self._world is not None:
