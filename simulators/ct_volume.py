@@ -168,7 +168,7 @@ def _add_sphere(slab: Array32, grid: Grid, first_row: int, centre: Array) -> Non
 
 
 def _bone(scene: Scene, grid: Grid, origin: NDArray[np.int64], inside: Array32) -> Array32:
-    """Hounsfield values of bone or soft tissue in a box at voxel `origin` (i, j, k)."""
+    """Bone mask (1: bone, 0: soft tissue) of a box at voxel `origin` (i, j, k)."""
     bone = np.zeros(inside.shape, dtype=np.float32)
     k, j, i = np.nonzero(inside > 0.02)
     if len(k) == 0:
