@@ -1,7 +1,7 @@
-"""Measurements: each file is a script that anyone can run; one thread of linear algebra, as in the program itself."""
+"""Benchmarks: each file is a script that anyone can run; linear algebra uses one thread, as in the program."""
 
 from __future__ import annotations
 
 import os
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is loaded
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # must be set before numpy is imported

@@ -1,4 +1,4 @@
-"""Accuracy of the registration against the truth: every source of poses, several scenes and resolutions."""
+"""Accuracy of the registration against ground truth: all sources of poses, several scenes and resolutions."""
 
 from __future__ import annotations
 
@@ -39,31 +39,31 @@ RESULTS = Path(__file__).parent / "results"
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """A rendered capture, read back through the project's own readers, and its truth."""
+    """A rendered capture, read back through the project's own readers, and its ground truth."""
 
     seed: int
     folder: Path
     files: list[Path]
     camera: CameraModel
-    T_world_camera: Array  # (N, 4, 4) truth
-    T_base_camera: Array  # (N, 4, 4) as the robot reports, true hand-eye
+    T_world_camera: Array  # (N, 4, 4) ground truth
+    T_base_camera: Array  # (N, 4, 4) as the robot reports, with the true hand-eye
     stations: list[int]
-    registration_m: Array  # from the scan's mesh
+    registration_m: Array  # (M, 3) sphere centres found in the scan's mesh
     control_m: Array
     true_registration_m: Array
     true_control_m: Array
     radius_m: float
-    covariance_m2: Array  # (M, 3, 3) of registration_m, as the location in the mesh states it
-    T_world_scan: Transform  # truth
+    covariance_m2: Array  # (M, 3, 3) stated covariance of registration_m
+    T_world_scan: Transform  # ground truth
 
     @property
     def names(self) -> list[str]:
-        """Of the images."""
+        """File names of the images."""
         return [file.name for file in self.files]
 
 
 def read_capture(seed: int, folder: Path) -> Capture:
-    """What a user would have: images, camera, poses, scan; and the truth beside it."""
+    """Read what a user would have (images, camera, poses, scan), and the ground truth."""
     files = sorted((folder / "images").glob("*.jpg"))
     camera = read_camera_json(folder / "camera.json")
     spheres = read_spheres_json(folder / "spheres.json")
@@ -96,7 +96,7 @@ def read_capture(seed: int, folder: Path) -> Capture:
 
 
 class Reconstructions:
-    """Models of one capture, made when asked for, on shared features."""
+    """SfM models of one capture, built on demand from shared features."""
 
     def __init__(self, capture: Capture, folder: Path, effort: Effort) -> None:
         self._capture, self._folder = capture, folder
@@ -104,11 +104,11 @@ class Reconstructions:
         self._made: dict[Mapper, SfmModel] = {}
 
     def model(self, mapper: Mapper) -> SfmModel:
-        """By COLMAP's incremental or the global mapper."""
+        """The model of COLMAP's incremental mapper or of the global mapper."""
         if mapper not in self._made:
             c = self._capture
             files = dict(zip(c.names, c.files, strict=True))
-            prior = dict(zip(c.names, c.T_world_camera, strict=True))  # chooses which images are matched, no more
+            prior = dict(zip(c.names, c.T_world_camera, strict=True))  # only selects which images are matched
             options = options_for(self._effort, c.camera)
             self._made[mapper] = reconstruct(
                 files, c.camera, self._folder, mapper, T_world_camera_prior=prior, options=options
@@ -117,7 +117,7 @@ class Reconstructions:
 
 
 def measure(capture: Capture, sources: Sequence[str], effort: Effort, workers: int) -> dict[str, Any]:
-    """One row for each source of poses."""
+    """Return one row of errors for each source of poses."""
     started = time.monotonic()
     outlines = detect_all(capture.files, capture.camera, workers=workers)
     detection_s = time.monotonic() - started
@@ -227,7 +227,7 @@ def _errors(
     index: Sequence[int] | None = None,
     adjusted: HybridPoses | None = None,
 ) -> dict[str, float]:
-    """Of a registration, or of an adjustment that has placed the scan itself."""
+    """Errors of a registration, or of an adjustment that has already placed the scan."""
     at = list(range(len(capture.files))) if index is None else list(index)
     centre = capture.true_registration_m.mean(axis=0)
     T_scan_camera_true = inverse(capture.T_world_scan) @ capture.T_world_camera[at]
@@ -257,7 +257,7 @@ def _errors(
 
 
 def _outline_errors(capture: Capture, outlines: Outlines, solved: PipelineResult) -> dict[str, float]:
-    """Signed distances of the outlines' points from the true outlines (px, positive outside)."""
+    """Statistics of the signed distances of the outline points from the true outlines (px, positive outside)."""
     f = 0.5 * (capture.camera.fx + capture.camera.fy)
     distances: list[Array] = []
     for i, T in enumerate(inverse(capture.T_world_scan) @ capture.T_world_camera):
@@ -291,7 +291,7 @@ def _nearest(found: Array, wanted: Array) -> list[int]:
 
 
 def summarise(captures: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Median and worst of every figure, by source of the poses."""
+    """Median and worst value of every figure, by source of the poses."""
     by_source: dict[str, list[Mapping[str, float]]] = {}
     for capture in captures:
         for source, row in capture["sources"].items():
@@ -322,7 +322,7 @@ _COLUMNS = (
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """The record as a person reads it."""
+    """Format the record as Markdown."""
     computer = record["machine"]
     lines = [
         f"# Accuracy on simulated scenes, {record['date']}",
@@ -368,7 +368,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
 
 
 def main() -> int:
-    """Measure, print and write."""
+    """Measure, print and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=list(range(1, 11)), metavar="SEED")
     parser.add_argument("--width", type=int, default=1920)

@@ -1,4 +1,4 @@
-"""How long the auditor's pages take on the server with a run of 100 000 events and 10 000 artefacts."""
+"""Response times of the auditor's pages on the server, for a run of 100 000 events and 10 000 artefacts."""
 
 from __future__ import annotations
 
@@ -31,7 +31,10 @@ LIMIT_MS = 200.0
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Write the run, verify it, measure every page, print the table and write it. 1 when a page is too slow."""
+    """Write the run, verify it, measure every page, and print and write the table.
+
+    Returns 1 if a page is too slow.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--events", type=int, default=100_000)
     parser.add_argument("--repeat", type=int, default=20, help="requests of each page after the first")
@@ -62,7 +65,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def prepare(folder: Path, events: int) -> dict[str, Any]:
-    """The run, its chain and every file of it verified."""
+    """Write the run and verify its chain and every file."""
     data = folder / "data"
     begun = time.perf_counter()
     note = folder / "written_s"
@@ -88,7 +91,7 @@ def prepare(folder: Path, events: int) -> dict[str, Any]:
 
 
 def appending(folder: Path) -> dict[str, dict[str, float]]:
-    """Milliseconds of appending one event in a transaction of its own, with the index of events and without."""
+    """Milliseconds to append one event in its own transaction, with and without the index of events."""
     found: dict[str, dict[str, float]] = {}
     for name, indexed in (("without_index", False), ("with_index", True), ("with_index_in_large", True)):
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
@@ -126,7 +129,7 @@ def _times_ms(act: Callable[[], object], times: int) -> list[float]:
 
 
 def measure(browser: Browser, run: str, store: Store, repeat: int) -> dict[str, Any]:
-    """First request, median and 95th percentile of every page."""
+    """Time of the first request, median and 95th percentile for every page."""
     here = f"/audit/runs/{run}"
 
     def get(address: str) -> str:
@@ -137,7 +140,7 @@ def measure(browser: Browser, run: str, store: Store, repeat: int) -> dict[str, 
 
     rows: dict[str, Any] = {}
     begun = time.perf_counter()
-    # The very first request of this process: nothing is computed yet, and the page says so.
+    # The first request of this process: nothing is computed yet, and the page says so.
     cold = _times_ms(lambda: get(here), 1)[0]
     while "data-pending" in get(here):
         time.sleep(0.1)
@@ -155,14 +158,14 @@ def measure(browser: Browser, run: str, store: Store, repeat: int) -> dict[str, 
             "first_ms": round(first, 1),
             "median_ms": round(statistics.median(taken), 1),
             "p95_ms": round(taken[min(len(taken) - 1, round(0.95 * len(taken)))], 1),
-            "cpu_ms": round(cpu, 1),  # of this process, client included: what a busy machine does not change
+            "cpu_ms": round(cpu, 1),  # of this process, client included; independent of other load
             "kilobytes": round(len(get(address)) / 1000),
         }
     return rows | {"filled_in_s": round(filled_in_s, 1)}
 
 
 def pages(here: str, get: Callable[[str], str]) -> dict[str, str]:
-    """Every page, with filters and searches, hard ones included."""
+    """URLs of every page, including demanding filters and searches."""
     files = re.findall(r"/artefacts/([0-9a-f]{64})", get(f"{here}/artefacts?kind=image&page=20"))
     results = re.findall(r"/artefacts/([0-9a-f]{64})", get(f"{here}/artefacts?kind=live_view&page=20"))
     return {
@@ -210,7 +213,7 @@ def pages(here: str, get: Callable[[str], str]) -> dict[str, str]:
 
 
 def table(about: dict[str, Any]) -> str:
-    """For people."""
+    """Format the table as Markdown."""
     lines = [
         f"{about['events']} events, {about['artefacts']} artefacts, {about['jobs']} jobs; written in "
         f"{about['written_s']} s, verified in {about['verified_s']} s; deviations filled in after "

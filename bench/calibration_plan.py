@@ -1,7 +1,7 @@
-"""Planned calibration images on simulated scenes, corners without images: boards cut, coverage, uncertainty, mount.
+"""Planned calibration on simulated scenes, with corners instead of images: cut boards, coverage, uncertainty, mount.
 
-Every scene draws its lens, its mount, where the board lies, the arm's errors and the tape measure anew. What a run's
-steps `intrinsics` and `hand_eye` do is done with the corners that the images would show, with noise.
+Each scene draws a new lens, mount, board position, arm errors and tape measurement. The steps `intrinsics` and
+`hand_eye` are reproduced with the corners that the images would show, plus noise.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _TAPE_SIGMA_M = 0.003
 _STATION = "station_1"
 _BOARD = Board(16, 23, 0.015)
 _LENS = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-_EDGE_PX = 12.0  # a corner nearer to the edge of the frame counts as cut
+_EDGE_PX = 12.0  # a corner closer to the edge of the image counts as cut off
 
 
 @dataclass
@@ -62,7 +62,7 @@ class Shoot:
 
 
 class Room:
-    """One scene: what is stated of it, and what its images show."""
+    """One scene: its nominal values, and what its images show."""
 
     def __init__(self, seed: int) -> None:
         self.scene = Scene.generate(seed)
@@ -77,7 +77,7 @@ class Room:
             self.mount, self.layout, arm, CollisionSection(arm="UR10e"), None, Motion(),
             usual_posture(arm, self.layout, self.mount),
         )  # fmt: skip
-        # The simulator's board has its 23 corners along x; ours along y.
+        # The simulator's board has its 23 corners along x; ours has them along y.
         there = self.scene.board_placement(0)
         turn = np.array([[0, 1, 0, 0], [-1, 0, 0, 15 * 0.015], [0, 0, 1, 0], [0, 0, 0, 1.0]])
         self.T_world_board = there @ turn
@@ -89,11 +89,11 @@ class Room:
         return StationLayout(_STATION, "robot", (x, y, z), (-x / away, -y / away, 0.0))
 
     def feasible(self, T_base_camera: Transform) -> bool:
-        """Whether the arm can take a pose."""
+        """Whether the arm can reach a pose T_base_camera (4, 4)."""
         return bool(able_postures(T_base_camera, self.situation))
 
     def photograph(self, sent: Transform, shoot: Shoot) -> None:
-        """Take an image from where the nominal mount would have the camera at `sent`."""
+        """Take an image from the pose where a camera on the nominal mount would be at `sent`."""
         q = able_postures(sent, self.situation)[0]
         T_camera_board = inverse(self.scene.true_camera(q, _STATION)) @ self.T_world_board
         pixels = self.camera.project(apply(T_camera_board, _BOARD.points()))
@@ -111,7 +111,7 @@ class Room:
 def capture(
     room: Room, wanted: BoardPoses, solve: Sequence[str], nominal: BoardKnowledge, before: Shoot | None
 ) -> tuple[Shoot, PlannedBoard]:
-    """The images of a step, planned stage by stage as the step does it."""
+    """Plan the images of a step stage by stage, as the step does, and take them."""
     aims = Aims("intrinsics" in solve, "hand_eye" in solve, wanted.coverage)
     planner = Planner(wanted, _BOARD, aims, np.array(room.layout.approach), room.mount, room.feasible)
     lens_known = "intrinsics" not in solve
@@ -141,7 +141,7 @@ def _refined(nominal: BoardKnowledge, shoot: Shoot, *, lens_known: bool) -> Boar
 
 
 def measure(seed: int) -> dict[str, Any]:
-    """One scene."""
+    """Measure one scene."""
     steps = {step["id"]: step.get("params", {}) for step in yaml.safe_load(PROTOCOL.read_text())["steps"]}
     room = Room(seed)
     lens = LensSection(focal_length_mm=50, sensor_width_mm=35.7, image_px=(room.camera.width, room.camera.height))

@@ -1,4 +1,4 @@
-"""Corners of rendered boards against the truth: error and time, from a small image to a full one of 61 megapixels."""
+"""Corners of rendered boards against ground truth: error and time, from small images up to 61 megapixels."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LENS = CameraModel(1536, 1024, 2148.9, 2149.0, 770.9, 514.0, -0.0458, 0.0256, 4.
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Render, detect, compare; print the table and write it."""
+    """Render, detect and compare; print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--widths", type=int, nargs="+", default=[1536, 4752, 9504])
     parser.add_argument("--images", type=int, default=3)
@@ -62,7 +62,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def measure(width: int, k: int) -> dict[str, Any]:
-    """One image: errors of its corners, and times."""
+    """Corner errors and times of one image."""
     camera = LENS.scaled(width, round(width * LENS.height / LENS.width))
     rng = np.random.default_rng(k)
     points = BOARD.points()
@@ -70,7 +70,7 @@ def measure(width: int, k: int) -> dict[str, Any]:
     T = transform(R, np.array([0.004, -0.006, 0.86]) - R @ points.mean(axis=0))
     truth = camera.project(apply(T, points))
     shade = checkerboard(BOARD.columns, BOARD.rows, BOARD.square_m)
-    # What blurs 0.7 px at 4752 blurs 1.4 px at 9504; smaller pictures are as sharp as their pixels.
+    # The blur scales with resolution above 4752 px (0.7 px there); smaller images are pixel-sharp.
     how = Photography(blur_px=0.7 if width < 4752 else 0.7 * width / 4752)
     image = photograph(shade, camera, T, rng, corners=truth if width > 4000 else None, samples=3, how=how)
     with tempfile.TemporaryDirectory() as folder:

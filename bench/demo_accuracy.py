@@ -1,4 +1,4 @@
-"""Accuracy of the whole chain: the demo on several simulated scenes, with errors on control spheres and true ones."""
+"""Accuracy of the whole chain: the demo on several simulated scenes, with control-sphere errors and true errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DEMO_TIMEOUT_S = 1800
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run the demo on each scene; print the tables and write them. 1 if a demo failed."""
+    """Run the demo on each scene; print and write the tables. Returns 1 if a demo failed."""
     options = arguments(words)
     about = {
         "date": options.date,
@@ -39,7 +39,7 @@ def main(words: Sequence[str] | None = None) -> int:
     text = ""
     for seed in options.scenes:
         scenes.append(run_demo(seed, options.image_width, options.keep))
-        # Written after each scene: a bench that is interrupted has not measured for nothing.
+        # Written after each scene, so that an interrupted bench keeps its results.
         record = {**about, "scenes": scenes, "summary": summarise(scenes)}
         stem.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         text = as_markdown(record)
@@ -49,7 +49,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def arguments(words: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=[1, 2, 3], metavar="SEED", help="seeds (1 2 3)")
     parser.add_argument("--image-width", type=int, default=1280, help="of the simulated photographs (1280)")
@@ -60,7 +60,7 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
 
 
 def run_demo(seed: int, image_width: int, keep: Path | None) -> dict[str, Any]:
-    """One demo in processes of its own: seed, duration, audit and table, or the seed and what went wrong."""
+    """Run one demo in separate processes; returns seed, duration, audit and table, or seed and error."""
     with tempfile.TemporaryDirectory(prefix="orthocapture-bench-") as temporary:
         out = Path(temporary) if keep is None else keep / f"scene-{seed}"
         print(f"scene {seed} …", file=sys.stderr, flush=True)
@@ -86,7 +86,7 @@ def run_demo(seed: int, image_width: int, keep: Path | None) -> dict[str, Any]:
 
 
 def summarise(scenes: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
-    """Median and worst of each measure over the scenes that came to an end, by source of the poses."""
+    """Median and worst of each measure over the scenes that completed, by source of the poses."""
     tables = [scene["table"] for scene in scenes if "table" in scene]
     sources = dict.fromkeys(source for table in tables for source in table)
     summary: dict[str, dict[str, dict[str, float]]] = {}
@@ -100,7 +100,7 @@ def summarise(scenes: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, dict[s
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """The record as a person reads it."""
+    """Format the record as Markdown."""
     computer = record["machine"]
     lines = [
         f"# Accuracy of the demo, {record['date']}",

@@ -1,4 +1,4 @@
-"""Hand-eye calibration against the truth: independent robot noise, the simulated arm's systematic error, odd arms."""
+"""Hand-eye calibration against ground truth: independent robot noise, systematic arm errors, unusual arms."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ DATASET = ("viewpoint_capture_1", "viewpoint_capture_2")
 
 
 def independent_noise(seeds: int) -> list[dict[str, Any]]:
-    """Median error of T_flange_camera by method, and error over stated sigma of the default."""
+    """Median error of T_flange_camera by method, and the ratio of error to stated sigma for the default method."""
     rows: list[dict[str, Any]] = []
     for count, mm, deg in NOISES:
         errors: dict[str, list[float]] = {}
@@ -82,7 +82,7 @@ def _chi_squared(result: HandEyeResult) -> float:
 def systematic_arm(
     kind: type[Scene], sessions: Sequence[tuple[str, str, tuple[str, ...]]], seeds: list[int]
 ) -> list[dict[str, Any]]:
-    """Error at the scene's centre over the data set's 108 viewpoints of both stations, by method, for each seed."""
+    """Error at the scene's centre over the 108 viewpoints of both stations, by method, for each seed."""
     rows: list[dict[str, Any]] = []
     for name, protocol, steps in sessions:
         for seed in seeds:
@@ -121,7 +121,7 @@ def _one(scene: Scene, views: list[Shot], session: Session) -> dict[str, Any]:
 
 
 def as_markdown(record: dict[str, Any]) -> str:
-    """The record as a person reads it."""
+    """Format the record as Markdown."""
     lines = [
         f"# Hand-eye calibration, {record['date']}",
         "",
@@ -166,7 +166,7 @@ METHODS = ("weighted", "park", "daniilidis", "tsai", "horaud", "andreff", "repro
 
 
 def main() -> None:
-    """Measure, print, and write the two result files."""
+    """Measure, print and write both result files."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=5, help="how many (5)")
     parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat())

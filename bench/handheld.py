@@ -1,4 +1,4 @@
-"""Accuracy of the capture by hand beside the robot's: handheld_spine.yaml and the demo on the same scenes."""
+"""Accuracy of a hand-held capture compared with the robot's: handheld_spine.yaml and the demo on the same scenes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STEPS = ("board_capture", "handheld_capture")
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run every scene; print the tables and write them. 1 if a run failed."""
+    """Run every scene; print and write the tables. Returns 1 if a run failed."""
     options = arguments(words)
     about = {"date": options.date, "commit": commit(), "machine": machine(), "image_width": options.image_width}
     stem = options.results / f"handheld-{options.date}"
@@ -55,7 +55,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def arguments(words: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=[7], metavar="SEED", help="seeds (7)")
     parser.add_argument("--image-width", type=int, default=1280, help="of the simulated photographs (1280)")
@@ -70,7 +70,7 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
 
 
 def run_by_hand(seed: int, image_width: int, hand: str) -> dict[str, Any]:
-    """One run of the protocol in processes of its own: images, table with true errors, audit; or what went wrong."""
+    """Run the protocol once in separate processes; returns images, table with true errors and audit, or the error."""
     with tempfile.TemporaryDirectory(prefix="orthocapture-bench-") as temporary:
         folder = Path(temporary)
         with (folder / "rig.log").open("w") as log:
@@ -97,7 +97,7 @@ def run_by_hand(seed: int, image_width: int, hand: str) -> dict[str, Any]:
 
 
 def summary(data: Path, truth: Path) -> dict[str, Any]:
-    """Figures of a completed run."""
+    """The figures of a completed run."""
     loaded = load_protocol(PROTOCOL, params_models())
     with Store.open(data) as store:
         run = summarise(store, store.find_run("latest"), loaded.protocol)
@@ -119,7 +119,7 @@ def summary(data: Path, truth: Path) -> dict[str, Any]:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """The record as a person reads it."""
+    """Format the record as Markdown."""
     computer = record["machine"]
     beside = any("robot" in scene for scene in record["scenes"])
     robot = " The robot's rows are those of the demo (22 images) on the same scene." if beside else ""

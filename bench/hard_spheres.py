@@ -1,6 +1,6 @@
-"""Spheres that people brought: large under twelve lights, glossy, orange in pale pictures; and the usual ones.
+"""Sphere detection on difficult images (large under twelve lamps, glossy, orange in pale images) and usual ones.
 
-Each run adds its rows to the result under its label, so that two revisions stand beside each other.
+Each run adds its rows to the result under its label, so that two revisions can be compared.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from tests.support.sphere_conditions import Look, render_look
 from tests.support.sphere_images import RADIUS_M, camera
 
 RESULTS = Path(__file__).parent / "results"
-RIGHT = 0.05  # of the radius: an outline so near in place and size is the sphere's
+RIGHT = 0.05  # in radii: an outline within this distance and size difference counts as correct
 LIGHTS = 12
-SHARES = (0.21,)  # radius over the image's width
+SHARES = (0.21,)  # radius as a fraction of the image width
 USUAL = (
     "white on skin",
     "dark green on green cloth",
@@ -44,18 +44,18 @@ USUAL = (
 
 @dataclass
 class Tally:
-    """What was found of the spheres of one group."""
+    """Detection counts of one group of spheres."""
 
     expected: int = 0
     right: int = 0
-    wrong: int = 0  # at a sphere, of another size: a ring on it
-    false: int = 0  # at none
-    radius_off: list[float] = field(default_factory=list[float])  # of those that are right, px
+    wrong: int = 0  # at a sphere, but of another size, such as a ring on it
+    false: int = 0  # where there is no sphere
+    radius_off: list[float] = field(default_factory=list[float])  # of the correct outlines, in px
     cpu_s: float = 0.0
     images: int = 0
 
     def add(self, cam: CameraModel, centres: Array, look: Look, options: DetectionOptions, seed: int) -> None:
-        """One picture."""
+        """Detect the spheres in one image and count the results."""
         image = render_look(cam, centres, look, seed)
         start = time.process_time()
         found = detect_spheres(image, cam, options)
@@ -79,7 +79,7 @@ class Tally:
 
 
 def lights() -> Iterator[tuple[tuple[float, float, float], float]]:
-    """Twelve lamps around the camera, from beside it to well to the side, one at a time."""
+    """Twelve lamps around the camera, from beside it to far to the side, one at a time."""
     for k in range(LIGHTS):
         tilt, around = np.radians(20 + 15 * (k % 4)), 2 * np.pi * k / LIGHTS
         across = float(np.sin(tilt))
@@ -87,7 +87,7 @@ def lights() -> Iterator[tuple[tuple[float, float, float], float]]:
 
 
 def large(share: float) -> Tally:
-    """A grey ball before black velvet, under one lamp after the other, its size told."""
+    """A grey ball in front of black velvet under each lamp in turn, with its size given."""
     tally, cam = Tally(), camera(280)
     centre = np.array([[0.03 * RADIUS_M, -0.1 * RADIUS_M, RADIUS_M * cam.fx / (share * cam.width)]])
     for k, lamp in enumerate(lights()):
@@ -97,7 +97,7 @@ def large(share: float) -> Tally:
 
 
 def glossy() -> Tally:
-    """A ball on a table that mirrors the room over it: the horizon is a ring at three quarters of its radius."""
+    """A ball on a table that reflects the room: the horizon appears as a ring at three quarters of its radius."""
     tally, cam = Tally(), camera(280)
     centre = np.array([[0.005, 0.0, 0.12]])
     for colour in ("white", "orange", "grey"):
@@ -109,7 +109,7 @@ def glossy() -> Tally:
 
 
 def pale(share: float) -> Tally:
-    """Orange balls in pictures of little contrast and a wrong white balance, their colour told by name."""
+    """Orange balls in low-contrast images with a wrong white balance, with their colour given by name."""
     tally, cam = Tally(), camera(600)
     for seed in range(1):
         centres = places(cam, 12, seed=40 + seed)
@@ -120,7 +120,7 @@ def pale(share: float) -> Tally:
 
 
 def hard(label: str) -> list[dict[str, Any]]:
-    """Rows of the hard pictures."""
+    """Rows of the difficult images."""
     rows: list[dict[str, Any]] = []
     made = [
         *((f"large: radius {share:.0%} of the width, {LIGHTS} lights", lambda s=share: large(s)) for share in SHARES),
@@ -139,7 +139,7 @@ def hard(label: str) -> list[dict[str, Any]]:
 
 
 def usual(label: str, images: int) -> list[dict[str, Any]]:
-    """Rows of the usual pictures of bench/sphere_conditions.py, fewer and smaller."""
+    """Rows of the usual images of bench/sphere_conditions.py, but fewer and smaller."""
     rows: list[dict[str, Any]] = []
     for name in USUAL:
         tally = measure(name, LOOKS[name], images, 600, 6, "classical", given=False)
@@ -168,7 +168,7 @@ def _cell(value: float | None) -> str:
 
 
 def main() -> None:
-    """Measure and add to the result."""
+    """Measure and add the rows to the result."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--label", required=True, help="of the revision that is measured")
     parser.add_argument("--images", type=int, default=1, help="of each usual condition")

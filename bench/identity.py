@@ -1,4 +1,4 @@
-"""Identity of spheres in one image, four of ten visible, three false detections: how often right, refused, wrong."""
+"""Sphere identity in one image (four of ten visible, three false detections): counts of right, refused and wrong."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CAMERA = CameraModel(1920, 1280, 2688.0, 2689.0, 966.0, 634.0, -0.05, 0.03, 2e-4
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One image: outlines in random order, and which sphere each of them is (-1: none)."""
+    """One image: outlines in random order, and the sphere of each (-1: none)."""
 
     outlines: tuple[SphereOutline, ...]
     truth: tuple[int, ...]
@@ -40,7 +40,7 @@ def _laboratory(seed: int) -> Array:
 
 
 def random_layout(rng: np.random.Generator) -> Array:
-    """Ten spheres (10, 3) standing anywhere on a board, at least 50 mm apart, centres 30 to 110 mm high."""
+    """Ten spheres (10, 3) anywhere on a board, at least 50 mm apart, with centres 30 to 110 mm high."""
     points: list[Array] = []
     while len(points) < 10:
         p = rng.uniform([-0.22, -0.14, 0.03], [0.22, 0.14, 0.11])
@@ -50,7 +50,7 @@ def random_layout(rng: np.random.Generator) -> Array:
 
 
 def make_trial(seed: int, visible: int, n_false: int, noise_px: float) -> Trial:
-    """Layout of the simulated laboratory (even seeds) or a random one (odd), seen from a random side."""
+    """A trial with the simulated laboratory's layout (even seeds) or a random one (odd), from a random direction."""
     rng = np.random.default_rng([seed, 0x1DE])
     while True:
         centres = _laboratory(seed % 80) if seed % 2 == 0 else random_layout(rng)
@@ -80,7 +80,7 @@ def make_trial(seed: int, visible: int, n_false: int, noise_px: float) -> Trial:
         truth.append(int(k))
     for _ in range(n_false):
         ray = np.append(CAMERA.normalise(rng.uniform([0, 0], [CAMERA.width, CAMERA.height])[None])[0], 1.0)
-        # Of the sizes that spheres have at these distances: nothing else gives them away.
+        # With the size of a real sphere at these distances, so that the size does not reveal a false detection.
         place = ray * rng.uniform(0.45, 0.85)
         outlines.append(outline_from_cone(cone_of_sphere(place, RADIUS_M), CAMERA, 8, evidence))
         truth.append(-1)
@@ -89,7 +89,7 @@ def make_trial(seed: int, visible: int, n_false: int, noise_px: float) -> Trial:
 
 
 def run(trials: int, visible: int, n_false: int, noise_px: float) -> dict[str, float | int]:
-    """Counts of right, refused and wrong answers, and the time of an answer."""
+    """Counts of right, refused and wrong answers, and the time per answer."""
     counts = {"right": 0, "in part": 0, "refused": 0, "wrong": 0}
     seconds: list[float] = []
     for seed in range(trials):
@@ -125,7 +125,7 @@ def main() -> None:
         run(options.trials // 4, 5, 3, 0.2),
         run(options.trials // 4, 8, 5, 0.2),
         run(options.trials // 4, 10, 8, 0.2),
-        run(options.trials // 4, 3, 5, 0.2),  # nothing right can be said
+        run(options.trials // 4, 3, 5, 0.2),  # no right answer is possible here
     ]
     options.out.parent.mkdir(exist_ok=True)
     options.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")

@@ -1,8 +1,8 @@
-"""The layout check on random layouts: how often it passes one that can be mistaken, or sends back one that cannot.
+"""The layout check on random layouts: how often it passes an ambiguous one or rejects an unambiguous one.
 
-Photographs are simulated outlines: the true lens of a simulated scene, read by the nominal camera that the step
-takes, with the noise and the bias that bench/results/outlines*.md shows. They go through the functions that the step
-calls, and its rule: passed, sent back, or one more photograph from another side, five at most.
+Photographs are simulated outlines: projected with the true lens of a simulated scene, read with the nominal camera
+that the step uses, with the noise and the bias given in bench/results/outlines*.md. They go through the step's own
+functions and its rule: passed, rejected, or one more photograph from another side, five at most.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ Array = NDArray[np.float64]
 RESULTS = Path(__file__).parent / "results"
 KINDS = ("regular", "nearly regular", "irregular", "simulated scene")
 NOMINAL = CameraModel(1920, 1280, 50 / 35.7 * 1920, 50 / 35.7 * 1920, 959.5, 639.5)
-NOISE_PX, BIAS_PX, STATED_PX = 0.053, -0.021, 0.044  # of outlines at 1920 px: rms and chi² 1.46, common bias
+NOISE_PX, BIAS_PX, STATED_PX = 0.053, -0.021, 0.044  # outlines at 1920 px: rms with chi² 1.46, and common bias
 _RIM: Array = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One layout."""
+    """The result for one layout."""
 
     kind: str
     seed: int
-    margin_mm: float  # in truth
-    good: bool  # in truth: every number within its limit
+    margin_mm: float  # ground truth
+    good: bool  # ground truth: every value is within its limit
     passed: bool
     photographs: int
     decided: bool
 
 
 def layout_of(kind: str, rng: np.random.Generator, scene: Scene) -> Array:
-    """Centres (13, 3): ten around the specimen as somebody may place them, three on it."""
+    """Centres (13, 3): ten spheres around the specimen as somebody may place them, three on it."""
     if kind == "simulated scene":
         return np.concatenate([scene.registration_m, scene.control_m])
     turn = np.arange(10) * (2 * np.pi / 10) + rng.uniform(0, 0.6)
@@ -63,7 +63,7 @@ def layout_of(kind: str, rng: np.random.Generator, scene: Scene) -> Array:
 
 
 def photograph(world: Array, T_world_camera: Array, lens: CameraModel, rng: np.random.Generator) -> Photograph:
-    """Outlines of all spheres by the nominal camera, in any order."""
+    """Outlines of all spheres as read with the nominal camera, in any order."""
     cones: list[Cone] = []
     for centre in apply(inverse(T_world_camera), world)[rng.permutation(len(world))]:
         true = cone_of_sphere(centre, RADIUS_M)
@@ -78,7 +78,7 @@ def photograph(world: Array, T_world_camera: Array, lens: CameraModel, rng: np.r
 
 
 def judge(kind: str, seed: int) -> Outcome:
-    """One layout from its first photograph to its verdict."""
+    """Judge one layout, from its first photograph to its verdict."""
     rng = np.random.default_rng([seed, 0x1A90])
     scene = Scene.generate(seed)
     world = layout_of(kind, rng, scene)
@@ -102,7 +102,7 @@ def judge(kind: str, seed: int) -> Outcome:
 
 
 def main() -> None:
-    """Judge them all and write the table."""
+    """Judge all layouts and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--layouts", type=int, default=1000)
     args = parser.parse_args()

@@ -1,4 +1,4 @@
-"""On which machine and at which revision a measurement was made."""
+"""The machine and the revision of a measurement."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ REPOSITORY = Path(__file__).parents[1]
 
 
 def machine() -> dict[str, Any]:
-    """What the durations hold for."""
+    """The hardware and software on which the durations were measured."""
     cpu = Path("/proc/cpuinfo")
     models = [s for s in cpu.read_text().splitlines() if s.startswith("model name")] if cpu.exists() else []
     return {
@@ -25,7 +25,7 @@ def machine() -> dict[str, Any]:
 
 
 def commit() -> str:
-    """The revision that was measured, `+` behind it when files of the working tree differ from it."""
+    """The measured revision, with `+` appended if the working tree differs from it."""
     answer = subprocess.run(
         ["git", "describe", "--always", "--dirty=+"], cwd=REPOSITORY, capture_output=True, text=True, check=False
     )

@@ -1,4 +1,4 @@
-"""What markers cost an image beside its decoding, at three resolutions: CPU seconds on one thread, in one process."""
+"""CPU time of the markers per image, without decoding, at three resolutions on one thread."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import csv
 import json
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy loads its libraries
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # must be set before numpy loads its libraries
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import time
@@ -31,22 +31,22 @@ from service.core.geometry import inverse
 
 RESULTS = Path(__file__).parent / "results"
 SCENES = ("scene01_1920_20", "scene01_4752_18", "scene01_9504_12")
-LIMIT_S = 0.15  # of the markers of an image of 60 MP
+LIMIT_S = 0.15  # for the markers of a 60 MP image
 _T = TypeVar("_T")
 
 
 def cpu(work: Callable[[], _T]) -> tuple[float, _T]:
-    """CPU seconds of this process for `work`, and its result."""
+    """Return the CPU seconds of this process for `work`, and its result."""
     begin = time.process_time()
     result = work()
     return time.process_time() - begin, result
 
 
 def measure(folder: Path, most: int) -> dict[str, object]:
-    """Medians over the images of a folder that bench/scenes.py has made.
+    """Return medians over the images of a folder made by bench/scenes.py.
 
-    Where to look is said by the true poses (as good as structure from motion gives), and by the erroneous robot's,
-    with the margin that is then needed.
+    The search regions come from the true poses (as good as those of structure from motion), and from the erroneous
+    robot poses with the margin that they need.
     """
     camera = read_camera_json(folder / "camera.json")
     truth = json.loads((folder / "truth.json").read_text())
@@ -98,7 +98,7 @@ def measure(folder: Path, most: int) -> dict[str, object]:
 
 
 def table(results: list[dict[str, object]]) -> str:
-    """The results as Markdown."""
+    """Format the results as Markdown."""
     columns = {
         "width": "{:d}",
         "images": "{:d}",

@@ -1,4 +1,4 @@
-"""Spheres in meshes: accuracy, honesty of the covariances, missed and false ones over seeds; time and memory by size.
+"""Spheres in meshes: accuracy, consistency of the covariances, missed and false detections; time and memory by size.
 
 Run: python -m bench.mesh_spheres [--seeds N] [--faces 1 5 20] [--out FILE]
 """
@@ -17,7 +17,7 @@ from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import ComputeError
 from tests.support.sphere_meshes import RADIUS_M, MeshBuilder, cap, clutter, scattered_centres
 
-# name: half angle of the caps in degrees, white and shared noise in m, correlation length in m, subdivisions, cloud
+# name: half angle of the caps (°), white and correlated noise (m), correlation length (m), subdivisions, cloud
 CASES: dict[str, tuple[float, float, float, float, int, bool]] = {
     "150°, white 0.05 mm": (150, 5e-5, 0.0, 4e-3, 4, False),
     "90°, white 0.05 mm, coarse": (90, 5e-5, 0.0, 4e-3, 3, False),
@@ -32,7 +32,7 @@ CASES: dict[str, tuple[float, float, float, float, int, bool]] = {
 
 
 def accuracy(name: str, seeds: int) -> dict[str, float | str]:
-    """One case over seeds of eight spheres among clutter."""
+    """One case over several seeds of eight spheres among clutter."""
     half_deg, white, shared, length, level, cloud = CASES[name]
     squares: list[float] = []
     errors: list[float] = []
@@ -78,7 +78,7 @@ def accuracy(name: str, seeds: int) -> dict[str, float | str]:
 
 
 def size(million_faces: int) -> dict[str, float]:
-    """Time and memory of a large mesh: a wavy plane with spheres on it."""
+    """Time and memory for a large mesh: a wavy plane with spheres on it."""
     rng = np.random.default_rng(0)
     built = MeshBuilder()
     centres = scattered_centres(rng, 10)
@@ -117,7 +117,7 @@ def main() -> None:
     parser.add_argument("--faces", type=int, nargs="*", default=[1, 5, 20], help="millions")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    # Each size raises the peak memory of those after it: ascending.
+    # Ascending, because each size raises the peak memory reported for those after it.
     sizes = [size(million) for million in sorted(args.faces)]
     cases = [accuracy(name, args.seeds) for name in CASES] if args.seeds else []
     for row in (*sizes, *cases):

@@ -1,4 +1,4 @@
-"""Outlines against the truth: bias, rms, common shift, honesty of the covariance, recall and precision, by condition.
+"""Outlines against ground truth by condition: bias, rms, common shift, covariance consistency, recall, precision.
 
 Two renderers: the project's scenes (bench/scenes.py) and tests/support/sphere_conditions.py.
 """
@@ -59,7 +59,7 @@ LOOKS = {
 
 @dataclass
 class Tally:
-    """What was found over the images of one condition."""
+    """Results over the images of one condition."""
 
     errors_px: list[Array] = field(default_factory=list[Array])
     shift_px: list[Array] = field(default_factory=list[Array])
@@ -71,7 +71,7 @@ class Tally:
     images: int = 0
 
     def add(self, image: NDArray[np.uint8], cam: CameraModel, truth: list[Cone], options: DetectionOptions) -> None:
-        """Detect and compare; spheres wholly inside the image are expected."""
+        """Detect and compare; every sphere fully inside the image is expected."""
         start = time.process_time()
         found = detect_spheres(image, cam, options)
         self.cpu_s += time.process_time() - start
@@ -96,7 +96,7 @@ class Tally:
                 self.recalled += k in taken
 
     def row(self, name: str) -> str:
-        """A line of the table."""
+        """Format one line of the table."""
         head = f"| {name} | {self.recalled}/{self.expected} | {self.false} |"
         tail = f" {self.cpu_s / max(self.images, 1):.2f} |"
         if not self.errors_px:
@@ -128,7 +128,7 @@ def analytic(look: Look, name: str, images: int) -> Tally:
 
 
 def captures(folder: Path, every: int) -> Iterator[tuple[Path, CameraModel, list[Cone]]]:
-    """Images of a rendered scene with the cones of the spheres in sight of the camera."""
+    """Images of a rendered scene, with the cones of the spheres that are visible to the camera."""
     record = json.loads((folder / "camera.json").read_text())
     names = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     cam = CameraModel.from_record({k: record[k] for k in names})

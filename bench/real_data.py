@@ -1,6 +1,6 @@
-"""The stand-alone commands on public data of others: which sets, where to get them, what to expect, and a table.
+"""The stand-alone commands on public data sets: where to get them, what to expect, and a table of results.
 
-`python -m bench.real_data --data DIR` runs every set that lies in DIR under its name and says how to get the others.
+`python -m bench.real_data --data DIR` runs every set found in DIR under its name, and says how to get the others.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ RESULTS = Path(__file__).parent / "results"
 
 
 def run(one: PublicSet, data: Path, work: Path) -> dict[str, Any]:
-    """The row of a set: what came out, and whether it is as expected; a refusal is a result too."""
+    """Run a data set; returns its row with the result and whether it is as expected. A refusal is a result too."""
     row: dict[str, Any] = {"set": one.name, "what": one.what, "licence": one.licence, "expected": one.expected}
     folder = data / one.folder
     if one.measure is None or not folder.is_dir():
@@ -36,7 +36,7 @@ def run(one: PublicSet, data: Path, work: Path) -> dict[str, Any]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The rows as Markdown, those that were not run below."""
+    """Format the rows as Markdown, with the sets that were not run below."""
     lines = ["| set | data | expected | came out | as expected | s |", "|---|---|---|---|---|---|"]
     for row in rows:
         if row["ran"]:
@@ -63,7 +63,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Run what is there, say what is not, write the table if anything ran."""
+    """Run the available sets, list the missing ones, and write the table if anything ran."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="folder of the sets, each in a folder of its own")
     parser.add_argument("--only", default="", help="part of a set's name")
@@ -84,7 +84,7 @@ def main() -> None:
         elif row is not None:
             needed = "" if one.measure is None else f", into {options.data / one.folder}"
             print(f"{one.name}: not run. {one.where}{needed}")
-        # What ran another day is kept where only a part was asked for.
+        # Keep earlier rows if only some sets were requested.
         rows.append(
             row if row is not None and row["ran"] else before.get(one.name, row or run(one, Path("/"), Path()))
         )

@@ -1,4 +1,4 @@
-"""Public data sets for bench/real_data.py: where they are, their licences, and how each is measured."""
+"""The public data sets of bench/real_data.py: sources, licences, and how each is measured."""
 
 from __future__ import annotations
 
@@ -33,10 +33,13 @@ Measure = Callable[[Path, Path], tuple[str, bool]]
 
 @dataclass(frozen=True, slots=True)
 class PublicSet:
-    """One set. `measure` takes its folder and one to write to; None: only the command to try it with is known."""
+    """A public data set.
+
+    `measure` takes the set's folder and a folder to write to; None if only the command to try is known.
+    """
 
     name: str
-    folder: str  # under --data
+    folder: str  # relative to --data
     what: str
     where: str
     licence: str
@@ -45,10 +48,10 @@ class PublicSet:
 
 
 def command(*words: object) -> dict[str, Any]:
-    """What `orthocapture WORDS --json` answers.
+    """Run `orthocapture WORDS --json` and return its answer.
 
     Raises:
-        ComputeError: it refused; with its words.
+        ComputeError: the command refused; has its message.
     """
     line = [sys.executable, "-m", "service.cli.main", *map(str, words), "--json"]
     done = subprocess.run(line, cwd=REPOSITORY, capture_output=True, text=True, check=False)
@@ -62,7 +65,7 @@ def command(*words: object) -> dict[str, Any]:
 
 
 def _opencv_rms(objects: Sequence[Array], corners: Sequence[Array], size: tuple[int, int]) -> float:
-    """Reprojection error of OpenCV's calibration with k1 k2 p1 p2, as the command's default model."""
+    """RMS reprojection error (px) of OpenCV's calibration with k1 k2 p1 p2, the command's default model."""
     held = [np.asarray(points, dtype=np.float32) for points in objects]
     seen = [np.asarray(points, dtype=np.float32) for points in corners]
     return float(cv2.calibrateCamera(held, seen, size, np.eye(3), np.zeros(5), flags=cv2.CALIB_FIX_K3)[0])
@@ -126,7 +129,7 @@ def _doosan_camera(folder: Path, out: Path) -> tuple[str, bool]:
         assert grey is not None
         size = (grey.shape[1], grey.shape[0])
         found, ids, _, _ = detector.detectBoard(grey)
-        # None where no board is seen, whatever the stubs say.
+        # None if no board is visible, despite what the stubs say.
         shown = np.atleast_1d(np.array([] if len(np.shape(ids)) == 0 else np.ravel(ids), dtype=np.int64))
         if len(shown) >= 8:
             objects.append(np.asarray(board.getChessboardCorners(), dtype=np.float64)[shown])
@@ -207,7 +210,7 @@ def _twelve_lights(kind: str, least: int) -> Measure:
         ys, xs = np.nonzero(mask)
         centre, radius = np.array([xs.mean(), ys.mean()]), float(np.sqrt(mask.sum() / np.pi))
         height, width = mask.shape
-        # The camera is not known; from far away only the outline's place in the image matters.
+        # The camera is unknown; from far away only the outline's position in the image matters.
         camera = CameraModel(width, height, 5 * width, 5 * width, (width - 1) / 2, (height - 1) / 2)
         right, wrong, radii = 0, 0, list[float]()
         for light in range(12):

@@ -1,4 +1,4 @@
-"""Registration of 16 to 1000 images: wall and CPU time against decoding them, memory of each process."""
+"""Registration of 16 to 1000 images: wall and CPU time relative to decoding, and memory of each process."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before numpy loads its libraries
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # must be set before numpy loads its libraries
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import resource
@@ -33,23 +33,23 @@ RESULTS = Path(__file__).parent / "results"
 FILES = (("scene01_9504_12", (16, 32, 64, 108)), ("scene01_1920_20", (250, 1000)))
 SOLVE_FROM = "scene01_1920_20"
 SOLVED = (16, 32, 64, 108, 250, 500, 1000)
-POSE_NOISE_M = 2e-5  # of repeated poses, so that no two are equal
+POSE_NOISE_M = 2e-5  # noise added to repeated poses, so that no two are equal
 
 
 def decode(path: Path) -> int:
-    """Decode as the pipeline does."""
+    """Decode an image as the pipeline does."""
     cv2.setNumThreads(1)
     return read_image(path).shape[1]
 
 
 def decode_all(files: list[Path], workers: int) -> None:
-    """Decode with as many processes as the registration has."""
+    """Decode the images with as many processes as the registration uses."""
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         list(pool.map(decode, files))
 
 
 def locate_and_register(folder: Path, count: int, workers: int) -> dict[str, object]:
-    """The whole way, from files to the registration; the folder's images are used again under other names."""
+    """Run the whole chain from files to registration; the folder's images are reused under other names."""
     camera = read_camera_json(folder / "camera.json")
     known = read_spheres_json(folder / "spheres.json")
     originals = sorted((folder / "images").glob("*.jpg"))
@@ -84,7 +84,7 @@ def locate_and_register(folder: Path, count: int, workers: int) -> dict[str, obj
 
 
 def solve_only(folder: Path, count: int) -> dict[str, object]:
-    """Identity and the joint solution of `count` images: the outlines of a folder, repeated, poses a little apart."""
+    """Run identification and the joint solution on `count` images: repeated outlines with perturbed poses."""
     camera = read_camera_json(folder / "camera.json")
     known = read_spheres_json(folder / "spheres.json")
     files = sorted((folder / "images").glob("*.jpg"))
@@ -109,7 +109,7 @@ def solve_only(folder: Path, count: int) -> dict[str, object]:
 
 
 def one(arguments: list[str]) -> dict[str, object]:
-    """A measurement in a process of its own, whose children are only those that it measures."""
+    """Run one measurement in a separate process, so that its children are only those being measured."""
     answer = subprocess.run(
         [sys.executable, "-m", "bench.register_scale", *arguments], check=True, capture_output=True, text=True
     )
@@ -117,7 +117,7 @@ def one(arguments: list[str]) -> dict[str, object]:
 
 
 def measured(kind: str, folder: Path, count: int, workers: int) -> dict[str, object]:
-    """One measurement, in this process and its children."""
+    """Run one measurement in this process and its children."""
     begin = time.perf_counter()
     answer: dict[str, object] = {}
     if kind == "decode":
@@ -144,7 +144,7 @@ def measured(kind: str, folder: Path, count: int, workers: int) -> dict[str, obj
 
 
 def compare(folder: Path, count: int, workers: int) -> dict[str, object]:
-    """Registration between two decodings of the same images: what else the machine does falls on both."""
+    """Run the registration between two decodings of the same images, so that other load affects both."""
     first = one(["decode", str(folder), str(count), str(workers)])
     row = one(["register", str(folder), str(count), str(workers)])
     second = one(["decode", str(folder), str(count), str(workers)])
@@ -161,14 +161,14 @@ def compare(folder: Path, count: int, workers: int) -> dict[str, object]:
 
 
 def markdown(columns: dict[str, str], rows: list[dict[str, object]]) -> str:
-    """A table."""
+    """Format a table."""
     lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
     lines += ["| " + " | ".join(form.format(row[name]) for name, form in columns.items()) + " |" for row in rows]
     return "\n".join(lines)
 
 
 def main() -> None:
-    """Measure and write the results; with a kind, one measurement for the parent."""
+    """Measure and write the results; with a kind, run one measurement for the parent process."""
     if len(sys.argv) == 5 and sys.argv[1] in {"decode", "register", "whole", "solve"}:
         print(json.dumps(measured(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))))
         return
@@ -190,11 +190,11 @@ def main() -> None:
     for folder, counts in wanted:
         for n in counts:
             rows.append(compare(folder, n, options.workers))
-            write(rows, solved, options.out)  # after each, since they take long
+            write(rows, solved, options.out)  # after each measurement, because they take long
 
 
 def write(rows: list[dict[str, object]], solved: list[dict[str, object]], out: Path) -> None:
-    """The results as JSON and Markdown."""
+    """Write the results as JSON and Markdown."""
     rows = sorted(rows, key=lambda row: (-int(str(row["width"])), int(str(row["images"]))))
     here = machine()
     name = f"register_scale-{datetime.now(UTC):%Y-%m-%d}"

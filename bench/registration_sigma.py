@@ -1,4 +1,4 @@
-"""Whether stated sigmas of the registration hold: on rendered scenes with their truth, and on drawn outlines."""
+"""Consistency of the registration's stated sigmas: on rendered scenes with ground truth, and on drawn outlines."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from simulators.world import RADIUS_M, Scene
 RESULTS = Path(__file__).parent / "results"
 SOURCES = ("true", "disturbed", "smooth", "robot")
 CENTRE_M = np.array([0.0, 0.0, 0.05])
-SFM_NOISE = (3e-5 / np.sqrt(3), np.radians(0.003) / np.sqrt(3))  # a coordinate: 0.03 mm and 0.003° in all
+SFM_NOISE = (3e-5 / np.sqrt(3), np.radians(0.003) / np.sqrt(3))  # per coordinate: 0.03 mm and 0.003° in total
 ARM_NOISE = (4e-4, 4e-4)
 
 
 def chi2(result: RegistrationResult, T_world_scan: Transform) -> float:
-    """Squared error of all six numbers in the metric of the stated covariance, a degree of freedom."""
+    """Squared error of T_world_scan (six numbers) in the metric of the stated covariance, per degree of freedom."""
     w = Rotation.from_matrix(T_world_scan[:3, :3] @ result.T_world_scan[:3, :3].T).as_rotvec()
     both = np.concatenate([T_world_scan[:3, 3] - result.T_world_scan[:3, 3], w])
     return float(both @ np.linalg.solve(result.covariance[:6, :6], both)) / 6
 
 
 def disturbed(poses: Array, noise: tuple[float, float], rng: np.random.Generator) -> Array:
-    """Poses (N, 4, 4) with independent errors of position and rotation, sigma a coordinate."""
+    """Poses (N, 4, 4) with independent position and rotation errors; `noise` is sigma per coordinate (m, rad)."""
     out = poses.copy()
     for T in out:
         T[:3, :3] = Rotation.from_rotvec(rng.normal(size=3) * noise[1]).as_matrix() @ T[:3, :3]
@@ -51,7 +51,7 @@ def disturbed(poses: Array, noise: tuple[float, float], rng: np.random.Generator
 
 
 def disturbed_smoothly(poses: Array, noise: tuple[float, float], rng: np.random.Generator) -> Array:
-    """Poses (N, 4, 4) with errors that are linear in the camera's position, as a weak reconstruction bends."""
+    """Poses (N, 4, 4) with errors linear in the camera position, like the bending of a weak reconstruction."""
     out = poses.copy()
     place = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
     place /= np.sqrt(np.mean(np.sum(place**2, axis=1)))
@@ -66,7 +66,7 @@ def disturbed_smoothly(poses: Array, noise: tuple[float, float], rng: np.random.
 
 
 def outlines_of(capture: Capture, workers: int, cache: Path | None) -> list[tuple[SphereOutline, ...]]:
-    """Detected outlines, kept in `cache` where one is named."""
+    """Detected outlines; cached in `cache` if given."""
     file = None if cache is None else cache / f"{capture.folder.name}.json"
     if file is not None and file.is_file():
         stored = json.loads(file.read_text(encoding="utf-8"))
@@ -79,7 +79,7 @@ def outlines_of(capture: Capture, workers: int, cache: Path | None) -> list[tupl
 
 
 def rendered(capture: Capture, outlines: list[tuple[SphereOutline, ...]]) -> dict[str, dict[str, float]]:
-    """Registrations of a scene from true poses, from poses disturbed like those of SfM or bent, from the robot's."""
+    """Registrations of a scene from true poses, from poses with the errors of SfM or bent, and from robot poses."""
     rng = np.random.default_rng([capture.seed, 0x516])
     spheres, controls = capture.true_registration_m, capture.true_control_m
     centre = spheres.mean(axis=0)
@@ -103,7 +103,7 @@ def rendered(capture: Capture, outlines: list[tuple[SphereOutline, ...]]) -> dic
         spared = leave_one_out(r, refined=True)
         sigma = r.sigma_at_m(centre)
         refined = true_error_m(r.T_scan_camera_refined, T_scan_camera, centre)
-        # The robot's base is known no better than its poses: there it is the cameras that are compared.
+        # The robot's base is known no better than its poses, so the cameras are compared there.
         known = name != "robot"
         error = (
             float(np.linalg.norm(apply(r.T_world_scan, centre) - apply(capture.T_world_scan, centre)))
@@ -139,12 +139,12 @@ NOTHING_COMMON = CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=1e-5)
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Sizes of the errors that are drawn; the solver is told of all but those of the poses."""
+    """Sizes of the drawn errors; the solver knows all of them except those of the poses."""
 
     name: str
     outline_px: float = 0.1
     pose: tuple[float, float] = (0.0, 0.0)
-    told: bool = False  # the sizes of the poses' errors
+    told: bool = False  # whether the solver knows the sizes of the pose errors
     spheres_m: float = 0.0
     common: CommonErrors = NOTHING_COMMON
 
@@ -161,7 +161,7 @@ CASES = (
 
 
 def drawn(seed: int, case: Case, views: int = 18) -> tuple[RegistrationResult, Transform]:
-    """A capture of `views` images with errors drawn; the result and the true T_world_scan."""
+    """Simulate a capture of `views` images with drawn errors; returns the result and the true T_world_scan."""
     rng = np.random.default_rng([seed, 0x5E])
     scan_m = _LABORATORIES[seed % len(_LABORATORIES)]
     T_world_scan = transform(Rotation.random(rng=rng), rng.uniform(-0.3, 0.3, 3))
@@ -211,7 +211,7 @@ _LABORATORIES = [Scene.generate(seed).registration_m for seed in range(101, 109)
 
 
 def monte_carlo(case: Case, seeds: int) -> dict[str, Any]:
-    """Errors against their sigmas over many draws."""
+    """Errors relative to their sigmas over many draws."""
     errors: list[float] = []
     normalised: list[float] = []
     squares: list[float] = []
@@ -236,7 +236,7 @@ def monte_carlo(case: Case, seeds: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure, print, and write the result."""
+    """Measure, print and write the result."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="*", default=list(range(1, 11)), metavar="SEED")
     parser.add_argument("--seeds", type=int, default=200)
@@ -270,7 +270,7 @@ def main() -> None:
 
 
 def summary(scenes: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Median and worst of the errors, and how they compare with their sigmas, for each source of poses."""
+    """Median and worst of the errors, and their ratio to the sigmas, by source of poses."""
     out: dict[str, dict[str, float]] = {}
     for source in SOURCES if scenes else ():
         rows = [s[source] for s in scenes]
@@ -290,7 +290,7 @@ def summary(scenes: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def as_markdown(record: dict[str, Any]) -> str:
-    """The record as a person reads it."""
+    """Format the record as Markdown."""
     lines = [
         f"# Stated sigmas of the registration, {record['date']}",
         "",

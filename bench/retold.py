@@ -1,4 +1,4 @@
-"""A recorded run told again as a new one, event by event, up to a point: for pictures of runs under way."""
+"""Replays a recorded run as a new one, event by event, up to a chosen point: for screenshots of unfinished runs."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ def retell(
     until: Told,
     more: Mapping[int, Sequence[Payload]] | None = None,
 ) -> str:
-    """A new run with the same events, artefacts and jobs as `source`; the new run's name.
+    """Record a new run with the same events, artefacts and jobs as `source`; returns the new run's id.
 
-    What was confirmed automatically is confirmed by `person`. Signatures bind the new run's own records.
+    Automatic confirmations are attributed to `person`. Signatures are made anew for the new run's own records.
 
     Args:
-        until: the first event for which it is true, and all that follow, are left out.
-        more: events of `person` to add behind the event of that number of `source`.
+        until: the first event for which it is true is left out, with all that follow.
+        more: events of `person` to insert after the event of that number in `source`.
     """
     events = store.events(source)
     root = events[0].payload
@@ -58,7 +58,7 @@ def retell(
 
 @dataclass
 class _Jobs:
-    """The jobs of the new run, which a worker ended in an order of its own."""
+    """The jobs of the new run, whose order of completion is that of the source."""
 
     store: Store
     run_id: str
@@ -66,7 +66,7 @@ class _Jobs:
     claimed: dict[str, Job] = field(default_factory=dict[str, Job])
 
     def claim(self, payload: JobFinished) -> Job:
-        """The job that has this end. Raises AssertionError where it was never enqueued."""
+        """Return the job that has this end. Raises AssertionError if it was never enqueued."""
         key = self.keys[payload.job]
         while key not in self.claimed:
             job = self.store.claim_job(payload.worker, 3600.0, [payload.job_kind], run_id=self.run_id)
@@ -84,7 +84,7 @@ def _tell(
     again: Mapping[str, str],
     jobs: _Jobs,
 ) -> str:
-    """Record one event again; the hash of the new one."""
+    """Record one event again; returns the hash of the new one."""
     payload = event.payload
     actor = event.actor
     if isinstance(payload, JobEnqueued):

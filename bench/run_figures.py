@@ -1,4 +1,4 @@
-"""Seconds of a recorded run: of its steps, of a viewpoint beyond what arm and camera need, of the worker's jobs."""
+"""Timing figures of a recorded run: its steps, the overhead per viewpoint beyond arm and camera, and its jobs."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from service.core.model import (
 from service.core.protocol import Protocol
 from service.dataset.summary import RunSummary
 
-_PATIENCE_S = 3.0  # a longer overhead is a pause, a retry or another part of the step, and no viewpoint's share
+_PATIENCE_S = 3.0  # a longer overhead is a pause, a retry or another part of the step
 
 
 def run_figures(summary: RunSummary, speed_up: float = 1.0) -> dict[str, Any]:
-    """Everything about time that a run's own record tells. `speed_up`: by how much the simulated arm is too fast."""
+    """All timing figures in a run's record. `speed_up` is the factor by which the simulated arm is too fast."""
     return {
         "views": sum(isinstance(e.payload, ViewpointCaptured) for e in summary.events),
         "steps_s": steps_s(summary.events),
@@ -37,13 +37,13 @@ def run_figures(summary: RunSummary, speed_up: float = 1.0) -> dict[str, Any]:
 
 
 def seconds_between(first: Event, last: Event) -> float:
-    """Wall time between two events."""
+    """Wall time between two events, in seconds."""
     a, b = (datetime.fromisoformat(event.at_utc) for event in (first, last))
     return (b - a).total_seconds()
 
 
 def steps_s(events: Sequence[Event]) -> dict[str, float]:
-    """From the first start of each step to its passing, waits for people included."""
+    """Time from the first start of each step until it passed, including waits for people."""
     begun: dict[str, Event] = {}
     took: dict[str, float] = {}
     for event in events:
@@ -58,10 +58,10 @@ def steps_s(events: Sequence[Event]) -> dict[str, float]:
 
 
 def overhead(events: Iterable[Event], protocol: Protocol, speed_up: float) -> dict[str, float]:
-    """Seconds between two exposures that neither the arm nor the camera nor the protocol's waits account for.
+    """Seconds between two exposures that are not spent on arm, camera or the protocol's waits.
 
-    Arm: the time of the joint that turns furthest, at the protocol's speed and acceleration, and its ringing.
-    Camera: from the release until it announces the last file. Waits: the settle window and the dwell.
+    Arm: the motion time of the joint that turns furthest, at the protocol's speed and acceleration, plus its ringing.
+    Camera: from the release until it announces the last file. Waits: the settle window and the dwell time.
     """
     motion, settle = protocol.motion, protocol.settle
     shots = [e.payload for e in events if isinstance(e.payload, ViewpointCaptured)]
@@ -88,7 +88,7 @@ def overhead(events: Iterable[Event], protocol: Protocol, speed_up: float) -> di
 
 
 def after_the_scan_s(summary: RunSummary) -> dict[str, float]:
-    """From the passing of the last scan to each later step's passing, the run's end, and the last result of a job."""
+    """Time from the end of the last scan until each later step passed, the run ended, and the last job finished."""
     scans = {step.id for step in summary.protocol.steps if step.kind == "scan_import"}
     passed = [e for e in summary.events if isinstance(e.payload, StepPassed) and e.payload.step in scans]
     if not passed:

@@ -1,4 +1,4 @@
-"""Rendered captures for benchmarks: images, camera, poses, scan and truth of a simulated scene in one folder."""
+"""Rendered captures for benchmarks: a folder with the images, camera, poses, scan and ground truth of a scene."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ JPEG_QUALITY = 94
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One image to be taken: its file, its station, the joints of the arm."""
+    """One image to be taken: its file, station and the arm's joints."""
 
     name: str
     station: str
@@ -41,7 +41,7 @@ class Shot:
 
 
 def plan_shots(scene: Scene, views: int) -> list[Shot]:
-    """Views from both stations on two arcs, 14° and 32° from the vertical, a little irregular as in reality."""
+    """Views from both stations on two arcs, 14° and 32° from the vertical, slightly irregular as in reality."""
     rng = np.random.default_rng([scene.seed, 0xBE4C])
     shots: list[Shot] = []
     for station, side in zip(STATIONS, (-1.0, 1.0), strict=True):
@@ -64,7 +64,7 @@ def plan_shots(scene: Scene, views: int) -> list[Shot]:
 
 
 def render_scene(seed: int, width: int, views: int, *, cache: Path = CACHE, workers: int = 1) -> Path:
-    """The folder with the rendered capture; made when it is not there yet.
+    """Render a capture, unless it is cached, and return its folder.
 
     `images/`, `camera.json` (the true intrinsics), `poses.csv` (true T_world_camera), `robot_poses.csv`
     (T_base_flange as the controller reports it), `joints.csv`, `stations.csv`, `spheres.json` (true centres, scan
@@ -111,7 +111,10 @@ def render_scene(seed: int, width: int, views: int, *, cache: Path = CACHE, work
 
 
 def rendered(name: str, cache: Path = CACHE) -> Path:
-    """The folder of a name such as scene01_1920_20: seed, width, number of views; made when it is not there yet."""
+    """Render a capture named like scene01_1920_20 (seed, width, number of views), unless cached.
+
+    Returns its folder.
+    """
     seed, width, views = name.removeprefix("scene").split("_")
     return render_scene(int(seed), int(width), int(views), cache=cache)
 

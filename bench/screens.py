@@ -1,4 +1,4 @@
-"""Screenshots of every page at the size of a tablet and of a desktop, from a copy of a recorded run; docs/screens."""
+"""Screenshots of every page at tablet and desktop size, from a copy of a recorded run, for docs/screens."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ STANDING = {
     "robot": "standing", "robot_name": "robot", "speed_fraction": 0.25, "camera_battery_fraction": 0.82,
     "light_lux": 812.0, "temperature_c": 21.4, "disk_free_bytes": 412_000_000_000,
 }  # fmt: skip
-# Name of a picture, whose screen, the page, what it shows. RUN… are the runs of `tell_runs`.
+# Name of the picture, whose screen, the page, what it shows. RUN… are the runs of `tell_runs`.
 SHOTS: tuple[tuple[str, str, str, str], ...] = (
     ("sign-in", "", "/sign-in", "signing in"),
     ("set-up", "", "SET_UP", "an invited person sets up an account by a one-time link"),
@@ -77,12 +77,12 @@ SHOTS: tuple[tuple[str, str, str, str], ...] = (
     ("audit-site-event", "otto", "/audit/site/events/3", "one event of the site"),
     ("locked", "tina", "/runs/RUN_WORK#lock", "a locked screen still shows the capture"),
 )  # fmt: skip
-DARK = frozenset({"run-hold", "capture", "audit", "scene"})  # on the tablet
+DARK = frozenset({"run-hold", "capture", "audit", "scene"})  # in dark mode, on the tablet
 TABLET_ONLY = frozenset({"run-hold", "run-working", "viewpoint", "sign-dialog", "looking-on", "recovery", "locked"})
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Take the pictures into docs/screens, with a list of them."""
+    """Take the screenshots into docs/screens and write a list of them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True, help="data folder with a completed simulated demo run")
     parser.add_argument("--rig", type=Path, required=True, help="its rig file")
@@ -101,7 +101,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def tell_runs(data: Path, rig: Rig) -> dict[str, str]:
-    """Runs of Tina's at the points that the pictures show, told after the first run of the folder."""
+    """Create runs of Tina's that stop at the points the pictures show, from the folder's first run."""
     with Store.open(data) as store:
         source = store.runs()[0].run_id
         events = store.events(source)
@@ -146,7 +146,7 @@ def tell_runs(data: Path, rig: Rig) -> dict[str, str]:
 
 
 def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) -> list[Path]:
-    """Every page at both sizes; the files."""
+    """Take every page at both sizes; returns the files."""
     rig = load_rig(rig_file)
     add_people(data, PEOPLE)
     runs = tell_runs(data, rig)
@@ -182,7 +182,7 @@ def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) ->
                 shot = before[who]
                 for placeholder, text in names.items():
                     path = path.replace(placeholder, text)
-                # One rig drives one run at a time.
+                # A rig drives one run at a time.
                 driven = [key for key in runs if key in address and key != "RUN_DONE"]
                 with attended(data, {runs[key]: working if key == "RUN_WORK" else asking for key in driven}):
                     prepare(shot, path)
@@ -197,7 +197,7 @@ def photograph(rig_file: Path, data: Path, into: Path, only: re.Pattern[str]) ->
 
 
 def take_control(tablet: Screen, run_id: str) -> None:
-    """As the person before the screen does it, from another screen too."""
+    """Take control as the person in front of the screen does, also from another screen."""
     tablet.go(f"/runs/{run_id}")
     button = tablet.page.get_by_role("button", name=re.compile("Take control"))
     if button.count():
@@ -206,7 +206,7 @@ def take_control(tablet: Screen, run_id: str) -> None:
 
 
 def prepare(shot: Screen, path: str) -> None:
-    """The page, at rest."""
+    """Load the page and wait until it is at rest."""
     shot.go(path.partition("#")[0])
     page = shot.page
     page.wait_for_load_state("load")
@@ -227,7 +227,7 @@ def prepare(shot: Screen, path: str) -> None:
 
 
 def write_small(png: bytes, target: Path) -> Path:
-    """As WebP, in full colour; at two thirds of the size where it is a large photograph."""
+    """Write a WebP in full colour; large photographs are reduced to two thirds of their size."""
     whole = Image.open(io.BytesIO(png)).convert("RGB")
     small = b""
     for scale in (1.0, 0.67):
@@ -243,7 +243,7 @@ def write_small(png: bytes, target: Path) -> Path:
 
 
 def listing(taken: Sequence[Path]) -> str:
-    """The pictures, one a line."""
+    """Format the list of pictures, one per line."""
     what = {name: text for name, _, _, text in SHOTS}
     lines: list[str] = []
     for path in sorted(taken):

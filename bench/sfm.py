@@ -1,4 +1,4 @@
-"""Camera poses of every source against the truth: robot, triangulated, mapped and hybrid, on rendered scenes."""
+"""Camera poses of every source against ground truth (robot, triangulated, mapped, hybrid) on rendered scenes."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ COLUMNS = (
 
 
 def measure(capture: Capture, effort: Effort, workspace: Path) -> dict[str, dict[str, float]]:
-    """One row for each source of poses. Rotation, true error and chi² are of T_scan_camera.
+    """Return one row for each source of poses. Rotation, true error and chi² refer to T_scan_camera.
 
-    chi² is of the camera poses against their stated covariance, for each degree of freedom.
+    chi² is that of the camera poses given their stated covariance, per degree of freedom.
     """
     truth = np.array([inverse(capture.T_world_scan) @ T for T in capture.T_world_camera])
     centre_m = capture.registration_m.mean(axis=0)
@@ -67,14 +67,14 @@ def measure(capture: Capture, effort: Effort, workspace: Path) -> dict[str, dict
             capture.camera,
             workspace,
             mapper,
-            # The robot's, registered: they choose which images are matched, and where triangulation begins, no more.
+            # The registered robot poses only select image pairs and initialise the triangulation.
             T_world_camera_prior=dict(zip(capture.names, solved.T_scan_camera, strict=True)),
             options=options,
         )
         spent = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
         rows[source] = _timed(lambda m=models[source]: _from_model(capture, m, outlines, truth))
         rows[source] |= {"images": float(models[source].n_registered)}
-        if set(models[source].seconds) == {"map"}:  # features and matches were there already
+        if set(models[source].seconds) == {"map"}:  # features and matches existed already
             rows[source] |= {"map_cpu_s": spent}
     rows["hybrid"] = _timed(lambda: _hybrid(capture, models["colmap"], outlines, truth))
     return rows
@@ -165,7 +165,7 @@ def _scaled(T: Array, s: float) -> Array:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """The record as a person reads it."""
+    """Format the record as Markdown."""
     lines = [
         f"# Camera poses, {record['date']}",
         "",
@@ -190,7 +190,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Measure the scenes named; print the table and write it after each scene."""
+    """Measure the named scenes; print and write the table after each scene."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=[1, 2, 3], metavar="SEED")
     parser.add_argument("--width", type=int, default=1920)

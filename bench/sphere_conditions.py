@@ -1,6 +1,7 @@
-"""Precision, recall and accuracy of the sphere detector by condition: colours, grounds, light, occlusion, borders.
+"""Precision, recall and accuracy of the sphere detector by condition: colour, background, light, occlusion, borders.
 
-Spheres lie anywhere in the image, also across its border; those with 60 % of their outline in sight are expected.
+Spheres lie anywhere in the image, also across its border; those with at least 60 % of their outline visible are
+expected.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ CONDITIONS = LOOKS | {
     "orange on wood": Look("orange", "wood"),
     "grey on white cloth, side lamp": Look("grey", "white cloth", SIDE_LAMP),
 }
-EXPECTED = 0.6  # of the outline in sight
-WRONG_PX = 0.5  # an error of this size must be known to the covariance
+EXPECTED = 0.6  # visible fraction of the outline
+WRONG_PX = 0.5  # the covariance must reflect an error of this size
 WRONG_SIGMA = 4.0
 
 
 def places(cam: CameraModel, count: int, seed: int) -> Array:
-    """(count, 3) centres in the camera frame, anywhere in the image, seldom one before the other."""
+    """Centres (count, 3) in the camera frame, anywhere in the image and rarely overlapping."""
     rng = np.random.default_rng(seed)
     kept: list[Array] = []
     pixels: list[Array] = []
@@ -54,7 +55,7 @@ def places(cam: CameraModel, count: int, seed: int) -> Array:
 
 @dataclass
 class Tally:
-    """What was found over the images of one condition."""
+    """Results over the images of one condition."""
 
     errors_px: list[float] = field(default_factory=list[float])
     chi2: list[float] = field(default_factory=list[float])
@@ -62,7 +63,7 @@ class Tally:
     recalled: int = 0
     false: int = 0
     found: int = 0
-    overconfident: int = 0  # far off, and the covariance does not know
+    overconfident: int = 0  # far off, although the covariance claims otherwise
     cpu_s: float = 0.0
     images: int = 0
     notes: list[str] = field(default_factory=list[str])
@@ -70,7 +71,7 @@ class Tally:
     def add(
         self, found: Sequence[SphereOutline], truth: Sequence[Cone], picture: Picture, cam: CameraModel, name: str
     ) -> None:
-        """Compare the outlines of one image with the truth."""
+        """Compare the outlines of one image with ground truth."""
         self.images += 1
         self.found += len(found)
         taken: set[int] = set()
@@ -102,7 +103,7 @@ class Tally:
                     self.notes.append(f"{name} at {u:.0f} {v:.0f}: missed, in sight {part:.2f}")
 
     def row(self, name: str) -> str:
-        """A line of the table."""
+        """Format one line of the table."""
         precision = f"{1 - self.false / self.found:.3f}" if self.found else "–"
         recall = f"{self.recalled / self.expected:.3f}" if self.expected else "–"
         rms = median = chi2 = "–"
@@ -124,7 +125,7 @@ def _told(o: SphereOutline) -> str:
 
 
 def measure(name: str, look: Look, images: int, width: int, count: int, detector: str, *, given: bool) -> Tally:
-    """One condition; `given`: the detector is told the colour."""
+    """Measure one condition; with `given`, the detector knows the colour."""
     tally = Tally()
     cam = camera(width)
     options = replace(DEFAULTS, srgb=look.srgb)
@@ -142,7 +143,7 @@ def measure(name: str, look: Look, images: int, width: int, count: int, detector
 
 
 def _hex(look: Look) -> str:
-    """The albedo as #rrggbb, as somebody reads it from a photograph of a sphere."""
+    """The albedo as #rrggbb, as read from a photograph of a sphere."""
     linear = np.array(COLOURS_BGR[look.colour])[::-1]
     coded = (
         np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055) if look.srgb else linear

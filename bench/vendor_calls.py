@@ -1,4 +1,4 @@
-"""The control interface of ur_rtde: each call, what a real controller answers, what the simulated one does."""
+"""Calls of ur_rtde's control interface: each call, a real controller's answer, and the simulated one's."""
 
 from __future__ import annotations
 
@@ -19,54 +19,54 @@ NOTHING = [0.0] * 6
 
 @dataclass(frozen=True)
 class Call:
-    """One method: how it is called, whether its answer is the expected one, what that is worth, and why."""
+    """One method: how it is called, whether its answer is as expected, its verdict, and the reason."""
 
-    run: Callable[[Any], Any]  # takes the clients of a session
+    run: Callable[[Any], Any]  # called with the clients of a session
     right: Callable[[Any], bool]
     worth: str = AS_REAL
     note: str = ""
-    crashes: bool = False  # the client itself, whatever is at the other end
+    crashes: bool = False  # the client itself crashes, whatever the controller does
 
 
 def true(value: Any) -> bool:
-    """The call said True."""
+    """Whether the call returned True."""
     return value is True
 
 
 def done(value: Any) -> bool:
-    """The call came back without an answer."""
+    """Whether the call returned without a value."""
     return value is None
 
 
 def numbers(count: int) -> Callable[[Any], bool]:
-    """As many finite numbers."""
+    """Whether the value is a list of `count` finite numbers."""
     return lambda value: len(value) == count and all(math.isfinite(v) for v in value)
 
 
 def number(value: Any) -> bool:
-    """One finite number."""
+    """Whether the value is one finite number."""
     return isinstance(value, (int, float)) and math.isfinite(value)
 
 
 def within(what: list[float], tolerance: float = 1e-3) -> Callable[[Any], bool]:
-    """These numbers."""
+    """Whether the value equals these numbers within the tolerance."""
     return lambda value: (
         len(value) == len(what) and all(abs(a - b) < tolerance for a, b in zip(value, what, strict=True))
     )
 
 
 def zeros(count: int) -> Callable[[Any], bool]:
-    """As many zeros."""
+    """Whether the value is a list of `count` zeros."""
     return lambda value: list(value) == [0.0] * count
 
 
 def error(words: str) -> Callable[[Any], bool]:
-    """The call raised an error with these words in it."""
+    """Whether the call raised an error containing these words."""
     return lambda value: isinstance(value, str) and words in value
 
 
 def left(name: str) -> Callable[[Any], Any]:
-    """Disconnect one of the clients, tell whether it says so."""
+    """Disconnect one of the clients; returns whether it reports so."""
 
     def run(s: Any) -> Any:
         client = getattr(s, name)
@@ -77,7 +77,7 @@ def left(name: str) -> Callable[[Any], Any]:
 
 
 def back(name: str) -> Callable[[Any], Any]:
-    """Disconnect one of the clients, connect it again, tell what it says."""
+    """Disconnect and reconnect one of the clients; returns its answer."""
 
     def run(s: Any) -> Any:
         client = getattr(s, name)
@@ -88,12 +88,12 @@ def back(name: str) -> Callable[[Any], Any]:
 
 
 def no(value: Any) -> bool:
-    """The call said False."""
+    """Whether the call returned False."""
     return value is False
 
 
 def _second(ask: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """The real-time getters answer with what was in the registers before: the second answer counts."""
+    """Call twice: the real-time getters return the previous content of the registers, so the second answer counts."""
 
     def run(s: Any) -> Any:
         ask(s)
@@ -107,7 +107,7 @@ def _second(ask: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _arrives(start: Callable[[Any], Any], goal: list[float] = NEAR) -> Callable[[Any], Any]:
-    """Start a motion and tell where the arm is once it has ended."""
+    """Start a motion; returns the arm's position after it has ended."""
 
     def run(s: Any) -> Any:
         started = start(s)
@@ -122,7 +122,7 @@ def _arrived(value: Any) -> bool:
 
 
 def _moves(start: Callable[[Any], Any], stop: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Start something that goes on, tell how fast the tool or a joint moves, stop it, tell whether it stands."""
+    """Start a continuous motion, measure the speed of the tool or a joint, stop it, and check that the arm stops."""
 
     def run(s: Any) -> Any:
         said = [start(s)]

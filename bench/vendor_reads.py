@@ -1,4 +1,4 @@
-"""The same table for the receive, input/output, dashboard and script interfaces of ur_rtde."""
+"""Calls of ur_rtde's receive, input/output, dashboard and script interfaces, as in bench.vendor_calls."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ RECEIVE: dict[str, Call] = {
 
 
 def _shown(order: Callable[[Any], Any], read: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Give an order, tell what the stream then says."""
+    """Give an order; returns what the stream then reports."""
 
     def run(s: Any) -> Any:
         given = order(s)
@@ -184,9 +184,9 @@ def _paused(s: Any) -> Any:
 
 
 def _unlocked(s: Any) -> Any:
-    time.sleep(0.3)  # for the client to know that its script was stopped before
+    time.sleep(0.3)  # for the client to notice that its script was stopped
     s.control.triggerProtectiveStop()
-    time.sleep(1.3)  # five seconds of the simulated controller's
+    time.sleep(1.3)  # five seconds on the simulated controller's clock
     s.dashboard.closeSafetyPopup()
     s.dashboard.unlockProtectiveStop()
     time.sleep(0.1)

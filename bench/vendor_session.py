@@ -1,4 +1,4 @@
-"""The child of bench.vendor_surface: holds ur_rtde's clients and makes one call for each line of its input."""
+"""The child of bench.vendor_surface: holds ur_rtde's clients and makes one call per line of its input."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ VERSION = (5, 12)
 
 
 class Clients:
-    """All clients of one controller, and those of a newer one; each is made when it is asked for and kept."""
+    """All clients of one controller and of a newer one; each is created on demand and kept."""
 
     path, path_entry = rtde_control.Path, rtde_control.PathEntry
 
@@ -56,7 +56,7 @@ class Clients:
 
     @property
     def new_control(self) -> Any:
-        """The same on the newer controller."""
+        """The control interface of the newer controller."""
         return self._kept("new control", lambda: rtde_control.RTDEControlInterface(self._new_host))
 
     @property
@@ -76,7 +76,7 @@ class Clients:
 
     @property
     def new_dashboard(self) -> Any:
-        """The same on the newer controller."""
+        """A connected dashboard client of the newer controller."""
         return self._kept("new dashboard", lambda: _connected(dashboard_client.DashboardClient(self._new_host)))
 
     @property
@@ -85,13 +85,13 @@ class Clients:
         return self._kept("script", lambda: _connected(script_client.ScriptClient(self._host, *VERSION)))
 
     def remember(self, name: str, make: Callable[[Any], Any]) -> Any:
-        """What was made the first time, within one call."""
+        """Return what was made under this name within the current call, making it the first time."""
         if name not in self._remembered:
             self._remembered[name] = make(self)
         return self._remembered[name]
 
     def begin(self, *, arm: bool) -> None:
-        """Before each call: no stop, brakes released, full speed, and the arm at rest where it began."""
+        """Reset before each call: no stop, brakes released, full speed, and the arm at rest at its start."""
         self._remembered.clear()
         dashboard = self.dashboard
         dashboard.brakeRelease()
@@ -131,7 +131,10 @@ def _answer(clients: Clients, interface: str, method: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Read `interface<TAB>method` a line, answer with a line of JSON behind a mark: the library prints too."""
+    """Read lines `interface<TAB>method` and answer each with a line of JSON after a mark.
+
+    The mark is needed because the library prints too.
+    """
 
     clients = Clients(sys.argv[1], sys.argv[2])
     for line in sys.stdin:

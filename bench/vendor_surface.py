@@ -1,7 +1,7 @@
-"""Every method of ur_rtde and every configuration name of the camera body against the simulators, in one table.
+"""Every method of ur_rtde and every camera configuration name, tested against the simulators, in one table.
 
-`python -m bench.vendor_surface` writes bench/results/vendor_surface.md and ends with status 1 when an answer is not
-the expected one, or when the vendor's client has a method that bench.vendor_calls and bench.vendor_reads do not list.
+`python -m bench.vendor_surface` writes bench/results/vendor_surface.md. It exits with status 1 if an answer is not as
+expected, or if the vendor's client has a method that bench.vendor_calls and bench.vendor_reads do not list.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MARK = "@@"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One line of a table."""
+    """One row of a table."""
 
     name: str
     worth: str
@@ -43,7 +43,7 @@ class Row:
 
 @contextlib.contextmanager
 def simulator(*words: str) -> Generator[dict[str, Any]]:
-    """A simulator as a process of its own; yields what it announces."""
+    """Run a simulator as a process; yields its ready line."""
     command = [sys.executable, "-m", "simulators", *words, "--with-parent"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         assert process.stdout is not None
@@ -54,14 +54,14 @@ def simulator(*words: str) -> Generator[dict[str, Any]]:
 
 
 class Child:
-    """A process with the vendor's clients in it; one that does not answer in time is killed and replaced."""
+    """A process with the vendor's clients; killed and replaced if it does not answer in time."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
         self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
 
     def ask(self, interface: str, method: str) -> dict[str, Any]:
-        """Make one call; says so where no answer came or the process died."""
+        """Make one call; the answer says so if none came or the process died."""
         process = self._process
         if process is None or process.poll() is not None:
             process = self._process = self._start()
@@ -96,7 +96,7 @@ class Child:
 
 
 def _read(process: subprocess.Popen[str], lines: queue.SimpleQueue[str]) -> None:
-    """The child's answers, and an empty line at its end; the library prints lines of its own."""
+    """Queue the child's answers, and an empty line at its end; skips lines printed by the library."""
     assert process.stdout is not None
     for line in process.stdout:
         if line.startswith(_MARK):
@@ -105,7 +105,7 @@ def _read(process: subprocess.Popen[str], lines: queue.SimpleQueue[str]) -> None
 
 
 def robot_tables(only: str) -> dict[str, list[Row]]:
-    """Every method of the five interfaces."""
+    """One table per interface with every method of the five interfaces."""
     tables: dict[str, list[Row]] = {}
     child = Child()
     options = ("--model", "UR10e", "--speed-up", "5")
@@ -138,7 +138,7 @@ def _row(child: Child, interface: str, method: str) -> Row:
 
 
 def camera_table() -> list[Row]:
-    """Every configuration name of the body, and those that are listed but not there."""
+    """Every configuration name of the camera, including those that are listed but do not exist."""
     with simulator("camera", "--port", "0", "--image-width", "480") as ready:
         found = look(ready["gphoto_port"])
     rows: list[Row] = []
@@ -151,7 +151,7 @@ def camera_table() -> list[Row]:
 
 
 def markdown(tables: dict[str, list[Row]]) -> str:
-    """The document."""
+    """Format the document as Markdown."""
     lines = ["# Every call of the vendors' clients against the simulators", ""]
     where = machine()
     lines += [
@@ -175,7 +175,7 @@ def markdown(tables: dict[str, list[Row]]) -> str:
 
 
 def main() -> None:
-    """Make every call, print as it goes, write the table."""
+    """Make every call, print progress, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="methods with this in their name; writes no table")
     arguments = parser.parse_args()

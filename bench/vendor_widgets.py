@@ -1,4 +1,4 @@
-"""Every configuration name of the simulated body in libgphoto2: read; where it can be, set and read back."""
+"""Every configuration name of the simulated camera in libgphoto2: read, and where possible set and read back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 from typing import Any
 
 AS_REAL, REFUSED, NOT_SIMULATED = "as the real one", "refused as the real one refuses", "not simulated"
-CACHE_S = 2.1  # libgphoto2 keeps a property's value for two seconds
+CACHE_S = 2.1  # libgphoto2 caches a property's value for two seconds
 _TEXT, _RANGE, _TOGGLE, _RADIO, _MENU = 2, 3, 4, 5, 6  # widget types of gphoto2-widget.h
 _SECTIONS = (0, 1)
 _CONTROLS = ("d2c1", "d2c2", "d2d1")
@@ -46,7 +46,7 @@ LISTED: dict[str, tuple[str, str]] = {
 
 
 def look(port: str) -> dict[str, tuple[str, bool]]:
-    """Name → what was seen, and whether reading, setting and reading back agreed; in a process of its own."""
+    """Name → result, and whether reading, setting and reading back agreed; run it in a process of its own."""
     done = subprocess.run(
         [sys.executable, "-m", "bench.vendor_widgets", port],
         stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=300, check=True,
@@ -71,7 +71,7 @@ def _leaves(widget: Any) -> list[Any]:
 
 
 def _other_value(widget: Any) -> Any:
-    """A value to set that differs from the present one, or None where there is none."""
+    """A settable value that differs from the current one; None if there is none."""
     if widget.get_type() in (_RADIO, _MENU):
         others = [choice for choice in widget.get_choices() if choice != widget.get_value()]
         return others[0] if others else None
@@ -92,7 +92,7 @@ def _set(gp: Any, camera: Any, name: str, value: Any) -> str:
     return str(camera.get_single_config(name).get_value())
 
 
-# What reads back differently from what was set, as it must: toggles, steps, and the client's own mistakes.
+# What must read back differently from what was set: toggles, steps, and the client's own bugs.
 _EXPECTED = {"capturetarget": "refused", "manualfocus": "refused", "movie": "refused"}
 
 

@@ -1,4 +1,4 @@
-"""The paper's protocol from its first step to its last on simulated rigs: errors, seconds, bytes, memory."""
+"""The paper's whole protocol on simulated rigs: errors, durations, bytes and memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PROTOCOL = REPOSITORY / "protocols" / "exvivo_spine.yaml"
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run the protocol on each scene; print and write the figures. 1 if a scene did not come to its end."""
+    """Run the protocol on each scene; print and write the figures. Returns 1 if a scene did not complete."""
     options = arguments(words)
     scenes: list[int] = [*options.scenes, *(secrets.randbelow(10_000) for _ in range(options.drawn))]
     about = {
@@ -57,7 +57,7 @@ def main(words: Sequence[str] | None = None) -> int:
                 replayed=len(found) < options.replayed,
             )  # fmt: skip
         found.append({**answer, "load_before": load})
-        # Written after each scene: a bench that is interrupted has not measured for nothing.
+        # Written after each scene, so that an interrupted bench keeps its results.
         record = {**about, "scenes": found}
         stem.with_suffix(".json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         text = as_markdown(record)
@@ -67,7 +67,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def arguments(words: Sequence[str] | None) -> argparse.Namespace:
-    """What the command line says."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="*", default=[1, 7, 21], metavar="SEED", help="seeds (1 7 21)")
     parser.add_argument("--drawn", type=int, default=2, metavar="N", help="further seeds, drawn by chance (2)")
@@ -86,7 +86,7 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """The record as a person reads it."""
+    """Format the record as Markdown."""
     computer = record["machine"]
     share = f", one view of {record['one_viewpoint_of']}" if record["one_viewpoint_of"] > 1 else ""
     lines = [

@@ -1,4 +1,4 @@
-"""One whole protocol on a simulated rig, as its user runs it: each command measured, figures from the record."""
+"""One whole protocol on a simulated rig, run as by a user: each command is measured, figures come from the record."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _WATCH_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """One command: how it ended, how long it took, and the most memory its processes held together."""
+    """One command: its exit, its duration, and the peak memory of all its processes together."""
 
     status: int
     seconds: float
@@ -40,7 +40,7 @@ class Measured:
     complaint: str  # last lines of its standard error
 
     def figures(self) -> dict[str, Any]:
-        """As plain data."""
+        """Convert to JSON data."""
         figures: dict[str, Any] = {"seconds": round(self.seconds, 1), "peak_mb": round(self.peak_mb)}
         if self.status:
             figures |= {"status": self.status, "complaint": self.complaint}
@@ -48,7 +48,7 @@ class Measured:
 
 
 def orthocapture(*words: str, timeout_s: float, log: Path) -> Measured:
-    """Run the command to its end, watching the memory of its process and of all below it."""
+    """Run the command to its end while monitoring the memory of its process tree."""
     begun_s = time.monotonic()
     with log.open("w+") as errors:
         process = subprocess.Popen(
@@ -72,7 +72,7 @@ def orthocapture(*words: str, timeout_s: float, log: Path) -> Measured:
 
 
 def _watch(pid: int, peak_mb: list[float]) -> None:
-    """Sum the resident memory of a process tree until it ends; shared pages count once for each process."""
+    """Sum the resident memory of a process tree until it ends; shared pages count once per process."""
     while True:
         total = 0
         try:
@@ -92,7 +92,7 @@ def _watch(pid: int, peak_mb: list[float]) -> None:
 
 @contextmanager
 def simulated_rig(folder: Path, scene: int, options: Sequence[str]) -> Generator[Mapping[str, str]]:
-    """A rig around one scene; yields its ready line."""
+    """Start a rig around one scene; yields its ready line."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "rig.log").open("w") as log:
         process = subprocess.Popen(
@@ -123,16 +123,16 @@ def whole_run(
     timeout_s: float,
     replayed: bool,
 ) -> dict[str, Any]:
-    """Run, verify, replay, report and bundle one scene; the figures, and what went wrong where something did.
+    """Run, verify, replay, report and bundle one scene; returns the figures, and any errors.
 
     Args:
-        protocol: the file.
+        protocol: the protocol file.
         scene: seed of the simulated scene.
-        folder: for the rig, the evidence and what is exported.
-        rig_options: further words for `simulate rig`.
-        speed_up: of the simulated arm, as the rig's options say it.
+        folder: for the rig, the evidence and the exports.
+        rig_options: further options of `simulate rig`.
+        speed_up: of the simulated arm, as in the rig's options.
         timeout_s: of each command.
-        replayed: compute the whole run once more, which takes as long as the run's own computations.
+        replayed: recompute the whole run, which takes as long as the run's own computations.
     """
     with simulated_rig(folder / "rig", scene, rig_options) as ready:
         data = folder / "data"
@@ -167,14 +167,14 @@ def _table(summary: RunSummary, truth: Path) -> list[dict[str, Any]]:
 
 
 def _release(store: Store, summary: RunSummary) -> None:
-    """A second person releases the run, so that the bundle may be exported."""
+    """Release the run as a second person, so that the bundle can be exported."""
     payload = RunReleased(meaning="released by the bench", signed_sha256=summary.state.completed_sha256)
     store.record(summary.run_id, [payload], actor=SECOND_PERSON)
     checkpoint(store, summary.run_id)
 
 
 def _commands(run_id: str, data: Path, folder: Path, timeout_s: float, replayed: bool) -> dict[str, Any]:
-    """Every command that reads a finished run."""
+    """Run every command that reads a finished run."""
     common = ("--data", str(data), "--json")
     words = {
         "verify": ("audit", "verify", run_id, *common),

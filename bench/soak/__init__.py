@@ -1,1 +1,1 @@
-"""Long and large: what grows over an hour, over 10,000 viewpoints, side by side and in speed (docs/howto/soak.md)."""
+"""Soak tests: growth over an hour, 10,000 viewpoints, many processes at once, and speed (docs/howto/soak.md)."""

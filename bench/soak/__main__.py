@@ -1,8 +1,8 @@
-"""`make soak`: long and large. Four parts, each with its size; the figures go to bench/results/soak-DATE.
+"""`make soak`: four long or large tests of configurable size; figures go to bench/results/soak-DATE.
 
-    python -m bench.soak [--only captures large together speed] [--minutes 60] [--viewpoints 10000] …
+python -m bench.soak [--only captures large together speed] [--minutes 60] [--viewpoints 10000] …
 
-A part that is measured again today takes the place of its earlier figures, the others stay. Exit status: 0 without
+A part that is measured again on the same day replaces its earlier figures; the others stay. Exit status: 0 without
 faults, 1 with.
 """
 
@@ -40,7 +40,7 @@ TABLES: Mapping[str, Callable[[dict[str, Any]], list[str]]] = {
 
 
 def measured(part: str, folder: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """One part at the size that was asked for."""
+    """Measure one part at the requested size."""
     match part:
         case "captures":
             return captures.captures(
@@ -56,7 +56,7 @@ def measured(part: str, folder: Path, options: argparse.Namespace) -> dict[str, 
 
 
 def report(parts: Mapping[str, dict[str, Any]]) -> str:
-    """As Markdown."""
+    """Format the figures as Markdown."""
     lines = ["# Long and large", "", "`make soak` (docs/howto/soak.md).", ""]
     for part in (name for name in PARTS if name in parts):
         found = parts[part]
@@ -79,7 +79,7 @@ def report(parts: Mapping[str, dict[str, Any]]) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Measure, tell and write. The exit status."""
+    """Measure, report and write the results; returns the exit status."""
     words = sys.argv[1:] if words is None else words
     parser = argparse.ArgumentParser(prog="python -m bench.soak", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
@@ -100,7 +100,7 @@ def main(words: Sequence[str] | None = None) -> int:
     options.results.mkdir(parents=True, exist_ok=True)
     if options.work is not None:
         options.work.mkdir(parents=True, exist_ok=True)
-    revision = commit()  # before results make a difference
+    revision = commit()  # before the results change the working tree
     faults: list[str] = []
     for part in options.only:
         load, began_s = os.getloadavg()[0], time.monotonic()
@@ -131,7 +131,7 @@ _OPTIONS: Mapping[str, tuple[str, ...]] = {
 
 
 def _sizes(part: str, words: Sequence[str]) -> list[str]:
-    """The options of a part as they were given."""
+    """The options of a part, as given on the command line."""
     return [word for name, value in pairwise(words) if name in _OPTIONS[part] for word in (name, value)]
 
 

@@ -1,9 +1,9 @@
-"""`captures`: the real programs capture on a simulated rig for an hour; what they hold and write must not creep.
+"""`captures`: the real programs capture on a simulated rig for an hour; their memory and files must not creep up.
 
-`simulate rig` (the arm at many times its speed), `run` with its drivers' processes and its worker, and `serve`, which
-somebody reads all the while. Every few seconds memory (USS and RSS), descriptors and threads of every process are
-sampled, and the sizes of database, write-ahead log and logs. After a warm-up a line is fitted over the number of
-captures; bench/soak/creep.py judges it.
+The programs are `simulate rig` (with a sped-up arm), `run` with its driver processes and its worker, and `serve`,
+whose pages are read all the time. Every few seconds memory (USS and RSS), descriptors and threads of every process
+are sampled, and the sizes of the database, write-ahead log and logs. After a warm-up a line is fitted over the number
+of captures, which bench/soak/creep.py judges.
 """
 
 from __future__ import annotations
@@ -32,14 +32,17 @@ from tests.support.serving import Server, serving
 _HOST = "127.0.0.81"
 _SPEED_UP = 20
 _WIDTH_PX = 640
-_ROBOT_PORTS = {29999, 30001, 30002, 30003, 30004}  # fixed by the maker
-_LONGEST_S = 600.0  # until the first capture, on a busy machine
-_LOOK_S = 0.5  # between two pages that are asked for
-_ENDS_S = 120.0  # the runner is told to end, and does
+_ROBOT_PORTS = {29999, 30001, 30002, 30003, 30004}  # fixed by the manufacturer
+_LONGEST_S = 600.0  # until the first capture on a busy machine
+_LOOK_S = 0.5  # between two page requests
+_ENDS_S = 120.0  # for the runner to end after it was told to
 
 
 def captures(folder: Path, minutes: float, every_s: float, planned: int, *, calibrated: bool) -> dict[str, Any]:
-    """Capture for so long; samples, lines, and the faults. See `protocol_of` for the others."""
+    """Capture for `minutes`; returns samples, fitted lines and faults.
+
+    `planned` and `calibrated` are those of `protocol_of`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     rig = folder / "rig"
     rig.mkdir()
@@ -71,11 +74,11 @@ def captures(folder: Path, minutes: float, every_s: float, planned: int, *, cali
 
 
 def protocol_of(folder: Path, planned: int, *, calibrated: bool) -> Path:
-    """A capture of so many viewpoints at a station.
+    """Write a protocol that captures `planned` viewpoints at one station; returns the file.
 
-    When `calibrated`, the camera is calibrated before, and a registration after it is planned, which is never
-    reached: so the worker has features and matches to compute for every image. The live numbers are left out: each of
-    their jobs names all the images before it, which is not linear (docs/howto/soak.md).
+    If `calibrated`, a camera calibration precedes the capture and a registration is planned after it but never
+    reached, so the worker computes features and matches for every image. Live predictions are left out: each of their
+    jobs names all the images before it, so their cost is not linear (docs/howto/soak.md).
     """
     whole = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     steps: dict[str, dict[str, Any]] = {step["id"]: step for step in whole["steps"]}
@@ -116,7 +119,7 @@ class _Soak:
     pages: int = 0
 
     def go(self, seconds: float, every_s: float) -> None:
-        """Run, read and sample until the time is over; then end the run and what belongs to it."""
+        """Run, read pages and sample until the time is up; then end the run and its processes."""
         words = ("run", str(self.protocol), "--rig", str(self.rig), "--data", str(self.data))
         with self.log.open("wb") as log:
             runner = subprocess.Popen(
@@ -169,7 +172,7 @@ class _Soak:
                 time.sleep(_LOOK_S)
 
     def _look(self, client: httpx.Client, run: str, state: RunState) -> None:
-        """What an open page asks for when something has happened, and whole pages in turn."""
+        """Request what an open page requests after each event, and whole pages in turn."""
         whole = ("/", f"/runs/{run}", f"/runs/{run}/capture", f"/audit/runs/{run}", "/metrics", "/health")
         parts = (f"/runs/{run}/parts/banner,control,vitals,step", f"/runs/{run}/capture/parts/image,plan,sheet")
         for address in (whole[self.pages % len(whole)], *parts):
@@ -188,7 +191,7 @@ class _Soak:
         for process in sorted(psutil.Process().children(recursive=True), key=lambda p: p.pid):
             with suppress(psutil.Error):
                 name = role_of(process, runner)
-                if name == CHILD:  # there are several, and they stay
+                if name == CHILD:  # there are several, and they stay open
                     children += 1
                     name = f"{name} {children}"
                 if name:
@@ -207,7 +210,7 @@ def _is_of_the_capture(payload: Payload) -> bool:
 
 
 def role_of(process: psutil.Process, runner: int) -> str:
-    """What a process is, in a word or two; "" for what is no part of it. Raises psutil.Error."""
+    """The role of a process in a word or two; "" if it is not part of the run. Raises psutil.Error."""
     words = " ".join(process.cmdline())
     if process.pid == runner:
         return "runner"
@@ -228,7 +231,7 @@ def role_of(process: psutil.Process, runner: int) -> str:
 
 
 def figures_of(process: psutil.Process) -> dict[str, float]:
-    """What one process holds. Raises psutil.Error."""
+    """Memory, descriptors and threads of one process. Raises psutil.Error."""
     memory = process.memory_full_info()
     return {
         "uss_mb": memory.uss / 1e6,

@@ -1,4 +1,4 @@
-"""Whether something creeps: lines over the captures of an hour, each held against its bound and its reason."""
+"""Detects creeping growth: lines fitted over the captures of an hour, each compared with its bound."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from typing import Any
 
 from bench.soak.fit import Growth, growth
 
-WARM_UP = 0.25  # of the time, which is left out
-FEWEST = 8  # samples after it, to say anything
-JUDGED_S = 300.0  # in less time buffers and caches still fill: nothing is judged
+WARM_UP = 0.25  # fraction of the time that is left out
+FEWEST = 8  # minimum number of samples after the warm-up
+JUDGED_S = 300.0  # shorter runs are not judged, because buffers and caches are still filling
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One look at everything."""
+    """All figures at one moment."""
 
     at_s: float
     captured: int
     processes: Mapping[str, Mapping[str, float]]  # by role
-    sizes: Mapping[str, int]  # bytes
+    sizes: Mapping[str, int]  # in bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """The most that something may grow in 1000 captures, and why it may."""
+    """The largest allowed growth per 1000 captures, and its reason."""
 
     most: float
     why: str
@@ -52,7 +52,7 @@ SIZES_MB: Mapping[str, Bound] = {
 
 
 def judge(samples: Sequence[Sample]) -> dict[str, Any]:
-    """Rows with growth per 1000 captures, and the faults."""
+    """Return rows with the growth per 1000 captures, and the faults."""
     warm = [s for s in samples if s.at_s >= samples[0].at_s + WARM_UP * (samples[-1].at_s - samples[0].at_s)]
     if len(warm) < FEWEST:
         return {
@@ -82,7 +82,7 @@ def _process(name: str, samples: Sequence[Sample]) -> list[dict[str, Any]]:
 
 
 def _row(what: str, points: Sequence[tuple[int, float]], bound: Bound) -> dict[str, Any]:
-    """Faulty is what grows faster than its bound for certain: at the near end of the 95 % interval."""
+    """One row; a fault if even the lower end of the growth's 95 % interval exceeds the bound."""
     values = [y for _x, y in points]
     line: Growth | None = growth([x / 1000 for x, _y in points], values)
     fault = ""
@@ -104,7 +104,7 @@ def _row(what: str, points: Sequence[tuple[int, float]], bound: Bound) -> dict[s
 
 
 def table(found: Mapping[str, Any]) -> list[str]:
-    """For people, in Markdown."""
+    """Format the findings as Markdown lines."""
     lines = [
         f"{found['minutes']:g} minutes of captures with the arm at 20 times its speed: {found['captured']:,} "
         f"viewpoints, {found['events']:,} events, {found['jobs']:,} jobs, {found['pages']:,} rounds of pages, "

@@ -1,4 +1,4 @@
-"""Lines through measurements: how fast something grows, how well that is known, and of which order a duration is."""
+"""Fits to measurements: growth rates with confidence intervals, and the order of growth of durations."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ BLOCKS = 12
 
 
 class Took(NamedTuple):
-    """How long something took: on the wall, and of this process's processors, which other work does not lengthen."""
+    """A duration: wall time, and CPU time of this process, which other load does not lengthen."""
 
     wall_s: float
     cpu_s: float
 
     @classmethod
     def now(cls) -> Took:
-        """The clocks, for a difference."""
+        """The current clock readings."""
         return cls(time.perf_counter(), time.process_time())
 
     def since(self, earlier: Took) -> Took:
-        """The difference."""
+        """The difference to earlier readings."""
         return Took(self.wall_s - earlier.wall_s, self.cpu_s - earlier.cpu_s)
 
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """Slope of a line, with the half-width of its 95 % interval; both in units of y per unit of x."""
+    """The slope of a line with the half-width of its 95 % interval, in units of y per unit of x."""
 
     slope: float
     half_width: float
 
     @property
     def least(self) -> float:
-        """What it grows by at least, with 97.5 % confidence."""
+        """The lower bound of the growth, with 97.5 % confidence."""
         return self.slope - self.half_width
 
 
 def growth(x: Sequence[float], y: Sequence[float]) -> Growth | None:
-    """How fast y grows with x; None for fewer than four distinct places.
+    """Fit a line to y over x; None for fewer than four distinct x.
 
-    Samples that follow one another closely say nearly the same: they count as the mean of their block, of which there
-    are at most BLOCKS, so that the interval is not narrower than what is known.
+    Successive samples are correlated, so they are averaged in at most BLOCKS blocks; otherwise the interval would be
+    too narrow.
     """
     blocks = [part for part in np.array_split(np.arange(len(x)), min(BLOCKS, len(x))) if len(part)]
     at = [float(np.mean(np.asarray(x)[part])) for part in blocks]
@@ -62,7 +62,7 @@ def growth(x: Sequence[float], y: Sequence[float]) -> Growth | None:
 
 
 def exponent(sizes: Sequence[float], seconds: Sequence[float]) -> float:
-    """The p of seconds ∝ sizes**p, by least squares of the logarithms; 1: linear."""
-    shortest = 1e-6  # of a clock
+    """The exponent p in seconds ∝ sizes**p, by least squares of the logarithms; 1 means linear."""
+    shortest = 1e-6  # resolution of the clock
     logarithms = [math.log(max(taken, shortest)) for taken in seconds]
     return float(np.polyfit(np.log(sizes), logarithms, 1)[0])

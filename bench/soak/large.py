@@ -1,8 +1,7 @@
-"""`large`: one run of 10,000 viewpoints and 50 GB, measured on the way: what is asked of it must stay linear.
+"""`large`: a run that grows to 10,000 viewpoints and 50 GB; the cost of every operation must stay linear.
 
-At each size: what another viewpoint costs (store, runner), `status`, `audit show`, `audit verify` (with the files and
-without), and the pages as somebody asks for them who has just started the server, who asks again, and whose page
-follows the run.
+Measured at each size: the cost of another viewpoint (store, runner), `status`, `audit show`, `audit verify` (with and
+without the files), and the pages right after the server started, requested again, and while following the run.
 """
 
 from __future__ import annotations
@@ -25,17 +24,20 @@ from service.store.audit import verify
 from tests.support.web import Browser, web_site
 
 MOST_EXPONENT = 1.15
-PAGE_S = 1.0  # a page of the largest run, asked for again or following the run
-FIRST_S = 5.0  # the first one after the server has begun, which reads the whole run
-SMALL_S = 0.05  # what is quicker than this at the largest size needs no order of growth
-_LOOKS = 3  # the shortest counts: what else the machine does only adds
+PAGE_S = 1.0  # limit for a page of the largest run, requested again or following the run
+FIRST_S = 5.0  # limit for the first page after the server started, which reads the whole run
+SMALL_S = 0.05  # operations faster than this at the largest size need no order of growth
+_LOOKS = 3  # repetitions; the fastest counts, since other load only adds time
 _SHEET = 60
 
 Times = dict[str, Took]
 
 
 def large(folder: Path, sizes: Sequence[int], gigabytes: float) -> dict[str, Any]:
-    """Grow a run through these sizes to so many GB of photographs; what everything took at each, and the faults."""
+    """Grow a run through these sizes to `gigabytes` of photographs.
+
+    Returns the times at each size, and the faults.
+    """
     record = LargeRecord(folder, sizes[-1] + 200, int(gigabytes * 1e9 / sizes[-1]))
     at: dict[int, Times] = {}
     try:
@@ -62,7 +64,7 @@ def large(folder: Path, sizes: Sequence[int], gigabytes: float) -> dict[str, Any
 
 
 def commands(record: LargeRecord) -> Times:
-    """What is asked at the terminal takes, without the start of Python."""
+    """Times of the commands used at the terminal, without the start of Python."""
     data = str(record.folder / "data")
     runner = CliRunner()
 
@@ -83,7 +85,7 @@ def commands(record: LargeRecord) -> Times:
 
 
 def pages(record: LargeRecord) -> Times:
-    """Every page: the very first one of a server, asked for again, and after one more event."""
+    """Times of every page: the first of a new server, requested again, and after one more event."""
     found: Times = {}
     run = record.run_id
     with web_site(record.folder) as web, web.browser("technician") as browser, web.browser("auditor") as auditor:
@@ -139,12 +141,12 @@ def pages(record: LargeRecord) -> Times:
 
 
 def judge(at: dict[int, Times]) -> list[dict[str, Any]]:
-    """A row for everything that was measured: seconds by size, order of growth, and what is wrong with it."""
+    """One row per measured operation: seconds by size, order of growth, and its fault if any."""
     rows: list[dict[str, Any]] = []
     sizes = list(at)
     for name in at[sizes[-1]]:
         took = [at[size][name] for size in sizes]
-        seconds = [one.cpu_s for one in took]  # what else the machine does only lengthens the wall's
+        seconds = [one.cpu_s for one in took]  # wall time also contains other load
         order = exponent(sizes, seconds) if len(sizes) > 1 else float("nan")
         faults: list[str] = []
         if len(sizes) > 1 and order > MOST_EXPONENT and seconds[-1] > SMALL_S:
@@ -158,7 +160,7 @@ def judge(at: dict[int, Times]) -> list[dict[str, Any]]:
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """For people, in Markdown."""
+    """Format the findings as Markdown lines."""
     sizes = found["sizes"]
     gigabytes, written = found["artefact_bytes"] / 1e9, found["disk_bytes"] / 1e9
     lines = [

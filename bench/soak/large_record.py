@@ -1,8 +1,8 @@
-"""One run that grows to thousands of viewpoints: the real runner begins and resumes it, the rest fills it up.
+"""A run that grows to thousands of viewpoints: the real runner begins and resumes it, the rest is filled in.
 
-The runner takes the first viewpoints, and a few at each size, on the rig in memory of the tests. Those between come
-to the record as a capture brings them: photograph and poses into the store, one transaction with rows and event; then
-a job that looks at it, enqueued, claimed and finished. The photographs are sparse (bench/soak/sparse.py).
+The runner takes the first viewpoints, and a few at each size, on the in-memory rig of the tests. Those between are
+recorded as a capture records them: photograph and poses into the store, one transaction with rows and event, then a
+job that evaluates it, enqueued, claimed and finished. The photographs are sparse files (bench/soak/sparse.py).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from service.store.store import Store
 from tests.support.bench_run import PROTOCOL, Bench
 
 STEP = "capture"
-TIMED = 200  # viewpoints before each size that are brought with every fsync, and timed
-_POSES = 4  # of a pose log; a real one has a hundred, which here would only be written to the disk
+TIMED = 200  # viewpoints before each size that are recorded with every fsync and timed
+_POSES = 4  # poses per log; a real one has a hundred, which would only cost disk space here
 _RIG = """\
 name: large
 simulated: true
@@ -37,7 +37,7 @@ T_flange_camera_nominal: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 
 
 
 class _DiedError(BaseException):
-    """The runner's process is gone; nothing catches this."""
+    """The runner's process died; nothing catches this."""
 
 
 @dataclass
@@ -73,9 +73,9 @@ class LargeRecord:
         self.store.close()
 
     def grow(self, until: int) -> list[Took]:
-        """Bring viewpoints to the record until there are so many; what each of the last ones took.
+        """Record viewpoints until there are `until`; returns the durations of the last TIMED ones.
 
-        Those before the last ones are not synced one by one, which would take an hour of the disk's time.
+        The viewpoints before those are not synced one by one, which would take an hour.
         """
         took: list[Took] = []
         photograph = self.folder / "photograph.jpg"
@@ -91,7 +91,10 @@ class LargeRecord:
         return took
 
     def take(self, count: int) -> tuple[Took, list[Took]]:
-        """A runner resumes the run, takes so many more and dies: what the first exposure took, and the others."""
+        """Resume the run, take `count` more viewpoints and die.
+
+        Returns the times of the first one and of the others.
+        """
         bench = Bench(self.store, self.run_id, self.folder / "data")
         at: list[Took] = []
 

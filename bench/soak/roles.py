@@ -1,7 +1,7 @@
 """One process of the part `together`: `python -m bench.soak.roles ROLE DATA RUN LOG URL COOKIE`, until SIGTERM.
 
-The commands are those of the command line, called in this process so that their imports are not measured. The runner
-is the real one on the rig in memory of the tests, the worker's loop the real one with a job that writes a small file.
+The commands run within this process, so that imports are not measured. The runner is the real one on the in-memory
+rig of the tests, and the worker's loop is the real one with a job that writes a small file.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from service.worker import loop
 from service.worker.job import JobAnswer, JobContext
 from tests.support.bench_run import Bench
 
-KIND = "coverage_points"  # of jobs: one from which no page reads anything
-_COMPUTED_S = 0.02  # by a job
-_PAUSE_S = 0.05  # of a reader between two looks
-_WRITTEN_EVERY_S = 0.5  # by the person
+KIND = "coverage_points"  # a job kind from which no page reads anything
+_COMPUTED_S = 0.02  # computing time of a job
+_PAUSE_S = 0.05  # pause of a reader between two requests
+_WRITTEN_EVERY_S = 0.5  # interval between a person's actions
 
 
 class _EndedError(BaseException):
-    """SIGTERM came; nothing catches this."""
+    """SIGTERM arrived; nothing catches this."""
 
 
 class Diary:
-    """What this process did: one line a thing, with its seconds or its error."""
+    """Log of this process: one line per action, with its duration or its error."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("w")
 
     def timed(self, act: Callable[[], str]) -> None:
-        """Do it; what it returns is an error, unless empty."""
+        """Time an action; a non-empty return value is an error."""
         began_s = time.perf_counter()
         try:
             error = act()
@@ -54,14 +54,14 @@ class Diary:
         self.write(time.perf_counter() - began_s, error)
 
     def write(self, seconds: float, error: str = "") -> None:
-        """One line."""
+        """Write one line."""
         line = {"seconds": seconds} | ({"error": error[:600]} if error else {})
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()
 
 
 def read(diary: Diary, *words: str) -> None:
-    """A command, again and again."""
+    """Run a command again and again."""
     runner = CliRunner()
 
     def command() -> str:
@@ -74,7 +74,7 @@ def read(diary: Diary, *words: str) -> None:
 
 
 def pages(diary: Diary, run: str, url: str, cookie: str) -> None:
-    """The pages of the run, one after the other."""
+    """Request the pages of the run in turn."""
     addresses = cycle(
         ["/", f"/runs/{run}", f"/runs/{run}/capture", f"/audit/runs/{run}", f"/audit/runs/{run}/timeline", "/health"]
     )
@@ -85,8 +85,8 @@ def pages(diary: Diary, run: str, url: str, cookie: str) -> None:
             try:
                 answer = client.get(address)
             except (httpx.ReadError, httpx.RemoteProtocolError):
-                answer = client.get(address)  # a connection that had been idle: every browser asks once more
-            # /health may say that no worker gives a sign of life: here none of those that work is a whole `worker`.
+                answer = client.get(address)  # the idle connection was closed: every browser retries once
+            # /health may report that no worker is alive: none of the workers here is a whole `worker` command.
             well = answer.status_code == 200 or (address == "/health" and "locked" not in answer.text)
             return "" if well else f"{address} answers {answer.status_code}: {_words(answer.text)[:300]}"
 
@@ -117,7 +117,7 @@ def run_it(diary: Diary, store: Store, data: Path, run: str) -> None:
 
 
 def compute(diary: Diary, store: Store) -> None:
-    """The worker's loop; a job writes a small file."""
+    """The worker's loop, with a job that writes a small file."""
 
     def handle(context: JobContext) -> JobAnswer:
         time.sleep(_COMPUTED_S)
@@ -137,7 +137,7 @@ def compute(diary: Diary, store: Store) -> None:
 
 
 def write(diary: Diary, store: Store, run: str) -> None:
-    """A person whose every press of a button is recorded."""
+    """A person whose button presses are recorded."""
 
     def press() -> str:
         store.record(run, [StepNote(step="capture", attempt=1, note="pressed")], actor="Grace")
@@ -149,7 +149,7 @@ def write(diary: Diary, store: Store, run: str) -> None:
 
 
 def main(role: str, data: Path, run: str, log: Path, url: str, cookie: str) -> None:
-    """Do it until SIGTERM."""
+    """Run the role until SIGTERM."""
 
     def on_terminate(_signal: int, _frame: object) -> None:
         raise _EndedError

@@ -1,4 +1,4 @@
-"""Files that are long and take no room: a photograph with nothing behind it, kept by a store that leaves holes."""
+"""Sparse photographs: long files that occupy no space, kept by a store that preserves their holes."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ _ZEROS = bytes(_BLOCK_BYTES)
 
 
 class SparseFiles(DurableFiles):
-    """The store's own effects, but that zeros are not written: the file system keeps holes for them.
+    """The store's file operations, except that zeros are not written, so that the file system stores holes.
 
-    Everything else is as it is: every byte passes through the store and is hashed. While `unhurried`, files and
-    folders are synced too; otherwise only the database is.
+    All bytes still pass through the store and are hashed. While `unhurried`, files and folders are synced too;
+    otherwise only the database is.
     """
 
     unhurried = True
 
     def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
-        """See service.store.seam.Files."""
+        """Write a file, leaving holes instead of zeros."""
         flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW
         with open(os.open(path, flags, 0o600 if private else 0o666), "wb", buffering=0) as handle:
             for chunk in chunks:
@@ -38,18 +38,18 @@ class SparseFiles(DurableFiles):
             handle.truncate(handle.tell())
 
     def sync_file(self, path: Path) -> None:
-        """See service.store.seam.Files."""
+        """Sync a file while `unhurried`; otherwise do nothing."""
         if self.unhurried:
             super().sync_file(path)
 
     def sync_directory(self, path: Path) -> None:
-        """See service.store.seam.Files."""
+        """Sync a folder while `unhurried`; otherwise do nothing."""
         if self.unhurried:
             super().sync_directory(path)
 
 
 def sparse_photograph(path: Path, number: int, size_bytes: int) -> None:
-    """A JPEG that shows its number, and a hole up to `size_bytes` behind it."""
+    """Write a JPEG that shows its number, followed by a hole up to `size_bytes`."""
     picture = np.full((120, 180, 3), 40 + number % 200, dtype=np.uint8)
     cv2.putText(picture, str(number), (8, 70), cv2.FONT_HERSHEY_SIMPLEX, 1.2, (255, 255, 255), 2)
     done, encoded = cv2.imencode(".jpg", picture)

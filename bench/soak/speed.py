@@ -1,9 +1,9 @@
-"""`speed`: the store against the tools that everybody has, on the same files, one after the other in one run.
+"""`speed`: the store compared with standard tools, on the same files and in alternation.
 
 Ingest: `sha256sum FILE`, `cp FILE COPY`, `sync COPY` against what a capture does with its photograph
-(`Store.put_file` and the transaction with row and event): both end with the image on the disk, the store also
-with its name and its record. Verification: `sha256sum` of all stored files against `audit verify`, with the files in
-the page cache, and with them taken out of it before each.
+(`Store.put_file` and the transaction with row and event). Both end with the image on the disk; the store also records
+its name. Verification: `sha256sum` of all stored files against `audit verify`, with the files in the page cache and
+with them evicted from it.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from service.store.records import NewArtefact
 from service.store.store import Store
 from tests.support.store import captured, start_run
 
-LEAST = 0.8  # of the tools' speed
+LEAST = 0.8  # minimum speed as a fraction of the tools' speed
 
 
 def speed(folder: Path, rounds: int, files: int, megabytes: float) -> dict[str, Any]:
-    """So many rounds with so many images of this size; the median speeds, their ratios, and the faults."""
+    """Run `rounds` rounds with `files` images of `megabytes`; returns median speeds, their ratios, and the faults."""
     sources = folder / "sources"
     sources.mkdir(parents=True)
     size = int(megabytes * 1e6)
@@ -46,7 +46,7 @@ def speed(folder: Path, rounds: int, files: int, megabytes: float) -> dict[str, 
     ]
     if shutil.which("openssl"):
         rows.append(_row("verify, cached", "openssl dgst", total, {**warm, "tools": warm["openssl"]}))
-    # OpenSSL computes where coreutils may compute slower: told, and no part of the promise.
+    # OpenSSL can be faster than coreutils: reported, but not required.
     faults = [
         f"{row['what']}: {row['ratio']:.2f} of the speed of {row['against']}, less than {LEAST:g}"
         for row in rows
@@ -66,7 +66,7 @@ def _ingest(store: Store, copies: Path, images: Sequence[Path], rounds: int) -> 
     for _round in range(rounds):
         for image in images:
             number += 1
-            _renew(image)  # the store keeps no content twice
+            _renew(image)  # the store keeps identical content only once
             copy = copies / image.name
 
             def tools(image: Path = image, copy: Path = copy) -> None:
@@ -114,7 +114,7 @@ def _quietly(words: Sequence[str]) -> None:
 
 
 def _renew(path: Path) -> None:
-    """Other content of the same length, on the disk and in the page cache."""
+    """Replace the content by other bytes of the same length, on the disk and in the page cache."""
     with path.open("r+b") as handle:
         handle.write(os.urandom(32))
         handle.flush()
@@ -149,7 +149,7 @@ def _row(what: str, against: str, size: int, seconds: Mapping[str, Sequence[floa
 
 
 def table(found: Mapping[str, Any]) -> list[str]:
-    """For people, in Markdown."""
+    """Format the findings as Markdown lines."""
     lines = [
         f"{found['rounds']} rounds with {found['images']} images of {found['megabytes']:g} MB, in turn with the "
         f"tools; then {found['verified_bytes'] / 1e9:.2f} GB verified {found['rounds']} times. Medians.",

@@ -1,7 +1,7 @@
-"""`together`: one runner, four workers, eight readers, a person and a web process on one database file, for minutes.
+"""`together`: one runner, four workers, eight readers, a person and a web process on one database for minutes.
 
-Each is a process (bench/soak/roles.py) that works as fast as it can and writes down how long everything took, and
-every error. No lock error may reach anybody, and nobody waits longer than WAIT_S for an answer.
+Each is a process (bench/soak/roles.py) that works as fast as it can and logs every duration and error. No lock error
+may reach anybody, and nobody may wait longer than WAIT_S for an answer.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from tests.support.serving import serving
 WAIT_S = 10.0
 WORKERS = 4
 READERS = ("status", "status", "status", "pages", "pages", "pages", "audit show", "audit show")
-_PLANNED = 800  # viewpoints for each minute; more than there is time for
+_PLANNED = 800  # viewpoints per minute, more than can be taken
 _GRACE_S = 60.0
-_BEGUN_S = 240.0  # until everybody has done something once
+_BEGUN_S = 240.0  # until every process has done something once
 
 
 def together(folder: Path, minutes: float) -> dict[str, Any]:
-    """Let them all work for so long; what each did and waited, and the faults."""
+    """Run all processes for `minutes`; returns what each did and how long it waited, and the faults."""
     folder.mkdir(parents=True, exist_ok=True)
     rig = folder / "rig.yaml"
     rig.write_text("name: together\nsimulated: true\ndevices: {}\n")
@@ -86,7 +86,7 @@ def together(folder: Path, minutes: float) -> dict[str, Any]:
 
 
 class _Role:
-    """One process and what it writes down."""
+    """One process and its log."""
 
     def __init__(self, folder: Path, number: int, name: str, run_id: str, url: str, cookie: str) -> None:
         self.name = name
@@ -100,7 +100,7 @@ class _Role:
             )  # fmt: skip
 
     def lines(self) -> list[dict[str, Any]]:
-        """What it has done so far."""
+        """The log lines written so far."""
         whole = self.log.read_text().rpartition("\n")[0] if self.log.exists() else ""
         return [json.loads(line) for line in whole.splitlines()]
 
@@ -109,7 +109,7 @@ class _Role:
         return self.errors.read_text().strip()[-400:]
 
     def end(self) -> None:
-        """Wait for its end after it was told to; it is killed where it does not."""
+        """Wait until the process has ended after being told to; kill it if it does not."""
         with suppress(subprocess.TimeoutExpired):
             self.process.wait(timeout=_GRACE_S)
             return
@@ -137,7 +137,7 @@ def _row(name: str, roles: Sequence[_Role]) -> dict[str, Any]:
         faults.append(f"{name} did nothing: {roles[0].complaint()}")
         return {"who": name, "processes": len(roles), "times": 0, "faults": faults}
     late = [s for s in taken if s > WAIT_S]
-    if late and name not in ("runner", "worker"):  # they wait for nobody who sits there
+    if late and name not in ("runner", "worker"):  # these do not keep a person waiting
         faults.append(
             f"{name} waited {max(late):.1f} s, longer than {WAIT_S:g} s ({len(late)} of {len(taken)} times)"
         )
@@ -154,13 +154,13 @@ def _row(name: str, roles: Sequence[_Role]) -> dict[str, Any]:
 
 
 def _told_of_locks(data: Path) -> list[str]:
-    """What the processes' log says of a database that was locked."""
+    """Reports of a locked database in the processes' logs."""
     text = "\n".join(path.read_text() for path in sorted((data / "logs").glob("*.jsonl")))
     return [f"in the log: {line[:300]}" for line in text.splitlines() if "database is locked" in line]
 
 
 def table(found: dict[str, Any]) -> list[str]:
-    """For people, in Markdown."""
+    """Format the findings as Markdown lines."""
     jobs = ", ".join(f"{count:,} {state}" for state, count in found["jobs"].items())
     lines = [
         f"{found['minutes']:g} minutes on one database file: {found['events']:,} events, {found['captured']:,} "

@@ -1,1 +1,1 @@
-"""Sweeps for faults that no single test looks for, each a `make torture-…` of its own (docs/howto/torture.md)."""
+"""Sweeps for faults that no single test looks for, each with its own `make torture-…` (docs/howto/torture.md)."""

@@ -1,1 +1,1 @@
-"""The sweep of the evidence: `make torture-audit`."""
+"""The evidence sweep: `make torture-audit`."""

@@ -1,10 +1,10 @@
-"""Evidence, altered in every way there is: does `audit verify` tell it, and where? `make torture-audit`.
+"""Alters the evidence in every possible way and checks that `audit verify` reports it: `make torture-audit`.
 
-A small record made by the software itself; every byte of it with one bit flipped, every row and column altered,
-every roll-back, and a forger with every subset of what he can write and sign with. What is not told must stand in the
-table of docs/explanation/evidence.md, and what stands there must have been found not to be told. The changes of each
-sweep are done in a random order of a fixed seed: what a sweep that was ended early (--minutes) has done is a sample
-of all of them, and with the same --work it is continued.
+A small record made by the software itself is attacked: every byte with one bit flipped, every row and column altered,
+every roll-back, and a forger with every subset of what can be written and signed with. Undetected changes must be
+listed in the table of docs/explanation/evidence.md, and everything listed there must have been found undetected. Each
+sweep makes its changes in a random order of a fixed seed: if it ends early (--minutes), what it has done is a sample
+of all changes, and with the same --work it is continued.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from bench.torture.audit.tally import Sweep, Tallies, Tally, add_all, in_a_proce
 
 RESULTS = REPOSITORY / "bench" / "results"
 DOCUMENT = REPOSITORY / "docs" / "explanation" / "evidence.md"
-CHUNK = 250  # changes of one process
+CHUNK = 250  # changes per process
 SWEEPS: Mapping[str, Callable[[Record], Sweep]] = {
     "edits": Edits,
     "rollbacks": RollBacks,
@@ -48,7 +48,7 @@ SWEEPS: Mapping[str, Callable[[Record], Sweep]] = {
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Do the sweeps, print the table and write it. 1 when the documentation and what was found do not agree."""
+    """Run the sweeps, print and write the table. Returns 1 if the documentation and the findings disagree."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sample", type=int, help="so many changes of each sweep instead of all of them")
     parser.add_argument("--seed", type=int, default=11, help="of the order of the changes")
@@ -93,7 +93,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _memory() -> str | None:
-    """The record is written some hundred thousand times: not to a disk where there is room in memory."""
+    """A memory file system, if there is room: the record is written some hundred thousand times."""
     memory = Path("/dev/shm")
     return str(memory) if memory.is_dir() and os.access(memory, os.W_OK) else None
 
@@ -112,7 +112,7 @@ def _record(work: Path) -> Record:
 def sweep(
     work: Path, record: Record, name: str, *, sample: int | None, seed: int, ends: float | None
 ) -> tuple[int, int, Tallies]:
-    """Do one sweep, or go on with it: how many changes are done, of how many, and what became of them."""
+    """Run a sweep, or continue it; returns the number of changes done, the number of all, and the tallies."""
     log = work / f"{name}-{seed}.jsonl"
     total: Tallies = {}
     done = 0
@@ -122,7 +122,7 @@ def sweep(
         add_all(total, {kind: Tally.of_json(tally) for kind, tally in part["tallies"].items()})
     with quickened(files_stay=name != "artefacts", database_stays=name in ("log", "artefacts")):
         put_back(record)
-        verdict(record, ())  # so that every process knows what the record as it was needs
+        verdict(record, ())  # caches what every process needs about the unaltered record
         made = SWEEPS[name](record)
         numbers = list(range(made.size))
         random.Random(seed).shuffle(numbers)
@@ -141,7 +141,7 @@ def sweep(
 
 
 def documented_codes(text: str) -> dict[str, tuple[str, str]]:
-    """What the documentation says is not told: pattern → why not, and what tells it from outside."""
+    """Parse the documented undetected changes: pattern → the reason, and what reveals the change from outside."""
     found: dict[str, tuple[str, str]] = {}
     for line in text.splitlines():
         cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
@@ -159,7 +159,7 @@ def _codes(total: Mapping[str, Tally]) -> Iterator[tuple[str, str, int]]:
 
 
 def problems(total: Mapping[str, Tally], documented: Mapping[str, object], *, whole: bool) -> list[str]:
-    """Crashes, what is told without its place, and where the documentation and what was found do not agree."""
+    """List crashes, faults reported without their place, and disagreements between documentation and findings."""
     found = [f"{kind}: {crash}" for kind, tally in total.items() for crash in tally.crashes]
     for kind, tally in total.items():
         if tally.placed < tally.told:
@@ -180,7 +180,7 @@ def problems(total: Mapping[str, Tally], documented: Mapping[str, object], *, wh
 
 
 def report(about: Mapping[str, Any], total: Mapping[str, Tally], documented: Mapping[str, tuple[str, str]]) -> str:
-    """For people."""
+    """Format the findings as Markdown."""
     cpu = about["machine"]
     lines = [
         f"# Evidence, altered in every way: what `audit verify` tells ({about['date']})",

@@ -1,4 +1,4 @@
-"""Logical tampering: every row deleted, copied, renumbered, every column of every row edited, the schema changed."""
+"""Logical tampering: deletes, copies and renumbers every row, edits every column, and changes the schema."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TABLES = (*metadata.tables, "alembic_version")
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """One change: the kind it is counted under, a name for people, what of the record it is, the statements."""
+    """One change: the kind it is counted under, its name, the part of the record it affects, its SQL statements."""
 
     kind: str
     name: str
@@ -31,7 +31,7 @@ class Edit:
 
 
 def edits(data: Path) -> Iterator[Edit]:
-    """Every change, from the record as it is."""
+    """Yield every change for the record as it is."""
     with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
         connection.row_factory = sqlite3.Row
         for table in TABLES:
@@ -75,7 +75,7 @@ def _of_rows(table: str, rows: list[Any], columns: list[Any]) -> Iterator[Edit]:
 
 
 def _other_values(value: Any, kind: str, *, nullable: bool) -> Iterator[Any]:
-    """Several kinds of edits: slight, of another sort, and none."""
+    """Other values for a column: slightly different, of another type, and null."""
     match value:
         case None:
             yield {"INTEGER": 1, "REAL": 1.5}.get(kind, "x")
@@ -95,7 +95,7 @@ def _other_values(value: Any, kind: str, *, nullable: bool) -> Iterator[Any]:
 
 
 def _copy(table: str, names: list[str], row: Any, of_key: list[str]) -> tuple[str, tuple[Any, ...]]:
-    """The row once more, with another key: what is text gets a letter more, a number the next free one."""
+    """Statement that copies a row under another key: text keys get a letter appended, numbers the next free value."""
     values: list[Any] = []
     for name in names:
         value = row[name]
@@ -116,7 +116,7 @@ def _copy(table: str, names: list[str], row: Any, of_key: list[str]) -> tuple[st
 def _exchanged(
     table: str, names: list[str], of_key: list[str], one: Any, other: Any
 ) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    """Each row at the other's place: with the other's key."""
+    """Statements that swap the keys of two rows."""
     for row in (one, other):
         yield f'DELETE FROM "{table}" WHERE rowid = ?', (row["row_number"],)
     listed, marks = ", ".join(f'"{name}"' for name in names), ", ".join("?" for _ in names)
@@ -126,7 +126,7 @@ def _exchanged(
 
 
 def _of_another_run(connection: sqlite3.Connection) -> Iterator[Edit]:
-    """The rows that there is one of for a run, for the runs that have none."""
+    """Changes that copy a run's unique rows to runs that have none."""
     for table in ("leases", "control"):
         columns = [str(row["name"]) for row in connection.execute(f"PRAGMA table_info({table})")]
         listed = ", ".join(name for name in columns if name != "run_id")
@@ -137,7 +137,7 @@ def _of_another_run(connection: sqlite3.Connection) -> Iterator[Edit]:
 
 
 def _of_words(connection: sqlite3.Connection) -> Iterator[Edit]:
-    """The search index, whose rows are no rows: words put in, taken out, everything gone, its tables altered."""
+    """Changes of the search index, which has no ordinary rows: words added or removed, emptied, tables altered."""
     insert = "INSERT INTO event_words (rowid, words) VALUES (?, ?)"
     delete = "INSERT INTO event_words (event_words, rowid, words) VALUES ('delete', ?, ?)"
     for place, actor in connection.execute("SELECT position, actor FROM event_index").fetchall():
@@ -182,7 +182,7 @@ _WRITABLE = "PRAGMA writable_schema = ON", ()
 
 
 class Edits:
-    """All of them, numbered, so that a part of them can be done."""
+    """All changes, numbered, so that a subset can be done."""
 
     name = "logical tampering"
 
@@ -198,7 +198,7 @@ class Edits:
         self._before = before
 
     def part(self, numbers: Sequence[int]) -> Tallies:
-        """Do these, one at a time; by kind."""
+        """Make these changes one at a time; returns the tallies by kind."""
         tallies: Tallies = {}
         for number in numbers:
             edit = self.all[number]
@@ -216,7 +216,10 @@ class Edits:
 
 
 def _apply(data: Path, edit: Edit) -> bool:
-    """As somebody with full rights to the file does it. False: the tables themselves refuse even that."""
+    """Apply a change as somebody with full access to the file would.
+
+    Returns False if the tables themselves refuse it.
+    """
     with closing(sqlite3.connect(database_path(data), isolation_level=None)) as connection:
         of_schema = edit.kind == "schema changed"
         triggers: list[tuple[str, str]] = []

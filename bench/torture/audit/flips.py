@@ -1,4 +1,4 @@
-"""Every byte of the record with one bit of it flipped: database, write-ahead log, log of signatures, artefacts."""
+"""Flips one bit of every byte of the record: database, write-ahead log, signature log, artefacts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.store.wal import wal_findings
 
 @contextmanager
 def flipped(path: Path, offset: int) -> Generator[None]:
-    """One bit of one byte is another: bit number offset modulo 8, so that every bit has its turn."""
+    """Flip one bit of the byte at `offset` within the context: bit `offset` modulo 8, so that every bit occurs."""
     descriptor = os.open(path, os.O_RDWR)
     try:
         byte = os.pread(descriptor, 1, offset)
@@ -32,7 +32,7 @@ def flipped(path: Path, offset: int) -> Generator[None]:
 
 
 class DatabaseFlips:
-    """Flips in the database, with or without a write-ahead log beside it."""
+    """Bit flips in the database, with or without a write-ahead log beside it."""
 
     def __init__(self, record: Record, *, wal: bool) -> None:
         put_back(record)
@@ -61,7 +61,7 @@ class DatabaseFlips:
         self._known: dict[str, tuple[Verdict, set[str]]] = {}
 
     def part(self, offsets: Sequence[int]) -> Tallies:
-        """Flip these bytes."""
+        """Flip the bytes at these offsets, one at a time; returns the tallies."""
         tally = Tally()
         original = self._path.read_bytes()
         for offset in offsets:
@@ -80,7 +80,7 @@ class DatabaseFlips:
             tally.meaningless += 1
             return
         name = f"byte {offset}, bit {offset % 8}"
-        if self._wal:  # a frame that does not fit ends the log: few contents come of very many flips
+        if self._wal:  # an invalid frame ends the log, so very many flips give few distinct contents
             key = repr((now, wal_findings(self._record.data)))
             if key not in self._known:
                 found = verdict(self._record, self._notes)
@@ -101,7 +101,7 @@ class DatabaseFlips:
 
 
 class LogFlips:
-    """Flips in the log of signatures."""
+    """Bit flips in the signature log."""
 
     name = f"flip in {NAME}"
 
@@ -113,7 +113,7 @@ class LogFlips:
         self._notes = outcome.audit.verify(record.data).notes
 
     def part(self, offsets: Sequence[int]) -> Tallies:
-        """Flip these bytes."""
+        """Flip the bytes at these offsets, one at a time; returns the tallies."""
         tally = Tally()
         for offset in offsets:
             with flipped(self._path, offset):
@@ -123,7 +123,7 @@ class LogFlips:
 
 
 class ArtefactFlips:
-    """Flips in the artefacts: the same byte of every file that is so long, each of which must be named."""
+    """Bit flips in the artefacts: the same byte of every file that is long enough, each of which must be named."""
 
     name = "flip in an artefact"
 
@@ -137,7 +137,7 @@ class ArtefactFlips:
         self.size = max(self._sizes.values())
 
     def part(self, offsets: Sequence[int]) -> Tallies:
-        """Flip these bytes of every file."""
+        """Flip the bytes at these offsets in every file, one offset at a time; returns the tallies."""
         tally = Tally()
         for offset in offsets:
             self._one(tally, offset)

@@ -1,4 +1,4 @@
-"""The forger: he rewrites a run from some event on, makes every hash fit, and signs with the keys that he has."""
+"""A forger who rewrites a run from some event on, makes every hash fit, and signs with the available keys."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _CHECKPOINT = tuple(Checkpoint.__dataclass_fields__)
 
 
 class Forgeries:
-    """Every event of every run × every subset of what he can write × every set of keys, numbered."""
+    """Numbered forgeries: every event of every run × every subset of what can be written × every set of keys."""
 
     name = "forgery"
 
@@ -55,16 +55,16 @@ class Forgeries:
             for some in product((True, False), repeat=len(CAN_WRITE))
             for keys in KEYS
         ]
-        # Without the database the site's chain cannot be written either; without anything nothing happens.
+        # Without the database the site's chain cannot be written either; without any power nothing happens.
         powers = [(can, keys) for can, keys in powers if can and ("database" in can or "site's chain" not in can)]
         self.all = [(run_id, seq, can, keys) for run_id, seq in places for can, keys in powers]
         self.size = len(self.all)
 
     def part(self, numbers: Sequence[int]) -> Tallies:
-        """Do these, one at a time; by keys, and whether the second place is compared with.
+        """Make these forgeries one at a time; returns tallies by keys, and by whether the signature copy is compared.
 
-        Of what is not told it is seen whether something kept elsewhere tells it: the copy of the log as it was, the
-        time stamp as it was, the fingerprints of the keys, the hashes of the ends of the chains.
+        For undetected forgeries it is checked whether something kept elsewhere reveals them: the copy of the log, the
+        time stamp, the fingerprints of the keys, or the hashes of the chain ends.
         """
         tallies: Tallies = {}
         for number in numbers:
@@ -114,10 +114,10 @@ class _Forger:
             key = load_pem_private_key(pem, password=None)
             assert isinstance(key, Ed25519PrivateKey)
             self._keys[key_fingerprint(public_bytes(key))] = key
-        self._renamed: dict[str, str] = {}  # hashes of events before → after
+        self._renamed: dict[str, str] = {}  # event hashes: before → after
 
     def forge(self, run_id: str, seq: int) -> None:
-        """All that he can do for an event that he changes."""
+        """Make the best possible forgery that changes this event."""
         if "database" in self._can:
             with closing(sqlite3.connect(database_path(self._record.data), isolation_level=None)) as connection:
                 connection.row_factory = sqlite3.Row
@@ -150,7 +150,7 @@ class _Forger:
         connection.execute("COMMIT")
 
     def _rewrite(self, connection: sqlite3.Connection, run_id: str, seq: int, changes: Mapping[int, Any]) -> None:
-        """Events from `seq` on with changed fields, links and hashes that fit, and all rows that hang on them."""
+        """Rewrite the events from `seq` on, with changed fields and matching hashes, and all dependent rows."""
         asked = "SELECT * FROM events WHERE run_id = ? ORDER BY seq"
         previous = ROOT
         for row in connection.execute(asked, (run_id,)).fetchall():
@@ -158,7 +158,7 @@ class _Forger:
                 previous = row["sha256"]
                 continue
             text = row["payload"]
-            for before, after in self._renamed.items():  # signatures and exports name events by their hashes
+            for before, after in self._renamed.items():  # signatures and exports refer to events by hash
                 text = text.replace(before, after)
             fields = {name: row[name] for name in _EVENT} | {"payload": parse_canonical(text)}
             fields = changes.get(row["seq"], dict)(fields) | {"previous_sha256": previous}
@@ -195,7 +195,7 @@ class _Forger:
             connection.execute(f"UPDATE runs SET root_sha256 = {first} WHERE run_id = ?", (run_id,))
 
     def _rewrite_site(self, connection: sqlite3.Connection, run_id: str, seq: int) -> None:
-        """What the site's chain says of the run, and of stamps that he cannot make; his own keys for the others."""
+        """Rewrite the site's chain about the run and its stamps, with the forger's keys in place of the others."""
         changes: dict[int, Any] = {}
         first: int | None = None
         new = self._keys if self._own is not None else {}
@@ -226,7 +226,7 @@ class _Forger:
 
     @staticmethod
     def _new_keys(connection: sqlite3.Connection, own: Ed25519PrivateKey) -> dict[str, Ed25519PrivateKey]:
-        """For each key of the record the one that he puts in its place, by the fingerprints of both."""
+        """For each key of the record the key that replaces it, by their fingerprints."""
         asked = "SELECT json_extract(payload, '$.key_id') FROM events WHERE kind = 'key_changed' ORDER BY seq"
         known = [str(row[0]) for row in connection.execute(asked).fetchall()]
         keys = [own, *(Ed25519PrivateKey.generate() for _ in known[1:])]
@@ -239,7 +239,7 @@ class _Forger:
         return str(connection.execute(asked, (run_id, seq)).fetchone()[0])
 
     def _sign_again(self, connection: sqlite3.Connection, run_id: str, seq: int, *, after_site: int = 0) -> None:
-        """Signatures from an event on that no longer fit: made again where he has the key, taken away otherwise."""
+        """Make the signatures that no longer fit again where the key is available, and delete the others."""
         asked = f"SELECT {', '.join(_CHECKPOINT)} FROM checkpoints WHERE run_id = ? AND seq >= ? AND site_seq >= ?"
         for row in connection.execute(asked, (run_id, seq, after_site)).fetchall():
             where = (run_id, row["seq"])
@@ -270,7 +270,10 @@ class _Forger:
     # --- log of signatures ---
 
     def _in_log(self, run_id: str, seq: int) -> None:
-        """The lines from the first that no longer fits: written again where he has a key, cut off otherwise."""
+        """Rewrite the log lines from the first that no longer fits where a key is available.
+
+        Truncate the log otherwise.
+        """
         path = self._record.data / NAME
         lines = path.read_bytes().splitlines(keepends=True)
         with closing(sqlite3.connect(f"file:{database_path(self._record.data)}?mode=ro", uri=True)) as connection:
@@ -295,7 +298,7 @@ class _Forger:
 
 
 def _checkpoints(record: Record, *, stamped: bool = False) -> list[tuple[Any, ...]]:
-    """All signatures as they are now, or those that have a time stamp."""
+    """All current signatures, or those with a time stamp."""
     asked = f"SELECT {', '.join(_CHECKPOINT)} FROM checkpoints"
     if stamped:
         asked += " WHERE (run_id, seq) IN (SELECT run_id, seq FROM timestamps)"

@@ -1,4 +1,4 @@
-"""What verification says of an altered record, and what a database holds beyond what verification looks at."""
+"""The verdict of verification on an altered record, and the parts of a database that verification does not read."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ _WORDS_COME_FROM = (
     "SELECT run_id, seq, actor, payload FROM events",
 )
 _NUMBERS = ("user_version", "application_id", "encoding")
-WORDS = "event_words"  # the search index; its tables hold its own structure
+WORDS = "event_words"  # the search index, whose tables have an internal structure
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What `audit verify` says of a record.
+    """The verdict of `audit verify` on a record.
 
     Attributes:
-        told: a fault was named, or the record was refused loudly.
-        place: the fault says where: a run, an event, a row, a file.
-        noted: what was said beside faults that is not said of the record as it was.
-        text: the first fault or the refusal; of a crash the traceback.
-        crashed: it ended in an error that is none of ours.
+        told: a fault was named, or the record was refused with an error.
+        place: the fault names its place: a run, an event, a row or a file.
+        noted: remarks other than faults that the unaltered record does not have.
+        text: the first fault or the refusal; the traceback of a crash.
+        crashed: it ended in an error outside our error tree.
     """
 
     told: bool
@@ -56,7 +56,7 @@ class Verdict:
 
 
 def verdict(record: Record, notes: tuple[str, ...], *, with_copy: bool = False, run_id: str | None = None) -> Verdict:
-    """Verify the record as it lies there now; `notes` are those of the record as it was."""
+    """Verify the record in its current state; `notes` are those of the unaltered record."""
     try:
         report = audit.verify(record.data, run_id, signatures_copy=record.copy if with_copy else None)
     except OrthocaptureError as error:
@@ -71,11 +71,11 @@ def verdict(record: Record, notes: tuple[str, ...], *, with_copy: bool = False, 
 
 @contextmanager
 def quickened(*, files_stay: bool, database_stays: bool = False) -> Generator[None]:
-    """Remember what pure functions answered: the same text has the same hash, the same signature the same answer.
+    """Cache the answers of pure functions, such as hashes of equal texts and checks of equal signatures.
 
-    Nothing else of verification is changed: database and log of signatures are read again each time, and so are the
-    files of the artefacts unless they stay as they are (`files_stay`). The search index is compared anew whenever
-    what goes into the comparison is not what it was before (and never where `database_stays`).
+    Nothing else of the verification changes: the database and the signature log are read again each time, and so are
+    the artefact files unless they cannot have changed (`files_stay`). The search index is compared again whenever the
+    inputs of the comparison have changed (and never if `database_stays`).
     """
     payload_of: Any = vars(audit_checks)["_payload_of"]
     kept: dict[tuple[Any, ...], Any] = {}
@@ -134,10 +134,10 @@ Content = Mapping[str, Any]
 
 
 def content_of(data: Path) -> Content | str:
-    """All that SQLite reads from a database: every row of every table, what was made, what it finds damaged.
+    """Read everything that SQLite reads from a database: all rows of all tables, the schema, and reported damage.
 
-    Indexes are not read here: `damage_of` holds each of their entries against its row. A text instead of the content
-    where it cannot be read.
+    Indexes are not read here: `damage_of` compares each of their entries with its row. Returns an error text if the
+    database cannot be read.
     """
     found: dict[str, Any] = {}
     try:
@@ -157,14 +157,17 @@ def content_of(data: Path) -> Content | str:
 
 
 def same_rows(one: Content, other: Content | str) -> bool:
-    """Whether the same rows are there. Where they lie within a table means nothing: what is ordered has a column."""
+    """Whether both have the same rows.
+
+    Their order within a table does not matter: where order counts, a column has it.
+    """
     if isinstance(other, str) or one.keys() != other.keys():
         return False
     return all(sorted(map(repr, one[name])) == sorted(map(repr, other[name])) for name in one)
 
 
 def damage_of(data: Path) -> str:
-    """What SQLite's integrity_check says: "ok", or what it finds damaged."""
+    """The result of SQLite's integrity_check: "ok", or the damage it finds."""
     try:
         with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
             return "\n".join(str(row[0]) for row in connection.execute("PRAGMA integrity_check"))
@@ -173,7 +176,7 @@ def damage_of(data: Path) -> str:
 
 
 def columns_of(data: Path) -> dict[str, tuple[str, ...]]:
-    """Names of the columns of every table, as `content_of` gives them."""
+    """The column names of every table, in the order of `content_of`."""
     with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
         made = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         names: dict[str, tuple[str, ...]] = {}
@@ -203,7 +206,10 @@ def differences(before: Content, now: Content | str, columns: Mapping[str, tuple
 
 
 def search_content(data: Path, terms: tuple[str, ...]) -> object:
-    """What searches give: the events of every word, and where each word stands; a text where it cannot be read."""
+    """The results of searches: the events of every word, and the positions of the words.
+
+    Returns an error text if the database cannot be read.
+    """
     try:
         with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
             connection.execute(f"CREATE VIRTUAL TABLE temp.words USING fts5vocab('main', '{WORDS}', 'instance')")
@@ -215,7 +221,7 @@ def search_content(data: Path, terms: tuple[str, ...]) -> object:
 
 
 def search_terms(data: Path) -> tuple[str, ...]:
-    """Every word of the search index."""
+    """All words in the search index."""
     with closing(sqlite3.connect(f"file:{database_path(data)}?mode=ro", uri=True)) as connection:
         connection.execute(f"CREATE VIRTUAL TABLE temp.words USING fts5vocab('main', '{WORDS}', 'row')")
         return tuple(row[0] for row in connection.execute("SELECT term FROM temp.words"))

@@ -1,4 +1,4 @@
-"""The record that is attacked: a small, complete one, made by the software itself, and its state at every commit."""
+"""The attacked record: small but complete, made by the software itself, with its state at every commit."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WAL_NAME = "orthocapture.sqlite-wal"
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What lay on the disk right after a commit."""
+    """The files on the disk right after a commit."""
 
     database: bytes
     log: bytes | None
@@ -49,11 +49,11 @@ class Record:
     """A finished record.
 
     Attributes:
-        folder: holds data/ and the second place of the signatures; nothing has it open.
+        folder: holds data/ and the signature copy; nothing has it open.
         run_id: of the run that is complete, corrected and released.
-        states: after every commit, oldest first; the last is the present one.
-        with_wal: the database and its write-ahead log as a crash leaves them, some commits before the end.
-        keys: PEM of every key that signed, oldest first; of all but the last the file is gone.
+        states: after every commit, oldest first; the last one is the current state.
+        with_wal: the database and its write-ahead log as left by a crash, some commits before the end.
+        keys: PEM of every key that signed, oldest first; only the last one's file still exists.
     """
 
     folder: Path
@@ -69,25 +69,25 @@ class Record:
 
     @property
     def copy(self) -> Path:
-        """The second place of the log of signatures."""
+        """The second copy of the signature log."""
         return self.folder / COPY
 
 
 @dataclass
 class _Keeping(DurableFiles):
-    """The seam to the disk; keeps what lies there after every commit."""
+    """The store's file operations; keeps a copy of the files after every commit."""
 
     folder: Path
     states: list[State] = field(default_factory=list[State])
 
     def commit(self, commit: Callable[[], None]) -> None:
-        """See Files."""
+        """Commit, then copy the files."""
         commit()
         self.states.append(state_of(self.folder))
 
 
 def state_of(folder: Path) -> State:
-    """The three files as they are now."""
+    """Read the three files in their current state."""
     with closing(sqlite3.connect(database_path(folder / "data"))) as connection:
         database = connection.serialize()
     return State(database, _content(folder / "data" / NAME), _content(folder / COPY))
@@ -98,7 +98,7 @@ def _content(path: Path) -> bytes | None:
 
 
 def make_record(folder: Path) -> Record:
-    """Two ended runs and an open one, jobs of every end, people, a correction, a release, a time stamp, two keys."""
+    """Record two ended runs, an open one, jobs of every outcome, people, a correction, a release, a stamp, keys."""
     folder.mkdir(parents=True)
     files = _Keeping(folder)
     with time_stamp_authority(folder / "tsa") as authority, Store.open(folder / "data", files=files) as store:
@@ -121,12 +121,12 @@ def make_record(folder: Path) -> Record:
 
 
 def put_back(record: Record) -> None:
-    """The files of the record as they were at its end."""
+    """Restore the record's final state."""
     put(record, record.states[-1])
 
 
 def put(record: Record, state: State) -> None:
-    """The files of the record as they were once. None: the file is not there."""
+    """Restore a state of the record's files; None means that the file does not exist."""
     for left in record.data.glob("orthocapture.sqlite-*"):
         left.unlink()
     database_path(record.data).write_bytes(state.database)
@@ -166,7 +166,7 @@ def _complete_run(store: Store, folder: Path, authority: Authority) -> str:
 
 
 def _jobs(store: Store, run_id: str) -> None:
-    """One that is finished with a file, one that failed after it was tried again, one that waits."""
+    """Add a job that finished with a file, one that failed after retries, and one that is waiting."""
     for key in ("one", "two", "three"):
         store.enqueue_job(run_id, NewJob("registration", "capture", 1, key, {"sigma_px": 0.5}), actor="runner")
     job = store.claim_job("worker 1", 10.0)
@@ -188,7 +188,7 @@ def _person(people: People, account: str) -> Person:
 
 
 def _people_act(store: Store, people: People, run_id: str) -> None:
-    """A password refused, a PIN changed, a role changed, an invitation left open, a locked and an open screen."""
+    """Record a refused password, a changed PIN and role, an open invitation, and a locked and an open screen."""
     administrator = _person(people, "ada")
     people.accounts.invite(administrator, "marie", "Marie Curie", "technician")
     people.accounts.change_role(administrator, "lise", "supervisor", "she supervises now")
@@ -210,13 +210,13 @@ def _aborted_run(store: Store, folder: Path) -> None:
 
 
 def _open_run(store: Store, folder: Path, people: People) -> None:
-    """One that was signed once and has gone on; its lease and its control are what a killed runner left."""
+    """Add an open run that was signed once and continued; its lease and control are those of a killed runner."""
     bench = begin_run(store, PROTOCOL, folder)
     Control(store).take(bench.run_id, _person(people, "emmy"))
     store.lease(bench.run_id, "runner", 1.0)
     store.enqueue_job(bench.run_id, NewJob("registration", "capture", 1, "four"), actor="runner")
     store.claim_job("worker 2", 1.0, run_id=bench.run_id)
-    # From here on commits stay in the write-ahead log: a signature, and an event after it.
+    # From here on commits stay in the write-ahead log: a signature, and one event after it.
     with closing(sqlite3.connect(database_path(folder / "data"))) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     checkpoint(store, bench.run_id)

@@ -1,4 +1,4 @@
-"""Roll-backs: the record put back as it was after each earlier commit, alone and with what lies beside it."""
+"""Roll-backs: the record restored to each earlier commit, in part or together with the files beside it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bench.torture.audit.outcome import Verdict, verdict
 from bench.torture.audit.record import Record, State, put, put_back
 from bench.torture.audit.tally import Tallies, Tally
 
-# What is rolled back → whether the second place is compared with.
+# What is rolled back → whether the signature copy is compared.
 WAYS = {
     "database rolled back": (("database",), False),
     "log of signatures rolled back": (("log",), False),
@@ -23,7 +23,7 @@ _CODES = {"database rolled back": "commits after the last signature"}
 
 
 class RollBacks:
-    """Every earlier commit in each of the ways."""
+    """Roll-backs to every earlier commit in each of the ways."""
 
     name = "roll-back"
 
@@ -35,7 +35,7 @@ class RollBacks:
         self._notes = outcome.audit.verify(record.data, signatures_copy=record.copy).notes
 
     def part(self, numbers: Sequence[int]) -> Tallies:
-        """Do these, one at a time; by way."""
+        """Make these roll-backs one at a time; returns the tallies by way."""
         tallies: Tallies = {}
         for number in numbers:
             way, commit = self.all[number]
@@ -55,6 +55,6 @@ class RollBacks:
         return replace(self._record.states[-1], **{name: getattr(then, name) for name in what})
 
     def _verdict(self, state: State, *, with_copy: bool) -> Verdict:
-        if with_copy and state.copy is None:  # the file that is named to the command is not there: refused
+        if with_copy and state.copy is None:  # the named copy does not exist, so the command refuses
             return Verdict(True, place=True, text="there is no such copy of the log of signatures")
         return verdict(self._record, self._notes, with_copy=with_copy)

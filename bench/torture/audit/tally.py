@@ -1,4 +1,4 @@
-"""Counting what became of changes to the record, in forked processes: one that dies or hangs is a finding too."""
+"""Counts the outcomes of changes to the record, made in forked processes, so that crashes and hangs count too."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ _A_CHANGE_S = 10.0
 
 @dataclass
 class Tally:
-    """What became of the changes of one kind.
+    """The outcomes of the changes of one kind.
 
-    `meaningless`: nothing that can be read differs. `untold`: code of what differs → how often, `noted` of them with
-    a note that is no fault; `samples` by code. `anchors`: what outside the folder was seen to tell it → how often.
+    `meaningless`: nothing readable differs. `untold`: code of an undetected difference → count, `noted` of them with
+    a remark; `samples` by code. `anchors`: what outside the folder revealed the change → count.
     """
 
     number: int = 0
@@ -32,7 +32,7 @@ class Tally:
     anchors: Counter[str] = field(default_factory=Counter[str])
 
     def add(self, other: Tally) -> None:
-        """Count another part of the same kind too."""
+        """Add the counts of another tally of the same kind."""
         self.number += other.number
         self.told += other.told
         self.placed += other.placed
@@ -44,7 +44,7 @@ class Tally:
         self.anchors += other.anchors
 
     def count(self, found: Verdict, name: str, codes: Callable[[], set[str]]) -> None:
-        """One change. `codes`: what differs that nothing told; empty for nothing."""
+        """Count one change. `codes` returns what differs without having been detected; empty if nothing."""
         self.number += 1
         if found.crashed:
             self.crashes.append(f"{name}: {found.text}")
@@ -64,12 +64,12 @@ class Tally:
                 self.samples.setdefault(code, name)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data."""
+        """Convert to JSON data."""
         return {**vars(self), "untold": dict(self.untold), "anchors": dict(self.anchors)}
 
     @classmethod
     def of_json(cls, data: Mapping[str, Any]) -> Self:
-        """From plain data."""
+        """Create from JSON data."""
         made = cls(**data)
         made.untold, made.anchors = Counter(made.untold), Counter(made.anchors)
         return made
@@ -79,24 +79,24 @@ Tallies = dict[str, Tally]  # by kind of change
 
 
 def add_all(total: Tallies, more: Mapping[str, Tally]) -> None:
-    """Count another part too."""
+    """Add the tallies of another part."""
     for kind, tally in more.items():
         total.setdefault(kind, Tally()).add(tally)
 
 
 class Sweep(Protocol):
-    """Numbered changes, each done to the record as it was, and judged."""
+    """Numbered changes, each applied to the original record and judged."""
 
     name: str
     size: int
 
     def part(self, offsets: Sequence[int], /) -> Tallies:
-        """Do the changes of these numbers, one at a time."""
+        """Make the changes of these numbers one at a time; returns the tallies."""
         ...
 
 
 def in_a_process(sweep: Sweep, numbers: Sequence[int]) -> Tallies:
-    """What became of these changes, done in a forked process, whose memory of pure functions ends with it."""
+    """Run these changes in a forked process, whose caches of pure functions end with it; returns the tallies."""
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
 

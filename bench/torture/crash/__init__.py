@@ -1,1 +1,1 @@
-"""The sweep of crashes: `make torture-crash`."""
+"""The crash sweep: `make torture-crash`."""

@@ -1,8 +1,8 @@
 """The crash sweep: a short run is killed at every point of its durable effects, and processes at random moments.
 
 `python -m bench.torture.crash` (or `make torture-crash`) kills at every point, by SIGKILL and by a loss of power, and
-then at random over the real wires. After each death the run is resumed, confirmed, brought to its end and checked:
-bench/torture/crash/check.py says for what. The table goes to bench/results.
+then at random over the real wires. After each death the run is resumed, confirmed, completed and checked by
+bench/torture/crash/check.py. The table goes to bench/results.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from bench.torture.crash.sweep import Case, How, Sweep, Verdict
 
 RESULTS = Path(__file__).parents[2] / "results"
 _WAYS: tuple[How, ...] = ("kill", "power")
-_TWICE = 10  # one case of so many dies once more after the resumption
+_TWICE = 10  # one case in this many dies again after resuming
 
 
 def chosen(sweep: Sweep, rng: Random, options: argparse.Namespace) -> list[Case]:
-    """Every case, or some, in an order of chance: a sweep that is cut short has tried a bit of everything."""
+    """All cases, or a sample, in random order, so that an aborted sweep has tried a bit of everything."""
     cases = list(sweep.cases(options.ways))
     rng.shuffle(cases)
     if options.kinds:
@@ -46,10 +46,10 @@ def chosen(sweep: Sweep, rng: Random, options: argparse.Namespace) -> list[Case]
 
 
 def sweep_points(folder: Path, options: argparse.Namespace, rng: Random) -> dict[str, Any]:
-    """The systematic part; what was tried and what it showed."""
+    """Run the systematic part; returns what was tried and found."""
     began_s = time.monotonic()
     sweep = Sweep.begin(folder)
-    # What all children share is not copied when they count references.
+    # Objects shared by all children are then not copied when their reference counts change.
     gc.collect()
     gc.freeze()
     cases = chosen(sweep, rng, options)
@@ -84,7 +84,7 @@ def _named(case: Case) -> str:
 
 
 def rows(sweep: Sweep, verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
-    """A row for each process, effect and way to die."""
+    """One row for each process, effect and way to die."""
     by: dict[tuple[str, str, str], list[Verdict]] = defaultdict(list)
     for verdict in verdicts:
         by[verdict.case.role, verdict.case.how, verdict.case.point.effect].append(verdict)
@@ -104,7 +104,7 @@ def rows(sweep: Sweep, verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
 
 
 def report(result: dict[str, Any]) -> str:
-    """As Markdown."""
+    """Format the result as Markdown."""
     command = " ".join(["python -m bench.torture.crash", *result["options"]])
     lines = [
         "# Crash sweep",
@@ -151,7 +151,7 @@ def report(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Sweep and write bench/results/torture_crash-DATE.{json,md}; status 1 when there is a fault."""
+    """Sweep and write bench/results/torture_crash-DATE.{json,md}; exits with status 1 if there is a fault."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--sample", type=int, help="so many cases of the systematic sweep; all of them without it")
@@ -201,7 +201,7 @@ def _kill_record(kill: Kill) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    if "OPENBLAS_NUM_THREADS" not in os.environ:  # it is read when the library is loaded; a fork has no threads
+    if "OPENBLAS_NUM_THREADS" not in os.environ:  # read when numpy is loaded; a fork must have no threads
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
         os.execv(sys.executable, [sys.executable, "-m", "bench.torture.crash", *sys.argv[1:]])
     main()

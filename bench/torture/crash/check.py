@@ -1,4 +1,4 @@
-"""What must hold of a folder right after a crash, and of the run that was resumed and brought to its end."""
+"""Checks a folder right after a crash, and the run that was resumed and completed afterwards."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ ROLES: tuple[Role, ...] = ("begin", "runner", "worker", "web")
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a run came to, as far as it must be the same whatever killed it on the way.
+    """The results of a run that must not depend on where it was killed.
 
     Attributes:
-        results: of the steps that computed, as canonical text: positions, covariance, residuals, errors.
-        jobs: how often each kind of job was finished.
+        results: of the computing steps, as canonical text: positions, covariance, residuals, errors.
+        jobs: number of finished jobs of each kind.
     """
 
     results: str
@@ -41,7 +41,7 @@ class Outcome:
 
 
 def outcome(events: Sequence[Event]) -> Outcome:
-    """Of a run's events."""
+    """Extract the outcome from a run's events."""
     results: dict[str, Any] = {}
     jobs: Counter[str] = Counter()
     for event in events:
@@ -55,12 +55,12 @@ def outcome(events: Sequence[Event]) -> Outcome:
 
 
 def after_the_crash(place: Place) -> list[str]:
-    """Faults of a folder before anybody has resumed: nothing that was said to be recorded may be gone."""
+    """Faults of a folder before anybody has resumed the run: nothing reported as recorded may be missing."""
     if not database_path(place.data).exists() and not _events_said(place):
-        return []  # nobody was told that there was anything
+        return []  # nobody was told that anything was recorded
     try:
         found = [f"after the crash: {fault}" for fault in verify(place.data).faults]
-    except StoreVersionError:  # its tables are not there yet
+    except StoreVersionError:  # its tables do not exist yet
         return ["after the crash: the tables are gone"] if _events_said(place) else []
     said = _events_said(place)
     with closing(sqlite3.connect(f"file:{database_path(place.data)}?mode=ro", uri=True)) as connection:
@@ -71,7 +71,7 @@ def after_the_crash(place: Place) -> list[str]:
 
 
 def of_a_beginning(place: Place) -> tuple[list[str], int]:
-    """Faults of a folder in which a run was begun, perhaps twice; and how many leftovers were collected."""
+    """Faults of a folder in which a run was begun, perhaps twice; and the number of leftovers collected."""
     with Store.open(place.data) as store:
         begun = len(store.runs())
         gone = remove_leftovers(store, actor="Sue", min_age_s=0)
@@ -84,7 +84,7 @@ def of_a_beginning(place: Place) -> tuple[list[str], int]:
 
 
 def _events_said(place: Place) -> int:
-    """How many events had been recorded by commits that returned."""
+    """The number of events recorded by commits that returned."""
     return max(
         (line["events"] for role in ROLES for line in read_journal(place.journal(role)) if "events" in line),
         default=0,
@@ -92,7 +92,7 @@ def _events_said(place: Place) -> int:
 
 
 def at_the_end(place: Place, expected: Outcome | None) -> tuple[list[str], int]:
-    """Faults of a run at its end, and how many leftovers were collected. `expected`: of the undisturbed run."""
+    """Faults of a completed run, and the number of leftovers collected. `expected` is that of the undisturbed run."""
     found: list[str] = []
     with Store.open(place.data) as store:
         run_id = store.find_run("latest")
@@ -130,14 +130,14 @@ def at_the_end(place: Place, expected: Outcome | None) -> tuple[list[str], int]:
 
 
 def _once(events: Sequence[Event], names: Sequence[str]) -> list[str]:
-    """Every viewpoint and every photograph once."""
+    """Faults if a viewpoint or photograph is missing or duplicated."""
     taken = Counter(event.payload.viewpoint for event in events if isinstance(event.payload, View))
     wrong = {name: taken[name] for name in {*names, *taken} if taken[name] != (name in names)}
     return [f"{name} is in the record {count} times" for name, count in sorted(wrong.items())]
 
 
 def _surprises(motions: Path, events: Sequence[Event], moving: set[str]) -> list[str]:
-    """Motions without a person's confirmation since the program began that made them."""
+    """Motions without a person's confirmation since the start of the program that made them."""
     if not motions.exists():
         return ["the arm never moved"]
     found: list[str] = []

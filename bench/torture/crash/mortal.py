@@ -1,4 +1,4 @@
-"""A seam of durable effects that dies by SIGKILL at a chosen point, and keeps a journal of what is synced."""
+"""File operations that die by SIGKILL at a chosen point, and keep a journal of what has been synced."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from service.store.database import database_path
 from service.store.seam import DurableFiles
 
 Where = Literal["before", "within", "after"]
-HALVED = ("write", "append")  # effects that a crash may cut in half
-TORN = "commit"  # and the one that a loss of power may
+HALVED = ("write", "append")  # effects that a crash can leave half done
+TORN = "commit"  # the effect that a loss of power can leave half done
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A place at which a process may die: a call of the seam, counted from 0, and where in it."""
+    """A point at which a process may die: a call of the file operations, counted from 0, and the place within it."""
 
     call: int
     effect: str
@@ -32,7 +32,7 @@ class Point:
 
 
 def points(journal: Path, *, power: bool) -> list[Point]:
-    """Every point of a run that nobody disturbed; with `power`, those within a commit too."""
+    """All points of an undisturbed run; with `power` also those within a commit."""
     found: list[Point] = []
     for line in read_journal(journal):
         if line["where"] == "before":
@@ -45,7 +45,7 @@ def points(journal: Path, *, power: bool) -> list[Point]:
 
 
 def read_journal(journal: Path) -> list[dict[str, Any]]:
-    """The lines of a journal; the last may have been cut by a SIGKILL from outside."""
+    """Read the lines of a journal; the last one may be truncated by a SIGKILL."""
     if not journal.exists():
         return []
     content = journal.read_bytes()
@@ -53,7 +53,7 @@ def read_journal(journal: Path) -> list[dict[str, Any]]:
 
 
 class MortalFiles:
-    """service.store.seam.Files that keeps a journal of every effect, and dies at one point of one of them."""
+    """service.store.seam.Files that records every effect in a journal and dies at one point of one of them."""
 
     def __init__(self, data: Path, journal: Path, die_at: Point | None) -> None:
         self._data = data
@@ -66,7 +66,7 @@ class MortalFiles:
         self._out = os.open(journal, os.O_CREAT | os.O_APPEND | os.O_WRONLY | os.O_CLOEXEC)
 
     def make_directory(self, path: Path, *, private: bool = False) -> None:
-        """See Files."""
+        """Create a directory, with journal."""
         self._effect(
             "make_directory",
             lambda: self._real.make_directory(path, private=private),
@@ -75,7 +75,7 @@ class MortalFiles:
         )
 
     def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
-        """See Files."""
+        """Write a new file, with journal; can die half-way."""
 
         def half() -> None:
             data = b"".join(chunks)
@@ -84,7 +84,7 @@ class MortalFiles:
         self._effect("write", lambda: self._real.write(path, chunks, private=private), half, path=str(path))
 
     def append(self, path: Path, offset: int, data: bytes) -> None:
-        """See Files."""
+        """Append to a file at an offset, with journal; can die half-way."""
         self._effect(
             "append",
             lambda: self._real.append(path, offset, data),
@@ -94,36 +94,36 @@ class MortalFiles:
         )
 
     def make_read_only(self, path: Path) -> None:
-        """See Files."""
+        """Make a file read-only, with journal."""
         self._effect("make_read_only", lambda: self._real.make_read_only(path), path=str(path))
 
     def sync_file(self, path: Path) -> None:
-        """See Files."""
+        """Sync a file, with journal."""
         self._effect("sync_file", lambda: self._real.sync_file(path), path=str(path))
 
     def rename(self, source: Path, target: Path) -> None:
-        """See Files."""
+        """Rename a file, with journal."""
         self._effect("rename", lambda: self._real.rename(source, target), path=str(target), source=str(source))
 
     def sync_directory(self, path: Path) -> None:
-        """See Files."""
+        """Sync a directory, with journal."""
         self._effect("sync_directory", lambda: self._real.sync_directory(path), path=str(path))
 
     def remove(self, path: Path) -> None:
-        """See Files. The file is kept aside: until the folder is synced, a loss of power may bring it back."""
-        aside = self._attic / f"{os.getpid()}-{self._calls}"  # a process that resumed has this journal too
+        """Remove a file, keeping a copy: until the folder is synced, a loss of power may bring it back."""
+        aside = self._attic / f"{os.getpid()}-{self._calls}"  # a process that resumes also uses this journal
         if path.exists():
             self._attic.mkdir(exist_ok=True)
             os.link(path, aside)
         self._effect("remove", lambda: self._real.remove(path), path=str(path), aside=str(aside))
 
     def commit(self, commit: Callable[[], None]) -> None:
-        """See Files. Notes how far the chains had come when the commit returned."""
+        """Commit, and record how far the chains had come when the commit returned."""
 
         def torn() -> None:
             before, unchanged = self._log_bytes(), self._checkpointed()
             commit()
-            if self._checkpointed() == unchanged:  # else SQLite has synced its log in the middle
+            if self._checkpointed() == unchanged:  # otherwise SQLite has checkpointed its log meanwhile
                 self._note({"torn": [before, end_of_commit(Path(f"{database_path(self._data)}-wal"), before)]})
 
         self._effect("commit", commit, torn)
@@ -166,10 +166,10 @@ class MortalFiles:
 
 
 def end_of_commit(log: Path, start: int) -> int:
-    """Where the first commit after `start` ends in a write-ahead log, which another process may have added to since.
+    """Find the end of the first commit after `start` in a write-ahead log, to which others may have appended since.
 
     https://www.sqlite.org/fileformat2.html#the_write_ahead_log: a frame is a header of 24 bytes and a page; the
-    second word of the header is not 0 in the last frame of a commit.
+    second word of the header is non-zero in the last frame of a commit.
     """
     content = log.read_bytes() if log.exists() else b""
     if len(content) < 32:
@@ -182,7 +182,7 @@ def end_of_commit(log: Path, start: int) -> int:
 
 
 def events_recorded(data: Path) -> int:
-    """How many events all chains of a data folder hold together; 0 before the tables are there."""
+    """The number of events in all chains of a data folder; 0 if the tables do not exist yet."""
     with closing(sqlite3.connect(database_path(data), timeout=30)) as connection:
         try:
             return int(connection.execute("SELECT coalesce(sum(seq), 0) FROM heads").fetchone()[0])

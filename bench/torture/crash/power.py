@@ -1,4 +1,4 @@
-"""What a loss of power takes from a data folder: whatever the journals of its processes do not say was synced."""
+"""Simulates a loss of power: removes from a data folder whatever the journals do not show as synced."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from service.store.database import database_path
 
 @dataclass
 class _Unsynced:
-    """What is not on the disk for certain.
+    """Changes that may not have reached the disk.
 
     Attributes:
-        data: file → as many of its first bytes as are there for certain.
-        names: name → the one that the file had before; None for a file or folder that was made.
+        data: file → the number of its leading bytes that are certainly on the disk.
+        names: name → the file's previous name; None for a new file or folder.
         removed: name → where its content is kept.
-        torn: where a commit that did not return begins and ends in the database's log.
+        torn: where an unreturned commit begins and ends in the database's log.
     """
 
     data: dict[Path, int] = field(default_factory=dict[Path, int])
@@ -32,16 +32,16 @@ class _Unsynced:
 
 
 def lose_power(data: Path, journals: Iterable[Path], rng: Random) -> list[str]:
-    """Take away what was not synced, all of it or a part, as chance has it; in words, what was taken.
+    """Undo unsynced changes, all or a random part of them; returns sentences that say what was undone.
 
-    Every process must have ended. SQLite's shared memory goes too; its log loses what a commit that did not return
+    Every process must have ended. SQLite's shared memory is deleted too, and its log loses what an unreturned commit
     has written.
     """
     lines = sorted((line for journal in journals for line in read_journal(journal)), key=lambda line: line["at_ns"])
     unsynced = _Unsynced()
     for line in lines:
         _replay(unsynced, line)
-    share = rng.choice((0.0, 0.5, 0.5, 1.0))  # of it survives
+    share = rng.choice((0.0, 0.5, 0.5, 1.0))  # fraction that survives
     taken: list[str] = []
     for path, aside in unsynced.removed.items():
         if aside.exists() and path.parent.exists() and not path.exists() and rng.random() >= share:
@@ -56,7 +56,7 @@ def lose_power(data: Path, journals: Iterable[Path], rng: Random) -> list[str]:
     Path(f"{database_path(data)}-shm").unlink(missing_ok=True)
     if unsynced.torn is not None:
         log, (low, high) = Path(f"{database_path(data)}-wal"), unsynced.torn
-        # Where another process has committed since, its sync has brought this commit to the disk too.
+        # If another process has committed since, its sync has brought this commit to the disk too.
         if log.exists() and log.stat().st_size == high > low:
             os.truncate(log, rng.randint(low, high))
             taken.append("a part of the commit")
@@ -78,7 +78,7 @@ def _replay(unsynced: _Unsynced, line: dict[str, Any]) -> None:
             unsynced.names[path] = None
         case ("sync_file", "after"):
             unsynced.data.pop(path, None)
-        case ("rename", "before"):  # a process that was killed from outside may have come as far as that
+        case ("rename", "before"):  # a process killed from outside may have got as far as this
             source = Path(line["source"])
             unsynced.names[path] = source
             if source in unsynced.data:
@@ -97,7 +97,7 @@ def _replay(unsynced: _Unsynced, line: dict[str, Any]) -> None:
 
 
 def _spoil(path: Path, certain: int, rng: Random) -> str:
-    """Content that was not synced is missing, cut or zeros."""
+    """Spoil content that was not synced: delete it, truncate it or fill it with zeros."""
     size, mode = path.stat().st_size, path.stat().st_mode
     path.chmod(0o600)
     keep = rng.randint(min(certain, size), size)
@@ -112,7 +112,7 @@ def _spoil(path: Path, certain: int, rng: Random) -> str:
 
 
 def _undo(path: Path, before: Path | None, rng: Random) -> str:
-    """A name that was not synced is not there; a renamed file may still be under its old name."""
+    """Undo an unsynced name: a new file disappears, a renamed file may return to its old name."""
     if path.is_dir():
         shutil.rmtree(path)
         return f"folder {path.name}"

@@ -1,4 +1,4 @@
-"""Kills at random moments, over the real wires, of every process of a run, as a user starts them."""
+"""Kills every process of a run at random moments, over the real wires, with the programs started as by a user."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from tests.support.rig import REPOSITORY, command, simulated_rig, without_calibr
 
 _HOST = "127.0.0.71"
 _VIEWS = 6
-_LONGEST_S = 420.0  # of a run with its kills, on a busy machine
-_ROBOT_PORTS = {29999, 30001, 30002, 30003, 30004}  # fixed by the maker
-_REVIVED_S = 2.0  # a device that was killed is switched on again
-_STILL_M = 2e-4  # the camera's place from one look to the next, 0.2 s later
+_LONGEST_S = 420.0  # for a run with its kills on a busy machine
+_ROBOT_PORTS = {29999, 30001, 30002, 30003, 30004}  # fixed by the manufacturer
+_REVIVED_S = 2.0  # time until a killed device is switched on again
+_STILL_M = 2e-4  # largest change of the camera's position within 0.2 s that counts as standing still
 
 
 @dataclass(frozen=True, slots=True)
 class Kill:
-    """One SIGKILL: of which process, in which run, how long after the one before."""
+    """One SIGKILL: the process, the run, and the time since the previous one."""
 
     what: str
     run: int
@@ -54,7 +54,7 @@ class Kill:
 
 
 def random_kills(folder: Path, runs: int, kills: int, rng: Random) -> tuple[list[Kill], list[str]]:
-    """So many runs, each with so many kills; every kill, and the faults in words."""
+    """Run `runs` runs with `kills` kills each; returns the kills, and the faults as sentences."""
     done: list[Kill] = []
     faults: list[str] = []
     targets: list[str] = []
@@ -70,7 +70,7 @@ def random_kills(folder: Path, runs: int, kills: int, rng: Random) -> tuple[list
             "--revive-after-s", str(_REVIVED_S), host=_HOST,
         ) as ready:  # fmt: skip
             run.go(ready)
-        targets += run.targets  # that were not there to be killed before the run had ended
+        targets += run.targets  # these could not be killed before the run ended
         done += run.kills
         faults += [f"random run {number} ({', '.join(k.what for k in run.kills)}): {f}" for f in run.faults]
         print(f"random run {number}: {[k.what for k in run.kills]}, faults: {run.faults}", flush=True)
@@ -85,7 +85,7 @@ _TARGETS = (
 
 
 def protocol_of(folder: Path) -> Path:
-    """A capture over the wires, a scan for the worker, a signature before and after."""
+    """Write a protocol: a capture over the wires, a scan for the worker, a signature before and after."""
     whole = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     steps: dict[str, dict[str, Any]] = {step["id"]: step for step in whole["steps"]}
     capture, scan = steps["viewpoint_capture_1"], steps["control_scan"]
@@ -106,7 +106,7 @@ def protocol_of(folder: Path) -> Path:
 
 @dataclass
 class _Run:
-    """One run with its kills. A person, Grace, answers whatever is asked."""
+    """One run with its kills. A person, Grace, answers all questions."""
 
     folder: Path
     number: int
@@ -124,7 +124,7 @@ class _Run:
         return self.folder / "data"
 
     def go(self, ready: dict[str, Any]) -> None:
-        """Begin, kill, resume and answer until the run has ended; then look."""
+        """Begin, kill, resume and answer until the run has ended; then check it."""
         loaded = load_protocol(protocol_of(self.folder), params_models())
         rig = load_rig(Path(ready["rig"]))
         with Store.open(self.data) as store:
@@ -172,7 +172,7 @@ class _Run:
             self.faults.append("the pages do not answer at the end")
 
     def _answer(self, store: Store, run_id: str, protocol: Protocol) -> None:
-        """What `orthocapture act` does, once a runner of this session is there to be answered."""
+        """Do what `orthocapture act` does, once a runner of this session is there."""
         events = store.events(run_id)
         if not store.driven(run_id) or self.runner is None or _session(events) != self.runner.pid:
             return
@@ -200,7 +200,7 @@ class _Run:
             )  # fmt: skip
 
     def _find(self, what: str, ready: dict[str, Any]) -> int | None:
-        """The number of a living process of this kind; None while there is none."""
+        """The pid of a living process of this kind; None if there is none."""
         mine = psutil.Process()
         for process in mine.children(recursive=True):
             with suppress(psutil.Error):
@@ -215,7 +215,7 @@ class _Run:
                 with urlopen(f"http://127.0.0.1:{self.port}/", timeout=5):
                     return True
             except HTTPError:
-                return True  # it answers, and wants a sign-in
+                return True  # it responds and asks for a sign-in
             except (URLError, OSError):
                 time.sleep(0.5)
         return False
@@ -241,7 +241,7 @@ class _Run:
 
 
 def _is(what: str, process: psutil.Process, rig: str) -> bool:
-    """Whether a process is what is to be killed. Raises psutil.Error when it has ended meanwhile."""
+    """Whether a process is of the kind to be killed. Raises psutil.Error if it has ended meanwhile."""
     words = " ".join(process.cmdline())
     simulators = {"simulated robot": " ur ", "simulated camera": " camera ", "simulated light box": " lightbox "}
     if what in simulators:
@@ -260,7 +260,7 @@ def _is(what: str, process: psutil.Process, rig: str) -> bool:
 
 
 def _driver(process: psutil.Process) -> str:
-    """Which device a driver's process is of, by the wire that it holds; that of the light box has no process."""
+    """The device of a driver's process, found by its connections; the light box's driver has no process."""
     ports = {link.raddr.port for link in process.net_connections("tcp") if link.raddr}
     if ports & _ROBOT_PORTS:
         return "driver of the robot"
@@ -268,12 +268,12 @@ def _driver(process: psutil.Process) -> str:
 
 
 def _session(events: Sequence[Event]) -> int:
-    """The process that drives the run now, by its last session."""
+    """The pid of the process that drives the run now, from its last session."""
     return next((e.payload.pid for e in reversed(events) if isinstance(e.payload, SessionStarted)), 0)
 
 
 def _let(events: Sequence[Event], moment: float) -> bool:
-    """Whether a person had confirmed, at a moment (monotonic s), since the program that drove the run had begun."""
+    """Whether a person had confirmed by a moment (monotonic s), after the start of the program that drove the run."""
     leave = False
     for event in events:
         if event.monotonic_s > moment:
@@ -286,7 +286,7 @@ def _let(events: Sequence[Event], moment: float) -> bool:
 
 
 class _Eye:
-    """Looks at the laboratory five times a second, and remembers when the arm began to move."""
+    """Polls the laboratory five times a second and records when the arm began to move."""
 
     def __init__(self, world: str) -> None:
         host, _, port = world.rpartition(":")
@@ -297,7 +297,7 @@ class _Eye:
         self._thread.start()
 
     def close(self) -> list[float]:
-        """The moments, monotonic seconds."""
+        """Stop; returns the moments in monotonic seconds."""
         self._over.set()
         self._thread.join()
         self._link.close()
@@ -306,7 +306,7 @@ class _Eye:
     def _watch(self) -> None:
         lines = self._link.makefile()
         before = None
-        moving = True  # whatever it does at first was not seen to begin
+        moving = True  # a motion in progress at the start was not seen to begin
         while not self._over.wait(0.2):
             looked_s = time.monotonic()
             with suppress(OSError, ValueError):

@@ -1,7 +1,7 @@
-"""A worker's handlers that compute the same job once: an answer is a function of its arguments alone.
+"""Caches a worker's answers to jobs: an answer is a pure function of the job's arguments.
 
-A sweep has the same jobs a thousand times. Where the arguments are the same to the bit, the files of the first answer
-are stored again, through the same calls; where anything differs, it is computed.
+A sweep repeats the same jobs a thousand times. If the arguments are bitwise equal, the files of the first answer are
+stored again through the same calls; if anything differs, the job is computed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from service.worker.job import ArtefactStore, Handler, JobAnswer, JobContext
 
 @dataclass
 class _Recording:
-    """An ArtefactStore that remembers what was put."""
+    """An ArtefactStore that records what was stored."""
 
     store: ArtefactStore
     put: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
@@ -35,7 +35,7 @@ class _Recording:
 
 
 def remembering(handlers: Mapping[str, Handler], folder: Path) -> dict[str, Handler]:
-    """The same handlers, which keep their answers in a folder."""
+    """Wrap the handlers so that they keep their answers in a folder."""
     folder.mkdir(exist_ok=True)
     return {kind: _remembering(kind, handler, folder) for kind, handler in handlers.items()}
 
@@ -45,7 +45,7 @@ def _remembering(kind: str, handler: Handler, folder: Path) -> Handler:
         named = canonical({"kind": kind, "arguments": dict(context.arguments)})
         known = folder / hashlib.sha256(named.encode()).hexdigest()
         if known.exists():
-            puts, answer = pickle.loads(known.read_bytes())  # written below, by this program
+            puts, answer = pickle.loads(known.read_bytes())  # written below by this program
             for put in puts:
                 context.store.put_bytes(**put)
             return answer

@@ -1,4 +1,4 @@
-"""The run that the crash sweep kills, and its processes: runner, worker, and the web's record of a release."""
+"""The run that the crash sweep kills, and its processes: runner, worker, and the release recorded by the web."""
 
 from __future__ import annotations
 
@@ -109,11 +109,11 @@ steps:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """One run's folder: data, journals of the processes, motions, what they said."""
+    """One run's folder: data, the processes' journals, the arm's motions, and the output."""
 
     folder: Path
-    files: Path  # what prepare_files has made
-    remember: bool = True  # the answers of jobs, see bench.torture.crash.remembered
+    files: Path  # created by prepare_files
+    remember: bool = True  # whether to cache the answers of jobs, see bench.torture.crash.remembered
 
     @property
     def data(self) -> Path:
@@ -127,12 +127,12 @@ class Place:
 
     @property
     def signature_copy(self) -> Path:
-        """The second place of the log of signatures."""
+        """The second copy of the signature log."""
         return self.folder / "elsewhere.jsonl"
 
     @property
     def motions(self) -> Path:
-        """When the arm moved."""
+        """The log of the arm's motions."""
         return self.folder / "motions.txt"
 
     @property
@@ -141,12 +141,12 @@ class Place:
         return self.folder / "processes.log"
 
     def journal(self, role: Role) -> Path:
-        """What the seam of a process wrote down."""
+        """The journal of a process's file operations."""
         return self.folder / f"{role}.jsonl"
 
 
 def prepare(folder: Path) -> Place:
-    """A run that has calibrated, and nothing else, not even signed that; copies of it are killed."""
+    """Make a run that has only been calibrated, without a signature; copies of it are killed."""
     place = Place(folder / "seed", folder / "files")
     for made in (place.folder, place.files):
         made.mkdir(parents=True)
@@ -170,9 +170,9 @@ def prepare(folder: Path) -> Place:
 
 
 def start(role: Role, place: Place, *, die_at: Point | None = None, person: str = "Ada") -> int:
-    """Fork a process of a run from this one, which has imported everything; its number.
+    """Fork a process of the run from this one, which has imported everything; returns its pid.
 
-    It leaves with status 0 when its work is done, with 3 after an exception, and dies of SIGKILL at `die_at`.
+    It exits with status 0 when its work is done, with 3 after an exception, and dies of SIGKILL at `die_at`.
     """
     parent = os.getpid()
     child = os.fork()
@@ -185,10 +185,10 @@ def start(role: Role, place: Place, *, die_at: Point | None = None, person: str 
         os.dup2(said, 2)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)
-        # Helpers that a job starts would load everything anew, a thousand times; the jobs compute in this process.
+        # Helper processes would import everything again, a thousand times: compute the jobs in this process.
         os.cpu_count = lambda: 1
         np.seterr(all="ignore")
-        runner.software_versions = _SOFTWARE.copy  # which files are installed is read once, too
+        runner.software_versions = _SOFTWARE.copy  # also read the installed packages only once
         files = MortalFiles(place.data, place.journal(role), die_at)
         with Store.open(place.data, files=files) as store:
             _ROLES[role](store, place, parent, person)
@@ -200,13 +200,13 @@ def start(role: Role, place: Place, *, die_at: Point | None = None, person: str 
 
 
 def _begin(store: Store, place: Place, _parent: int, person: str) -> None:
-    """As `orthocapture run` does first."""
+    """Begin the run, as `orthocapture run` does first."""
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="torture.yaml")
     start_run(store, loaded, load_rig(place.rig), operator=person, auto_confirm=False)
 
 
 def _run(store: Store, place: Place, parent: int, person: str) -> None:
-    """As service.cli.run.drive does."""
+    """Run, as service.cli.run.drive does."""
     run_id = store.find_run("latest")
     protocol, _ = recorded_run(store, run_id)
     rig = CrashRig(folder=place.files, motions=place.motions)
@@ -221,7 +221,7 @@ def _run(store: Store, place: Place, parent: int, person: str) -> None:
 
 
 def _work(store: Store, place: Place, parent: int, _person: str) -> None:
-    """Jobs, until the sweep ends this process. It claims only when there is something: its points stay the same."""
+    """Work until killed by the sweep. It claims only when a job exists, so that its points are reproducible."""
 
     def stop() -> bool:
         while os.getppid() == parent:
@@ -236,7 +236,7 @@ def _work(store: Store, place: Place, parent: int, _person: str) -> None:
 
 
 def _release(store: Store, place: Place, _parent: int, person: str) -> None:
-    """As service.web.audit.exports.release does: a second person lets the completed run go."""
+    """Release the completed run as a second person, as service.web.audit.exports.release does."""
     run_id = store.find_run("latest")
     protocol, _ = recorded_run(store, run_id)
     state = fold(protocol, store.events(run_id))

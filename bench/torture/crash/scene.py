@@ -1,4 +1,4 @@
-"""What the crash sweep captures: spheres on a table, by an arm in memory that writes down its motions; imports."""
+"""What the crash sweep captures: spheres on a table, by an in-memory arm that logs its motions; and the imports."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ _SAMPLES = 20
 
 
 def planned() -> tuple[Viewpoint, ...]:
-    """The viewpoints that the run must have, each once."""
+    """The viewpoints that the run must have, each exactly once."""
     return plan_viewpoints(VIEWPOINTS, LAYOUT)
 
 
 def prepare_files(folder: Path) -> None:
-    """Everything that devices and people bring: pictures (one a viewpoint), an export of the scanner, photographs."""
+    """Create all input files: pictures (one per viewpoint), a scanner export, photographs."""
     for viewpoint in planned():
         centres = apply(inverse(viewpoint.T_base_camera) @ T_BASE_SCAN, REGISTRATION_M)
         np.save(folder / f"{viewpoint.name}.npy", render(CAMERA, centres, seed=7))
@@ -62,7 +62,7 @@ def prepare_files(folder: Path) -> None:
 
 
 def import_list(folder: Path) -> ImportList:
-    """The photographs and the scan as files that were captured earlier."""
+    """The photographs and the scan, as files captured earlier."""
 
     def entry(path: Path, media_type: str) -> ImportedFile:
         found = listed(path)
@@ -90,10 +90,10 @@ def import_list(folder: Path) -> ImportList:
 
 
 class SteadyArm(BenchArm):
-    """An arm whose stream has as many samples at each exposure: the mean pose is the same to the bit in every run."""
+    """An arm with a fixed number of samples per exposure, so that the mean pose is bitwise reproducible."""
 
     def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
-        """See drivers.interfaces.RobotArm."""
+        """Return a fixed number of samples between two host times, oldest first."""
         return super().samples(start_monotonic_s, start_monotonic_s + 1.0)[:1] * _SAMPLES
 
 
@@ -102,8 +102,8 @@ class CrashRig(BenchRig):
     """Arm and camera in memory, a scanner's folder, and files to import.
 
     Attributes:
-        folder: with what `prepare_files` has made.
-        motions: one line is added for each motion, before it begins: monotonic seconds.
+        folder: created by `prepare_files`.
+        motions: log file with one line per motion, written before it begins: monotonic seconds.
     """
 
     folder: Path = field(default=Path())
@@ -124,20 +124,20 @@ class CrashRig(BenchRig):
         os.close(descriptor)
 
     def _picture(self, _exposure: int) -> NDArray[np.uint8]:
-        """What the camera sees from where the arm is."""
+        """The camera's picture from the arm's current pose."""
         here = from_rotation_vector(self.arm.state().sample.joints_rad) @ self.nominal_T_flange_camera()
         return min(self._pictures, key=lambda one: float(np.abs(one[0] - here).max()))[1]
 
     def layout(self, station: str) -> StationLayout:
-        """See service.steps.context.Devices."""
+        """The layout of the station."""
         return LAYOUT
 
     def scanner(self, name: str | None = None) -> Scanner:
-        """The real driver, on a folder."""
+        """The real driver on a folder."""
         scanner = ScanFolder(ScanFolderConfig(folder=self.folder / "scans", stable_s=0))
         scanner.open()
         return scanner
 
     def imported(self) -> ImportList | None:
-        """The photographs and the scan."""
+        """The photographs and the scan to import."""
         return import_list(self.folder)

@@ -1,4 +1,4 @@
-"""The systematic crash sweep: the same short run, once for each point of its durable effects, killed there."""
+"""The systematic crash sweep: the same short run, killed once at each point of its durable effects."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from bench.torture.crash.run import Place, Role, prepare, start
 from service.store.store import Store
 
 How = Literal["kill", "power"]
-_ALONE: dict[Role, str] = {"begin": "Ada", "web": "Sue"}  # processes beside which no other works, and who acts
-_LONGEST_S = 300.0  # of a process of the run, on a busy machine; the undisturbed run takes a few seconds
+_ALONE: dict[Role, str] = {"begin": "Ada", "web": "Sue"}  # processes that work alone, and who acts in them
+_LONGEST_S = 300.0  # for a process of the run on a busy machine; the undisturbed run takes a few seconds
 _POLL_S = 0.004
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One death: which process dies where, alone or with the power of the whole machine."""
+    """One death: which process dies where, alone or by a power failure of the whole machine."""
 
     role: Role
     point: Point
@@ -37,15 +37,15 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What a case showed.
+    """The result of a case.
 
     Attributes:
-        case: see there.
-        reached: whether the process came to the point; a run of several processes is not the same every time.
-        faults: what did not hold, in words.
-        taken: what the loss of power took.
-        leftovers: files that were collected afterwards.
-        seconds: of all of it.
+        case: the case.
+        reached: whether the process reached the point; a run of several processes varies.
+        faults: violated conditions, as sentences.
+        taken: what the loss of power removed.
+        leftovers: number of files collected afterwards.
+        seconds: total duration.
     """
 
     case: Case
@@ -57,12 +57,12 @@ class Verdict:
 
 
 class SweepError(Exception):
-    """The undisturbed run itself does not hold."""
+    """Even the undisturbed run has a fault."""
 
 
 @dataclass
 class Sweep:
-    """A prepared run, what it comes to undisturbed, and its points."""
+    """A prepared run, its undisturbed outcome, and its points."""
 
     folder: Path
     seed: Place
@@ -73,9 +73,9 @@ class Sweep:
 
     @classmethod
     def begin(cls, folder: Path, *, remember: bool = True) -> Sweep:
-        """Run undisturbed, twice, so that it is known that the results are the same to the bit.
+        """Run twice undisturbed, to check that the results are bitwise equal.
 
-        Raises SweepError when anything does not hold even so.
+        Raises SweepError if there is a fault even so.
         """
         seed = prepare(folder)
         seed = replace(seed, remember=remember)
@@ -83,7 +83,7 @@ class Sweep:
         completed = seed
         for number in range(2):
             place = _copy(seed, folder / f"undisturbed-{number}")
-            # The first computes everything and keeps the answers; the second computes everything again.
+            # The first run computes and caches all answers; the second computes them again.
             worker = start("worker", replace(place, remember=remember and number == 0))
             _ended(start("runner", place), place)
             _end({"worker": worker})
@@ -107,14 +107,14 @@ class Sweep:
         return cls(folder, seed, outcomes[0], completed, found)
 
     def cases(self, ways: Sequence[How]) -> Iterator[Case]:
-        """Every point of every process, in every way."""
+        """Yield every point of every process, in every way to die."""
         for how in ways:
             for role in ROLES:
                 for point in self.points[role, how]:
                     yield Case(role, point, how)
 
     def try_case(self, case: Case, rng: Random) -> Verdict:
-        """Run up to the point, die there, resume, confirm, go to the end, and look what does not hold."""
+        """Run up to the point, die there, resume, confirm, complete the run and check it."""
         began_s = time.monotonic()
         self.numbered += 1
         place = self._place(case)
@@ -134,12 +134,12 @@ class Sweep:
         except SweepError as error:
             faults.append(str(error))
         if not faults:
-            shutil.rmtree(place.folder)  # what shows a fault is kept
+            shutil.rmtree(place.folder)  # folders of cases with faults are kept
         seconds = time.monotonic() - began_s
         return Verdict(case, reached, tuple(faults), tuple(taken), collected, seconds)
 
     def _place(self, case: Case) -> Place:
-        """A copy of what the process finds that is to die; a run is begun where there is nothing."""
+        """Copy the state in which the dying process starts, or begin a run if there is none."""
         folder = self.folder / f"case-{self.numbered}"
         if case.role == "begin":
             folder.mkdir()
@@ -147,7 +147,7 @@ class Sweep:
         return _copy(self.completed if case.role == "web" else self.seed, folder)
 
     def _die(self, case: Case, place: Place) -> bool:
-        """Whether the process came to its point; nobody lives afterwards."""
+        """Run until the process dies; returns whether it reached its point. No process is alive afterwards."""
         if case.role in _ALONE:
             status = _wait(start(case.role, place, die_at=case.point, person=_ALONE[case.role]))
             return os.WIFSIGNALED(status)
@@ -159,7 +159,7 @@ class Sweep:
             victim = self._first_to_end(alive)
             died = _died(place, case.role)
             if victim == "worker" and case.how == "kill" and died:
-                # As the pool does with a child that died: another takes its place, and the runner goes on.
+                # As the pool does after a child died: replace it, and the runner continues.
                 alive["worker"] = start("worker", place)
                 if self._first_to_end(alive) != "runner":
                     raise SweepError(f"the second worker ended: {_tail(place)}")
@@ -183,7 +183,7 @@ class Sweep:
         raise SweepError(f"{' and '.join(alive)} did not end within {_LONGEST_S:.0f} s")
 
     def _resume(self, case: Case, place: Place) -> None:
-        """Another runner and worker, and another person who confirms; then the release."""
+        """Start a new runner and worker, with another person who confirms; then release the run."""
         if case.role == "begin":
             _ended(start("begin", place), place)
             return
@@ -214,7 +214,7 @@ def _died(place: Place, role: Role) -> bool:
 
 
 def _wait(pid: int) -> int:
-    """The status of a process at its end. Raises SweepError, and ends it, when it takes too long."""
+    """Wait for a process and return its status. Raises SweepError, after ending it, if it takes too long."""
     deadline_s = time.monotonic() + _LONGEST_S
     while time.monotonic() < deadline_s:
         ended, status = os.waitpid(pid, os.WNOHANG)
@@ -226,7 +226,7 @@ def _wait(pid: int) -> int:
 
 
 def _ended(pid: int, place: Place) -> None:
-    """Wait for a process that must do its work to the end."""
+    """Wait for a process that must finish its work. Raises SweepError if it fails."""
     status = _wait(pid)
     if status:
         raise SweepError(f"a process ended with {status}: {_tail(place)}")

@@ -1,1 +1,1 @@
-"""The fault matrix: every kind of message of every device spoilt in every way: `make torture-faults`."""
+"""The fault matrix, `make torture-faults`: every kind of message of every device, spoilt in every way."""

@@ -1,10 +1,10 @@
-"""The fault matrix: every message of every wire spoilt in every way, and what devices and disks do by themselves.
+"""The fault matrix: every message of every wire spoilt in every way, plus faults of the devices and disks themselves.
 
 `python -m bench.torture.faults` (or `make torture-faults`) tries every case on a small rig: the real drivers over
-their real wires, the real runner, and a simulated person who takes the first way on that the screen lists. Each case
-is judged by the same rules (bench/torture/faults/rules.py). What happened is compared with the table in
+their real wires, the real runner, and a simulated person who takes the first way on that the screen lists. All cases
+are judged by the same rules (bench/torture/faults/rules.py), and the outcomes are compared with the table in
 docs/reference/faults.md; `--record` writes that table, and the results to bench/results.
-Exit status: 0 when every rule held and the table is right, 1 otherwise.
+Exit status: 0 if every rule held and the table is right, 1 otherwise.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _POLL_S = 0.02
 
 
 def chosen(options: argparse.Namespace) -> list[Case]:
-    """The cases of this sweep; in an order of chance where it may be cut short. Raises SystemExit for none."""
+    """Select the cases of this sweep, in random order if it may be cut short. Raises SystemExit if there are none."""
     every = list(cases().values())
     patterns: list[str] = options.only
     found = [c for c in every if not patterns or any(fnmatch.fnmatchcase(c.name, p) for p in patterns)]
@@ -52,7 +52,7 @@ def chosen(options: argparse.Namespace) -> list[Case]:
 
 
 def tried(case: Case, folder: Path, seed: Path, number: int) -> Verdict:
-    """Fork a process for the case and wait for its verdict; what exceeds the bound is killed with its children."""
+    """Run a case in a forked process and wait for its verdict; kill it with its children if it exceeds its bound."""
     folder.mkdir(parents=True)
     began_s = time.monotonic()
     pid = os.fork()
@@ -73,7 +73,7 @@ def tried(case: Case, folder: Path, seed: Path, number: int) -> Verdict:
         time.sleep(_POLL_S)
         ended, _ = os.waitpid(pid, os.WNOHANG)
     with suppress(ProcessLookupError):
-        os.killpg(pid, signal.SIGKILL)  # simulators and proxy too, whatever became of the case
+        os.killpg(pid, signal.SIGKILL)  # ends the simulators and the proxy too, whatever the case did
     if not ended:
         os.waitpid(pid, 0)
         return Verdict(case.name, broken=[f"it did not end within {case.bound_s:.0f} s"], seconds=case.bound_s)
@@ -84,11 +84,11 @@ def tried(case: Case, folder: Path, seed: Path, number: int) -> Verdict:
 
 
 def sweep(some: Sequence[Case], folder: Path, options: argparse.Namespace) -> list[Verdict]:
-    """Try them one after the other, until the time is over; tells each as it ends."""
+    """Try the cases in turn until the time is up, reporting each as it ends."""
     began_s = time.monotonic()
     seed = prepare_seed(folder / "seed")
     gc.collect()
-    gc.freeze()  # what all children share is not copied when they count references
+    gc.freeze()  # objects shared by all children are then not copied when their reference counts change
     verdicts: list[Verdict] = []
     for number, case in enumerate(some):
         if options.minutes and time.monotonic() - began_s > 60 * options.minutes:
@@ -110,7 +110,7 @@ def sweep(some: Sequence[Case], folder: Path, options: argparse.Namespace) -> li
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Sweep, compare, tell. The exit status."""
+    """Sweep, compare and report; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m bench.torture.faults", description=__doc__)
     parser.add_argument("--only", nargs="+", default=[], metavar="PATTERN", help="cases by name, as robot/rtde/*")
     parser.add_argument("--sample", type=int, default=0, metavar="N", help="so many of them, drawn by --seed")
@@ -125,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print("\n".join(case.name for case in some))
         return 0
     cv2.setNumThreads(1)
-    revision = commit()  # before results make a difference
+    revision = commit()  # before the results change the working tree
     folder = Path(tempfile.mkdtemp(prefix="orthocapture-faults-"))
     began_s = time.monotonic()
     verdicts = sweep(some, folder, options)
@@ -156,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    if "OPENBLAS_NUM_THREADS" not in os.environ:  # it is read when the library is loaded; a fork has no threads
+    if "OPENBLAS_NUM_THREADS" not in os.environ:  # read when numpy is loaded; a fork must have no threads
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
         os.execv(sys.executable, [sys.executable, "-m", "bench.torture.faults", *sys.argv[1:]])
     sys.exit(main())

@@ -1,4 +1,4 @@
-"""What somebody or something does in a case besides the wire, and what the person does before going on."""
+"""Acts of people and devices in a case, apart from faults on the wire, and the person's repairs before going on."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _DASHBOARD = 29999
 
 
 def _say(trial: Trial, *orders: str) -> list[str]:
-    """To the simulated controller's dashboard, as at the pendant."""
+    """Send lines to the simulated controller's dashboard, as from the pendant; returns its replies."""
     with (
         socket.create_connection((trial.arm_host, _DASHBOARD), timeout=3) as link,
         link.makefile("rw") as lines,
@@ -44,7 +44,7 @@ def _say(trial: Trial, *orders: str) -> list[str]:
 
 
 def _slider(trial: Trial, fraction: float) -> None:
-    """Somebody moves the speed slider at the pendant."""
+    """Move the speed slider on the pendant."""
     client = RtdeClient(trial.arm_host)
     recipe, _ = client.input_setup(["speed_slider_mask", "speed_slider_fraction"])
     client.send("U", struct.pack(">BId", recipe, 1, fraction))
@@ -53,7 +53,7 @@ def _slider(trial: Trial, fraction: float) -> None:
 
 
 def _unlock(trial: Trial) -> None:
-    """The protective stop, which the controller releases some seconds after it happened."""
+    """Release the protective stop, which the controller allows some seconds after it happened."""
     deadline_s = time.monotonic() + 15.0
     while time.monotonic() < deadline_s:
         if _say(trial, "unlock protective stop")[0].startswith(("Protective stop rel", "Failed")):
@@ -62,7 +62,7 @@ def _unlock(trial: Trial) -> None:
 
 
 def _power_up(trial: Trial) -> None:
-    """Turn the emergency stop out, power on, release the brakes."""
+    """Release the emergency stop button, power on, and release the brakes."""
     deadline_s = time.monotonic() + 15.0
     while time.monotonic() < deadline_s:
         _say(trial, "power on", "brake release")
@@ -72,7 +72,7 @@ def _power_up(trial: Trial) -> None:
 
 
 def _background(trial: Trial, work: Callable[[], None]) -> None:
-    """While the run goes on."""
+    """Run `work` in a thread while the run continues."""
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     trial.ends.append(lambda: thread.join(20.0))
@@ -82,7 +82,7 @@ def _background(trial: Trial, work: Callable[[], None]) -> None:
 
 
 def _cut(trial: Trial) -> bytes:
-    """Leave the beginning of the export; the rest of it."""
+    """Truncate the export; returns the removed bytes."""
     path = trial.scene_folder / SCAN
     data = path.read_bytes()
     kept = len(data) * 6 // 10
@@ -110,7 +110,7 @@ def _half_written(trial: Trial) -> None:
 
 
 def _replaced(trial: Trial) -> None:
-    """Exported again and again for some seconds: whenever it is read, it changes."""
+    """Export again and again for some seconds, so that the file changes while it is read."""
     path = trial.scene_folder / SCAN
     whole = (trial.material / SCAN).read_bytes()
     other = (trial.material / "eight.ply").read_bytes()
@@ -139,7 +139,7 @@ def _scaled(trial: Trial, factor: float) -> None:
 
 
 def _away(trial: Trial, seconds: float | None) -> None:
-    """The share is gone, and comes back or does not."""
+    """Remove the share, and bring it back after `seconds` if not None."""
     aside = trial.scene_folder.with_name("aside")
     trial.scene_folder.rename(aside)
 
@@ -170,7 +170,7 @@ def _ct(trial: Trial, kind: str) -> None:
 
 
 def _whole_scan(trial: Trial) -> None:
-    """Scanned and exported again."""
+    """Scan and export again."""
     scan_folder(trial.scene_folder, trial.material)
 
 
@@ -189,7 +189,7 @@ def _share_back(trial: Trial) -> None:
 
 
 def _faulty_disk(trial: Trial) -> dict[str, Any]:
-    """Keywords of Store.open."""
+    """Keyword arguments of Store.open for a failing disk."""
     if trial.disk is None:
         value = trial.case.value
         trial.disk = FaultyDisk(str(value["effect"]), int(value["nth"]), int(value["errno"]))
@@ -217,7 +217,7 @@ def _jump(trial: Trial) -> None:
 
 
 def _lock(trial: Trial) -> None:
-    """Another program holds the database for writing: a browser of databases that somebody has left open."""
+    """Lock the database for writing, like a database browser that somebody has left open."""
 
     def hold() -> None:
         with closing(sqlite3.connect(database_path(trial.data), timeout=10.0, isolation_level=None)) as connection:

@@ -1,4 +1,4 @@
-"""One case of the matrix: what goes wrong, where, and what the person who is asked does about it."""
+"""One case of the fault matrix: what goes wrong, where, and what the person does about it."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import Any, Literal
 from bench.torture.faults.proxy import AWAY_S, Spoil
 
 Scene = Literal["arm", "camera", "lightbox", "scan", "ct", "store"]
-BOUND_S = 240.0  # of a case, beyond the time that its device is away
+BOUND_S = 240.0  # limit for a case, in addition to the time that its device is away
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A row and a column of the matrix.
+    """One cell of the fault matrix.
 
     Attributes:
-        name: stable, `device/wire or state/what happens`; `--only` selects by it.
-        scene: which small rig and protocol it runs on.
-        what: what goes wrong, for people.
-        spoil: of a message on a wire, by the proxy; None: the fault is the device's own.
-        after: images that are in the record before the fault is armed; -1: it is armed from the start.
-        faults: plan of the simulator (simulators/faults.py).
-        options: further words for the simulator.
-        act: name of what somebody or something does once armed (bench/torture/faults/acts.py).
-        value: what the act needs to know.
-        mend: name of what the person does before taking the first way on that the screen lists.
-        patience: how many times the same question is answered before the person leaves it open.
-        longer_s: what the program itself waits before it asks, beyond the bound of all cases.
+        name: stable name, `device/wire or state/what happens`; `--only` selects by it.
+        scene: the small rig and protocol on which it runs.
+        what: description of the fault for people.
+        spoil: message that the proxy spoils on a wire; None if the fault is the device's own.
+        after: number of recorded images after which the fault is armed; -1: from the start.
+        faults: fault plan of the simulator (simulators/faults.py).
+        options: further options of the simulator.
+        act: name of an act once the fault is armed (bench/torture/faults/acts.py).
+        value: parameters of the act.
+        mend: name of the person's repair before taking the first way on that the screen lists.
+        patience: how often the same question is answered before the person leaves it open.
+        longer_s: waiting time of the program itself before it asks, added to the bound.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Case:
 
     @property
     def bound_s(self) -> float:
-        """No case may take longer."""
+        """Time limit of the case."""
         if self.spoil is None:
             return BOUND_S + self.longer_s
         garbled_s = 120.0 if self.spoil.column in ("noise", "mutated") else 0.0  # every way on is tried, 60 s each

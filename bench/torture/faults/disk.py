@@ -1,4 +1,4 @@
-"""A disk, a database and a clock that go wrong under the store, through its own seam."""
+"""A failing disk and database and a jumping clock, injected through the store's file operations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sqlalchemy.exc import OperationalError
 
 from service.store.seam import DurableFiles, SystemClock
 
-# What SQLite says where the system says this, as its result codes SQLITE_FULL, SQLITE_READONLY, SQLITE_IOERR do.
+# SQLite's messages for system errors, as for its codes SQLITE_FULL, SQLITE_READONLY, SQLITE_IOERR.
 _SQLITE = {
     errno.ENOSPC: ("SQLITE_FULL", "database or disk is full"),
     errno.EROFS: ("SQLITE_READONLY", "attempt to write a readonly database"),
@@ -23,12 +23,12 @@ _SQLITE = {
 
 @dataclass
 class FaultyDisk:
-    """service.store.seam.Files on a disk that fails from one call on, until somebody has mended it.
+    """service.store.seam.Files on a disk that fails from one call on, until somebody repairs it.
 
     Attributes:
-        effect: the kind of call that fails; empty: every one of them.
-        nth: the first call that fails, from 1, counted from when it is armed.
-        number: of the system's error.
+        effect: the kind of call that fails; empty: all kinds.
+        nth: the first failing call, from 1, counted from when the fault is armed.
+        number: errno of the system's error.
     """
 
     effect: str
@@ -41,12 +41,12 @@ class FaultyDisk:
     _real: DurableFiles = field(default_factory=DurableFiles)
 
     def make_directory(self, path: Path, *, private: bool = False) -> None:
-        """See Files."""
+        """Create a directory. Raises OSError while the disk fails."""
         self._check("make_directory", path)
         self._real.make_directory(path, private=private)
 
     def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
-        """See Files. A full disk takes the beginning of a file."""
+        """Write a file. A full disk still takes the beginning of it. Raises OSError while the disk fails."""
         try:
             self._check("write", path)
         except OSError:
@@ -57,7 +57,7 @@ class FaultyDisk:
         self._real.write(path, chunks, private=private)
 
     def append(self, path: Path, offset: int, data: bytes) -> None:
-        """See Files."""
+        """Append to a file. Raises OSError while the disk fails."""
         try:
             self._check("append", path)
         except OSError:
@@ -67,33 +67,33 @@ class FaultyDisk:
         self._real.append(path, offset, data)
 
     def make_read_only(self, path: Path) -> None:
-        """See Files."""
+        """Make a file read-only. Raises OSError while the disk fails."""
         self._check("make_read_only", path)
         self._real.make_read_only(path)
 
     def sync_file(self, path: Path) -> None:
-        """See Files."""
+        """Sync a file. Raises OSError while the disk fails."""
         self._check("sync_file", path)
         self._real.sync_file(path)
 
     def rename(self, source: Path, target: Path) -> None:
-        """See Files."""
+        """Rename a file. Raises OSError while the disk fails."""
         self._check("rename", target)
         self._real.rename(source, target)
 
     def sync_directory(self, path: Path) -> None:
-        """See Files."""
+        """Sync a directory. Raises OSError while the disk fails."""
         self._check("sync_directory", path)
         self._real.sync_directory(path)
 
     def remove(self, path: Path) -> None:
-        """See Files. A full disk lets go of files."""
+        """Remove a file, which also a full disk can do. Raises OSError while the disk fails otherwise."""
         if self.number != errno.ENOSPC:
             self._check("remove", path)
         self._real.remove(path)
 
     def commit(self, commit: Callable[[], None]) -> None:
-        """See Files. SQLite has words of its own for what the system says."""
+        """Commit. Raises SQLite's error for the system error while the disk fails."""
         try:
             self._check("commit", Path())
         except OSError as error:
@@ -114,10 +114,10 @@ class FaultyDisk:
 
 @dataclass
 class JumpingClock(SystemClock):
-    """The host's UTC is set by somebody; its monotonic time goes on."""
+    """A clock whose UTC can be set by somebody, while its monotonic time continues."""
 
     ahead_s: float = 0.0
 
     def utc_now(self) -> datetime:
-        """See Clock."""
+        """The UTC time with the current offset."""
         return datetime.now(UTC) + timedelta(seconds=self.ahead_s)

@@ -1,22 +1,22 @@
-"""Just enough of each wire to cut it into messages, to name their kinds, and to say no in its own words."""
+"""Just enough of each wire protocol to split it into messages, name their kinds, and refuse in the device's words."""
 
 from __future__ import annotations
 
 import struct
 from typing import Protocol
 
-Message = tuple[str, bytes]  # kind and bytes; an empty kind is passed on whatever is planned
+Message = tuple[str, bytes]  # kind and bytes; an empty kind is always passed on
 
 
 class Framer(Protocol):
-    """Cuts one direction of one connection into messages."""
+    """Splits one direction of a connection into messages."""
 
     def feed(self, data: bytes) -> list[Message]:
-        """The messages that are whole with these bytes."""
+        """Add bytes; returns the messages that are now complete."""
         ...
 
     def rest(self) -> bytes:
-        """What is left over and is passed on as it is, since nothing followed it."""
+        """Return the remaining bytes, to be passed on unchanged because nothing followed them."""
         ...
 
 
@@ -25,7 +25,7 @@ class _Buffered:
         self._buffer = b""
 
     def rest(self) -> bytes:
-        """See Framer."""
+        """Return the remaining bytes."""
         left, self._buffer = self._buffer, b""
         return left
 
@@ -42,14 +42,14 @@ _RTDE_ANSWERS = {
 
 
 class Rtde(_Buffered):
-    """Frames of port 30004: size with header (big-endian u16), type, payload."""
+    """RTDE frames of port 30004: size with header (big-endian u16), type, payload."""
 
     def __init__(self, *, answers: bool) -> None:
         super().__init__()
         self._answers = answers
 
     def feed(self, data: bytes) -> list[Message]:
-        """See Framer."""
+        """Add bytes; returns the frames that are now complete."""
         self._buffer += data
         found: list[Message] = []
         while len(self._buffer) >= 3:
@@ -65,14 +65,14 @@ class Rtde(_Buffered):
 
 
 class Lines(_Buffered):
-    """Lines of a dashboard or a light box; `kinds` names them by their first word, in small letters."""
+    """Lines of a dashboard or a light box; `kinds` maps their lower-case first word to a kind."""
 
     def __init__(self, kinds: dict[str, str], otherwise: str = "") -> None:
         super().__init__()
         self._kinds, self._otherwise = kinds, otherwise
 
     def feed(self, data: bytes) -> list[Message]:
-        """See Framer."""
+        """Add bytes; returns the lines that are now complete."""
         *whole, self._buffer = (self._buffer + data).split(b"\n")
         found: list[Message] = []
         for line in whole:
@@ -82,10 +82,10 @@ class Lines(_Buffered):
 
 
 class Script(_Buffered):
-    """Programs of the script port: each ends with a line `end` that is not indented."""
+    """Programs of the script port: each ends with an unindented line `end`."""
 
     def feed(self, data: bytes) -> list[Message]:
-        """See Framer."""
+        """Add bytes; returns the programs that are now complete."""
         self._buffer += data
         found: list[Message] = []
         while (at := self._buffer.find(b"\nend\n")) >= 0:
@@ -108,16 +108,16 @@ _OPERATIONS = {
 
 
 class PtpTalk:
-    """The operation that is under way on one command connection: answers are named after it."""
+    """The current operation on a command connection, after which its answers are named."""
 
     def __init__(self) -> None:
         self.operation = ""
 
 
 class PtpIp(_Buffered):
-    """Packets of PTP/IP: length with header, type (little-endian u32 each), body.
+    """PTP/IP packets: length with header, type (little-endian u32 each), body.
 
-    An answer without data is named after its operation; of one with data, each packet of the data is.
+    An answer without data is named after its operation, and so is each data packet of an answer with data.
     """
 
     def __init__(self, talk: PtpTalk, *, answers: bool) -> None:
@@ -126,7 +126,7 @@ class PtpIp(_Buffered):
         self._with_data = False
 
     def feed(self, data: bytes) -> list[Message]:
-        """See Framer."""
+        """Add bytes; returns the packets that are now complete."""
         self._buffer += data
         found: list[Message] = []
         while len(self._buffer) >= 8:
@@ -158,7 +158,7 @@ _ACCESS_DENIED = 0x200F
 
 
 def refused(device: str, kind: str, message: bytes) -> bytes:
-    """What this device says in place of a message to refuse what was asked. Raises KeyError where it cannot."""
+    """The message with which this device refuses a request. Raises KeyError if the device cannot refuse it."""
     if device == "camera":
         if kind in ("connect", "event_connect"):
             return struct.pack("<III", 12, 5, 1)
@@ -174,5 +174,5 @@ def refused(device: str, kind: str, message: bytes) -> bytes:
 
 
 def denied(transaction: bytes) -> bytes:
-    """The response that takes the place of a camera's data: little-endian transaction number (4 bytes)."""
+    """The response that replaces a camera's data; `transaction` is the little-endian transaction number (4 bytes)."""
     return struct.pack("<IIH", 14, RESPONSE, _ACCESS_DENIED) + transaction

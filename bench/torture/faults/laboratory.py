@@ -1,4 +1,4 @@
-"""The small rig of a case: real drivers for the device that is tried, arm and camera in memory beside it."""
+"""The small rig of a case: the real driver for the tested device, with an in-memory arm and camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.bench_rig import BenchArm, BenchCamera, numbered
 
 _READY_S = 30.0
 _STATION = {"robot": "robot", "scene_centre_m": [0.75, 0.0, -0.1], "approach_azimuth_deg": 180}
-_BENCH = StationLayout("station_1", "robot", (0.0, 0.8, 0.0), (0.0, -1.0, 0.0))  # of the arm in memory
+_BENCH = StationLayout("station_1", "robot", (0.0, 0.8, 0.0), (0.0, -1.0, 0.0))  # of the in-memory arm
 VIEWS = ("v001", "v002", "v003")
 PROTOCOL = """\
 id: faults
@@ -87,13 +87,13 @@ steps:
 
 
 def exposed(number: int) -> NDArray[np.uint8]:
-    """A picture that takes as long as an exposure: samples of the arm arrive meanwhile."""
+    """Take an exposure's time over a picture, so that samples of the arm arrive meanwhile."""
     time.sleep(0.3)
     return numbered(number)
 
 
 class Laboratory(Station):
-    """A station on which what is not in the rig file is in memory."""
+    """A station whose devices are in memory unless they are in the rig file."""
 
     def __init__(self, rig: Path, arm: BenchArm | None, shutter: BenchCamera | None) -> None:
         super().__init__(load_rig(rig))
@@ -103,25 +103,25 @@ class Laboratory(Station):
                 device.open()
 
     def robot(self, station: str) -> RobotArm:
-        """See service.steps.context.Devices."""
+        """The robot of a station, real or in memory."""
         return self.arm if self.arm is not None else super().robot(station)
 
     def camera(self) -> Camera:
-        """See service.steps.context.Devices."""
+        """The camera, real or in memory."""
         return self.shutter if self.shutter is not None else super().camera()
 
     def layout(self, station: str) -> StationLayout:
-        """See service.steps.context.Devices."""
+        """The layout of a station, from the rig file or for the in-memory arm."""
         return _BENCH if self.arm is not None else super().layout(station)
 
     def let_move(self, leave: LeaveToMove) -> None:
-        """See service.steps.context.Devices."""
+        """Permit motion of the real robot or of the in-memory arm."""
         super().let_move(leave)
         if self.arm is not None:
             self.arm.let_move(leave.by, leave.not_before_monotonic_s)
 
     def reopen(self, device: Device) -> None:
-        """See service.steps.context.Devices."""
+        """Reopen a device, real or in memory."""
         if device is self.arm or device is self.shutter:
             device.close()
             device.open()
@@ -130,7 +130,7 @@ class Laboratory(Station):
 
 
 def write_rig(folder: Path, devices: dict[str, Any]) -> Path:
-    """A rig file."""
+    """Write a rig file; returns it."""
     path = folder / "rig.yaml"
     rig = {
         "name": "faults",
@@ -146,14 +146,14 @@ def write_rig(folder: Path, devices: dict[str, Any]) -> Path:
 
 
 class Simulators:
-    """Simulators as processes that are forked from this one, before it has threads."""
+    """Simulators in processes forked from this one before it has threads."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._pids: dict[str, int] = {}
 
     def start(self, *words: str) -> dict[str, Any]:
-        """As `python -m simulators WORDS`; its ready line. Raises RuntimeError when it does not start."""
+        """Start `python -m simulators WORDS`; returns its ready line. Raises RuntimeError if it does not start."""
         reading, writing = os.pipe()
         pid = os.fork()
         if pid == 0:
@@ -176,7 +176,7 @@ class Simulators:
         return loads(line)
 
     def stop(self, names: Sequence[str] = ()) -> None:
-        """End these, or all."""
+        """End these simulators, or all of them."""
         for name in names or list(self._pids):
             pid = self._pids.pop(name, 0)
             with suppress(ProcessLookupError, ChildProcessError):
@@ -185,5 +185,5 @@ class Simulators:
                     os.waitpid(pid, 0)
 
     def signal(self, name: str, number: int) -> None:
-        """To one of them."""
+        """Send a signal to a simulator."""
         os.kill(self._pids[name], number)

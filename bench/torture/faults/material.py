@@ -1,4 +1,4 @@
-"""What the folders of scanner and CT hold in a case, made once for all cases."""
+"""The contents of the scanner and CT folders in a case, made once for all cases."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _AIR, _PLASTIC = -1000, 120
 
 
 def make_material(folder: Path) -> None:
-    """An export of ten spheres, one of eight, one of five, and a CT series of these five."""
+    """Make exports of ten, eight and five spheres, and a CT series of the same five."""
     folder.mkdir()
     rng = np.random.default_rng(3)
     for name, centres in ((SCAN, REGISTRATION_M), ("eight.ply", REGISTRATION_M[:8]), (FIVE, _CENTRES_MM * 1e-3)):
@@ -36,31 +36,31 @@ def make_material(folder: Path) -> None:
 
 
 def write_ct(folder: Path, centres_mm: Array, series: str, plan: tuple[Fault, ...] = ()) -> None:
-    """A series with spheres of 15 mm radius at these places (N, 3)."""
+    """Write a CT series with spheres of 15 mm radius at these centres (N, 3)."""
     folder.mkdir(exist_ok=True)
     k, j, i = np.meshgrid(*(np.arange(n) * _VOXEL_M * 1e3 for n in _SHAPE), indexing="ij")
     inside = np.full(_SHAPE, -np.inf)
     for x, y, z in centres_mm:
         inside = np.maximum(inside, 15.0 - np.sqrt((i - x) ** 2 + (j - y) ** 2 + (k - z) ** 2))
-    share = np.clip(inside / (_VOXEL_M * 1e3) + 0.5, 0.0, 1.0)  # of a voxel within plastic
+    share = np.clip(inside / (_VOXEL_M * 1e3) + 0.5, 0.0, 1.0)  # fraction of a voxel inside plastic
     volume = (_AIR + share * (_PLASTIC - _AIR)).astype(np.int16)
     frame = transform(np.eye(3), np.zeros(3))
     write_series(folder, volume, Grid(frame, _VOXEL_M, _SHAPE), frame, series, faults=FaultPlan(plan))
 
 
 def scan_folder(folder: Path, material: Path, name: str = SCAN) -> None:
-    """The scanner's folder with one export."""
+    """Fill the scanner's folder with one export."""
     folder.mkdir(exist_ok=True)
     shutil.copy(material / name, folder / SCAN)
 
 
 def ct_folder(folder: Path, material: Path) -> None:
-    """The CT's folder with one series."""
+    """Fill the CT folder with one series."""
     shutil.copytree(material / CT, folder, dirs_exist_ok=True)
 
 
 def spoilt_ct(folder: Path, kind: str) -> None:
-    """The CT's folder with a series that something is wrong with."""
+    """Fill the CT folder with a faulty series."""
     fault = Fault(
         device="ct", on="series" if kind == "localiser" else "slice", kind=kind, nth=1 if kind == "localiser" else 12
     )
@@ -68,12 +68,12 @@ def spoilt_ct(folder: Path, kind: str) -> None:
 
 
 def mirrored_ct(folder: Path) -> None:
-    """A series whose pixels were turned over left to right, as some export programs do."""
+    """Write a series mirrored left to right, as by some export programs."""
     mirrored = _CENTRES_MM.copy()
     mirrored[:, 0] = (_SHAPE[2] - 1) * _VOXEL_M * 1e3 - mirrored[:, 0]
     write_ct(folder, mirrored, "1.2.3.4")
 
 
 def other_ct(folder: Path) -> None:
-    """A second series in the same folder, of another specimen with two spheres."""
+    """Add a second series, of another specimen with two spheres."""
     write_ct(folder / "other", _CENTRES_MM[:2] + 3.0, "1.2.3.9")

@@ -1,4 +1,4 @@
-"""Every case, device by device; names are stable."""
+"""All cases of the fault matrix, device by device; their names are stable."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COLUMNS: dict[Column, str] = {
     "noise": "and each of its kind is random bytes",
     "mutated": "and each of its kind comes with bytes changed",
 }
-# device and wire, kind → (what it is, images in the record before it is armed, which message of the kind, how many)
+# device and wire, kind → (what it is, recorded images before it is armed, which message of the kind, how many)
 _ROBOT: dict[str, tuple[str, int, int, int]] = {
     "rtde/version": ("the answer to the protocol version", -1, 1, 1),
     "rtde/controller": ("the answer to the controller's version", -1, 1, 1),
@@ -56,7 +56,7 @@ _LIGHTBOX: dict[str, tuple[str, int, int, int]] = {
     "serial/pedal": ("the count of the pedal", -1, 1, 1),
     "serial/request": ("a request to the box", 1, 1, 1),
 }
-# What cannot be refused in the wire's own words, or cannot come in another order since it is waited for.
+# Messages that the protocol cannot refuse, or that cannot be reordered because the sender waits for the answer.
 _NO_REFUSAL = {"rtde/controller", "rtde/stream", "rtde/command", "dashboard/welcome", "script/script"} | {
     "ptpip/event", "ptpip/request", "serial/request",
 }  # fmt: skip
@@ -182,7 +182,7 @@ def _files() -> Iterator[Case]:
     yield Case("ct/series/none", "ct", "there is no series", act="no_export", mend="ct")
 
 
-# How many calls of each kind a capture makes once its first image is in the record: the disk fails at each of them.
+# Calls of each kind that a capture makes after its first image is recorded: the disk fails at each of them.
 _CALLS = {"write": 6, "sync_file": 6, "rename": 5, "make_read_only": 4, "sync_directory": 8, "commit": 6, "append": 1}
 
 
@@ -216,7 +216,7 @@ def _store() -> Iterator[Case]:
 
 
 def cases() -> dict[str, Case]:
-    """By name, in the order of the table."""
+    """All cases by name, in the order of the table."""
     found = [
         *_wires("robot", "arm", _ROBOT),
         *_robot_itself(),

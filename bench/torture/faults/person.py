@@ -1,4 +1,4 @@
-"""The person of a case, who takes the first way on that the screen lists, and the watch over what moves."""
+"""The person in a case, who takes the first way on that the screen lists, and the observer of all motions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _MAY_MOVE = 0b11  # safety_status_bits: normal, reduced
 
 
 class LeftError(Exception):
-    """The person has left the question open, and gone home."""
+    """The person has left the question open and gone."""
 
 
 @dataclass
@@ -28,8 +28,8 @@ class Person(ScriptedOperator):
     """Does what the screen lists, a few times.
 
     Attributes:
-        fix: what is done at the device before an answer.
-        patience: answers to one and the same question, before it is left open.
+        fix: repair made at the device before an answer.
+        patience: answers to the same question before it is left open.
         look: called several times a second.
     """
 
@@ -40,7 +40,7 @@ class Person(ScriptedOperator):
     stopped: list[AskOperator] = field(default_factory=list[AskOperator])
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
-        """See service.runner.Operator."""
+        """Return the person's answer to a question, or None while there is none yet. Raises LeftError."""
         if question.for_ != "recovery":
             return agree(question, state)
         self.stopped.append(question)
@@ -55,25 +55,25 @@ class Person(ScriptedOperator):
         return OperatorAction(action=way.verb, step=way.step, reason="as the screen says")
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
-        """See service.runner.Operator."""
+        """Observe what the runner is doing."""
         del doing, pedal_armed, asked
         self.look(state)
 
 
 class Motions:
-    """When an arm began to move, and when it was in a safety stop: host time.monotonic()."""
+    """Times at which an arm began to move, and at which it was in a safety stop: host time.monotonic()."""
 
     def __init__(self) -> None:
         self.begun_s: list[float] = []
         self.stopped_s: list[float] = []
 
     def began(self, _number: int = 0) -> None:
-        """An arm in memory says so itself."""
+        """Note the start of a motion, reported by an in-memory arm."""
         self.begun_s.append(time.monotonic())
 
 
 class ArmEye(Motions):
-    """Looks at a simulated controller over a connection of its own, past the proxy."""
+    """Observes a simulated controller over a connection of its own, past the proxy."""
 
     def __init__(self, host: str) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class ArmEye(Motions):
         self._thread.start()
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop observing."""
         with contextlib.suppress(OSError):
             self._client.shutdown()
         self._thread.join(5.0)

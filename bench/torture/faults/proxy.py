@@ -1,4 +1,4 @@
-"""Stands between a driver and its simulator, in a process of its own, and spoils one message: neither knows of it."""
+"""A proxy between a driver and its simulator, in a process of its own, that spoils one message unnoticed."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ Column = Literal[
     "away_1s", "away_30s", "away_never", "slow", "noise", "mutated",
 ]  # fmt: skip
 AWAY_S: dict[str, float | None] = {"away_1s": 1.0, "away_30s": 30.0, "away_never": None}
-SLOW_S = 0.3  # by which every message of the kind is late
-_IDLE_S = 0.2  # after which a message that is not whole is passed on as it is
-_FLIPS = 24  # bytes of a message from the middle on that are corrupted, at most
+SLOW_S = 0.3  # delay of every message of the kind
+_IDLE_S = 0.2  # time after which an incomplete message is passed on
+_FLIPS = 24  # maximum number of corrupted bytes of a message, from its middle on
 
 
 @dataclass(frozen=True, slots=True)
 class Spoil:
-    """What happens to the `nth` message (from 1) of a kind, and the `times` - 1 after it, once the proxy is armed."""
+    """The fault of the `nth` message (from 1) of a kind, and of the `times` - 1 after it, once the proxy is armed."""
 
     kind: str
     column: Column
@@ -53,7 +53,7 @@ class Spoil:
 
 @dataclass(frozen=True, slots=True)
 class Wire:
-    """One TCP port or pseudo-terminal: where the driver connects, and where the simulator is."""
+    """One TCP port or pseudo-terminal: the driver's end and the simulator's address."""
 
     device: Literal["robot", "camera", "lightbox"]
     protocol: Literal["rtde", "dashboard", "script", "ptpip", "serial"]
@@ -73,7 +73,7 @@ class _Link:
 
 
 class Proxy:
-    """All wires of one device. What it did is one JSON line each in `journal`."""
+    """All wires of one device. It appends one JSON line to `journal` for each thing it does."""
 
     def __init__(self, wires: list[Wire], spoil: Spoil | None, journal: Path, seed: int) -> None:
         self._wires, self._spoil, self._journal = wires, spoil, journal
@@ -87,7 +87,7 @@ class Proxy:
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def serve(self, control: int) -> None:
-        """Until the other end of `control` is closed; a byte there arms it."""
+        """Serve until the other end of `control` is closed; a byte received there arms the fault."""
         await self._plug_in()
         os.write(control, b"r")
         pipe = Pipe(control)
@@ -123,7 +123,7 @@ class Proxy:
 
         def close() -> None:
             for descriptor in (master, far):
-                asyncio.get_running_loop().remove_reader(descriptor)  # its number is another's soon
+                asyncio.get_running_loop().remove_reader(descriptor)  # the descriptor's number is about to be reused
             for pump in pumps:
                 pump.cancel()
             for descriptor in (master, slave, far):
@@ -165,7 +165,7 @@ class Proxy:
                 asyncio.create_task(self._pump(wire, link, far, near, answers=True)),
             ]
             await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
-            await asyncio.sleep(0.02)  # what the other direction still has to say
+            await asyncio.sleep(0.02)  # time for what the other direction has not sent yet
             for pump in pumps:
                 pump.cancel()
             link.close()
@@ -220,7 +220,7 @@ class Proxy:
                 await target.write(held)
 
     def _spoilt(self, wire: Wire, link: _Link, kind: str, message: bytes, *, answers: bool) -> bytes:  # noqa: PLR0911, PLR0912 - one line a column
-        """What is passed on in place of a message."""
+        """Return what is passed on instead of a message."""
         if link.refusing:
             link.refusing = struct.unpack_from("<I", message, 4)[0] != RESPONSE
             return b""
@@ -260,7 +260,7 @@ class Proxy:
                 return b""
 
     def _corrupted(self, message: bytes) -> bytes:
-        """The length stays right: what is wrong is in what is said."""
+        """Corrupt a message's content; its length stays right."""
         damaged = bytearray(message)
         first = min(len(message) - 1, 3 if len(message) < 64 else 12)
         for at in self._rng.sample(range(first, len(message)), min(_FLIPS, (len(message) - first + 3) // 4)):
@@ -274,7 +274,7 @@ class Proxy:
         return refused(wire.device, kind, message)
 
     def _go_away(self, seconds: float | None) -> None:
-        """Every connection of the device ends, and nobody can make a new one for a while."""
+        """Close every connection of the device and refuse new ones for `seconds` (None: for good)."""
         for server in self._servers:
             server.close()
         self._servers.clear()
@@ -314,26 +314,26 @@ def _framer(wire: Wire, link: _Link, *, answers: bool) -> Framer:
 
 @dataclass(frozen=True, slots=True)
 class RunningProxy:
-    """The proxy's process, as the case holds it."""
+    """The proxy's process, as seen by the case."""
 
     pid: int
     control: socket.socket
     journal: Path
 
     def arm(self) -> None:
-        """Let it count and act from now on."""
+        """Make the proxy count and act from now on."""
         with contextlib.suppress(OSError):
             self.control.sendall(b"a")
 
     def deeds(self) -> list[dict[str, Any]]:
-        """What it did so far, oldest first."""
+        """What the proxy has done so far, oldest first."""
         if not self.journal.exists():
             return []
         return [json.loads(line) for line in self.journal.read_text().splitlines()]
 
 
 def start_proxy(wires: list[Wire], spoil: Spoil | None, journal: Path, seed: int) -> RunningProxy:
-    """Fork it, before this process has threads; returns once it listens."""
+    """Fork the proxy, before this process has threads; returns once it listens."""
     ours, theirs = socket.socketpair()
     pid = os.fork()
     if pid == 0:

@@ -1,4 +1,4 @@
-"""By what a case is judged, whatever went wrong in it: rules, not expectations written down case by case."""
+"""The rules by which every case is judged, independent of its fault, instead of expectations per case."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from service.store.audit import verify
 _SAYS = re.compile(r"^.+ \[[^\]]+\]\. .+$", re.DOTALL)  # what, [place], remedy
 _NOTICE_S = 0.1  # between a motion and a sample of it, or a stop and its sample
 _TRACES = ("Traceback (most recent call last)", "Exception in thread", "Exception ignored in")
-assert _device_errors.DeviceError  # its subclasses are known once it is imported
+assert _device_errors.DeviceError  # imported so that its subclasses are known
 
 
 def broken(
     events: Sequence[Event], motions: Motions, data: Path, views: Iterable[str], status: str, logs: Iterable[Path]
 ) -> list[str]:
-    """Which rules do not hold, in words."""
+    """Return the violated rules, as sentences."""
     return [
         *_words(events),
         *_views(events, tuple(views), status),
@@ -45,7 +45,7 @@ def tells(message: str) -> bool:
 
 
 def _known() -> set[str]:
-    """Names of every class of the one error tree."""
+    """The names of all classes of the error tree."""
     names: set[str] = set()
     classes: list[type[OrthocaptureError]] = [OrthocaptureError]
     while classes:
@@ -71,7 +71,7 @@ def _words(events: Sequence[Event]) -> list[str]:
 
 
 def _views(events: Sequence[Event], views: tuple[str, ...], status: str) -> list[str]:
-    """Each viewpoint once; again only where its image was refused by its own verdicts."""
+    """Faults if a viewpoint is missing, or repeated although its image was not rejected by its own verdicts."""
     good = Counter[str]()
     found: list[str] = []
     for event in events:
@@ -90,7 +90,7 @@ def _views(events: Sequence[Event], views: tuple[str, ...], status: str) -> list
 
 
 def _surprises(events: Sequence[Event], motions: Motions) -> list[str]:
-    """A motion needs a confirmation since the arm was stopped last, and one for each connection to it."""
+    """Motions without a confirmation since the last stop, and since the last connection to the arm."""
     connections: dict[int, set[int]] = {}
     found: list[str] = []
     for moment in motions.begun_s:
@@ -113,7 +113,7 @@ def _surprises(events: Sequence[Event], motions: Motions) -> list[str]:
 
 
 def _traces(logs: Iterable[Path]) -> list[str]:
-    """Nobody may be shown the inside of the program."""
+    """Faults for tracebacks in the logs: nobody may be shown the program's internals."""
     found: list[str] = []
     for log in logs:
         if log.exists():

@@ -1,4 +1,4 @@
-"""Terminals and TCP connections as streams of bytes, as the proxy reads and writes them."""
+"""Terminals and TCP connections as byte streams for the proxy."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import struct
 
 
 class Pipe:
-    """A terminal as a stream."""
+    """A terminal as a byte stream."""
 
     def __init__(self, descriptor: int) -> None:
         self.descriptor = descriptor
         os.set_blocking(descriptor, False)
 
     async def read(self) -> bytes:
-        """The next bytes; none when the terminal is gone."""
+        """Read the next bytes; empty if the terminal has gone."""
         loop = asyncio.get_running_loop()
         ready = loop.create_future()
         loop.add_reader(self.descriptor, lambda: ready.done() or ready.set_result(None))
@@ -31,31 +31,31 @@ class Pipe:
                 loop.remove_reader(self.descriptor)
 
     async def write(self, data: bytes) -> None:
-        """A serial line is slow to fill."""
+        """Write the data piecewise, because a serial line is slow."""
         with contextlib.suppress(OSError):
             os.write(self.descriptor, data)
 
 
 class Stream:
-    """A TCP connection as a stream."""
+    """A TCP connection as a byte stream."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader, self._writer = reader, writer
 
     async def read(self) -> bytes:
-        """The next bytes; none at the end."""
+        """Read the next bytes; empty at the end."""
         try:
             return await self._reader.read(1 << 16)
         except OSError:
             return b""
 
     async def write(self, data: bytes) -> None:
-        """Raises OSError when the other side has gone."""
+        """Write the data. Raises OSError if the peer has gone."""
         self._writer.write(data)
         await self._writer.drain()
 
     def cut(self) -> None:
-        """With a reset, as a cable that is pulled and a device that is switched off leave it."""
+        """Close with a reset, like a pulled cable or a device that is switched off."""
         link: socket.socket = self._writer.get_extra_info("socket")
         with contextlib.suppress(OSError):
             link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))

@@ -1,4 +1,4 @@
-"""The table in docs/reference/faults.md, and the results: what went wrong, what was done about it, how it ended."""
+"""The table in docs/reference/faults.md and the results: what went wrong, what was done about it, how it ended."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ the run is resumed later. Where nothing is done, the case does no harm: what com
 
 """
 _COLUMNS = "| case | what goes wrong | what is done | how it ends | errors | words on the screen |"
-_LONGEST = 140  # of a command in the results; the whole is in the JSON
+_LONGEST = 140  # length of a command in the results; the JSON has all of it
 _RULE = "|---|---|---|---|---|---|"
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A line of the table, cells as they are written there."""
+    """One row of the table, with its cells as written there."""
 
     case: str
     what: str
@@ -44,23 +44,23 @@ class Row:
 
     @classmethod
     def of(cls, case: Case, verdict: Verdict) -> Row:
-        """What a case showed."""
+        """The row for the result of a case."""
         done = ", ".join(verdict.policy) or "nothing"
         return cls(case.name, case.what, done, verdict.end, ", ".join(verdict.errors), _cell(verdict.words))
 
     def line(self) -> str:
-        """As Markdown."""
+        """Format the row as Markdown."""
         return f"| {self.case} | {self.what} | {self.done} | {self.end} | {self.errors} | {self.words} |"
 
 
 def _cell(text: str) -> str:
-    """Text that keeps a table whole."""
+    """Escape text for a table cell."""
     plain = " ".join(text.split()).replace("|", "/").replace("`", "'").replace("<", "&lt;")
     return plain if len(plain) <= 400 else f"{plain[:400]} …"
 
 
 def read_table(document: Path) -> dict[str, Row]:
-    """The rows of the table by case; none where there is no document yet."""
+    """Read the rows of the table by case; empty if the document does not exist."""
     if not document.exists():
         return {}
     rows: dict[str, Row] = {}
@@ -72,7 +72,7 @@ def read_table(document: Path) -> dict[str, Row]:
 
 
 def differences(verdicts: Sequence[Verdict], rows: Mapping[str, Row]) -> list[str]:
-    """In which rows something else happened than the table says: another policy, end or error."""
+    """The rows whose policy, end or error differs from the table."""
     found: list[str] = []
     for verdict in verdicts:
         row = rows.get(verdict.name)
@@ -86,7 +86,7 @@ def differences(verdicts: Sequence[Verdict], rows: Mapping[str, Row]) -> list[st
 
 
 def table(cases: Sequence[Case], verdicts: Sequence[Verdict], before: Mapping[str, Row]) -> str:
-    """The document: rows that were tried are written anew, the others stay."""
+    """Format the document: tried rows are replaced, the others stay."""
     new = {verdict.name: verdict for verdict in verdicts if not verdict.broken}
     parts: dict[str, list[str]] = defaultdict(list)
     for case in cases:
@@ -98,7 +98,7 @@ def table(cases: Sequence[Case], verdicts: Sequence[Verdict], before: Mapping[st
 
 
 def report(about: Mapping[str, Any], known: Container[str], new: Sequence[Verdict], stem: Path) -> None:
-    """The results as JSON and Markdown; those of the same day that were not tried again stay."""
+    """Write the results as JSON and Markdown; results of the same day that were not tried again stay."""
     path = stem.with_suffix(".json")
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"sweeps": [], "verdicts": []}
     rows = {row["name"]: row for row in before["verdicts"] if row["name"] in known}

@@ -1,4 +1,4 @@
-"""One case, in a process of its own: simulators, proxy, rig, run, person; then the rules."""
+"""Runs one case in a process of its own (simulators, proxy, rig, run, person), then applies the rules."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from service.worker import loop
 from tests.support.bench_rig import BenchArm, BenchCamera
 
 _UNSIGNED = "the record could not be signed"
-_SESSIONS = 3  # programs that drive the run, one after the other, where an error ends them
+_SESSIONS = 3  # programs that drive the run in turn, if an error ends them
 
 
 @dataclass
 class Session:
-    """How one program that drove the run ended: by itself, by an error, or with a question that is left open."""
+    """How one program that drove the run ended: by itself, by an error, or with an open question."""
 
     status: str = ""
     error: OrthocaptureError | None = None
@@ -51,7 +51,7 @@ class Session:
 
 
 class Trial:
-    """The case while it runs. Acts and mends (bench/torture/faults/acts.py) reach what they need through it."""
+    """The running case. Acts and repairs (bench/torture/faults/acts.py) access the rig through it."""
 
     def __init__(self, case: Case, folder: Path, seed: int) -> None:
         self.case, self.folder, self.seed = case, folder, seed
@@ -61,7 +61,7 @@ class Trial:
         self.arm_host = f"127.{101 + os.getpid() % 100}.{os.getpid() // 100 % 250}.1"
         self.armed = False
         self.acted = False
-        self.ends: list[Callable[[], None]] = []  # what is undone at the end
+        self.ends: list[Callable[[], None]] = []  # clean-up functions
         self.scene_folder = folder / "export"
         self.material = folder.parent / "material"
         self.arm: BenchArm | None = None
@@ -138,7 +138,7 @@ class Trial:
     # --- the run ------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """To its end, or to the question that is left open."""
+        """Run the case to its end, or to the question that is left open."""
         began_s = time.monotonic()
         station = self._laboratory()
         self._log()
@@ -154,7 +154,7 @@ class Trial:
             self.verdict.seconds = round(time.monotonic() - began_s, 1)
 
     def _log(self) -> None:
-        """Only now: simulators and proxy, which are forked, have logs of their own."""
+        """Configure the log; only now, because the forked simulators and the proxy have logs of their own."""
         words = "%(levelname)s %(name)s: %(message)s"
         logging.basicConfig(filename=self.folder / "program.log", level=logging.INFO, format=words)
         for chatty in ("transitions", "alembic"):
@@ -183,12 +183,12 @@ class Trial:
             unsigned = [words for words in ended.told if words.startswith(_UNSIGNED)]
             if ended.error is None and not unsigned:
                 break
-            if ended.error is None:  # the person reads this, does what it says, and resumes: then it is signed
+            if ended.error is None:  # the person reads this, does what it says and resumes; then it is signed
                 self.words += unsigned[:1]
                 self.verdict.policy.append("told")
                 self._mend()
                 continue
-            # What the command line prints; the person does what it says, and resumes.
+            # What the command line prints; the person does what it says and resumes.
             self.words.append(str(ended.error))
             self.verdict.policy.append("stop")
             self.verdict.errors.append(type(ended.error).__name__)
@@ -199,7 +199,7 @@ class Trial:
         self._judge(run_id, person, status)
 
     def _session(self, run_id: str, station: Laboratory, person: Person) -> Session:
-        """As one program that drives the run, to its end."""
+        """Drive the run to its end, as one program does."""
         ended = Session()
         person.told = []
         try:
@@ -217,7 +217,10 @@ class Trial:
         return ended
 
     def _apart(self, session: Callable[[], Session]) -> Session:
-        """In a process of its own, which dies at its end as a program does; arm and camera live on in this one."""
+        """Run a session in a forked process, which dies at its end like a program.
+
+        Arm and camera stay in this one.
+        """
         path = self.folder / "session.pickle"
         pid = os.fork()
         if pid == 0:
@@ -248,7 +251,7 @@ class Trial:
             self._work()
 
     def _arm_now(self, captured: int) -> None:
-        """Arm the fault once so many images are in the record."""
+        """Arm the fault once `captured` images are recorded."""
         if self.armed or captured < self.case.after:
             return
         self.armed = True
@@ -260,7 +263,7 @@ class Trial:
             self.acted = True
 
     def _prepare(self, step: str) -> None:
-        """A technician does what a step begins with."""
+        """Prepare a step, as a technician does."""
         if self.case.scene == "ct" and step == "scan":
             scan_folder(self.folder / "scans", self.material, FIVE)
 
@@ -272,7 +275,7 @@ class Trial:
             self._await_return()
 
     def _await_return(self) -> None:
-        """The person looks after the cable until the device is back, where it comes back at all."""
+        """Wait until the device is back, unless it never comes back."""
         assert self.proxy is not None
         assert self.case.spoil is not None
         if self.case.spoil.column == "away_never":
@@ -285,7 +288,7 @@ class Trial:
             time.sleep(0.1)
 
     def _work(self) -> None:
-        """What a worker process does, in this one."""
+        """Work on jobs in this process, as a worker process does."""
         if self.case.scene not in ("scan", "ct"):
             return
         if not database_path(self.data).exists():
@@ -320,17 +323,17 @@ class Trial:
 
 
 def prepare_seed(folder: Path) -> Path:
-    """An empty data folder, which each case copies; and what all of them need is loaded by then."""
+    """Create an empty data folder, which each case copies, and load what all cases need."""
     with Store.open(folder):
         pass
     loaded = parse_protocol(PROTOCOL.replace("DISTANCE", "0.5").encode(), params_models(), name="faults.yaml")
     make_material(folder.with_name("material"))
-    initial_state(loaded.protocol)  # which makes the table of its states
+    initial_state(loaded.protocol)  # builds the table of its states
     return folder
 
 
 def run_in_child(case: Case, folder: Path, seed: int) -> None:
-    """In the forked process: run the case and write verdict.json; whatever escapes is a fault of its own."""
+    """Run the case in the forked process and write verdict.json; an escaping exception is a fault of its own."""
     trial = Trial(case, folder, seed)
     try:
         trial.run()

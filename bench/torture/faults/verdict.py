@@ -1,4 +1,4 @@
-"""What a case showed, and how it is read from the events of its run and from what a person saw."""
+"""The result of a case, read from the events of its run and from what a person saw."""
 
 from __future__ import annotations
 
@@ -16,19 +16,17 @@ _DIGITS = re.compile(r"\d+(?:[.,]\d+)*")
 
 @dataclass
 class Verdict:
-    """What a case showed.
+    """The result of a case.
 
     Attributes:
-        name: of the case.
-        reached: whether what was to go wrong did.
-        broken: rules that do not hold, in words.
-        policy: what was done about it, in order: `again` (the same viewpoint or step, at once), `reopen`, `retry`
-            (of the step), `skip` (of a viewpoint), `ask`, `told` (and nothing stopped), `stop` (of the program).
-        errors: classes of the errors, in order of their first appearance.
+        name: of the case. reached: whether the fault occurred. broken: violated rules, as sentences. policy: the
+        reactions in order: `again` (the same viewpoint or step, at once), `reopen`, `retry` (of the step),
+            `skip` (of a viewpoint), `ask`, `told` (and nothing stopped), `stop` (of the program).
+        errors: classes of the errors, in order of first appearance.
         words: on the screen.
         end: `completed`, or the ways on that are listed.
-        events: kinds of the run's events and how many of each.
-        seconds: of all of it.
+        events: kinds of the run's events with their counts.
+        seconds: total duration.
     """
 
     name: str
@@ -42,12 +40,12 @@ class Verdict:
     seconds: float = 0.0
 
     def told(self) -> dict[str, Any]:
-        """For the file that the sweep reads."""
+        """Convert to JSON data for the file that the sweep reads."""
         return asdict(self)
 
 
 def policy_of(events: Iterable[Event]) -> list[str]:
-    """What was done, each kind where it came first."""
+    """The reactions, each kind at its first occurrence."""
     done: list[str] = []
     opened: set[str] = set()
     for event in events:
@@ -66,12 +64,12 @@ def policy_of(events: Iterable[Event]) -> list[str]:
 
 
 def errors_of(events: Iterable[Event]) -> list[str]:
-    """Their classes, each where it came first."""
+    """The classes of the errors, each at its first occurrence."""
     return list(dict.fromkeys(e.payload.error for e in events if isinstance(e.payload, StepFailed | ViewpointFailed)))
 
 
 def first_words(events: Iterable[Event], stopped: Iterable[AskOperator], printed: list[str]) -> str:
-    """What a person read first about it, figures left out."""
+    """The first words about the fault that a person read, without figures."""
     failed = [e.payload.message for e in events if isinstance(e.payload, StepFailed)]
     asked = [question.text for question in stopped]
     tried = [e.payload.message for e in events if isinstance(e.payload, ViewpointFailed)]
@@ -79,13 +77,13 @@ def first_words(events: Iterable[Event], stopped: Iterable[AskOperator], printed
 
 
 def masked(words: str, folder: Path | None = None) -> str:
-    """Words without what differs from run to run."""
+    """Replace everything in the words that varies from run to run."""
     plain = words.replace(str(folder), "…") if folder is not None else words
     return _DIGITS.sub("N", " ".join(plain.split()))
 
 
 def listed(question: AskOperator | None) -> str:
-    """The ways on of the question that was left open; empty where there is none besides ending the run."""
+    """The ways on of an open question; empty if the only one is to end the run."""
     if question is None:
         return ""
     ways = [way.verb for way in question.ways if way.available and way.verb != "abort"]

@@ -1,1 +1,1 @@
-"""Bad input for every parser of the project: no crash, no hang, no memory beyond a bound, always a typed error."""
+"""Fuzzing of every parser in the project: no crash, no hang, bounded memory, always a typed error."""

@@ -1,11 +1,11 @@
-"""`make torture-fuzz`: bad input for every parser of the project, for a stated time each; results to bench/results.
+"""`make torture-fuzz`: fuzzes every parser of the project for a given time each; results go to bench/results.
 
-    python -m bench.torture.fuzz --seconds-per-target 60 [--target NAME …] [--engine both|hypothesis|atheris]
+python -m bench.torture.fuzz --seconds-per-target 60 [--target NAME …] [--engine both|hypothesis|atheris]
 
-Two engines read mutated files that this project's own simulators and exporters wrote: hypothesis, and atheris, which
-follows the lines that an input reaches (the extra `fuzz`; where it is missing, that is said and hypothesis has
-the whole time). Each target runs in a process of its own. A finding's smallest input is kept in the folder --keep.
-Exit status: 0 without findings, 1 with.
+Two engines mutate files written by the project's own simulators and exporters: hypothesis, and atheris, which is
+guided by the lines that an input reaches (the extra `fuzz`; if it is not installed, this is reported and hypothesis
+gets the whole time). Each target runs in a process of its own. A finding's smallest input is kept in the folder
+--keep. Exit status: 0 without findings, 1 with.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ UNLIMITED = 1 << 60
 
 
 def engines(wanted: str) -> tuple[Engine, ...]:
-    """Those that are wanted and there. Raises SystemExit when the only one that is wanted is missing."""
+    """The requested engines that are installed. Raises SystemExit if the only requested one is missing."""
     there = importlib.util.find_spec("atheris") is not None
     if wanted == "atheris" and not there:
         raise SystemExit("atheris is not installed: python -m pip install '.[fuzz]'")
@@ -46,7 +46,7 @@ def engines(wanted: str) -> tuple[Engine, ...]:
 
 
 def keep(finding: Finding, folder: Path) -> Path:
-    """Write the input of a finding and what it did; the file's name is that of its content."""
+    """Write the input of a finding and its effect; the file is named after its content."""
     place = folder / finding.target
     place.mkdir(parents=True, exist_ok=True)
     path = place / hashlib.sha256(finding.data).hexdigest()[:16]
@@ -58,7 +58,7 @@ def keep(finding: Finding, folder: Path) -> Path:
 def swept(
     target: Target, group: str, with_engines: Sequence[Engine], options: argparse.Namespace
 ) -> dict[Engine, Outcome]:
-    """One target under each engine, for its share of the time."""
+    """Fuzz one target with each engine for its share of the time."""
     share_s: float = options.seconds_per_target / len(with_engines)
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
         return {
@@ -70,7 +70,7 @@ def swept(
 
 
 def row(target: Target, outcomes: dict[Engine, Outcome], revision: str) -> dict[str, object]:
-    """What is recorded of a target."""
+    """The recorded row of a target."""
     each = list(outcomes.values())
     seconds, inputs = sum(one.seconds for one in each), sum(one.inputs for one in each)
     return {
@@ -88,7 +88,7 @@ def row(target: Target, outcomes: dict[Engine, Outcome], revision: str) -> dict[
 
 
 def record(new: dict[str, object], order: Sequence[str]) -> None:
-    """Write a row into today's results; rows of other targets stay as they were measured."""
+    """Write a row into today's results; the rows of other targets stay."""
     stem = RESULTS / f"fuzz-{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
     path = stem.with_suffix(".json")
     before = json.loads(path.read_text())["targets"] if path.exists() else []
@@ -99,7 +99,7 @@ def record(new: dict[str, object], order: Sequence[str]) -> None:
 
 
 def markdown(rows: Sequence[dict[str, object]]) -> str:
-    """The table as people read it."""
+    """Format the rows as Markdown."""
     total = sum(sum(counts.values()) for one in rows if isinstance(counts := one["inputs"], dict))
     here = machine()
     lines = [
@@ -130,7 +130,7 @@ def markdown(rows: Sequence[dict[str, object]]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Sweep and tell. The exit status."""
+    """Sweep and report; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m bench.torture.fuzz", description="Bad input for every parser.")
     parser.add_argument("--seconds-per-target", type=float, default=60.0, help="of each engine's share together")
     parser.add_argument("--inputs", type=int, default=UNLIMITED, help="at most so many, in place of the time alone")
@@ -145,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if unknown:
         parser.error(f"there is no target {unknown[0]}; there are {', '.join(targets)}")
     with_engines = engines(options.engine)
-    revision = commit()  # before results make a difference
+    revision = commit()  # before the results change the working tree
     rows: list[dict[str, object]] = []
     for name in options.target or targets:
         group, target = targets[name]

@@ -1,7 +1,7 @@
-"""The process that reads inputs, of one target after the other. It may be killed at any moment: its folder tells why.
+"""The process that parses inputs, target by target. It may be killed at any moment; its folder then shows the cause.
 
-In the folder: plan.json (what to read), slot (the input it is at), told.jsonl (findings, and ends of targets), trace
-(where it was when it crashed or was stopped), and for each target its seeds and its corpus.
+The folder holds plan.json (what to do), slot (the current input), told.jsonl (findings and finished targets), trace
+(where it was when it crashed or was stopped), and the seeds and corpus of each target.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from bench.torture.fuzz.target import Target, fault_of
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 INSTRUMENTED = ["service", "drivers", "simulators", "yaml", "trimesh", "pydicom"]
-_CHUNK = 100  # examples of one round of hypothesis
+_CHUNK = 100  # examples per round of hypothesis
 _MINIMISE_S = 4.0
 _UNWANTED = (
     hypothesis.HealthCheck.too_slow,
@@ -45,7 +45,7 @@ _MIB = 1 << 20
 
 
 class Reader:
-    """Feeds one target and tells what it did not refuse as it should."""
+    """Feeds inputs to one target and reports those that it did not refuse properly."""
 
     def __init__(self, target: Target, slot: Slot, folder: Path, known: set[str]) -> None:
         self.target = target
@@ -54,7 +54,7 @@ class Reader:
         self._slot, self._folder, self._known = slot, folder, known
         self._scratch = Path(tempfile.mkdtemp(prefix="fuzz-", dir=os.environ.get("TMPDIR")))
         slot.open(target.name, target.seconds)
-        # The seeds first, so that what a parser loads at its first call is not counted as an input's.
+        # The seeds first, so that what a parser loads at its first call is not attributed to an input.
         for seed in self.seeds:
             if fault := self._outcome(seed):
                 self._keep(fault, seed)
@@ -63,7 +63,7 @@ class Reader:
         self._base_kib = _peak_kib()
 
     def read(self, data: bytes) -> None:
-        """One input."""
+        """Parse one input."""
         fault = self._timed(data)
         grown_kib = max(_peak_kib() - self._base_kib, 0)
         self._slot.end(refused=self.refused, peak_kib=grown_kib)
@@ -74,7 +74,7 @@ class Reader:
             self._keep(fault, data if fault.startswith("memory") else self._smallest(data, fault))
 
     def close(self) -> None:
-        """Say how much was read, and leave nothing behind."""
+        """Report the number of inputs and clean up."""
         slot = self._slot
         self._tell({"counts": [slot.inputs, slot.refused, slot.spent_s, slot.peak_kib]})
         shutil.rmtree(self._scratch, ignore_errors=True)
@@ -92,7 +92,7 @@ class Reader:
         return minimised(data, shows, tries=3000, seconds=_MINIMISE_S)
 
     def _outcome(self, data: bytes) -> str:
-        """What is wrong with how the target took this input; "" for nothing."""
+        """The fault in how the target handled this input; "" if there is none."""
         error = self._raised(data)
         self.refused = error is not None
         fault = fault_of(self.target, error) if error is not None else ""
@@ -122,7 +122,7 @@ class Reader:
 
 
 def _seeds(target: Target, folder: Path) -> list[bytes]:
-    """Made once for all processes of a sweep; the corpus of the other engine begins with them."""
+    """The target's seeds, made once for all processes of a sweep; the other engine's corpus begins with them."""
     place = folder / "seeds"
     if not place.exists():
         with tempfile.TemporaryDirectory(prefix="seeds-") as made_in:
@@ -135,7 +135,7 @@ def _seeds(target: Target, folder: Path) -> list[bytes]:
 
 
 def _bound_memory(mib: int) -> None:
-    """Where the kernel stops this process: well beyond the bound that counts, which is on what is really used."""
+    """Set the kernel's memory limit well above the bound that is checked, which applies to the memory really used."""
     mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (mapped + (3 * mib + 1024) * _MIB, most))
@@ -149,14 +149,14 @@ def _forget_peak() -> None:
 
 
 def _peak_kib() -> int:
-    # Not ru_maxrss of this process: that one begins with what its parent had when it was started.
+    # Not ru_maxrss of this process, which begins with the value of its parent.
     with Path("/proc/self/status").open("rb") as status:
         own = next(int(line.split()[1]) for line in status if line.startswith(b"VmHWM"))
     return max(own, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 
 
 def _place(error: BaseException) -> str:
-    """The innermost line of the project that an exception passed, by which findings are told apart."""
+    """The innermost line of the project that the exception passed, which identifies a finding."""
     found = ""
     for frame, line in traceback.walk_tb(error.__traceback__):
         path = Path(frame.f_code.co_filename)
@@ -169,7 +169,7 @@ def _place(error: BaseException) -> str:
 
 
 def explore(reader: Reader, *, seed: int, inputs: int, seconds: float) -> None:
-    """Hypothesis: mutated seeds, the same ones for the same seed."""
+    """Fuzz with hypothesis: mutated seeds, reproducible for a given `seed`."""
     ends_s = time.monotonic() + seconds
     done = rounds = 0
     while done < inputs and time.monotonic() < ends_s:
@@ -197,7 +197,7 @@ def explore(reader: Reader, *, seed: int, inputs: int, seconds: float) -> None:
 
 
 def explore_by_coverage(reader: Reader, atheris: Any, folder: Path, *, seed: int, seconds: float) -> None:
-    """atheris: libFuzzer over a corpus that begins with the seeds and grows with the lines reached. Never returns."""
+    """Fuzz with atheris: libFuzzer with a corpus that starts with the seeds and grows by coverage. Never returns."""
     words = [sys.argv[0], str(folder / reader.target.name / "corpus"), f"-max_total_time={max(1, round(seconds))}"]
     words += [f"-seed={seed + 1}", "-rss_limit_mb=0", "-max_len=65536", "-verbosity=0", "-timeout=3600"]
     atheris.Setup([*words, f"-artifact_prefix={folder}/"], reader.read)
@@ -205,14 +205,14 @@ def explore_by_coverage(reader: Reader, atheris: Any, folder: Path, *, seed: int
 
 
 def main() -> None:
-    """Read what the plan says."""
+    """Do what the plan says."""
     folder = Path(sys.argv[1])
     plan: dict[str, Any] = json.loads((folder / "plan.json").read_text())
     trace = (folder / "trace").open("w")
     faulthandler.enable(trace)
     faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
     warnings.simplefilter("ignore")
-    logging.disable(logging.CRITICAL)  # simulators say in their logs what they refuse
+    logging.disable(logging.CRITICAL)  # simulators log what they refuse
     slot = Slot(folder / "slot")
     atheris = importlib.import_module("atheris") if plan["engine"] == "atheris" else None
     with atheris.instrument_imports(include=INSTRUMENTED) if atheris else contextlib.nullcontext():

@@ -1,4 +1,4 @@
-"""Targets among files that devices deliver: photographs, scans, point clouds, CT slices, features of images."""
+"""Fuzz targets for files that devices deliver: photographs, scans, point clouds, CT slices, image features."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _pictures(_: Path) -> list[bytes]:
 def _exif(data: bytes, folder: Path) -> None:
     path = _put(folder, "DSC00007.ARW" if data.startswith(b"II*") else "DSC00007.JPG", data)
     record = read_exif(path)
-    canonical(camera_record(record))  # as an import writes it down
+    canonical(camera_record(record))  # as an import records it
     taken_utc_s(record.taken)
     record.settings(focus_mode=record.focus_mode, image_quality="JPEG")
 
@@ -103,7 +103,7 @@ def _obj_parts() -> list[tuple[str, bytes]]:
 
 
 def _exported(shape: Any, kind: str, **options: Any) -> bytes:
-    """As trimesh writes it, which has other habits than the simulated scanner."""
+    """Export with trimesh, whose files differ from those of the simulated scanner."""
     written = shape.export(file_type=kind, **options)
     return written.encode() if isinstance(written, str) else bytes(written)
 
@@ -180,7 +180,7 @@ _WHOLE: dict[str, Path] = {}
 
 
 def _series(data: bytes, folder: Path) -> None:
-    """The middle one of three slices is the input."""
+    """Read three slices, of which the middle one is the input."""
     whole = _WHOLE.get("series")
     if whole is None or not whole.exists():
         whole = _WHOLE["series"] = folder.parent / "series"

@@ -1,7 +1,7 @@
-"""Targets behind native libraries: a camera and a robot whose answers are spoilt on the wire.
+"""Fuzz targets behind native libraries: a camera and a robot whose answers are spoilt on the wire.
 
-The libraries (libgphoto2, ur_rtde) run in the driver's process, which may crash or hang: what counts is that whoever
-asked gets a DeviceError in time. An input is an offset, and bytes that are laid over the device's answers from there.
+The libraries (libgphoto2, ur_rtde) run in the driver's process, which may crash or hang; the caller must get a
+DeviceError in time. An input is an offset, and bytes that replace the device's answers from there on.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from simulators.ur_controller.controller import Controller
 from simulators.ur_controller.kinematics import MODELS
 from simulators.ur_controller.server import DASHBOARD_PORT, RTDE_PORT, SCRIPT_PORT, Server
 
-_CALL_S = 20.0  # after which the driver's process is ended
+_CALL_S = 20.0  # time after which the driver's process is ended
 _NEAR, _FAR = (f"127.{100 + os.getpid() % 100}.{os.getpid() // 100 % 250}.{last}" for last in (8, 9))
 
 
 class _Spoiler:
-    """Hands connections on to a device, and lays the input over what it answers."""
+    """Forwards connections to a device and overwrites its answers with the input."""
 
     def __init__(self, listen: tuple[str, int], device: tuple[str, int], *, spoils: bool = True) -> None:
         self._device, self._spoils = device, spoils
@@ -48,7 +48,7 @@ class _Spoiler:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def spoil(self, data: bytes) -> None:
-        """From the next connection on."""
+        """Overwrite answers from the next connection on."""
         at = struct.unpack("<I", data[:4].ljust(4, b"\0"))[0]
         self.at, self.over = at % 60_000, data[4:]
 
@@ -84,7 +84,7 @@ class _Spoiler:
 
 
 def _overlay(draw: DrawFn, data: bytes) -> bytes:
-    """Another place of the stream, and other bytes over it."""
+    """Choose another offset and other bytes for the overlay."""
     del data
     near = draw(st.sampled_from((400, 3_000, 60_000)))
     return struct.pack("<I", draw(st.integers(0, near))) + draw(st.binary(min_size=1, max_size=16))
@@ -105,7 +105,7 @@ class _CameraRig:
 
 @cache
 def _camera_rig() -> _CameraRig:
-    """Made once in each process; the driver's process ends with it."""
+    """The camera rig, made once per process; the driver's process ends with it."""
     server = CameraServer("127.0.0.1", 0, CameraBody(StillLife(96), FaultPlan(), BodyOptions(fast=True)), FaultPlan())
     server.__enter__()
     spoiler = _Spoiler(("127.0.0.1", 0), server.address)
@@ -161,10 +161,10 @@ def _robot_rig() -> _RobotRig:
 
 
 class _Never:
-    """A simulator that ends with its process."""
+    """A termination that is never set: the simulator ends with its process."""
 
     def is_set(self) -> bool:
-        """It is not."""
+        """Never set."""
         return False
 
 

@@ -1,4 +1,4 @@
-"""Makes an input smaller as long as it shows the same fault."""
+"""Reduces an input while it still shows the same fault."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Callable
 
 
 def minimised(data: bytes, shows: Callable[[bytes], bool], *, tries: int, seconds: float) -> bytes:
-    """Delta debugging over bytes: halves, quarters … single bytes are left out, and what is left becomes plain.
+    """Reduce an input by delta debugging: drop halves, quarters … single bytes, then simplify the remaining ones.
 
     Args:
-        data: shows the fault.
-        shows: whether an input shows the same one.
-        tries, seconds: after which the smallest input so far is good enough.
+        data: an input that shows the fault.
+        shows: whether an input shows the same fault.
+        tries, seconds: limits, after which the smallest input so far is returned.
     """
     ends_s = time.monotonic() + seconds
     size = max(len(data) // 2, 1)

@@ -1,4 +1,4 @@
-"""How a real file becomes a bad one: hypothesis strategies over bytes, over text, and over JSON trees."""
+"""Mutations of valid files: hypothesis strategies over bytes, text and JSON trees."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis.strategies import DrawFn, SearchStrategy
 
 Mutation = Callable[[DrawFn, bytes], bytes]
 
-LARGEST = 1 << 20  # bytes of a mutated input; seeds are smaller
+LARGEST = 1 << 20  # size limit of a mutated input; seeds are smaller
 _NUMBER = re.compile(rb"[-+]?[0-9]+(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?")
 _WORD = re.compile(rb"[A-Za-z_][A-Za-z_0-9]*")
 _INTEGERS = (
@@ -54,13 +54,13 @@ def _at(draw: DrawFn, data: bytes) -> int:
 
 
 def flip(draw: DrawFn, data: bytes) -> bytes:
-    """One byte becomes another one."""
+    """Replace one byte."""
     at = _at(draw, data)
     return data[:at] + bytes([draw(st.integers(0, 255))]) + data[at + 1 :]
 
 
 def integer(draw: DrawFn, data: bytes) -> bytes:
-    """A count, size or offset becomes one on the edge of what its field can say."""
+    """Replace a count, size or offset by a boundary value of its field."""
     at, width = _at(draw, data), draw(st.sampled_from((1, 2, 4, 8)))
     value = draw(st.sampled_from(_INTEGERS)) & ((1 << 8 * width) - 1)
     order = draw(st.sampled_from(("little", "big")))
@@ -68,30 +68,30 @@ def integer(draw: DrawFn, data: bytes) -> bytes:
 
 
 def cut(draw: DrawFn, data: bytes) -> bytes:
-    """The end is missing."""
+    """Truncate the end."""
     return data[: draw(st.integers(0, len(data)))]
 
 
 def remove(draw: DrawFn, data: bytes) -> bytes:
-    """Something within is missing."""
+    """Remove a part from within."""
     at = _at(draw, data)
     return data[:at] + data[at + draw(st.integers(1, 64)) :]
 
 
 def again(draw: DrawFn, data: bytes) -> bytes:
-    """A part stands there several times."""
+    """Repeat a part."""
     at, length, times = _at(draw, data), draw(st.integers(1, 64)), draw(st.sampled_from((2, 3, 100, 1000)))
     return data[:at] + data[at : at + length] * times + data[at + length :]
 
 
 def token(draw: DrawFn, data: bytes) -> bytes:
-    """Something that parsers stumble over is inserted."""
+    """Insert something that often breaks parsers."""
     at = _at(draw, data)
     return data[:at] + draw(st.sampled_from(_TOKENS)) + data[at:]
 
 
 def nest(draw: DrawFn, data: bytes) -> bytes:
-    """Brackets that open and open."""
+    """Insert deeply nested brackets."""
     at, depth = _at(draw, data), draw(st.sampled_from((60, 900, 990, 2_000, 30_000)))
     return data[:at] + draw(st.sampled_from(_NESTS)) * depth + data[at:]
 
@@ -103,7 +103,7 @@ BYTES: tuple[Mutation, ...] = (flip, integer, cut, remove, again, token, nest)
 
 
 def number(draw: DrawFn, data: bytes) -> bytes:
-    """A number of the text becomes one that cannot be, or no number."""
+    """Replace a number in the text by an impossible one, or by something that is not a number."""
     found = list(_NUMBER.finditer(data, 0, 1 << 16))
     if not found:
         return token(draw, data)
@@ -112,7 +112,7 @@ def number(draw: DrawFn, data: bytes) -> bytes:
 
 
 def word(draw: DrawFn, data: bytes) -> bytes:
-    """A word becomes another word of the file, or something strange."""
+    """Replace a word by another word of the file, or by something strange."""
     found = list(_WORD.finditer(data, 0, 1 << 16))
     if not found:
         return token(draw, data)
@@ -122,7 +122,7 @@ def word(draw: DrawFn, data: bytes) -> bytes:
 
 
 def line(draw: DrawFn, data: bytes) -> bytes:
-    """A line is missing, stands there twice, or somewhere else."""
+    """Remove, repeat or move a line."""
     lines = data.split(b"\n")
     at, to = (draw(st.integers(0, len(lines) - 1)) for _ in range(2))
     what = draw(st.sampled_from(("missing", "twice", "elsewhere")))
@@ -141,7 +141,7 @@ TEXT: tuple[Mutation, ...] = (*BYTES, number, word, line, number, word)
 
 
 def tree(draw: DrawFn, data: bytes) -> bytes:
-    """Within a JSON document (or one line of several) a value becomes another one, goes, or has its name twice."""
+    """Replace or remove a value within a JSON document (or one line of several), or duplicate its key."""
     lines = data.split(b"\n")
     at = draw(st.integers(0, len(lines) - 1)) if _is_lines(lines) else -1
     try:
@@ -196,7 +196,7 @@ JSON: tuple[Mutation, ...] = (*TEXT, tree, tree, tree, tree)
 
 
 def mutated(seeds: Sequence[bytes], mutations: Sequence[Mutation]) -> SearchStrategy[bytes]:
-    """One of the seeds with one to five mutations, now and then spliced with another one."""
+    """One of the seeds with one to five mutations, occasionally spliced with another seed."""
 
     @st.composite
     def build(draw: DrawFn) -> bytes:

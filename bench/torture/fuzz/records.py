@@ -1,4 +1,4 @@
-"""Targets among records: signatures, bundles, time stamps, keys, events, snapshots, and the forms of the web."""
+"""Fuzz targets for records: signatures, bundles, time stamps, keys, events, snapshots and web forms."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ MEMBERS = ("manifest.json", "events.jsonl", "site_events.jsonl", "artefacts.json
 
 @dataclass(frozen=True)
 class _Recorded:
-    """A data folder with a completed run, its bundle, and the bundle unpacked."""
+    """A data folder with a completed run, and its bundle, packed and unpacked."""
 
     data: Path
     run_id: str
@@ -60,7 +60,7 @@ class _Recorded:
 
 @cache
 def _recorded() -> _Recorded:
-    """Recorded once in each process that needs it, in a folder that goes with its TMPDIR."""
+    """The recorded data, made once per process in a folder that is deleted with its TMPDIR."""
     folder = Path(tempfile.mkdtemp(prefix="recorded-", dir=os.environ.get("TMPDIR")))
     with Store.open(folder / "data") as store:
         bench = begin_run(store, PROTOCOL, folder)
@@ -86,7 +86,7 @@ def _stamp(folder: Path, signed: Checkpoint) -> tuple[bytes, Path]:
 
 
 def _check(bundle: Path, certificates: Path | None = None) -> None:
-    """As the stand-alone verifier does, up to the words that it prints."""
+    """Verify a bundle as the stand-alone verifier does, apart from what it prints."""
     check = bundle_verifier.Check()
     check.run(bundle, None, certificates)
     bundle_verifier.report(check).encode()
@@ -94,7 +94,7 @@ def _check(bundle: Path, certificates: Path | None = None) -> None:
 
 
 def _small_zip(folder: Path) -> bytes:
-    """The records of the bundle without its files, stored and packed: a small zip, whose every byte counts."""
+    """The bundle's records without its files, stored and compressed: a small zip in which every byte counts."""
     with zipfile.ZipFile(folder / "small.zip", "w") as archive:
         for name in MEMBERS:
             kind = zipfile.ZIP_STORED if name.endswith(".sig") else zipfile.ZIP_DEFLATED
@@ -112,7 +112,7 @@ def _zip(data: bytes, folder: Path) -> None:
 
 
 def _members(_: Path) -> list[bytes]:
-    """A name of a member, and its content."""
+    """Seeds: a member's name and its content."""
     return [name.encode() + b"\n" + (_recorded().unpacked / name).read_bytes() for name in MEMBERS]
 
 
@@ -134,7 +134,7 @@ def _tokens(_: Path) -> list[bytes]:
 
 
 def _token(data: bytes, folder: Path) -> None:
-    """As the service reads a time stamp that it kept, and as the verifier does."""
+    """Read a time stamp as the service reads a stored one, and as the verifier does."""
     known = _recorded()
     stamp = Timestamp(
         known.run_id, known.stamped.seq, "http://here", "2026-11-22T10:00:00Z", base64.b64encode(data).decode()
@@ -177,7 +177,7 @@ def _logs(_: Path) -> list[bytes]:
 
 
 def _log(data: bytes, folder: Path) -> None:
-    """As `audit verify` and the next signature read it: every fault is named, none is raised."""
+    """Read a log as `audit verify` and the next signature do: every fault is reported and none is raised."""
     path = folder / NAME
     path.write_bytes(data)
     lines = read_log(path)
@@ -214,7 +214,7 @@ def _events(_: Path) -> list[bytes]:
 
 
 def _event(data: bytes, _: Path) -> None:
-    """The text of a row of the table of events."""
+    """Read the text of a row of the events table."""
     row: Any = SimpleNamespace(
         seq=1, run_id="run", at_utc="2026-11-22T10:00:00Z", monotonic_s=1.0, actor="ada",
         payload=data.decode(errors="replace"), previous_sha256="0" * 64, sha256="0" * 64,
@@ -250,7 +250,7 @@ def _snapshot(data: bytes, folder: Path) -> None:
 
 # --- web ----------------------------------------------------------------------------------------------------------
 
-_RUN = "RUN"  # stands in addresses for the run of the site
+_RUN = "RUN"  # placeholder in URLs for the site's run
 _REQUESTS: tuple[dict[str, Any], ...] = (
     {"path": "/sign-in", "role": "", "form": {"account": "grace", "password": "x", "next": "/"}},
     {"path": "/runs", "role": "supervisor", "form": {"protocol": "bench.yaml"}},
@@ -281,7 +281,7 @@ _REQUESTS: tuple[dict[str, Any], ...] = (
 
 @dataclass
 class _Site:
-    """A site with people of every role, and one run that waits and one that is over."""
+    """A site with people in every role, one waiting run and one finished run."""
 
     browsers: dict[str, Browser]
     run_id: str
@@ -292,7 +292,7 @@ _OPEN = contextlib.ExitStack()
 
 @cache
 def _site() -> _Site:
-    """Opened once in each process that needs it; it ends with the process."""
+    """The site, opened once per process; it ends with the process."""
     folder = Path(tempfile.mkdtemp(prefix="site-", dir=os.environ.get("TMPDIR")))
     site = _OPEN.enter_context(web_site(folder))
     site.record_run()
@@ -313,18 +313,21 @@ def _requests(_: Path) -> list[bytes]:
 
 
 def _web(data: bytes, _: Path) -> None:
-    """A request as JSON: path, role of who is signed in, form or query, content type; its token is always right."""
+    """Send a request given as JSON: path, role of the user, form or query, content type.
+
+    Its CSRF token is always valid.
+    """
     try:
         request = json.loads(data)
         path, role = str(request["path"]), str(request.get("role", ""))
         path.encode()
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return  # no request came of it
+        return  # the input did not give a request
     site = _site()
     browser = site.browsers.get(role, site.browsers[""])
     address = "/" + path.replace(_RUN, site.run_id).lstrip("/")[:2000]
     form, query = request.get("form"), request.get("query")
-    with contextlib.suppress(ValueError, TypeError, httpx.InvalidURL):  # what no client could send
+    with contextlib.suppress(ValueError, TypeError, httpx.InvalidURL):  # requests that no client could send
         if isinstance(form, dict):
             csrf = browser.person.csrf if role in site.browsers and role else ""
             answer = browser.post(address, data={**form, "csrf": csrf}, follow_redirects=False)

@@ -1,4 +1,4 @@
-"""The table of all targets: every parser of the project, in groups that are imported apart."""
+"""The table of all fuzz targets: every parser of the project, in groups that are imported separately."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ GROUPS = tuple(f"bench.torture.fuzz.{name}" for name in ("written", "delivered",
 
 
 def targets_of(group: str) -> tuple[Target, ...]:
-    """The targets of one group; its parsers are imported now."""
+    """Import the parsers of one group and return its targets."""
     return cast("tuple[Target, ...]", importlib.import_module(group).TARGETS)
 
 
 def table() -> dict[str, tuple[str, Target]]:
-    """Every target with its group, by name."""
+    """All targets with their group, by name."""
     return {target.name: (group, target) for group in GROUPS for target in targets_of(group)}

@@ -1,4 +1,4 @@
-"""What one target of the sweep is: a parser, real files to begin with, how they are spoilt, and what it may cost."""
+"""The definition of a fuzz target: a parser, seed files, their mutations, and the cost limits."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 from bench.torture.fuzz.mutations import BYTES, Mutation
 from service.core.errors import OrthocaptureError
 
-LONGEST_LINE = 6_000  # characters of an error as people read it
+LONGEST_LINE = 6_000  # maximum length of an error message
 
 
 class MisbehavedError(Exception):
-    """The parser took something for good that is not, or answered as it must not."""
+    """The parser accepted a bad input, or answered wrongly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,17 +21,17 @@ class Target:
     """One row of the table.
 
     Attributes:
-        name: as the command line and the results call it.
-        entry: what is tried, module:function.
-        parse: reads one input; gets the bytes and an empty folder of its own. What it raises is judged.
-        seeds: makes real inputs, as simulators and exporters of this project write them; gets an empty folder.
-        mutations: how a seed becomes an input.
-        errors: what the parser may raise.
-        says_place: whether its errors must name the file (or address) and what to do: everything but simulators,
-            whose errors have one text only.
-        memory_mib: beyond what the process has before.
-        seconds: of processor time for one input; eight times as long on the clock.
-        pace: inputs of the short version, in parts of the usual number: less where each takes long.
+        name: used on the command line and in the results.
+        entry: what is tested, module:function.
+        parse: parses one input; gets the bytes and an empty folder of its own. Its exceptions are judged.
+        seeds: makes valid inputs with the project's simulators and exporters; gets an empty folder.
+        mutations: how a seed is turned into an input.
+        errors: the exceptions that the parser may raise.
+        says_place: whether its errors must name the file (or address) and a remedy; false only for simulators, whose
+            errors have a single text.
+        memory_mib: limit for the memory growth of the process.
+        seconds: limit for the CPU time of one input; eight times as much in wall time.
+        pace: fraction of the usual number of inputs in the short version; below 1 for slow targets.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Target:
 
 
 def fault_of(target: Target, error: BaseException) -> str:
-    """Why an exception is a finding, "" for one that people can act upon."""
+    """Why an exception is a finding; "" if people can act on it."""
     if isinstance(error, MemoryError):
         return "memory: MemoryError"
     if not isinstance(error, target.errors):

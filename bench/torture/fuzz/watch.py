@@ -1,4 +1,4 @@
-"""Watches the process that reads: an input at which it dies or hangs is a finding, kept and made smaller."""
+"""Watches the parsing process: an input that kills or hangs it is a finding, which is kept and minimised."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from bench.torture.fuzz.slot import Reading, Slot
 
 Engine = Literal["hypothesis", "atheris"]
 START_S = 240.0  # imports and seeds on a busy machine
-CLOCK_FACTOR = 10  # on the clock an input may take so many times its processor time: machines are shared
+CLOCK_FACTOR = 10  # limit in wall time as a multiple of that in CPU time, because machines are shared
 _POLL_S = 0.05
-_REDUCING_S = 120.0  # each try is a process of its own
+_REDUCING_S = 120.0  # each try needs a process of its own
 _MOST_STARTS = 40
 _TICK = os.sysconf("SC_CLK_TCK")
 _FRAME = re.compile(r'File "([^"]+)", line (\d+) in (\S+)')
 
 
 class HarnessError(Exception):
-    """The sweep itself does not work."""
+    """The sweep itself has failed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One fault, and the smallest input that shows it."""
+    """A fault and the smallest input that shows it."""
 
     target: str
     fault: str
@@ -45,7 +45,7 @@ class Finding:
 
 @dataclass
 class Outcome:
-    """What a target withstood."""
+    """The results for one target."""
 
     inputs: int = 0
     refused: int = 0
@@ -54,7 +54,7 @@ class Outcome:
     findings: list[Finding] = field(default_factory=list[Finding])
 
     def add(self, inputs: int, refused: int, spent_s: float, peak_kib: int) -> None:
-        """What one process read of it."""
+        """Add the counts of one process."""
         self.seconds += spent_s
         self.inputs += inputs
         self.refused += refused
@@ -63,27 +63,27 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class _Death:
-    """How and at which input a process ended before its time."""
+    """How, and at which input, a process ended prematurely."""
 
     fault: str
     at: Reading
 
 
 class Sweep:
-    """Reads inputs of one group's targets in processes, and begins anew after each death."""
+    """Parses inputs for one group's targets in processes, and starts a new one after each death."""
 
     def __init__(self, group: str, engine: Engine, folder: Path, *, reducing_tries: int = 24) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self._group, self._folder = group, folder
         self._engine: Engine = engine
         self._reducing_tries = reducing_tries
-        # What a killed process leaves behind goes with the folder.
+        # Files left by a killed process are deleted with the folder.
         (folder / "tmp").mkdir(exist_ok=True)
         self._environment = {**os.environ, "TMPDIR": str(folder / "tmp")}
         self.outcomes: dict[str, Outcome] = {}
 
     def run_each(self, *, inputs: int, seconds: float, seed: int = 0) -> dict[str, Outcome]:
-        """All targets, one process after the other reading what its predecessor left: `inputs` times their pace."""
+        """Run all targets in one process, or in successive ones after a death: `inputs` times each target's pace."""
         each = {"inputs": inputs, "seconds": seconds}
         death = self._process({"targets": {}, "each": each, "paced": True, "seed": seed})
         if death is not None:
@@ -91,7 +91,7 @@ class Sweep:
         return self.outcomes
 
     def run(self, target: str, *, inputs: int, seconds: float, seed: int = 0) -> Outcome:
-        """One target, for a time or so many inputs."""
+        """Run one target for a time or a number of inputs."""
         outcome = self.outcomes.setdefault(target, Outcome())
         began_s = time.monotonic()
         for start in range(_MOST_STARTS):
@@ -114,7 +114,7 @@ class Sweep:
         return [finding.fault for outcome in self.outcomes.values() for finding in outcome.findings]
 
     def _process(self, plan: dict[str, Any]) -> _Death | None:
-        """One process from its start to its end. Raises HarnessError when it fails by itself."""
+        """Run one process to its end. Raises HarnessError if it fails by itself."""
         for name in ("slot", "told.jsonl"):
             (self._folder / name).unlink(missing_ok=True)
         whole = {"group": self._group, "engine": self._engine, "known": self._known(), **plan}
@@ -161,7 +161,7 @@ class Sweep:
         return used_s > at.bound_s or time.monotonic() - at.began_s > CLOCK_FACTOR * at.bound_s
 
     def _stopped_at(self, process: subprocess.Popen[bytes]) -> str:
-        """Where it hangs; then it is ended."""
+        """Find where the process hangs, then end it."""
         process.send_signal(signal.SIGUSR1)
         time.sleep(0.3)
         process.kill()
@@ -169,7 +169,7 @@ class Sweep:
         return self._last_place()
 
     def _last_place(self) -> str:
-        """The innermost line of the project in what faulthandler wrote."""
+        """The innermost line of the project in faulthandler's output."""
         for path, line, name in _FRAME.findall((self._folder / "trace").read_text(errors="replace")):
             parts = Path(path).parts
             package = next((one for one in ("service", "drivers", "simulators") if one in parts), "")
@@ -178,7 +178,7 @@ class Sweep:
         return "at unknown place"
 
     def _collect(self, at: Reading | None) -> None:
-        """What the process told; of a target that did not say its end (libFuzzer ends so), what the slot says."""
+        """Collect the process's reports; for a target without an end (libFuzzer reports none), use the slot."""
         path = self._folder / "told.jsonl"
         ended: set[str] = set()
         for text in path.read_text().splitlines() if path.exists() else ():
@@ -194,7 +194,7 @@ class Sweep:
             self.outcomes.setdefault(at.target, Outcome()).add(at.inputs, at.refused, at.spent_s, at.peak_kib)
 
     def _reduced(self, death: _Death) -> bytes:
-        """The input at which a process died or hung, made smaller."""
+        """Minimise the input at which a process died or hung."""
         kind = death.fault.split()[0]
         trial = Sweep(self._group, self._engine, self._folder)
 
@@ -217,5 +217,5 @@ def _processor_s(pid: int) -> float:
 
 
 def all_findings(outcomes: Sequence[Outcome]) -> list[Finding]:
-    """Of several outcomes, each fault once."""
+    """The findings of several outcomes, each fault once."""
     return list({(f.target, f.fault): f for outcome in outcomes for f in outcome.findings}.values())

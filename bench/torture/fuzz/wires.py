@@ -1,4 +1,4 @@
-"""Targets on wires: what simulators read of clients, and what drivers read of a robot, a camera and a light box."""
+"""Fuzz targets on wires: what simulators read from clients, and drivers from a robot, a camera and a light box."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from simulators.ur_controller.server import LineLink, RtdeLink, ScriptLink, Serv
 from simulators.world import Scene
 
 _HOST = f"127.{100 + os.getpid() % 100}.{os.getpid() // 100 % 250}.7"  # the ports of a robot are fixed
-_CYCLES = 4  # of the controller, after the bytes
+_CYCLES = 4  # of the controller after the bytes
 
 
 # --- the simulated robot ------------------------------------------------------------------------------------------
@@ -55,7 +55,7 @@ def _robot(link: Callable[[socket.socket, Server], Any]) -> Callable[[bytes, Pat
         ours, theirs = socket.socketpair()
         ours.setblocking(False)
         try:
-            # As the network hands it over, in two parts.
+            # As the network delivers it, in two parts.
             one = link(ours, server)
             for part in (data[: len(data) // 2], data[len(data) // 2 :]):
                 if part and not one.dead:
@@ -109,7 +109,7 @@ def _dashboard_lines(_: Path) -> list[bytes]:
 
 
 def _scripts(_: Path) -> list[bytes]:
-    """In the form of the vendor's control script, and a small one."""
+    """Seeds in the form of the vendor's control script, and a small script."""
     control = """\
 def rtde_control():
   # registers
@@ -132,7 +132,7 @@ end
 
 @contextlib.contextmanager
 def _threads_watched() -> Generator[list[BaseException]]:
-    """What threads die of while the block runs."""
+    """Collect the exceptions that end threads within the block."""
     died: list[BaseException] = []
     before = threading.excepthook
 
@@ -169,10 +169,10 @@ def _sessions(_: Path) -> list[bytes]:
 
 
 def _say(address: tuple[str, int], data: bytes) -> None:
-    """Send all of it, and read until the other side closes."""
+    """Send everything, and read until the peer closes."""
     with socket.create_connection(address, timeout=4.0) as link, contextlib.suppress(ConnectionError):
         link.sendall(data)
-        with contextlib.suppress(OSError):  # closed already
+        with contextlib.suppress(OSError):  # already closed
             link.shutdown(socket.SHUT_WR)
         while link.recv(1 << 16):
             pass
@@ -215,12 +215,12 @@ def _world_requests(_: Path) -> list[bytes]:
 
 
 class _WatchedWorld(WorldServer):
-    """Keeps what its threads die of."""
+    """Keeps the exceptions of its threads."""
 
     died: BaseException | None = None
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """See socketserver."""
+        """Keep the current exception."""
         del request, client_address
         self.died = self.died or sys.exception()
 
@@ -262,7 +262,7 @@ def _fault_plan(data: bytes, _: Path) -> None:
 
 
 class _Answering:
-    """A server that answers every line, or the connection itself, with the next part of the input."""
+    """A server that answers every line, or each connection, with the next part of the input."""
 
     def __init__(self, host: str, port: int, parts: list[bytes]) -> None:
         self._parts = itertools.cycle(parts or [b""])
@@ -291,31 +291,31 @@ class _Answering:
 
 
 class _Dashboard:
-    """Stands for the vendor's client, which is not what is tried here: it hands on what the controller says."""
+    """Replaces the vendor's client, which is not under test, and forwards what the controller answers."""
 
     def __init__(self, said: str) -> None:
         self._said = said
 
     def connect(self, timeout_ms: int) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def polyscopeVersion(self) -> str:
-        """What the controller says."""
+        """Return the controller's answer."""
         return self._said
 
     def isInRemoteControl(self) -> bool:
-        """It is."""
+        """Always true."""
         return True
 
     def stop(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def isConnected(self) -> bool:
-        """It is."""
+        """Always true."""
         return True
 
     def disconnect(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
 
 def _dashboard_answers(_: Path) -> list[bytes]:
@@ -338,12 +338,12 @@ def _box_answers(_: Path) -> list[bytes]:
 
 
 def _box_driver(data: bytes, _: Path) -> None:
-    """Whatever is asked, the box says all of this."""
+    """Query a box that answers everything with the input."""
     with _Answering("127.0.0.1", 0, [data[: 1 << 16]]) as port:
         box = SerialLightbox(LightboxConfig(port=f"socket://127.0.0.1:{port}", timeout_s=0.05))
         try:
             identity = box.open()
-            canonical(dataclasses.asdict(identity))  # as a run writes it down
+            canonical(dataclasses.asdict(identity))  # as a run records it
             canonical(dataclasses.asdict(box.read()))
             canonical({"presses": box.pedal_presses()})
             box.report()

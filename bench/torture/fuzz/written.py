@@ -1,4 +1,4 @@
-"""Targets among files that people write: protocols, rig files, lists of imports, poses, cameras, spheres, joints."""
+"""Fuzz targets for files that people write: protocols, rig files, import lists, poses, cameras, spheres, joints."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MODEL_PARTS = ("cameras", "images", "frames", "points3D", "rigs")
 
 
 def _poses() -> dict[str, Transform]:
-    """Three of them, apart."""
+    """Three distinct poses."""
     poses: dict[str, Transform] = {}
     for k in range(3):
         c, s = np.cos(0.2 * k), np.sin(0.2 * k)
@@ -162,7 +162,7 @@ def _hand_eyes(_: Path) -> list[bytes]:
 def _hand_eye(data: bytes, folder: Path) -> None:
     path = _put(folder, "hand_eye.json", data)
     _finite(read_hand_eye(path))
-    document = parse_json(data, name="hand_eye.json", remedy="")  # as it was read
+    document = parse_json(data, name="hand_eye.json", remedy="")  # as it was parsed
     if isinstance(document.get("arm_correction"), dict):
         read_arm_correction(document["arm_correction"])
 
@@ -175,13 +175,13 @@ def _box_files(_: Path) -> list[bytes]:
 
 
 def _packed(parts: dict[str, bytes]) -> bytes:
-    """Several files as one input: a line of names and sizes, then their bytes."""
+    """Pack several files into one input: a line of names and sizes, then their bytes."""
     head = " ".join(f"{name}:{len(data)}" for name, data in parts.items())
     return head.encode() + b"\n" + b"".join(parts.values())
 
 
 def _unpack(data: bytes, folder: Path, suffix: str) -> None:
-    """The files of an input; where its first line is spoilt, everything goes into the images."""
+    """Unpack the files of an input; if its first line is spoilt, everything goes into the images."""
     head, _, rest = data.partition(b"\n")
     for entry in head.split(b" "):
         name, _, size = entry.partition(b":")
