@@ -28,7 +28,7 @@ class Noise:
     def octaves(self, name: int, cell_m: float, count: int, gain: float = 0.6, stretch: float = 1.0) -> Array32:
         """Sum `count` fields, each with half the feature size and `gain` times the amplitude of the last.
 
-        About unit variance.
+        The result has about unit variance.
         """
         total = np.zeros(self.shape, dtype=np.float32)
         power = 0.0
