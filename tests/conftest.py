@@ -1,4 +1,4 @@
-"""What holds for every test: repeatable, and one thread of linear algebra a process as in the program."""
+"""Settings for all tests: repeatable examples, and one thread of linear algebra per process, as in the program."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import os
 
 from hypothesis import settings
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is loaded, here and in processes started from here
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported, here and in child processes
 
-# The same examples every time: a failure belongs to the change. `--hypothesis-profile=default` looks for new ones.
+# The same examples every time, so that a failure is due to the change. `--hypothesis-profile=default` tries new ones.
 settings.register_profile("repeatable", derandomize=True, database=None)
 settings.load_profile("repeatable")

@@ -1,4 +1,4 @@
-"""Watches a simulated arm over a connection of its own: when it moved, and when it came to rest, by its own clock."""
+"""Observes a simulated arm over a separate connection: when it moved and came to rest, on the controller's clock."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from tests.support.ur_rtde_protocol import RtdeClient
 from tests.support.waiting import until
 
-LONGEST_STEP_S = 0.05  # between two samples; a simulator that did not get its turn is not counted for longer
+LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator was not scheduled
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """One sample: the controller's time, how fast the fastest joint is driven, whether a program runs."""
+    """One sample: the controller's time, the speed of the fastest driven joint, whether a program runs."""
 
     time_s: float
     speed_rad_s: float
@@ -24,7 +24,7 @@ class Seen:
 
 
 class ArmWatch:
-    """Every sample since the watch began."""
+    """All samples since the watch began."""
 
     def __init__(self, host: str) -> None:
         self._client = RtdeClient(host)
@@ -40,7 +40,7 @@ class ArmWatch:
         self._client.close()
 
     def mark(self) -> int:
-        """The present moment, for what follows."""
+        """Mark the present moment, for the methods that take `since`."""
         return len(self._seen)
 
     @property
@@ -54,7 +54,7 @@ class ArmWatch:
         until(lambda: self.now.speed_rad_s == 0.0, "it rests", 20.0, every_s=0.01)
 
     def moved_for_s(self, since: int) -> float:
-        """How long after a moment the arm was last driven, in the controller's time; 0: never."""
+        """Time from a mark until the arm was last driven, on the controller's clock; 0 if it never was."""
         elapsed_s = last_s = 0.0
         for before, sample in zip(self._seen[since - 1 :], self._seen[since:], strict=False):
             elapsed_s += min(sample.time_s - before.time_s, LONGEST_STEP_S)
@@ -63,7 +63,7 @@ class ArmWatch:
         return last_s
 
     def way_rad(self, since: int) -> float:
-        """How far the first joint has come since a moment."""
+        """How far the first joint has moved since a mark."""
         return abs(self.now.joint_rad - self._seen[since - 1].joint_rad)
 
     def _run(self) -> None:
@@ -77,7 +77,7 @@ class ArmWatch:
 
 @contextlib.contextmanager
 def watched_arm(host: str) -> Generator[ArmWatch]:
-    """Watch the arm at this address."""
+    """Observe the arm at this address."""
     watch = ArmWatch(host)
     try:
         yield watch

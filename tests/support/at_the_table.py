@@ -1,4 +1,4 @@
-"""A technician with a tablet beside the table: a run that has begun, is driven, and is controlled from a screen."""
+"""A technician with a tablet beside the table, who controls a run in progress from a screen."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STANDING = {"doing": "asking", "robot": "standing", "robot_name": "robot"}
 def at_the_table(
     server: Served, browser: Browser, size: tuple[int, int] = TABLET, *, protocol: str = PROTOCOL, touch: bool = False
 ) -> Generator[tuple[Screen, str]]:
-    """A technician before a run of her own that has begun and is driven, and that she controls."""
+    """A technician's screen that controls her own run in progress."""
     with web_site(server.data.parent) as web:
         run_id = web.begin_run(protocol).run_id
     with attended(server.data, {run_id: STANDING}), screen(browser, server.url, size, touch=touch) as tablet:
@@ -36,13 +36,13 @@ def at_the_table(
 
 
 def record(server: Served, run_id: str, *payloads: Payload) -> None:
-    """What happened meanwhile."""
+    """Record what happened meanwhile."""
     with Store.open(server.data) as store:
         store.record(run_id, list(payloads), actor="grace")
 
 
 class _LeftError(Exception):
-    """Nobody is there any more."""
+    """The person has gone."""
 
 
 def _leave(_question: AskOperator, _state: RunState) -> OperatorAction:

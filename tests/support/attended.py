@@ -1,4 +1,4 @@
-"""Runs that look driven: this process holds their leases and says of them what a runner would say."""
+"""Runs that look driven: this process holds their leases and writes the snapshots that a runner would write."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LEASE_S = 600.0
 
 @contextmanager
 def attended(data: Path, runs: Mapping[str, Mapping[str, Any]]) -> Generator[None]:
-    """Run names with the fields of their snapshots; nothing moves, nothing is recorded."""
+    """Attend these runs, with the given fields in their snapshots; nothing moves and nothing is recorded."""
     over = threading.Event()
 
     def tell() -> None:
@@ -40,5 +40,5 @@ def attended(data: Path, runs: Mapping[str, Mapping[str, Any]]) -> Generator[Non
         finally:
             over.set()
             teller.join()
-            for run_id in runs:  # who ends runners reads process numbers there
+            for run_id in runs:  # code that ends runners reads their pids there
                 (data / "monitor" / f"{run_id}.json").unlink(missing_ok=True)

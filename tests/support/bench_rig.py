@@ -1,4 +1,4 @@
-"""A rig in memory for tests of the runner: an arm, a camera, a light box, and an operator who answers by script."""
+"""An in-memory rig for tests of the runner: arm, camera, light box, and an operator who answers from a script."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ def _nothing(_count: int) -> None:
 
 @dataclass
 class BenchArm:
-    """An arm whose six joints are the flange's position and rotation vector: its kinematics are exact.
+    """An arm whose six joints are the flange's position and rotation vector, so that its kinematics are exact.
 
-    A motion takes TRAVEL_S; the stream is what the arm did, sampled at 500 Hz.
+    A motion takes TRAVEL_S; the stream is the arm's actual motion, sampled at 500 Hz.
     """
 
     safety: SafetyState = SafetyState.NORMAL
@@ -118,7 +118,7 @@ class BenchArm:
         self.move_joints(to_rotation_vector(T_base_flange), speed_rad_s=1.0, acceleration_rad_s2=1.0)
 
     def dawdle(self) -> None:
-        """The motion under way takes ten seconds: whoever wants to stop it has the time, on any machine."""
+        """Make the current motion take ten seconds, so that a test has time to stop it on any machine."""
         start_s, start, _, target = self._legs[-1]
         self._legs[-1] = (start_s, start, start_s + 10.0, target)
 
@@ -148,7 +148,7 @@ class BenchArm:
 
     def _joints(self, at_s: float) -> Array:
         begun, origin, end, target = next((leg for leg in reversed(self._legs) if leg[0] <= at_s), self._legs[0])
-        if at_s >= end:  # exactly there, wherever it came from
+        if at_s >= end:  # exactly at the target, wherever it came from
             return target
         return origin + (at_s - begun) / (end - begun) * (target - origin)
 
@@ -159,7 +159,7 @@ class BenchArm:
 
 
 def numbered(exposure: int) -> NDArray[np.uint8]:
-    """A small picture with a number."""
+    """A small picture showing a number."""
     picture = np.full((40, 60, 3), 255, dtype=np.uint8)
     cv2.putText(picture, str(exposure), (5, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (0, 0, 0))
     return picture
@@ -167,16 +167,16 @@ def numbered(exposure: int) -> NDArray[np.uint8]:
 
 @dataclass
 class BenchCamera:
-    """A camera that writes a small real JPEG, another one each time."""
+    """A camera that writes a small real JPEG, a different one each time."""
 
-    on_capture: Callable[[int], None] = _nothing  # called with the exposure's number; may raise, as a camera fails
+    on_capture: Callable[[int], None] = _nothing  # called with the exposure's number; may raise
     exif: Callable[[CameraSettings], CameraSettings] = lambda applied: applied
-    picture: Callable[[int], NDArray[np.uint8]] = numbered  # of the exposure's number
+    picture: Callable[[int], NDArray[np.uint8]] = numbered  # of the exposure with this number
     connected: bool = False
     opened: int = 0
     exposures: int = 0
     applied: CameraSettings | None = None
-    # Presses of its own button that nobody has collected; with settings to which somebody has turned its dials.
+    # Presses of its own button that were not collected yet; not None: settings to which the dials were turned.
     pressed: list[CameraSettings | None] = field(default_factory=list[CameraSettings | None])
 
     def open(self) -> DeviceIdentity:
@@ -272,7 +272,7 @@ class BenchLightbox:
 
 @dataclass
 class BenchRig:
-    """service.steps.context.Devices around these."""
+    """service.steps.context.Devices with these in-memory devices."""
 
     arm: BenchArm = field(default_factory=BenchArm)
     shutter: BenchCamera = field(default_factory=BenchCamera)
@@ -291,7 +291,7 @@ class BenchRig:
         return self.shutter
 
     def imported(self) -> ImportList | None:
-        """Nothing."""
+        """No imported files."""
         return None
 
     def scanner(self, name: str | None = None) -> Scanner:
@@ -336,14 +336,14 @@ Answer = Callable[[AskOperator, RunState], OperatorAction | None]
 
 
 def agree(question: AskOperator, _state: RunState) -> OperatorAction | None:
-    """Confirm with every item ticked, or sign; a question of recovery is left to the test."""
+    """Confirm with every item ticked, or sign; questions about recovery are left to the test."""
     if question.for_ == "recovery":
         raise AssertionError(f"an unexpected question: {question.text}")
     return answer(question, question.for_)
 
 
 def answer(question: AskOperator, verb: str, **fields: object) -> OperatorAction:
-    """An action on the step that is asked about."""
+    """An action on the step that the question is about."""
     full: dict[str, object] = {"action": verb, "step": question.step, **fields}
     if verb == "confirm":
         full.setdefault("checklist", question.checklist)
@@ -355,7 +355,7 @@ def answer(question: AskOperator, verb: str, **fields: object) -> OperatorAction
 
 @dataclass
 class ScriptedOperator:
-    """Answers by (step, kind of question) from a script, one answer after the other; otherwise agrees."""
+    """Answers each (step, kind of question) from a script, one answer after the other; agrees otherwise."""
 
     script: Mapping[tuple[str, str], list[Answer]] = field(default_factory=dict[tuple[str, str], list[Answer]])
     name: str = "Ada"
@@ -402,5 +402,5 @@ class ScriptedOperator:
 
 
 def other_settings(applied: CameraSettings) -> CameraSettings:
-    """EXIF of a camera whose ISO somebody turned."""
+    """EXIF of a camera whose ISO dial was turned."""
     return replace(applied, iso=applied.iso * 2)

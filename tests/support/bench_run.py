@@ -1,4 +1,4 @@
-"""A small run on the rig in memory, through the public surface of store and runner."""
+"""A small run on the in-memory rig, through the public interface of store and runner."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ P = TypeVar("P")
 
 @dataclass
 class Bench:
-    """One run on a rig in memory."""
+    """One run on an in-memory rig."""
 
     store: Store
     run_id: str
@@ -73,11 +73,11 @@ class Bench:
     operator: ScriptedOperator = field(default_factory=ScriptedOperator)
     authority: Authority | None = None
     signature_copy: Path | None = None
-    ahead_s: float = 0.0  # how far the runner's clock is put forward
+    ahead_s: float = 0.0  # offset added to the runner's clock
     on_wait: Callable[[float], None] = lambda _seconds: None
 
     def run(self) -> RunState:
-        """A runner process's life."""
+        """Run one runner process to its end."""
         protocol, _ = recorded_run(self.store, self.run_id)
         return Runner(
             self.store,
@@ -96,7 +96,7 @@ class Bench:
         time.sleep(min(seconds, 0.002))
 
     def act(self, verb: str, **fields: object) -> None:
-        """What another terminal appends."""
+        """Append an action, as from another terminal."""
         action = OperatorAction.model_validate({"action": verb, **fields})
         self.store.record(self.run_id, [action], actor="Grace")
 
@@ -109,21 +109,21 @@ class Bench:
         return [e.payload for e in self.store.events(self.run_id) if isinstance(e.payload, kind)]
 
     def captured(self) -> list[str]:
-        """Viewpoints in the order of their exposures, repeated ones repeatedly."""
+        """The viewpoints in the order of their exposures, including repetitions."""
         return [capture.viewpoint for capture in self.payloads(ViewpointCaptured)]
 
     def script(self, step: str, kind: str, *answers: Answer) -> None:
-        """What the operator says when asked."""
+        """Set the operator's answers to a question."""
         self.operator.script = {**self.operator.script, (step, kind): list(answers)}
 
     def must_verify(self) -> None:
-        """The evidence is whole."""
+        """Assert that the evidence is intact."""
         report = verify(self.data, self.run_id)
         assert report.ok, report.first_fault
 
 
 def begin_run(store: Store, text: str, folder: Path) -> Bench:
-    """A run of a protocol's text in the store of folder/data, begun and no more; its rig file has no device."""
+    """Begin a run of a protocol text in the store of folder/data, without running it; its rig file has no devices."""
     rig_file = folder / "rig.yaml"
     rig_file.write_text("name: bench\nsimulated: true\ndevices: {}\n")
     loaded = parse_protocol(text.encode(), params_models(), name="bench.yaml")
@@ -132,7 +132,7 @@ def begin_run(store: Store, text: str, folder: Path) -> Bench:
 
 
 def record_runs(folder: Path) -> tuple[str, str]:
-    """A completed run and, begun after it, one that waits for its first confirmation, in folder/data."""
+    """Record a completed run and, after it, one that waits for its first confirmation, in folder/data."""
     with Store.open(folder / "data") as store:
         completed = begin_run(store, PROTOCOL, folder)
         completed.run()

@@ -1,4 +1,4 @@
-"""A rig in memory whose camera photographs a checkerboard: poses, mount and lens that differ from what is stated."""
+"""An in-memory rig whose camera photographs a checkerboard; poses, mount and lens differ from their stated values."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Picture = NDArray[np.uint8]
 
 
 def board_pose(shift_m: tuple[float, float, float] = (0.015, -0.012, 0.004), turn_deg: float = 5.0) -> Transform:
-    """T_base_board of a board near where PROTOCOL says: face up over the scene's centre, its long side across."""
+    """T_base_board of a board near its place in PROTOCOL: face up above the scene's centre, its long side across."""
     laid = np.column_stack([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     R = Rotation.from_euler("xyz", [1.5, -2.0, turn_deg], degrees=True).as_matrix() @ laid
     middle = np.array([0.0, 0.8, 0.09]) + shift_m
@@ -37,8 +37,8 @@ class BoardRoom:
     """What the bench's camera sees, and what happens to its images.
 
     Attributes:
-        spoil: makes a spoilt picture of a good one, by the exposure's number.
-        cut: exposures whose board was not whole in the frame.
+        spoil: turns a good picture into a spoilt one, by the exposure's number.
+        cut: exposures in which the board was cut off.
     """
 
     rig: BenchRig
@@ -47,7 +47,7 @@ class BoardRoom:
     cut: list[int] = field(default_factory=list[int])
 
     def picture(self, exposure: int) -> Picture:
-        """The photograph from where the arm stands."""
+        """The photograph from the arm's current pose."""
         flange = self.rig.arm.state().sample.T_base_flange
         T_camera_board = inverse(flange @ MOUNT) @ self.T_base_board
         corners = LENS.project(apply(T_camera_board, BOARD.points()))

@@ -1,4 +1,4 @@
-"""Folders of photographs of a board with the poses of the robot that held the camera, all of known truth."""
+"""Folders of photographs of a board with the poses of the robot that held the camera, with known ground truth."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class BoardFolder:
     T_base_flange: dict[str, Array]
 
     def poses(self, path: Path, T: Sequence[Array] | None = None) -> Path:
-        """A CSV of the robot's poses, or of others for the same images."""
+        """Write a CSV of the robot's poses, or of other poses for the same images."""
         write_poses_csv(path, dict(zip(self.T_base_flange, T or self.T_base_flange.values(), strict=True)))
         return path
 

@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform
 
-_NODES = 5  # a side, where a tile's rays are computed exactly; between them a polynomial
+_NODES = 5  # per side, where a tile's rays are exact; a polynomial interpolates between them
 _TILE = 256
 
 
 @dataclass(frozen=True)
 class Photography:
-    """What happens between the scene and the file."""
+    """Everything between the scene and the image file."""
 
-    blur_px: float = 0.7  # sigma, of the lens
+    blur_px: float = 0.7  # sigma of the lens blur
     gamma: float = 2.2
     noise: float = 2.0  # grey levels
-    light: float = 0.0  # relative fall of brightness from one side to the other
+    light: float = 0.0  # relative decrease of brightness from one side to the other
     dark: float = 0.04  # reflectance of the ink
     bright: float = 0.75
 
 
-Shade = Callable[[Array, float], Array]  # reflectance at board points (N, 2), as samples of this footprint (m) see it
+Shade = Callable[[Array, float], Array]  # reflectance at board points (N, 2), averaged over a footprint (m)
 
 
 def checkerboard(columns: int, rows: int, square_m: float, border: float = 1.0) -> Shade:
@@ -36,7 +36,7 @@ def checkerboard(columns: int, rows: int, square_m: float, border: float = 1.0) 
 
     def shade(xy: Array, footprint_m: float) -> Array:
         cell = xy / square_m
-        # A square wave whose steps are as wide as a sample: plain samples would round every edge to their grid.
+        # A square wave whose steps are as wide as a sample: point samples would round every edge to their grid.
         beyond = cell - np.round(cell)
         wave = np.clip(2 * beyond * square_m / footprint_m, -1, 1) * np.where(
             np.round(cell).astype(int) % 2, -1.0, 1.0
@@ -50,7 +50,7 @@ def checkerboard(columns: int, rows: int, square_m: float, border: float = 1.0) 
 
 
 def printed(image: NDArray[np.uint8], pixel_m: float, origin_m: Array) -> Shade:
-    """Reflectance of a drawn board whose image's corner lies at `origin_m` of the board frame."""
+    """Reflectance of a drawn board whose image's corner lies at `origin_m` in the board frame."""
 
     def shade(xy: Array, footprint_m: float) -> Array:
         index = np.floor((xy - origin_m) / pixel_m).astype(np.int64)
@@ -74,12 +74,12 @@ def photograph(
     """A grey photograph of a board.
 
     Args:
-        shade: of the board.
-        camera: lens.
+        shade: reflectance of the board.
+        camera: intrinsics.
         T_camera_board: pose.
-        rng: of the noise.
-        corners: (N, 2) where supersampling matters; None: everywhere.
-        samples: a side of a pixel.
+        rng: for the noise.
+        corners: (N, 2) pixels around which to supersample; None: everywhere.
+        samples: per side of a pixel.
         how: blur, tone curve, noise.
     """
     linear = np.empty((camera.height, camera.width), dtype=np.float32)
@@ -123,7 +123,7 @@ def _tile(
     nx, ny = nodes[0] * (width - 1), nodes[1] * (height - 1)
     grid = np.stack(np.meshgrid(nx + left, ny + top), axis=-1).reshape(-1, 2)
     rays = camera.normalise(grid)
-    # The board's plane in the camera: H maps (x, y, 1) of the board to rays.
+    # The board's plane in the camera: H maps (x, y, 1) on the board to rays.
     H = np.linalg.inv(T[:3, [0, 1, 3]])
     board = np.column_stack([rays, np.ones(len(rays))]) @ H.T
     values = (board[:, :2] / board[:, 2:]).reshape(_NODES, _NODES, 2)
@@ -135,7 +135,7 @@ def _tile(
 
 
 def _lagrange(nodes: Array, at: Array) -> Array:
-    """(len(at), nodes) weights of the polynomial through the nodes."""
+    """Weights (len(at), nodes) of the interpolating polynomial through the nodes."""
     weights = np.ones((len(at), len(nodes)))
     for k, node in enumerate(nodes):
         for j, other in enumerate(nodes):

@@ -1,4 +1,4 @@
-"""Board images and data set viewpoints of simulated scenes as geometry only: joints, poses, noisy corners."""
+"""Board images and data set viewpoints of simulated scenes, reduced to geometry: joints, poses, noisy corners."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _NEAR = np.array([1.57, -1.5, 1.9, -2.0, -1.57, 0.0])
 T_FLANGE_CAMERA = transform(Rotation.from_rotvec([0.02, -0.03, 1.55]), np.array([0.012, -0.055, 0.093]))
 T_BASE_BOARD = transform(Rotation.from_euler("xyz", [176, 3, 40], degrees=True), np.array([0.7, -0.1, 0.05]))
 CAMERA = CameraModel(4752, 3168, 6650.0, 6652.0, 2380.0, 1580.0, -0.05, 0.03, 2e-4, -3e-4)
-_VIEW_M = 0.65  # where the scene's centre is, in front of the camera
+_VIEW_M = 0.65  # distance of the scene's centre in front of the camera
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One viewpoint: its station and the joints of the arm."""
+    """One viewpoint: its station and the arm's joints."""
 
     station: str
     q: Array
@@ -44,7 +44,7 @@ class Shot:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """What a hand-eye calibration is given, N views."""
+    """The input of a hand-eye calibration with N views."""
 
     T_base_flange: Array
     T_camera_board: Array
@@ -53,7 +53,7 @@ class Session:
 
 
 def plan(scene: Scene, protocol: str, *steps: str) -> list[Shot]:
-    """The viewpoints of these steps that the arm reaches, as a protocol plans them."""
+    """The reachable viewpoints of these steps, as a protocol plans them."""
     text = yaml.safe_load((PROTOCOLS / f"{protocol}.yaml").read_text(encoding="utf-8"))
     by_id = {step["id"]: step for step in text["steps"]}
     shots: list[Shot] = []
@@ -78,7 +78,7 @@ def _tuples(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def planned_board_shots(scene: Scene, wanted: BoardPoses, solve: Sequence[str]) -> list[Shot]:
-    """The board images of a calibration as the software plans them when camera, mount and board are as stated."""
+    """The board images of a calibration, planned by the software for nominal camera, mount and board."""
     board, layout, mount = Board(16, 23, 0.015), _layout(scene, wanted.station), nominal_hand_eye()
     lens = LensSection(focal_length_mm=50, sensor_width_mm=35.7, image_px=(4752, 3168))
     known = nominal_board(wanted, board, layout, mount, *nominal_camera(lens))
@@ -100,7 +100,7 @@ def _layout(scene: Scene, station: str) -> StationLayout:
 
 
 def board_session(scene: Scene, shots: Sequence[Shot], *, sigma_px: float = 0.05, width: int = 4752) -> Session:
-    """The board as the images show it: all views that hold the whole board, corners with white noise."""
+    """The board as the images show it: all views that contain the whole board, with white noise on the corners."""
     lens = scene.camera_intrinsics(width).to_json()
     camera = CameraModel.from_record({key: lens[key] for key in _CAMERA})
     rng = np.random.default_rng([scene.seed, 7])
@@ -125,7 +125,7 @@ def board_session(scene: Scene, shots: Sequence[Shot], *, sigma_px: float = 0.05
 
 
 def noisy_session(count: int, mm: float, deg: float, seed: int, *, sigma_px: float = 0.05) -> Session:
-    """Views from all sides by an arm whose poses have independent noise (for each axis); joints are left zero."""
+    """Views from all sides by an arm with independent pose noise per axis; the joints are left at zero."""
     rng = np.random.default_rng([seed, count])
     points = BOARD.points()
     centre = points.mean(axis=0)
@@ -154,14 +154,14 @@ def noisy_session(count: int, mm: float, deg: float, seed: int, *, sigma_px: flo
 
 @dataclass(frozen=True)
 class OddScene(Scene):
-    """A scene whose arm errs in ways that no term of the correction describes exactly.
+    """A scene whose arm has errors that no term of the correction describes exactly.
 
-    Beside its other errors: gear waves between the whole numbers of periods, of two frequencies a joint, and links
-    that sag under their weight.
+    In addition to the usual errors: two gear waves per joint with non-integer numbers of periods, and links that sag
+    under their weight.
     """
 
     def true_flange(self, q: Array, station: str) -> Array:
-        """T_world_flange where the flange really is."""
+        """The true T_world_flange."""
         rng = np.random.default_rng([self.seed, 0x0DD])
         waves = rng.uniform(1.5, 7.5, (2, 6)), rng.uniform(0, 2 * np.pi, (2, 6))
         more = np.radians(0.006) * np.sin(waves[0] * q + waves[1]).sum(axis=0)
@@ -175,7 +175,7 @@ _CAMERA = ("width", "height", "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 def locate(points: Array, pixels: Array, camera: CameraModel, near: Array) -> Array:
-    """T_camera_board of the least reprojection error, from a start nearby."""
+    """The T_camera_board of least reprojection error, found from a start nearby."""
     rvec, tvec = cv2.solvePnPRefineLM(
         points, pixels, camera.matrix, camera.distortion, cv2.Rodrigues(near[:3, :3])[0], near[:3, 3].copy()
     )
@@ -185,7 +185,7 @@ def locate(points: Array, pixels: Array, camera: CameraModel, near: Array) -> Ar
 
 
 def scene_error_mm(scene: Scene, shots: Sequence[Shot], T_base_camera: Array) -> float:
-    """RMS error of where the cameras put the scene's centre, each station's base aligned as a registration does."""
+    """RMS error of the scene centre's position from the camera poses, with each station's base aligned."""
     about = np.array([[0, 0, _VIEW_M], [0.1, 0, _VIEW_M], [0, 0.1, _VIEW_M], [0, 0, _VIEW_M - 0.1], [0, 0, 0.0]])
     squares: list[Any] = []
     for station in sorted({shot.station for shot in shots}):

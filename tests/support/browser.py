@@ -1,4 +1,4 @@
-"""A browser before the served pages, for tests: Chromium, screens, `orthocapture serve` as a process, axe."""
+"""Browser tests of the served pages: Chromium, screens, `orthocapture serve` as a process, axe."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ TABLET = (1024, 768)
 DESKTOP = (1920, 1080)
 PASSWORD = "correct horse battery"
 PIN = "246810"
-_FAILURES = REPOSITORY / "build" / "browser-failures"  # what the screens showed when a test failed
+_FAILURES = REPOSITORY / "build" / "browser-failures"  # screenshots of failed tests
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-# Without the last ones a browser looks up its maker's hosts at every start. SwiftShader draws the 3D view.
+# Without the last options a browser looks up its vendor's hosts at every start. SwiftShader draws the 3D view.
 _OPTIONS = (
     "--no-sandbox",
     "--enable-unsafe-swiftshader",
@@ -44,13 +44,13 @@ _OPTIONS = (
 )
 _RULES = {
     "runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]},
-    "resultTypes": ["violations"],  # what is right is counted only
+    "resultTypes": ["violations"],  # passes are only counted
 }
 
 
 @contextmanager
 def chromium() -> Generator[Browser]:
-    """The system's Chromium, without a window."""
+    """The system's Chromium, headless."""
     path = next((found for name in _NAMES if (found := shutil.which(name))), None)
     if path is None:
         pytest.fail(
@@ -68,7 +68,7 @@ def chromium() -> Generator[Browser]:
 
 @dataclass
 class Served:
-    """`orthocapture serve` as a process; can be killed and started again on the same port."""
+    """`orthocapture serve` as a process, which can be killed and restarted on the same port."""
 
     rig: Path
     data: Path
@@ -78,7 +78,7 @@ class Served:
     _process: subprocess.Popen[str] | None = None
 
     def start(self) -> None:
-        """Start, and wait until it answers."""
+        """Start the process and wait until it answers."""
         port = self.url.rpartition(":")[2] or "0"
         words = ["serve", "--rig", str(self.rig), "--data", str(self.data), "--port", port, "--json", *self.options]
         with (self.data.parent / "serve.log").open("a") as log:
@@ -97,7 +97,7 @@ class Served:
         self.url, self.set_up = ready["url"], ready["set_up"]
 
     def kill(self, how: signal.Signals = signal.SIGKILL) -> None:
-        """End it; what it had started goes on."""
+        """Kill the process; the processes that it started continue."""
         if self._process is not None:
             self._process.send_signal(how)
             self._process.wait(timeout=20)
@@ -106,7 +106,7 @@ class Served:
             self._process = None
 
     def log(self) -> str:
-        """What it and its runners had to say."""
+        """The output of the process and its runners."""
         logs = [self.data.parent / "serve.log", *(self.data / "monitor").glob("*.log")]
         return "\n".join(f"{path.name}: {path.read_text()}" for path in logs if path.exists())
 
@@ -114,7 +114,7 @@ class Served:
         """End the processes that drive runs, and wait for them."""
         for path in (self.data / "monitor").glob("*.json"):
             pid = json.loads(path.read_text()).get("pid")
-            if pid is None:  # a verification's result
+            if pid is None:  # this is a verification's result
                 continue
             try:
                 os.kill(pid, signal.SIGTERM)
@@ -128,7 +128,7 @@ class Served:
 
 
 class Cable:
-    """The way from one screen to the server, which can be cut: nothing comes through any more, nothing is closed."""
+    """A connection from one screen to the server that can be interrupted: no data passes, but nothing is closed."""
 
     def __init__(self, url: str) -> None:
         self._target = ("127.0.0.1", int(url.rpartition(":")[2]))
@@ -139,20 +139,20 @@ class Cable:
         threading.Thread(target=self._accept, daemon=True).start()
 
     def cut(self) -> None:
-        """From now on every byte waits."""
+        """Hold back every byte from now on."""
         self._plugged.clear()
 
     def plug(self) -> None:
-        """What has waited goes on its way."""
+        """Deliver the bytes held back."""
         self._plugged.set()
 
     def close(self) -> None:
-        """No further connection."""
+        """Accept no further connection."""
         self.plug()
         self._listener.close()
 
     def _accept(self) -> None:
-        with contextlib.suppress(OSError):  # closed
+        with contextlib.suppress(OSError):  # already closed
             while True:
                 near, _ = self._listener.accept()
                 threading.Thread(target=self._join, args=(near,), daemon=True).start()
@@ -174,7 +174,7 @@ class Cable:
 
 @contextmanager
 def served(rig: Path, data: Path, *options: str) -> Generator[Served]:
-    """The pages over a data folder, until the block ends."""
+    """Serve the pages of a data folder until the block ends."""
     server = Served(rig, data, options)
     server.start()
     try:
@@ -185,7 +185,7 @@ def served(rig: Path, data: Path, *options: str) -> Generator[Served]:
 
 
 def add_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
-    """Accounts with PASSWORD and PIN, made as the pages make them: an administrator invites, people accept."""
+    """Create accounts with PASSWORD and PIN as the pages do: an administrator invites, people accept."""
     with Store.open(data) as store:
         desk = People(store)
         desk.accounts.set_up(desk.first_link() or "", "ada", "Ada Example", PASSWORD, PIN)
@@ -200,20 +200,20 @@ def add_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
 
 @dataclass
 class Screen:
-    """A tablet or a desktop with one person before it."""
+    """A tablet or a desktop with one person in front of it."""
 
     context: BrowserContext
     page: Page
     url: str
 
     def go(self, path: str) -> None:
-        """Open a page; it must load."""
+        """Open a page, which must load."""
         response = self.page.goto(self.url + path)
         assert response is not None, f"{path}: no answer"
         assert response.ok, f"{path}: {response.status}"
 
     def sign_in(self, account: str, password: str = PASSWORD) -> None:
-        """Through the page, as people do."""
+        """Sign in through the page."""
         self.go("/sign-in")
         self.page.get_by_label("Account").fill(account)
         self.page.get_by_label("Password").fill(password)
@@ -221,11 +221,11 @@ class Screen:
         expect(self.page.get_by_role("button", name="Sign out")).to_be_visible()
 
     def words(self) -> str:
-        """What the page says."""
+        """The text of the page."""
         return self.page.locator("body").inner_text()
 
     def hold(self, name: str, seconds: float = 1.8) -> None:
-        """Press a button of that name and keep it pressed."""
+        """Press the button of that name and hold it."""
         button = self.page.get_by_role("button", name=name)
         expect(button).to_be_enabled(timeout=20_000)
         button.scroll_into_view_if_needed()
@@ -239,7 +239,7 @@ class Screen:
 def screen(
     browser: Browser, url: str, size: tuple[int, int] = TABLET, *, dark: bool = False, touch: bool = False
 ) -> Generator[Screen]:
-    """A screen whose page must not complain: script errors and refused content fail the test."""
+    """A screen whose page must be free of errors: script errors and blocked content fail the test."""
     context = browser.new_context(
         viewport={"width": size[0], "height": size[1]},
         color_scheme="dark" if dark else "light",
@@ -265,7 +265,7 @@ def screen(
 
 
 def accessibility_faults(page: Page) -> list[str]:
-    """What axe finds against WCAG 2.2 AA: rule, and where."""
+    """What axe reports against WCAG 2.2 AA: the rule and the place."""
     found: dict[str, Any] = Axe().run(page, options=_RULES).response
     return [
         f"{violation['id']}: {violation['help']} at {node['target']}: {node['html'][:120]}"

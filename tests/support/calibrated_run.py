@@ -1,4 +1,4 @@
-"""A run that has calibrated camera and hand-eye on board corners with noise, computed as the worker does."""
+"""A run that has calibrated camera and hand-eye from noisy board corners, computed as the worker does."""
 
 from __future__ import annotations
 
@@ -81,7 +81,10 @@ _NAMES = [f"b{i:03d}" for i in range(VIEWS)]
 
 
 def begin_calibrated_run(site: WebSite, known: Mapping[str, Uncertainty] | None = None) -> str:
-    """Calibrated, and the step after it under way with no image yet; the run's name. `known`: of its measures."""
+    """Begin a run that is calibrated and in its next step, with no image yet; returns its id.
+
+    `known` has the uncertainties of the calibration's measures.
+    """
     rig = site.folder / "small.yaml"
     rig.write_text(RIG)
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="calibrated.yaml")
@@ -147,7 +150,7 @@ def capture(
     shade: int = 0,
     name: str = "DSC00001.JPG",
 ) -> str:
-    """One exposure in the record; the photograph's hash."""
+    """Record one exposure; returns the photograph's hash."""
     pixels = np.full((600, 900, 3), 40 + 5 * shade, np.uint8)
     cv2.putText(pixels, viewpoint, (40, 300), cv2.FONT_HERSHEY_SIMPLEX, 4, (255, 255, 255), 8)
     ref = _put(site, cv2.imencode(".jpg", pixels)[1].tobytes(), kind, "image/jpeg", name)

@@ -1,4 +1,4 @@
-"""Starts the simulated camera as a process of its own and ends it again."""
+"""Runs the simulated camera as a child process for tests."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""One session of plain python-gphoto2 in a process of its own: commands as JSON in argv, answers as JSON on stdout.
+"""A session of plain python-gphoto2 in a process of its own: JSON commands in argv, JSON answers on stdout.
 
-libgphoto2 closes descriptor 0 and holds the interpreter lock, so it may not run inside the test's process.
+libgphoto2 closes file descriptor 0 and holds the interpreter lock, so it may not run in the test's process.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ gp: Any = importlib.import_module("gphoto2")
 
 
 def vendor_session(port: str, *commands: list[Any], timeout_s: float = 60.0) -> list[Any]:
-    """Run the commands in a fresh process; an answer is {"error": code} where libgphoto2 raised."""
+    """Run the commands in a new process; an answer is {"error": code} if libgphoto2 raised."""
     done = subprocess.run(
         [sys.executable, "-m", "tests.support.camera_vendor_session", port, json.dumps(commands)],
         stdin=subprocess.DEVNULL,
@@ -31,7 +31,7 @@ def vendor_session(port: str, *commands: list[Any], timeout_s: float = 60.0) -> 
 
 
 def _fetch(camera: Any, path: Any) -> dict[str, Any]:
-    file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)  # owns the memory below: keep it
+    file = camera.file_get(path.folder, path.name, gp.GP_FILE_TYPE_NORMAL)  # keep it: it owns the memory used below
     data = bytes(memoryview(file.get_data_and_size()))
     return {
         "name": path.name,

@@ -1,4 +1,4 @@
-"""A card of a camera without a cable: photographs with their EXIF, copied by a process of its own."""
+"""The memory card of a camera without a cable: photographs with EXIF, copied by another process."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ with open(target, "wb") as stream:
 
 
 def photograph(number: int, taken: datetime, *, iso: int = 100, raw: bool = False) -> bytes:
-    """A small file, another one for each number."""
+    """A small image file, different for each number."""
     settings = ExposureSettings(22.0, 1 / 50, (1, 50), iso, manual_focus=True, file_format=2, jpeg_quality=2,
                                 capture_target=16)  # fmt: skip
     picture = np.full((64, 96, 3), 40 + number, dtype=np.uint8)
@@ -38,12 +38,12 @@ def photograph(number: int, taken: datetime, *, iso: int = 100, raw: bool = Fals
 
 
 def after(seconds: float) -> datetime:
-    """So long after the beginning."""
+    """A time this long after the beginning."""
     return BEGAN + timedelta(seconds=seconds)
 
 
 def put(folder: Path, name: str, data: bytes) -> Path:
-    """Copy a file there, by another process, whole before this returns."""
+    """Copy a file to the folder by another process; it is complete when this returns."""
     with half_copied(folder, name, data) as path:
         pass
     return path
@@ -51,7 +51,7 @@ def put(folder: Path, name: str, data: bytes) -> Path:
 
 @contextmanager
 def half_copied(folder: Path, name: str, data: bytes, *, whole: bool = True) -> Generator[Path]:
-    """Another process has copied half a file and stops; at the end of the block it goes on, or gives up."""
+    """Let another process copy half a file and pause; at the end of the block it finishes, or gives up."""
     source = folder.parent / f"{name}.source"
     source.write_bytes(data)
     command = [sys.executable, "-c", _COPY, str(folder / name), str(source)]

@@ -1,4 +1,4 @@
-"""A certificate for TLS on this machine, signed by its own key."""
+"""A self-signed TLS certificate for this machine."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cryptography.x509.oid import NameOID
 
 
 def self_signed(folder: Path) -> tuple[Path, Path]:
-    """Files of a certificate and its key, for 127.0.0.1, valid for an hour."""
+    """Write a certificate for 127.0.0.1, valid for an hour, and its key; returns both files."""
     private = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "table 3")])
     now = datetime.datetime.now(datetime.UTC)

@@ -1,4 +1,4 @@
-"""A small protocol with toy step kinds, and a log that makes events without a store."""
+"""A small protocol with toy step kinds, and a log that creates events without a store."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from service.core.protocol import LoadedProtocol, MovingParams, Protocol, parse_
 
 
 class ChecklistParams(Record):
-    """Nothing to set."""
+    """No parameters."""
 
 
 class CaptureParams(MovingParams):
@@ -87,17 +87,17 @@ steps:
 
 
 def toy_protocol(text: str = TOY) -> Protocol:
-    """The toy, or another text, loaded."""
+    """Load the toy protocol, or another text."""
     return load(text).protocol
 
 
 def load(text: str) -> LoadedProtocol:
-    """A protocol's text, as if it were the file lab.yaml."""
+    """Load a protocol text as if it were the file lab.yaml."""
     return parse_protocol(text.encode(), KINDS, name="lab.yaml")
 
 
 def artefact(kind: str = "image") -> ArtefactRef:
-    """A reference to nothing."""
+    """A reference to no file."""
     return ArtefactRef(sha256="0" * 64, kind=kind, media_type="image/jpeg", size_bytes=1, original_name="a.jpg")
 
 
@@ -105,7 +105,7 @@ EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0
 
 
 def captured(step: str, attempt: int, viewpoint: str) -> ViewpointCaptured:
-    """A capture with plausible figures."""
+    """A capture event with plausible figures."""
     return ViewpointCaptured(
         step=step,
         attempt=attempt,
@@ -126,7 +126,7 @@ def captured(step: str, attempt: int, viewpoint: str) -> ViewpointCaptured:
 
 
 def imported(step: str, attempt: int, viewpoint: str) -> ViewImported:
-    """A photograph that somebody brought."""
+    """An imported photograph."""
     return ViewImported(
         step=step,
         attempt=attempt,
@@ -141,7 +141,7 @@ def imported(step: str, attempt: int, viewpoint: str) -> ViewImported:
 
 
 class Log:
-    """Events of one run, folded as they come."""
+    """The events of one run, folded as they are appended."""
 
     def __init__(
         self, protocol: Protocol | None = None, *, simulated: bool = True, auto_confirm: bool = True
@@ -185,12 +185,12 @@ class Log:
         return self.state
 
     def act(self, action: OperatorVerb, actor: str = "Ada", **fields: Any) -> RunState:
-        """An operator's action, whether allowed or not."""
+        """Append an operator's action, whether allowed or not."""
         return self.append(OperatorAction.model_validate({"action": action, **fields}), actor)
 
     @property
     def decision(self) -> Decision:
-        """What would happen next."""
+        """The current decision."""
         return decide(self.protocol, self.state)
 
     @property
@@ -220,19 +220,19 @@ class Log:
         return self.append(StepStarted(step=self.state.current, attempt=self.state.step.attempt))
 
     def measure(self, **measures: float) -> RunState:
-        """Finish the work of the current step with these figures, and judge them."""
+        """Finish the work of the current step with these measures, and judge its gates."""
         step, attempt = self.state.current, self.state.step.attempt
         self.append(StepMeasured(step=step, attempt=attempt, measures=measures))
         return self.append(evaluate_gates(self.protocol.step(step), attempt, measures))
 
     def accept(self) -> RunState:
-        """Sign if due, and pass."""
+        """Sign if due, and pass the step."""
         if isinstance(self.decision, AskOperator):
             self.sign()
         return self.append(StepPassed(step=self.state.current, attempt=self.state.step.attempt))
 
     def do(self, **measures: float) -> RunState:
-        """The whole current step."""
+        """Do the whole current step."""
         self.begin()
         self.measure(**measures)
         return self.accept()

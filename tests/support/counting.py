@@ -1,4 +1,4 @@
-"""Work counted in function calls or in lines, which are the same on every machine."""
+"""Counts work in function calls or executed lines, which do not depend on the machine."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from typing import Any
 
 
 def calls_of(work: Callable[[], object]) -> int:
-    """Functions called while `work` runs, those of the libraries included."""
+    """Number of functions called while `work` runs, including those of libraries."""
     with cProfile.Profile() as profile:
         work()
     return sum(entry.callcount for entry in profile.getstats())
 
 
 def lines_of(work: Callable[[], object], part: str) -> int:
-    """Lines that `work` executes in this thread in files whose path contains `part`; each turn of a loop counts."""
+    """Number of lines that `work` executes in this thread in files whose path contains `part`.
+
+    Each iteration counts.
+    """
     count = 0
 
     def watch(frame: FrameType, event: str, _argument: object) -> Any:

@@ -1,4 +1,4 @@
-"""Parsers with every fault that the sweep of bad input is there to find, as a group of its targets."""
+"""A group of fuzz targets whose parsers have every kind of fault that the sweep is meant to find."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run in which a simulated person takes the images by hand, on the rig in memory; what images show is made up."""
+"""A run on the in-memory rig in which a simulated person takes the images by hand; what they show is made up."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ MIDDLE_M = SPHERES_M.mean(axis=0)
 
 @dataclass
 class Person:
-    """Goes where the words lead and presses the camera's button; `mishaps` by number of the press."""
+    """Follows the guidance and presses the camera's button; `mishaps` by number of the press."""
 
     rig: BenchRig
     mishaps: dict[int, str] = field(default_factory=dict[int, str])
@@ -57,7 +57,7 @@ class Person:
     idle: bool = False
 
     def read(self, message: str) -> None:
-        """What the screen says."""
+        """React to the words on the screen."""
         if not message.startswith("next: ") or self.idle:
             return
         self.presses += 1
@@ -73,7 +73,7 @@ P = TypeVar("P", bound=Person)
 
 @dataclass
 class ReadingOperator(ScriptedOperator):
-    """Hands what is told to a person."""
+    """Passes what it is told to a person."""
 
     person: Person | None = None
 
@@ -91,7 +91,7 @@ def held_run(
     step: str,
     person_of: Callable[[BenchRig, dict[int, str]], P] = Person,
 ) -> tuple[Bench, P]:
-    """A run of which a person takes the images; what they show follows from where the person held the camera."""
+    """A hand-held run; what the images show follows from where the person held the camera."""
     head = PROTOCOL.split("  - id: capture\n")[0]
     bench = begin(head + MEASURED + step)
     rig = MeasuringRig()
@@ -107,7 +107,7 @@ def held_run(
     looks = count()
 
     def look(*_args: Any, **_options: Any) -> HandView:
-        T, mishap = person.views[next(looks)]  # images are looked at one by one, in the order of arrival
+        T, mishap = person.views[next(looks)]  # images are evaluated one by one, in the order of arrival
         if mishap == "fails":
             raise ComputeError("the image cannot be decoded", remedy="Take it again")
         if mishap == "nothing":
@@ -128,7 +128,7 @@ def held_run(
 
 
 class _LeftError(Exception):
-    """The runner's process has ended in the middle."""
+    """The runner's process ended in the middle."""
 
 
 def left_held_run(
@@ -137,7 +137,7 @@ def left_held_run(
     folder: Path,
     mishaps: dict[int, str] | None = None,
 ) -> Bench:
-    """A run in which four images were taken, the second one blurred, and which nobody drives any more."""
+    """A hand-held run with four images, the second one blurred, that nobody drives any more."""
     bench, person = held_run(begin, monkeypatch, folder, mishaps or {2: "blurred"}, STEP)
     serve = bench.operator.on_show
 

@@ -19,7 +19,7 @@ from drivers.plugin import DriverConfig, DriverSpec
 
 
 class FakeConfig(DriverConfig):
-    """Where `close` leaves a trace, and the word that `report` gives back."""
+    """The file that `close` writes, and the word that `report` returns."""
 
     word: str = "hello"
     trace: Path | None = None
@@ -27,7 +27,7 @@ class FakeConfig(DriverConfig):
 
 
 class Fake(Device, Protocol):
-    """The misbehaviours."""
+    """The kinds of misbehaviour."""
 
     def double(self, values: Array, *, offset: float = 0.0) -> Array: ...
     def crash(self, signal_number: int) -> None: ...
@@ -53,7 +53,7 @@ class FakeDriver:
         self._beats.append((sent_monotonic_s, time.monotonic()))
 
     def beats(self) -> tuple[tuple[float, float], ...]:
-        """When each was sent and when it arrived, since the last question."""
+        """When each heartbeat was sent and when it arrived, since the last call."""
         beats, self._beats = self._beats, []
         return tuple(beats)
 

@@ -1,4 +1,4 @@
-"""A folder as people bring it: photographs of a simulated scene by a hand-held camera, board images, scans, a CT."""
+"""An import folder: photographs of a simulated scene by a hand-held camera, board images, scans and a CT."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _BEGAN = datetime(2024, 3, 1, 10, 0, 0, tzinfo=UTC)
 
 @dataclass
 class Photographer:
-    """Takes photographs of one scene, one after the other, as a camera writes them."""
+    """Takes photographs of one scene and writes them as a camera does."""
 
     folder: Path
     width: int
@@ -50,7 +50,7 @@ class Photographer:
         self.T_world_camera: dict[str, Array] = {}
 
     def photographs(self, part: str, poses: Sequence[Array], *, board: bool = False) -> None:
-        """Into a sub-folder, a minute apart; remembers where the camera was."""
+        """Take photographs into a subfolder, a minute apart, and remember the camera poses."""
         (self.folder / part).mkdir(parents=True, exist_ok=True)
         placed = self.scene.board_placement(1).tolist() if board else None
         for pose in poses:
@@ -74,7 +74,7 @@ class Photographer:
             self.T_world_camera[name] = pose
 
     def scan(self, part: str, *, control_spheres: bool, nth: int) -> None:
-        """A mesh in a sub-folder, in a frame of its own."""
+        """Write a mesh into a subfolder, in a frame of its own."""
         (self.folder / part).mkdir()
         scan = scan_scene(self.scene, spray=True, control_spheres=control_spheres, spacing_m=1.2e-3, nth=nth)
         (name, data), *_ = encode("ply", f"{part}.ply", 1e3 * scan.vertices_m, scan.faces, scan.normals)
@@ -82,7 +82,7 @@ class Photographer:
         self.T_world_scan = scan.T_world_scan
 
     def ct(self) -> None:
-        """A DICOM series of a few empty slices."""
+        """Write a DICOM series of a few empty slices."""
         (self.folder / "ct").mkdir()
         grid = grid_around(self.scene, np.eye(4), 0.05, control_spheres=True)
         volume = np.full(grid.shape, -1000, dtype=np.int16)
@@ -90,7 +90,7 @@ class Photographer:
 
 
 def around(count: int, *, distance_m: float = 0.62, turn: float = 0.3) -> list[Array]:
-    """Camera poses around the scene, as somebody takes them who walks around the table."""
+    """Camera poses around the scene, as of somebody walking around the table."""
     poses: list[Array] = []
     for i in range(count):
         azimuth, tilt = 2 * np.pi * (i + turn) / count, np.deg2rad(16 + 9 * (i % 3))
@@ -100,13 +100,13 @@ def around(count: int, *, distance_m: float = 0.62, turn: float = 0.3) -> list[A
 
 
 def over_the_board(count: int) -> list[Array]:
-    """Camera poses over the calibration board, tilted and turned."""
+    """Camera poses above the calibration board, tilted and turned."""
     poses: list[Array] = []
     centre = SCENE_CENTRE_M + np.array([0.0, 0.0, 0.09])
     for i in range(count):
         azimuth, tilt = 2.4 * i, np.deg2rad((8, 24, 34)[i % 3])
         out = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
         aim = centre + np.array([0.05 * np.cos(5.0 * i) - 0.01, 0.015 * np.sin(5.0 * i), 0.0])
-        T = look_at(centre + 0.72 * out, aim, np.array([0.1, 1.0, 0.0]))  # the long side of the board across
+        T = look_at(centre + 0.72 * out, aim, np.array([0.1, 1.0, 0.0]))  # the board's long side is horizontal
         poses.append(T @ from_euler(np.array([0.0, 0.0, 0.08 * (i % 4 - 1.5)]), np.zeros(3)))
     return poses

@@ -1,4 +1,4 @@
-"""A run as long as wanted, whose events add up: every action is one that the lifecycle allows, every hash is true."""
+"""A consistent run of any length: every action is allowed by the lifecycle and every hash is right."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from service.store.store import Store
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "demo.yaml"
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-BATCH = 500  # events in one transaction
+BATCH = 500  # events per transaction
 SOFTWARE = {f"package-{number}": f"1.{number}.0" for number in range(70)} | {"orthocapture": "0.1.0"}
 LIGHTBOX = {
     "identity": {"kind": "lightbox", "model": "ORTHO-LB1", "serial": "LB-1", "firmware": "1.2", "driver": "lightbox"},
@@ -54,7 +54,7 @@ LIGHTBOX = {
 
 
 class QuickFiles(DurableFiles):
-    """Writes without waiting for the disk: what is made here is measured, not kept."""
+    """Writes without waiting for the disk, since the data are for measurements and are not kept."""
 
     def sync_file(self, path: Path) -> None:
         pass
@@ -65,7 +65,7 @@ class QuickFiles(DurableFiles):
 
 @dataclass
 class Sizes:
-    """How much of everything."""
+    """The numbers of everything in the run."""
 
     events: int = 100_000
     slices: int = 3000
@@ -93,13 +93,13 @@ class LargeRun:
     )
 
     def add(self, payload: Payload, actor: str = "runner", *artefacts: NewArtefact) -> None:
-        """Append it with the next batch."""
+        """Append a payload with the next batch."""
         if self.waiting and (len(self.waiting) >= BATCH or self.waiting[-1][1] != actor):
             self.flush()
         self.waiting.append((payload, actor, artefacts))
 
     def flush(self) -> None:
-        """Append what waits, in one transaction, and follow the state."""
+        """Append the pending batch in one transaction, and update the state."""
         if not self.waiting:
             return
         payloads = [payload for payload, _actor, _artefacts in self.waiting]
@@ -110,11 +110,11 @@ class LargeRun:
         self.waiting = []
 
     def act(self, action: str, actor: str = "Ada", **fields: Any) -> None:
-        """What a person does."""
+        """Append a person's action."""
         self.add(OperatorAction.model_validate({"action": action, "via": "web", **fields}), actor)
 
     def begin(self, step: Step) -> None:
-        """Signature and confirmation where the protocol wants them, then the step's start."""
+        """Append signature and confirmation as the protocol requires, then the step's start."""
         self.flush()
         if step.irreversible and step.sign:
             self.act(
@@ -126,7 +126,7 @@ class LargeRun:
         self.add(StepStarted(step=step.id, attempt=self.state.step.attempt))
 
     def end(self, step: Step, artefacts: tuple[ArtefactRef, ...] = ()) -> None:
-        """Measures within every limit, gates, signature, pass."""
+        """Append measures within all limits, gates, signature and pass."""
         self.flush()
         attempt = self.state.step.attempt
         measures = {gate.measure: _within(gate.min, gate.max) for gate in step.gates}
@@ -140,7 +140,7 @@ class LargeRun:
         self.flush()
 
     def keep(self, kind: str, name: str, size: int, media_type: str = "application/octet-stream") -> ArtefactRef:
-        """A file of noise."""
+        """Store a file of noise."""
         return self.store.put_bytes(self.draw.randbytes(size), kind=kind, media_type=media_type, original_name=name)
 
 
@@ -151,7 +151,7 @@ def _within(low: float | None, high: float | None) -> float:
 
 
 def write_large_run(data: Path, sizes: Sizes) -> str:
-    """The run in a data folder, from its first event to its last; its name."""
+    """Write the run to a data folder, from its first event to its last; returns its id."""
     data.mkdir(parents=True, exist_ok=True)
     (data / "rig.yaml").write_text("name: large\nsimulated: true\ndevices: {}\n")
     loaded = load_protocol(PROTOCOL, params_models())
@@ -286,5 +286,5 @@ def _job(run: LargeRun, step: Step, images: list[str]) -> None:
 
 
 def database_bytes(data: Path) -> int:
-    """How large the database has become."""
+    """Size of the database."""
     return database_path(data).stat().st_size

@@ -1,4 +1,4 @@
-"""A PDF read back with pypdf: its pages' text, and the tags that a screen reader goes by."""
+"""Reads a PDF back with pypdf: the text of its pages, and the tags for screen readers."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ def root_of(pdf: bytes) -> Mapping[str, Any]:
 
 
 def fonts_of(pdf: bytes) -> set[str]:
-    """Names of the fonts that it is set in."""
+    """Names of the fonts used."""
     pages = [cast("Mapping[str, Any]", page) for page in reader_of(pdf).pages]
     return {str(font.get_object()["/BaseFont"]) for page in pages for font in page["/Resources"]["/Font"].values()}
 
 
 def pages_of(pdf: bytes) -> list[str]:
-    """The text of each page, in order, white space made one blank."""
+    """The text of each page, in order, with white space normalised."""
     return [" ".join(page.extract_text().split()) for page in reader_of(pdf).pages]
 
 
 def tags_of(pdf: bytes) -> list[tuple[str, str]]:
-    """Every tag in reading order with its alternative text, "" where it has none."""
+    """Every tag in reading order with its alternative text, or ""."""
     return list(_below(root_of(pdf)["/StructTreeRoot"]))
 
 

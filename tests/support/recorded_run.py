@@ -1,4 +1,4 @@
-"""A small run whose results a real worker computed: two scans of spheres, a registration on exact outlines."""
+"""A small run with results computed by a real worker: two scans of spheres, a registration on exact outlines."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ steps:
 
 
 def record_run(folder: Path, *, complete: bool = True) -> str:
-    """A run in folder/data, from its first event to its last; its name."""
+    """Record a run in folder/data, from its first event to its last; returns its id."""
     (folder / "rig.yaml").write_text("name: small\nsimulated: true\ndevices: {}\n")
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="recorded.yaml")
     with Store.open(folder / "data") as store:
@@ -94,7 +94,7 @@ class _Recorder:
         self.store, self.run_id, self.protocol = store, run_id, protocol
 
     def scan(self, step: str, *, seed: int, attempt: int = 1, **more: Any) -> dict[str, Any]:
-        """A scan_import step from begin to end; the job's result."""
+        """Record a whole scan_import step; returns the job's result."""
         self._begin(step, attempt)
         mesh = self.put(_mesh(seed), "scan_mesh", "application/x-npz", "scan.npz")
         kept = FilesKept(step=step, attempt=attempt, device="scanner", note="scan", artefacts=(mesh,))
@@ -106,11 +106,11 @@ class _Recorder:
         return result
 
     def register(self, scan: dict[str, Any]) -> None:
-        """A registration step on structure from motion, with outlines as a detector would find them."""
+        """Record a registration step on structure from motion, with outlines as from a detector."""
         step = "registration"
         self._begin(step, 1)
         made = scene(6, width=1200, seed=5)
-        # Imported here: records of outlines need the numerics of the worker.
+        # Imported here, because records of outlines need the worker's numerics.
         from service.compute.markers.archive import outline_record  # noqa: PLC0415
 
         outlines = [exact_outlines(made, i, REGISTRATION_M, noise_px=0.05, seed=5)[0] for i in range(6)]
@@ -177,7 +177,7 @@ class _Recorder:
 
 
 def _mesh(seed: int) -> bytes:
-    """The scanner's view of the registration spheres, as the store keeps it."""
+    """The scanner's mesh of the registration spheres, as stored."""
     rng = np.random.default_rng(seed)
     built = MeshBuilder()
     for centre in REGISTRATION_M:

@@ -1,4 +1,4 @@
-"""A run with everything that a report must tell: a certificate, a failed gate, a re-do, a correction, a result."""
+"""A run with everything that a report must state: a certificate, a failed gate, a redo, a correction, a result."""
 
 from __future__ import annotations
 
@@ -99,11 +99,12 @@ def record_reported_run(
     serials: tuple[str, str] = ("", ""),
     photographs: int = 2,
 ) -> str:
-    """The run in folder/data; its name. `acceptable`: a figure outside its limit may be; `accepted_by`: and is.
+    """Record the run in folder/data; returns its id.
 
-    `error_bounds_mm`: the evaluation's error states its uncertainty, and so does the calibration's. `serials`: of the
-    camera, over its connection and in its photographs. `photographs`: of the last attempt; more than two are as large
-    and detailed as real ones are once they are small, with a mesh and overlays to match.
+    `acceptable`: a figure outside its limit may be accepted; `accepted_by`: who accepts it. `error_bounds_mm`: the
+    uncertainty stated by the evaluation and the calibration. `serials`: of the camera, by its connection and in its
+    photographs. `photographs`: number in the last attempt; more than two are as large and detailed as real ones after
+    reduction, with a mesh and overlays to match.
     """
     text = PROTOCOL.replace("steps:", f"release: {release}\nsteps:", 1)
     if registered:
@@ -188,7 +189,7 @@ class _Writer:
         self._store, self._run_id, self._protocol, self._person = store, run_id, protocol, person
 
     def add(self, *payloads: Payload, actor: str = "runner", artefacts: tuple[NewArtefact, ...] = ()) -> str:
-        """Append events; the hash of the last."""
+        """Append events; returns the hash of the last one."""
         return self._store.record(self._run_id, payloads, actor=actor, artefacts=artefacts)[-1].sha256
 
     def act(self, verb: str, **fields: Any) -> None:
@@ -209,7 +210,7 @@ class _Writer:
         return self._store.put_bytes(data, kind=kind, media_type=media_type, original_name=name)
 
     def photograph(self, name: str, kind: str, attempt: int = 1) -> ArtefactRef:
-        """Of one grey with its name; a large one is as full of detail as anatomy is."""
+        """A photograph in one grey that shows its name; a large one is as detailed as anatomy."""
         if self._large:
             noise = self._random.normal(0, 70, (800, 1200, 3)).astype(np.float32)
             pixels = np.clip(110 + cv2.GaussianBlur(noise, (0, 0), 1.5) * 3, 0, 255).astype(np.uint8)
@@ -243,7 +244,7 @@ class _Writer:
         self.add(payload, artefacts=(NewArtefact(ref, "camera", "capture", attempt, viewpoint),))
 
     def register(self) -> None:
-        """The scan of a tetrahedron, and where the cameras are in its frame."""
+        """Record the scan of a tetrahedron, and the camera poses in its frame."""
         buffer = io.BytesIO()
         vertices_m = 0.05 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
         faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -268,7 +269,7 @@ class _Writer:
         artefacts: tuple[ArtefactRef, ...] = (),
         known: Mapping[str, Uncertainty] | None = None,
     ) -> str:
-        """StepMeasured and its gates; the hash of the latter."""
+        """Append StepMeasured and its gates; returns the hash of the latter."""
         measured = StepMeasured(
             step=step,
             attempt=attempt,
@@ -283,7 +284,7 @@ class _Writer:
 
 
 def calibration() -> dict[str, Any]:
-    """The result of a calibration step, as intrinsics_record and hand_eye_record write it."""
+    """The result of a calibration step, as written by intrinsics_record and hand_eye_record."""
     counts = [[5 * row + column for column in range(12)] for row in range(8)]
     intrinsics = {
         "coverage": {"share": 0.95, "corners": counts},

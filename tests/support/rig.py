@@ -1,4 +1,4 @@
-"""A simulated rig and the command line, as processes, for system tests."""
+"""Runs a simulated rig and the command line as processes, for system tests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REPOSITORY = Path(__file__).parents[2]
 
 
 class RigLock:
-    """Only one rig at a time on an address: RTDE's ports are fixed."""
+    """Only one rig at a time per address, because RTDE's ports are fixed."""
 
     def __init__(self, host: str) -> None:
         self._path = Path(tempfile.gettempdir()) / f"orthocapture-test-rig-{host}.lock"
@@ -35,7 +35,7 @@ RIG_LOCK = RigLock(_USUAL)
 
 
 def press_pedal(world: str) -> None:
-    """Press the foot pedal of the rig whose world listens at `world`, as somebody in the room."""
+    """Press the foot pedal of the rig whose world listens at `world`."""
     host, _, port = world.rpartition(":")
     with socket.create_connection((host, int(port)), timeout=10) as link:
         link.sendall(b'{"op": "act", "action": "press_pedal"}\n')
@@ -50,13 +50,13 @@ def orthocapture(*words: str, timeout_s: float = 120) -> subprocess.CompletedPro
 
 
 def command(*words: str) -> list[str]:
-    """The command line that an installed `orthocapture` stands for."""
+    """The command line that corresponds to an installed `orthocapture`."""
     return [sys.executable, "-m", "service.cli.main", *words]
 
 
 @contextmanager
 def simulated_rig(folder: Path, *options: str, host: str = _USUAL) -> Generator[dict[str, Any]]:
-    """A rig around one scene; yields its ready line. On another loopback address it waits for no other rig."""
+    """Start a rig around one scene; yields its ready line. On another loopback address it waits for no other rig."""
     with RigLock(host), (folder / "rig.log").open("w") as log:
         process = subprocess.Popen(
             command("simulate", "rig", "--dir", str(folder), "--host", host, *options),
@@ -75,7 +75,7 @@ def simulated_rig(folder: Path, *options: str, host: str = _USUAL) -> Generator[
 
 
 def without_calibration_and_ct(capture_step: dict[str, Any]) -> None:
-    """A capture step of demo.yaml for a protocol that has no calibration and no CT before it."""
+    """Adapt a capture step of demo.yaml to a protocol without calibration and CT."""
     capture_step["params"].pop("live", None)
     measured_from_them = ("optics_departures", "predicted_target_error_mm", "specimen_coverage")
     capture_step["gates"] = [gate for gate in capture_step["gates"] if gate["measure"] not in measured_from_them]

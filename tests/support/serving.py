@@ -1,4 +1,4 @@
-"""`orthocapture serve` as a process: its address, its log, and somebody signed in."""
+"""`orthocapture serve` as a process, with its address, its log and a signed-in user."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ _PASSWORD = "correct horse battery"
 
 @dataclass
 class Server:
-    """A running one."""
+    """A running server."""
 
     url: str
-    set_up: str  # the first set-up's link; "" when there is an administrator
+    set_up: str  # link for the first set-up; "" if there is an administrator
     process: subprocess.Popen[str]
-    log: Path  # what it says on stderr
+    log: Path  # its stderr
 
     @property
     def address(self) -> tuple[str, int]:
-        """Where it listens on this machine."""
+        """The address at which it listens."""
         return "127.0.0.1", int(self.url.rpartition(":")[2])
 
     def signed_in(self) -> dict[str, str]:
-        """The request headers of the first administrator, whose account is made with the first set-up."""
+        """Request headers of the first administrator, whose account is created by the first set-up."""
         secret = {"password": _PASSWORD, "repeated": _PASSWORD, "pin": "2468"}
         made = httpx.post(self.set_up, data={"account": "ada", "full_name": "Ada Lovelace", **secret}, timeout=30)
         assert made.status_code == 303, made.text
@@ -41,14 +41,14 @@ class Server:
         return {"Cookie": answer.headers["set-cookie"].partition(";")[0]}
 
     def refused_sign_in(self, account: str, headers: list[tuple[str, str]] | None = None) -> httpx.Response:
-        """A sign-in with a wrong password."""
+        """Try to sign in with a wrong password."""
         form = {"account": account, "password": "wrong"}
         return httpx.post(f"{self.url}/sign-in", data=form, headers=headers, timeout=30)
 
 
 @contextmanager
 def serving(rig: Path, *options: str, most_files: int = 0) -> Generator[Server]:
-    """Serve the folder `data` beside the rig file; `most_files` limits what the process may open."""
+    """Serve the folder `data` beside the rig file; `most_files` limits the process's open files."""
     words = command("serve", "--rig", str(rig), "--data", str(rig.parent / "data"), "--port", "0", "--json", *options)
     if most_files:
         words = ["sh", "-c", f'ulimit -n {most_files}; exec "$0" "$@"', *words]

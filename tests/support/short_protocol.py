@@ -1,4 +1,4 @@
-"""A protocol of a few minutes for the simulated rig: a checklist, one capture, a step to skip, one to sign."""
+"""A protocol of a few minutes for the simulated rig: a checklist, a capture, a step to skip, a step to sign."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.support.rig import REPOSITORY, without_calibration_and_ct
 
 
 def short_protocol(folder: Path, *, views: int = 5, release: bool = False) -> Path:
-    """Written into a folder of protocols."""
+    """Write the protocol into a folder of protocols."""
     protocol = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     steps: dict[str, dict[str, Any]] = {step["id"]: step for step in protocol["steps"]}
     capture = steps["viewpoint_capture_1"]

@@ -1,4 +1,4 @@
-"""A protocol with a part of its views and every kind of step: for sizes at which the whole would take hours."""
+"""Shortens a protocol to a part of its views, with every kind of step, where the whole would take hours."""
 
 from __future__ import annotations
 
@@ -8,21 +8,22 @@ from typing import Any
 import yaml
 
 _COUNTED = ("views", "viewpoints_captured")
-#: Board images that a calibration keeps, by what it solves: with fewer the protocol's own gates cannot pass.
+#: Least number of board images of a calibration, by what it solves: with fewer the gates cannot pass.
 _FEWEST = {"intrinsics": 15, "hand_eye": 12}
 
 
 def shortened(
     protocol: Path, divisor: int, into: Path, *, slice_mm: float | None = None, settle_s: float | None = None
 ) -> Path:
-    """Write the protocol with one view of `divisor`, and with the gates that count views lowered alike.
+    """Write the protocol with one view in `divisor`, and with the gates that count views lowered accordingly.
 
-    Board images are shortened too, but never below what lens and hand-eye need to pass the gates on their figures.
+    Board images are reduced too, but never below what the calibration of lens and hand-eye needs to pass its gates.
 
     Args:
-        slice_mm: the gate on the CT's slices lets those of this thickness pass, so that a coarse simulated CT, which
-            takes seconds, can be imported; None: as the protocol has it.
-        settle_s: how long a coat settles; None: as the protocol has it.
+        slice_mm: CT slice thickness that its gate shall accept, so that a coarse simulated CT, which takes seconds,
+        can
+            be imported; None: as in the protocol.
+        settle_s: settling time of the coating; None: as in the protocol.
     """
     document: dict[str, Any] = yaml.safe_load(protocol.read_text(encoding="utf-8"))
     for step in document["steps"]:
@@ -41,7 +42,7 @@ def shortened(
 
 
 def _shorten_views(params: dict[str, Any], divisor: int) -> tuple[int, int]:
-    """Shorten a step's views in place; how many it had and has."""
+    """Reduce a step's views in place; returns the old and the new number."""
     planned = taken = 0
     for viewpoint_set in params.get("viewpoints", []):
         for arc in viewpoint_set["arcs"]:

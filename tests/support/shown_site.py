@@ -1,4 +1,4 @@
-"""A data folder in which every page has something to show, recorded through the public surface without a rig."""
+"""A data folder in which every page has something to show, recorded through the public interface without a rig."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from tests.support.web import web_site
 
 @dataclass(frozen=True)
 class ShownSite:
-    """What lies in folder/data, folder/rig.yaml and folder/protocols."""
+    """The site in folder/data, folder/rig.yaml and folder/protocols."""
 
     folder: Path
-    completed: str  # with a re-do, a skipped viewpoint, a correction, a signature and a result
+    completed: str  # with a redo, a skipped viewpoint, a correction, a signature and a result
     registered: str  # scans with spheres and a registration
-    calibrated: str  # a calibration, and a capture under way
-    listing: str  # waits for the confirmation of a checklist, one item of which is ticked
+    calibrated: str  # a calibration, and a capture in progress
+    listing: str  # waits for the confirmation of a checklist with one item ticked
     moving: str  # waits for the confirmation of a motion
     signing: str  # waits for the signature of an irreversible step
     failed: str  # waits for a decision: a gate has failed
-    acceptable: str  # the same, and a supervisor may accept it
-    held: str  # images are taken by hand, one of them cannot be used
+    acceptable: str  # like `failed`, but a supervisor may accept it
+    held: str  # images are taken by hand, one of which cannot be used
 
     @property
     def under_way(self) -> tuple[str, ...]:
@@ -39,7 +39,7 @@ class ShownSite:
 
 
 def shown_site(folder: Path) -> ShownSite:
-    """Every kind of run, and the four people of tests.support.web."""
+    """Create every kind of run, and the four people of tests.support.web."""
     registered = record_run(folder)
     completed = record_reported_run(folder, person="grace")
     failed = record_reported_run(folder, error_mm=0.9, person="grace")
@@ -64,7 +64,7 @@ def shown_site(folder: Path) -> ShownSite:
 
 
 class _LeftError(Exception):
-    """Nobody is there any more."""
+    """The person has gone."""
 
 
 def leave(_question: AskOperator, _state: RunState) -> OperatorAction:

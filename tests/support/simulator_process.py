@@ -1,4 +1,4 @@
-"""A simulator as a child process for tests: waits for its ready line, ends it with SIGTERM."""
+"""Runs a simulator as a child process for tests: waits for its ready line, ends it with SIGTERM."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True)
 class Running:
-    """The process and what it announced."""
+    """The process and its ready line."""
 
     process: subprocess.Popen[str]
     ready: dict[str, Any]

@@ -1,4 +1,4 @@
-"""A second, independent renderer of marker spheres: lamps, gloss, grounds, blur, transfer curve and JPEG to choose.
+"""A second, independent renderer of marker spheres: selectable lamps, gloss, background, blur, tone curve and JPEG.
 
 Outlines are exact: every pixel near a sphere is the mean of rays through the distorted lens.
 """
@@ -45,12 +45,12 @@ class Look:
     subsampled: bool = True
     wires: int = 0
     stains: int = 0
-    tissue: int = 0  # patches of the ground in front of spheres
+    tissue: int = 0  # patches of background texture in front of spheres
     posts: bool = True
-    mirror: float = 0.0  # share of the surroundings' light that is reflected where one looks straight at the sphere
-    up: tuple[float, float, float] = (0.0, -0.2, -0.98)  # of the surroundings: a bright room over the ground
-    room: float = 0.9  # its brightness
-    pale: float = 0.0  # share of white light laid over the picture, as a cheap camera's lens and processing do
+    mirror: float = 0.0  # reflectance of the surroundings at normal incidence
+    up: tuple[float, float, float] = (0.0, -0.2, -0.98)  # of the surroundings: a bright room above the ground
+    room: float = 0.9  # brightness of the room
+    pale: float = 0.0  # fraction of white light added to the picture, like a cheap camera's lens flare and processing
     balance_bgr: tuple[float, float, float] = (1.0, 1.0, 1.0)  # gains of the camera's white balance
 
 
@@ -77,7 +77,7 @@ class Picture:
     owner: NDArray[np.int16]
 
     def visible(self, cam: CameraModel, index: int, cone: Cone) -> float:
-        """The part of a sphere's outline that is in the image with nothing in front of it."""
+        """The fraction of a sphere's outline that is in the image and not occluded."""
         azimuth = np.linspace(0.0, 2 * np.pi, 180, endpoint=False)
         rim = cam.project(cone.rays(azimuth, np.full(180, cone.half_angle_rad - 1.5 / cam.fx)))
         x, y = np.rint(rim).astype(int).T
@@ -87,12 +87,12 @@ class Picture:
 
 
 def render_look(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int = 0) -> NDArray[np.uint8]:
-    """Image (H, W, 3) BGR uint8 of spheres with centres (M, 3) in the camera frame."""
+    """Render an image (H, W, 3) BGR uint8 of spheres with centres (M, 3) in the camera frame."""
     return picture_of(cam, centres_camera_m, look, seed).image
 
 
 def picture_of(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int = 0) -> Picture:
-    """The same with what is seen of each sphere."""
+    """Render the same image, with what each pixel shows."""
     owner = np.full((cam.height, cam.width), -1, dtype=np.int16)
     rng = np.random.default_rng(seed)
     image = _ground((cam.height, cam.width), look.ground, rng) * (0.35 + 0.65 * sum(s for _, s in look.lamps))
@@ -149,10 +149,10 @@ def picture_of(cam: CameraModel, centres_camera_m: Array, look: Look, seed: int 
 
 
 def _reflection(rays: Array, normal: Array, look: Look) -> tuple[Array, Array]:
-    """What the sphere mirrors: the share (N, 1), after Fresnel as Schlick has it, and the light (N, 3) from there.
+    """Reflection on the sphere: the fraction (N, 1), by Schlick's approximation of Fresnel, and the light (N, 3).
 
-    The room lies above the horizon, the lit ground below: the horizon is a ring well inside the outline, and beside
-    the outline the sphere mirrors what lies behind it.
+    The room lies above the horizon, the lit ground below: the horizon is reflected as a ring well inside the outline,
+    and near the outline the sphere reflects what lies behind it.
     """
     facing = np.clip(-np.sum(rays * normal, axis=1), 0, 1)
     share = look.mirror + (1 - look.mirror) * (1 - facing) ** 5

@@ -45,7 +45,7 @@ class Scene:
 
 
 def scene(n_images: int = 6, width: int = 1536, seed: int = 0) -> Scene:
-    """Cameras on two arcs over the spheres, aimed near the scene's centre; the scan lies anywhere in the world."""
+    """Cameras on two arcs above the spheres, aimed near the scene's centre; the scan frame is arbitrary."""
     rng = np.random.default_rng(seed)
     T_world_scan = transform(Rotation.random(rng=rng), rng.uniform(-0.4, 0.4, 3))
     poses: list[Array] = []
@@ -63,9 +63,9 @@ def scene(n_images: int = 6, width: int = 1536, seed: int = 0) -> Scene:
 def exact_outlines(
     made: Scene, image: int, centres_scan_m: Array, noise_px: float = 0.0, seed: int = 0, margin_px: float = 0.0
 ) -> tuple[tuple[SphereOutline, ...], tuple[int, ...]]:
-    """Outlines as a perfect detector gives them, in random order, of the spheres inside the image; and their indices.
+    """Outlines of a perfect detector, in random order, of the spheres inside the image; and the spheres' indices.
 
-    `noise_px` moves a cone's two directions and its size.
+    `noise_px` is added to a cone's two directions and its size.
     """
     rng = np.random.default_rng(1000 * seed + image)
     c = made.centres_camera(image, centres_scan_m)
@@ -87,7 +87,7 @@ def exact_outlines(
 
 
 def false_outlines(cam: CameraModel, n: int, seed: int = 0) -> tuple[SphereOutline, ...]:
-    """Detections of things that are no spheres, at random places, of likely sizes."""
+    """False detections at random places, of plausible sizes."""
     rng = np.random.default_rng(seed)
     evidence = Evidence(0.8, 0.2, 0.2, 200, 0.05, 0.2, (120.0, 120.0, 120.0), 0.6, np.eye(3) * (0.1 / cam.fx) ** 2)
     out: list[SphereOutline] = []
@@ -99,7 +99,7 @@ def false_outlines(cam: CameraModel, n: int, seed: int = 0) -> tuple[SphereOutli
 
 
 def _background(shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Linear BGR in 0..1: blotches over several octaves, like tissue and cloth."""
+    """Linear BGR in 0…1: blotches over several octaves, like tissue and cloth."""
     h, w = shape
     out = np.zeros((h, w, 3))
     for octave in (4, 12, 40, 160):
@@ -121,7 +121,7 @@ def render(
     noise: float = 0.004,
     occluders: int = 0,
 ) -> NDArray[np.uint8]:
-    """Image (H, W, 3) BGR uint8, through JPEG, of matte spheres (centres (M, 3) in the camera frame) under a lamp."""
+    """JPEG image (H, W, 3) BGR uint8 of matte spheres, centres (M, 3) in the camera frame, with a lamp."""
     rng = np.random.default_rng(seed)
     image = _background((cam.height, cam.width), rng)
     lamp = np.array([0.35, -0.5, -0.8]) + rng.uniform(-0.2, 0.2, 3)

@@ -1,4 +1,4 @@
-"""Scan-like meshes and clouds of spheres with clutter, holes and noise that neighbouring points share."""
+"""Scan-like meshes and point clouds of spheres with clutter, holes and correlated noise."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ RADIUS_M = 0.015
 
 @dataclass
 class MeshBuilder:
-    """Pieces of surface that become one mesh."""
+    """Pieces of surface that are merged into one mesh."""
 
     pieces: list[tuple[Array, IntArray]] = field(default_factory=list)
 
     def add(self, vertices: Array, faces: IntArray) -> None:
-        """Add a piece with its own numbering."""
+        """Add a piece with its own vertex numbering."""
         self.pieces.append((np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)))
 
     def build(self) -> tuple[Array, IntArray]:
-        """Vertices (V, 3) and faces (F, 3) of everything."""
+        """Vertices (V, 3) and faces (F, 3) of all pieces."""
         offsets = np.cumsum([0, *(len(v) for v, _ in self.pieces)])
         return (
             np.concatenate([v for v, _ in self.pieces]),
@@ -36,7 +36,7 @@ class MeshBuilder:
 def shared_noise(
     points: Array, rng: np.random.Generator, white_m: float, shared_m: float = 0.0, length_m: float = 4e-3
 ) -> Array:
-    """Heights (N,): white noise, and a smooth part of a correlation length (random plane waves)."""
+    """Heights (N,): white noise, plus a smooth part with a correlation length (random plane waves)."""
     noise = rng.normal(0.0, white_m, len(points))
     if shared_m > 0:
         waves = rng.normal(0.0, 1 / length_m, (200, 3))
@@ -76,7 +76,7 @@ def cap(
         np.cross(points[faces[:, 1]] - points[faces[:, 0]], points[faces[:, 2]] - points[faces[:, 0]]),
         points[faces].mean(axis=1) - centre,
     )
-    if np.median(outward) < 0:  # a rotation drawn with a reflection turns the faces
+    if np.median(outward) < 0:  # the random rotation contains a reflection, which inverts the faces
         faces = faces[:, ::-1]
     return points, faces
 
@@ -114,7 +114,7 @@ def clutter(rng: np.random.Generator, noise_m: float) -> MeshBuilder:
 
 
 def scattered_centres(rng: np.random.Generator, count: int) -> Array:
-    """Places (count, 3) of spheres that do not touch one another or the clutter."""
+    """Centres (count, 3) of spheres that touch neither one another nor the clutter."""
     centres: list[Array] = []
     while len(centres) < count:
         centre = rng.uniform([-0.3, -0.25, 0.05], [0.3, 0.1, 0.12])

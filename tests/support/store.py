@@ -1,4 +1,4 @@
-"""For tests of the store: clocks and ids under control, a seam that crashes or loses power, a run to work on."""
+"""For tests of the store: controlled clocks and ids, file operations that crash or lose power, and a run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IDENTITY4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (
 
 
 class SteppedClock:
-    """Stands still until told."""
+    """A clock that stands still unless told otherwise."""
 
     def __init__(self) -> None:
         self.passed_s = 0.0
@@ -31,7 +31,7 @@ class SteppedClock:
 
 
 class CountedIds:
-    """The same names every time."""
+    """The same ids every time."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -51,14 +51,14 @@ class CountedIds:
 
 
 class Crash(BaseException):
-    """The process is gone; no handler of errors may catch it."""
+    """The process is gone; no error handler may catch this."""
 
 
 class CrashingFiles:
-    """Records the seam's calls and dies at point `crash_at`; dead, it does nothing any more.
+    """Records the file operations and dies at point `crash_at`; once dead, it does nothing.
 
-    Each call has three points: before it, within it (a write is cut in half, a commit does not happen), after it.
-    `lose_power` then takes away what was never made durable: data without fsync, names without fsync of the folder.
+    Each call has three points: before it, within it (a write is cut in half, a commit does not happen), and after it.
+    `lose_power` then removes what was never made durable: data without fsync, names without fsync of the folder.
     """
 
     def __init__(self, crash_at: int | None = None) -> None:
@@ -67,7 +67,7 @@ class CrashingFiles:
         self.dead = False
         self._real = DurableFiles()
         self._unsynced_data: set[Path] = set()
-        self._unsynced_names: dict[Path, Path | None] = {}  # name → what it was called before
+        self._unsynced_names: dict[Path, Path | None] = {}  # name → its previous name
 
     def _point(self, name: str) -> None:
         if self.dead:
@@ -148,7 +148,7 @@ class CrashingFiles:
         self._call("commit", commit)
 
     def lose_power(self) -> None:
-        """Empty the files whose data was not synced; undo names that were not, the deepest first."""
+        """Empty the files whose data was not synced, and undo unsynced names, the deepest first."""
         for path in self._unsynced_data:
             if path.exists():
                 path.chmod(0o644)
@@ -166,7 +166,7 @@ class CrashingFiles:
 
 
 def start_run(store: Store, *, simulated: bool = True) -> str:
-    """A run with its protocol and rig."""
+    """Begin a run with its protocol and rig."""
     protocol = store.put_bytes(b"id: demo\n", kind="protocol", media_type="text/yaml", original_name="demo.yaml")
     rig = store.put_bytes(b"name: rig\n", kind="rig", media_type="text/yaml", original_name="rig.yaml")
     payload = RunStarted(
@@ -206,13 +206,13 @@ def captured(ref: ArtefactRef, viewpoint: str, **changes: object) -> ViewpointCa
 
 
 def put_image(store: Store, viewpoint: str, size: int = 2000) -> ArtefactRef:
-    """Bytes that differ for each viewpoint."""
+    """Store bytes that differ for each viewpoint."""
     data = viewpoint.encode().ljust(size, b"\xff")
     return store.put_bytes(data, kind="image", media_type="image/jpeg", original_name=f"{viewpoint}.JPG")
 
 
 def capture(store: Store, run_id: str, viewpoint: str) -> ArtefactRef:
-    """Put an image and record it, as a capture does."""
+    """Store an image and record it, as a capture does."""
     ref = put_image(store, viewpoint)
     store.record(
         run_id,
@@ -224,13 +224,13 @@ def capture(store: Store, run_id: str, viewpoint: str) -> ArtefactRef:
 
 
 def rows(data_dir: Path, sql: str) -> list[tuple[object, ...]]:
-    """Read with plain sqlite3, as an outsider."""
+    """Query with plain sqlite3, as an outsider would."""
     with closing(sqlite3.connect(database_path(data_dir))) as connection:
         return list(connection.execute(sql))
 
 
 def tamper(data_dir: Path, *statements: str) -> None:
-    """Change evidence as somebody with full rights would: triggers dropped first, and put back afterwards."""
+    """Change evidence as somebody with full access would: drop the triggers first, and restore them afterwards."""
     with closing(sqlite3.connect(database_path(data_dir))) as connection:
         triggers: list[tuple[str, str]] = list(
             connection.execute("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'")

@@ -1,6 +1,6 @@
-"""A program that drives an arm to and fro and, whatever happens, tries to go on: a process that tests kill.
+"""A program that moves an arm back and forth and always tries to continue: a process for tests to kill.
 
-Each line that it reads is the name of a person who lets the arm move. It says in lines of JSON what it sees.
+Each line that it reads is the name of a person who permits motion. It reports its observations as lines of JSON.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from drivers.host import HostedDevice, hosted
 from drivers.interfaces import RobotArm
 from drivers.ur import UrConfig
 
-SPEED_RAD_S, ACCELERATION_RAD_S2 = 1.0, 1.5  # of protocols/demo.yaml, the fastest
+SPEED_RAD_S, ACCELERATION_RAD_S2 = 1.0, 1.5  # the fastest motion of protocols/demo.yaml
 GOAL_RAD = 2.5
 
 
@@ -47,7 +47,7 @@ def main() -> None:
             arm.move_joints(target, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=ACCELERATION_RAD_S2)
             said = None
             say(moves_to=target[0])
-            while hangs:  # its main loop; a screen's thread goes on watching the arm
+            while hangs:  # hang in the main loop; a screen's thread keeps watching the arm
                 arm.samples(time.monotonic() - 0.3, time.monotonic())
                 time.sleep(0.1)
             while arm.is_moving():

@@ -1,4 +1,4 @@
-"""Evidence rewritten by somebody with full rights to the database but without the signing key."""
+"""Rewrites evidence as somebody with full access to the database but without the signing key."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from service.store.artefacts import record_sha256
 from service.store.events import event_sha256, parse_canonical
 from tests.support.store import rows, tamper
 
-# The index of words made again from the events as they are now; before the first, tamper() has dropped the triggers.
+# Rebuilds the search index from the current events; tamper() has dropped the triggers before this runs.
 WORDS_AGAIN = (
     "INSERT INTO event_words (event_words) VALUES ('delete-all')",
     "INSERT INTO event_words (rowid, words) SELECT i.position, e.actor || ' ' || "
@@ -20,7 +20,7 @@ _EVENT: tuple[str, ...] = ("seq", "run_id", "at_utc", "monotonic_s", "actor", "p
 
 
 def rewrite_to_the_end(data: Path, run_id: str, seq: int, **changes: Any) -> None:
-    """Change fields of an event and make everything after it fit again: links, hashes, artefact rows, head."""
+    """Change fields of an event and make everything after it consistent: links, hashes, artefact rows, head."""
     statements: list[str] = []
     previous = ""
     for row in rows(data, f"SELECT {', '.join(_EVENT)} FROM events WHERE run_id = '{run_id}' ORDER BY seq"):
@@ -60,7 +60,7 @@ def _rows_again(data: Path, where: str, event: str) -> list[str]:
 
 
 def alter_row(data: Path, run_id: str, seq: int, device: str) -> None:
-    """Another device in an artefact's row, and the row's unkeyed hash made to fit."""
+    """Change the device in an artefact's row, and adapt the row's unkeyed hash."""
     where = f"run_id = '{run_id}' AND seq = {seq}"
     ((event,),) = rows(data, f"SELECT sha256 FROM events WHERE {where}")
     tamper(data, f"UPDATE artefacts SET device = '{device}' WHERE {where}")
@@ -68,12 +68,12 @@ def alter_row(data: Path, run_id: str, seq: int, device: str) -> None:
 
 
 def without_signatures_from(run: str, seq: int) -> list[str]:
-    """SQL that takes the signatures of a chain away, from an event on."""
+    """SQL that deletes the signatures of a chain from an event on."""
     return [f"DELETE FROM checkpoints WHERE run_id = '{run}' AND seq >= {seq}"]
 
 
 def cut(run: str, seq: int) -> list[str]:
-    """SQL after which a chain ends before `seq`, and everything says so."""
+    """SQL that consistently truncates a chain before `seq`."""
     of = f"run_id = '{run}' AND seq >= {seq}"
     last = f"(SELECT sha256 FROM events WHERE run_id = '{run}' AND seq = {seq - 1})"
     return [

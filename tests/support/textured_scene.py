@@ -1,4 +1,4 @@
-"""Renders textured slabs analytically, with lens distortion, as images whose true poses are known."""
+"""Renders textured slabs analytically, with lens distortion, as images with known poses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def camera_of_width(width: int) -> CameraModel:
 
 
 def ring_of_poses(count: int, distance_m: float = 0.62, tilt_deg: float = 32.0) -> list[Transform]:
-    """T_world_camera on two rings of tilt around the scene, looking near its centre."""
+    """T_world_camera on two rings of different tilt around the scene, looking near its centre."""
     poses: list[Transform] = []
     for k in range(count):
         azimuth = 2 * np.pi * k / count
@@ -46,7 +46,7 @@ def ring_of_poses(count: int, distance_m: float = 0.62, tilt_deg: float = 32.0) 
 
 @dataclass(frozen=True, slots=True)
 class Slab:
-    """A horizontal rectangle with a texture of its own."""
+    """A horizontal rectangle with its own texture."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -83,12 +83,12 @@ def _camera_rays(camera: CameraModel) -> Array:
 def render(
     scene: list[Slab], camera: CameraModel, T_world_camera: Transform, noise_seed: int | None = None
 ) -> NDArray[np.uint8]:
-    """Grey image (height, width), supersampled twice each way, with a little noise."""
+    """Grey image (height, width), 2 × 2 supersampled, with a little noise."""
     fine = camera.scaled(2 * camera.width, 2 * camera.height)
     rays: Array = _camera_rays(fine) @ T_world_camera[:3, :3].T
     eye = T_world_camera[:3, 3]
     image = np.full(len(rays), 60.0, dtype=np.float32)
-    for slab in sorted(scene, key=lambda s: s.z):  # seen from above: higher ones hide lower ones
+    for slab in sorted(scene, key=lambda s: s.z):  # seen from above: higher slabs hide lower ones
         points = eye + rays * ((slab.z - eye[2]) / rays[:, 2])[:, None]
         inside = np.all((points[:, :2] > slab.low) & (points[:, :2] < slab.high), axis=1)
         u = ((points[inside, :2] - slab.low) / TEXEL_M).astype(np.float32)

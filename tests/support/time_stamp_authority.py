@@ -1,4 +1,4 @@
-"""A small time-stamp authority: certificates made here, answers by `openssl ts`, served on this machine."""
+"""A small time-stamp authority: generated certificates, answers by `openssl ts`, served on this machine."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ess_cert_id_alg = sha256
 
 @dataclass
 class TimeStampAuthority:
-    """Where it is asked, what its answers lead to, and how it misbehaves when told to."""
+    """Its address, the effect of its answers, and how it misbehaves."""
 
     url: str
     certificates: Path
@@ -49,7 +49,7 @@ def _name(text: str) -> x509.Name:
 
 
 def make_certificates(folder: Path) -> Path:
-    """A root and a time-stamping certificate below it, with its key; the root's file."""
+    """Create a root and a time-stamping certificate signed by it, with its key; returns the root's file."""
     root_key, key = (rsa.generate_private_key(public_exponent=65537, key_size=2048) for _ in range(2))
     begins, ends = datetime.now(UTC) - timedelta(days=1), datetime.now(UTC) + timedelta(days=3650)
 
@@ -90,7 +90,7 @@ def _reply(folder: Path, query: bytes) -> bytes:
 
 @contextmanager
 def time_stamp_authority(folder: Path) -> Generator[TimeStampAuthority]:
-    """One that listens on a free port of this machine while the block runs."""
+    """Run an authority on a free port while the block runs."""
     root = make_certificates(folder)
 
     class Handler(BaseHTTPRequestHandler):

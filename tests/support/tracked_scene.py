@@ -19,17 +19,17 @@ from tests.support.sphere_images import REGISTRATION_M, exact_outlines, scene
 
 @dataclass(frozen=True)
 class TrackedScene:
-    """What structure from motion, the detector and the robot say, and the truth."""
+    """The output of structure from motion, detector and robot, and the ground truth."""
 
     camera: CameraModel
     tracks: Tracks  # in the frame and unit of `poses`
-    poses: Array  # (N, 4, 4) of structure from motion
+    poses: Array  # (N, 4, 4) from structure from motion
     outlines: list[tuple[SphereOutline, ...]]
     T_base_camera: Array  # (N, 4, 4), two stations
     groups: NDArray[np.int64]
-    T_scan_camera: Array  # truth
-    T_scan_base: Array  # (2, 4, 4) truth
-    scale: float  # metres a unit of `poses`
+    T_scan_camera: Array  # ground truth
+    T_scan_base: Array  # (2, 4, 4) ground truth
+    scale: float  # metres per unit of `poses`
 
 
 def small_turn(rng: np.random.Generator, sigma_rad: float) -> Rotation:
@@ -49,10 +49,10 @@ def tracked_scene(
     camera_error_px: float = 0.0,
     camera_errors: Mapping[str, float] | None = None,
 ) -> TrackedScene:
-    """Cameras over spheres and a bumpy scene; structure from motion begins near the truth, in a frame of its own.
+    """Cameras above spheres and a bumpy scene; structure from motion starts near the truth, in a frame of its own.
 
-    With `camera_error_px` the tracks and the outlines come from a camera whose principal point is off by so much from
-    the one that is returned as calibrated; `camera_errors` are added to parameters of it by name.
+    With `camera_error_px` the tracks and outlines come from a camera whose principal point differs by so much from
+    the one that is returned as calibrated; `camera_errors` are added to its parameters by name.
     """
     rng = np.random.default_rng(seed)
     made = scene(images, 1536, seed)
@@ -73,7 +73,7 @@ def tracked_scene(
     often = np.bincount(point, minlength=points) >= 3
     rows = often[np.array(point)]
     number = np.cumsum(often) - 1
-    # The frame and the unit of structure from motion, its errors small beside a pixel.
+    # Frame and unit of structure from motion; its errors are small compared with a pixel.
     scale = float(rng.uniform(0.05, 0.3))
     T_sfm_scan = transform(Rotation.random(rng=rng), rng.uniform(-1, 1, 3))
     poses: list[Array] = []
@@ -104,7 +104,7 @@ def tracked_scene(
 
 
 def _seen_with(outline: SphereOutline, true: CameraModel, calibrated: CameraModel) -> SphereOutline:
-    """The same outline as who believes the calibrated camera reads its pixels."""
+    """The same outline as read with the calibrated camera instead of the true one."""
     rim = outline.cone.rays(np.linspace(0, 2 * np.pi, 24), np.full(24, outline.cone.half_angle_rad))
     rays = np.column_stack([calibrated.normalise(true.project(np.vstack([outline.cone.axis, rim]))), np.ones(25)])
     rays /= np.linalg.norm(rays, axis=1)[:, None]
@@ -113,6 +113,6 @@ def _seen_with(outline: SphereOutline, true: CameraModel, calibrated: CameraMode
 
 
 def pose_errors(estimated: Array, true: Array) -> Array:
-    """(N, 6) increments (d, w) that lead from the true poses to the estimated ones."""
+    """Increments (N, 6) (d, w) from the true poses to the estimated ones."""
     turns = Rotation.from_matrix(estimated[:, :3, :3] @ np.swapaxes(true[:, :3, :3], 1, 2)).as_rotvec()
     return np.hstack([estimated[:, :3, 3] - true[:, :3, 3], turns])

@@ -1,4 +1,4 @@
-"""A small RTDE client written from Universal Robots' guide, as their own Python client speaks it."""
+"""A small RTDE client written from Universal Robots' guide, speaking like their own Python client."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RtdeClient:
         self.socket.close()
 
     def shutdown(self) -> None:
-        """End the connection under a thread that waits for data: that raises OSError there."""
+        """Shut the connection down under a thread that waits for data, in which this raises OSError."""
         self.socket.shutdown(socket.SHUT_RDWR)
 
     def send(self, kind: str, payload: bytes = b"") -> None:
@@ -48,7 +48,7 @@ class RtdeClient:
         return chr(message[2]), message[3:]
 
     def ask(self, kind: str, payload: bytes = b"") -> bytes:
-        """Send and wait for the reply of the same kind; data packages on the way are dropped."""
+        """Send and wait for the reply of the same kind; data packages in between are dropped."""
         self.send(kind, payload)
         while True:
             got, reply = self.receive()

@@ -1,4 +1,4 @@
-"""Starts simulated Universal Robots controllers for tests, each on an address of its own."""
+"""Runs simulated Universal Robots controllers for tests, each on its own address."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from collections.abc import Generator
 
 
 def address(number: int) -> str:
-    """A loopback address that no other test worker uses: the controller's ports are fixed."""
+    """A loopback address that no other test worker uses, because the controller's ports are fixed."""
     worker = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
     return f"127.7.{10 + int(worker)}.{number}"
 

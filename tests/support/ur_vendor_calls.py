@@ -1,4 +1,4 @@
-"""Calls of ur_rtde that are rarely made, against one address, what they said as JSON; run as a child process."""
+"""Rarely made calls of ur_rtde against one address, with their answers as JSON; run as a child process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _said(call: Callable[[], Any]) -> Any:
 
 
 def forward_kinematics(host: str) -> dict[str, Any]:
-    """The client's data package is longer than its recipe when it is given the tool alone, or a list of seven."""
+    """The client's data package is longer than its recipe if it is given the tool alone, or a list of seven."""
     control = RTDEControlInterface(host)
     long = [
         _said(lambda: control.getForwardKinematics([], TOOL)),

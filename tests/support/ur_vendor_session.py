@@ -1,4 +1,4 @@
-"""Uses all four ur_rtde interfaces against one address and writes what they said as JSON; run as a child process."""
+"""Uses all four ur_rtde interfaces against one address and prints their answers as JSON; run as a child process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Waiting for what another process will bring about."""
+"""Waiting for the effect of another process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The web application in this process, over a data folder of a test, with people of every role signed in."""
+"""The web application in this process, over a test's data folder, with signed-in people of every role."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from service.web.site import Site
 from tests.support.bench_run import PROTOCOL, Bench, begin_run
 
 with warnings.catch_warnings():
-    # It would rather have a successor of httpx, which this project has no other use for.
+    # Starlette's test client warns that it prefers httpx's successor, which this project does not use otherwise.
     warnings.simplefilter("ignore")
     from starlette.testclient import TestClient
 
@@ -46,12 +46,12 @@ _ACCOUNTS: dict[Role, str] = {role: name.split()[0].lower() for role, name in NA
 
 
 def password_of(account: str) -> str:
-    """Every account's password in tests."""
+    """The password of an account in tests."""
     return f"correct horse {account.lower()}"
 
 
 class NoLauncher(Launcher):
-    """Starts nothing: it remembers what it was to start."""
+    """Starts nothing, but remembers what it was asked to start."""
 
     started: list[str]
 
@@ -66,7 +66,7 @@ class NoLauncher(Launcher):
 
 
 class Browser(TestClient):
-    """A screen: keeps its cookie, sends the CSRF token of its sign-in with every POST unless told otherwise."""
+    """A screen: keeps its cookie and sends its CSRF token with every POST unless told otherwise."""
 
     site: Site
 
@@ -76,25 +76,25 @@ class Browser(TestClient):
 
     @property
     def person(self) -> Person:
-        """Who is signed in here."""
+        """The signed-in person."""
         person = self.site.people.person(self.token, idle_lock_s=1e9, deliberate=False)
         assert person is not None, "nobody is signed in on this screen"
         return person
 
     def send_form(self, address: str, *, csrf: str | None = None, **fields: Any) -> httpx.Response:
-        """POST a form as the page does, without following the redirect that answers it."""
+        """POST a form as the page does, without following the redirect."""
         token = self.person.csrf if csrf is None else csrf
         return self.post(address, data={"csrf": token, **fields}, follow_redirects=False)
 
     def sign_in(self, account: str, password: str | None = None, **more: str) -> httpx.Response:
-        """Through the page."""
+        """Sign in through the page."""
         fields = {"account": account, "password": password_of(account) if password is None else password, **more}
         return self.post("/sign-in", data=fields, follow_redirects=False)
 
 
 @dataclass
 class WebSite:
-    """A site with its four people. `as_technician` and so on are screens that they are signed in on."""
+    """A site with its four people. `as_technician` and so on are screens on which they are signed in."""
 
     site: Site
     app: FastAPI
@@ -110,7 +110,7 @@ class WebSite:
         return self.site.people
 
     def browser(self, role: Role | None = None) -> Browser:
-        """A new screen; with a role, signed in as the person who has it. Errors of the server become pages."""
+        """A new screen; with a role, signed in as its person. Server errors become pages."""
         browser = Browser(self.app, base_url=HOST, raise_server_exceptions=False)
         browser.site = self.site
         self.browsers.append(browser)
@@ -121,22 +121,22 @@ class WebSite:
         return browser
 
     def account(self, role: Role) -> str:
-        """Name of the account that has the role."""
+        """The account that has the role."""
         return _ACCOUNTS[role]
 
     def begin_run(self, protocol: str = PROTOCOL) -> Bench:
-        """A run that has begun and waits for its first confirmation."""
+        """Begin a run, which waits for its first confirmation."""
         return begin_run(self.store, protocol, self.folder)
 
     def record_run(self, protocol: str = PROTOCOL) -> str:
-        """A small completed run on the rig in memory."""
+        """Record a small completed run on the in-memory rig."""
         bench = self.begin_run(protocol)
         state = bench.run()
         assert state.status == "completed", state.status
         return bench.run_id
 
     def take_control(self, run_id: str, browser: Browser) -> None:
-        """This screen controls the run from now on."""
+        """Let this screen control the run from now on."""
         Control(self.store).take(run_id, browser.person)
 
 
@@ -172,7 +172,7 @@ def web_site(folder: Path, *, clock: Clock | None = None, idle_lock_s: float = 6
 
 
 def populate(people: People) -> None:
-    """The four people, made as people make them: a first link, and invitations."""
+    """Create the four people as in practice: by a first link and invitations."""
     first = people.first_link()
     if first is None:
         return
