@@ -1,4 +1,4 @@
-"""Whether an arm stands still: one judgement for the settling after a motion and for an exposure."""
+"""Judges whether an arm stands still, for settling after a motion and for exposures alike."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from service.core.geometry import Transform, transform
 
 @dataclass(frozen=True, slots=True)
 class PoseSpread:
-    """The mean of some poses of the flange, and how far they spread around it.
+    """The mean of several flange poses and their spread around it.
 
-    Peak to peak is the diagonal of the box around the positions, and of the box around the rotation vectors relative
-    to the mean rotation: never less than the largest distance between two samples. A sigma is the standard deviation
-    over all three axes: the root of the sum of their variances.
+    The peak-to-peak values are the diagonals of the bounding boxes of the positions and of the rotation vectors
+    relative to the mean rotation: never below the largest distance between two samples. A sigma is the standard
+    deviation over all three axes: the root of the sum of their variances.
     """
 
     T_base_flange: Transform  # mean position and mean rotation
@@ -29,7 +29,7 @@ class PoseSpread:
     rotation_sigma_rad: float
 
     def within(self, criteria: SettleCriteria) -> bool:
-        """Whether the poses lie as close together as those of an arm that stands still."""
+        """Whether both peak-to-peak values are below those of the settle criteria."""
         return (
             self.position_peak_to_peak_m < criteria.position_peak_to_peak_m
             and self.rotation_peak_to_peak_rad < criteria.rotation_peak_to_peak_rad
@@ -37,7 +37,7 @@ class PoseSpread:
 
 
 def pose_spread(samples: Sequence[RobotSample]) -> PoseSpread:
-    """Mean and spread of the poses of at least one sample."""
+    """Compute the mean and the spread of the flange poses of at least one sample."""
     T = np.stack([s.T_base_flange for s in samples])
     positions = T[:, :3, 3]
     rotations = Rotation.from_matrix(T[:, :3, :3])
