@@ -73,7 +73,7 @@ class ScanFolder:
         for path in export.files:
             if not path.is_file():
                 raise IncompleteExportError(
-                    "a file of the export is missing", where=str(path), remedy="Export the scan again and keep it"
+                    "a file of the export is gone", where=str(path), remedy="Export the scan again and keep it"
                 )
         return read_mesh_file(export.files[0], self._config.unit, export=export)
 
