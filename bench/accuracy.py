@@ -22,14 +22,14 @@ from bench.machine import commit, machine
 from bench.scenes import CACHE, render_scene
 from drivers.mesh_file import read_mesh_file
 from service.compute.camera_model import CameraModel
+from service.compute.evaluation.accuracy import true_error_m
 from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import PipelineResult, detect_all, register_images
-from service.compute.poses.hybrid import HybridPoses, hybrid_poses
-from service.compute.poses.pose_files import read_camera_json, read_poses_csv, read_spheres_json
-from service.compute.poses.sfm import SfmModel, reconstruct
-from service.compute.poses.sfm_options import Effort, Mapper, options_for
+from service.compute.poses.files.pose_files import read_camera_json, read_poses_csv, read_spheres_json
+from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
+from service.compute.poses.sfm.estimate import SfmModel, reconstruct
+from service.compute.poses.sfm.options import Effort, Mapper, options_for
 from service.compute.registration.cost import residuals
-from service.compute.registration.evaluation import true_error_m
 from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.geometry import Array, Transform, align_points, apply, inverse

@@ -18,9 +18,9 @@ from typing import Any
 from urllib.parse import quote
 
 from bench.machine import commit, machine
-from service.core.model import StepNote
-from service.store.audit import verify
+from service.core.records.events import StepNote
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.large_run import Sizes, write_large_run
 from tests.support.store import captured
 from tests.support.store import start_run as start_small_run

@@ -21,18 +21,18 @@ import numpy as np
 import yaml
 
 from bench.machine import commit, machine
-from service.compute.calibration.board import Board, BoardView
-from service.compute.calibration.board_design import NOTHING, Aims, Taken
-from service.compute.calibration.board_knowledge import BoardKnowledge, refined_knowledge
-from service.compute.calibration.hand_eye import calibrate_hand_eye
-from service.compute.calibration.hand_eye_record import board_corners
-from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_view
-from service.compute.calibration.kinematics import matching_arm
-from service.compute.calibration.uncertainty import board_distance_m, projection_uncertainty
+from service.compute.arm.kinematics import matching_arm
+from service.compute.calibration.board.board import Board, BoardView
+from service.compute.calibration.board_poses.design import NOTHING, Aims, Taken
+from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
+from service.compute.calibration.hand_eye.estimate import calibrate_hand_eye
+from service.compute.calibration.hand_eye.record import board_corners
+from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
+from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.camera_model import CameraModel
 from service.compute.planning.motion_plan import able_postures
 from service.core.geometry import Array, Transform, apply, inverse
-from service.core.protocol import Motion
+from service.core.protocol.models import Motion
 from service.rig import CollisionSection, LensSection
 from service.steps.board_plan import START, BoardPoses, PlannedBoard, Planner, Why, nominal_board, nominal_camera
 from service.steps.context import StationLayout

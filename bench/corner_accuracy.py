@@ -17,9 +17,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.machine import commit, machine
-from service.compute.calibration.board import Board, find_board
+from service.compute.calibration.board.board import Board, find_board
 from service.compute.camera_model import CameraModel
-from service.compute.images import read_grey
+from service.compute.images.files import read_grey
 from service.core.geometry import apply, transform
 from tests.support.board_images import Photography, checkerboard, photograph
 

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bench.demo_accuracy import RESULTS, commit, machine
-from service.compute.calibration.arm_correction import corrected_T_base_flange
-from service.compute.calibration.hand_eye import HandEyeResult, calibrate_hand_eye
-from service.compute.calibration.kinematics import arm_model
+from service.compute.arm.correction import corrected_T_base_flange
+from service.compute.arm.kinematics import arm_model
+from service.compute.calibration.hand_eye.estimate import HandEyeResult, calibrate_hand_eye
 from service.core.geometry import Array
 from simulators.world import Scene
 from tests.support.board_sessions import (

@@ -14,12 +14,12 @@ from typing import Any
 
 from bench.demo_accuracy import MEASURES, run_demo
 from bench.machine import REPOSITORY, commit, machine
-from service.cli.demo import true_errors_mm
-from service.core.protocol import load_protocol
+from service.cli.run.demo import true_errors_mm
+from service.core.protocol.models import load_protocol
 from service.dataset.summary import summarise
 from service.steps import params_models
-from service.store.audit import verify
 from service.store.store import Store
+from service.store.verification.verify import verify
 
 RESULTS = Path(__file__).parent / "results"
 PROTOCOL = REPOSITORY / "protocols" / "handheld_spine.yaml"

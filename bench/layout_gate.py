@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from bench.machine import machine
 from service.compute.camera_model import CameraModel
+from service.compute.layout.ambiguity import check_layout, layout_bounds
+from service.compute.layout.photo_adjustment import LensPrior, Photograph
+from service.compute.layout.photographs import layout_from_photographs
 from service.compute.markers.cones import Cone, cone_of_sphere, fit_cone
-from service.compute.registration.layout import check_layout, layout_bounds
-from service.compute.registration.photo_adjustment import LensPrior, Photograph
-from service.compute.registration.photo_layout import layout_from_photographs
 from simulators.geometry import apply, inverse
 from simulators.rig_world import HELD_CAMERAS
 from simulators.world import RADIUS_M, Scene

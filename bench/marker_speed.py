@@ -22,11 +22,11 @@ import numpy as np
 
 from bench.machine import machine
 from bench.scenes import rendered
-from service.compute.images import read_image, read_reduced
-from service.compute.locating import ANCHOR_WIDTH_PX
+from service.compute.images.files import read_image, read_reduced
 from service.compute.markers.detect import detect_spheres
-from service.compute.poses.pose_files import read_camera_json, read_poses, read_spheres_json
-from service.compute.predicting import WIDE, Prediction, Tone, locate_predicted, tone_of
+from service.compute.markers.search.image_files import ANCHOR_WIDTH_PX
+from service.compute.markers.search.predicted import WIDE, Prediction, Tone, locate_predicted, tone_of
+from service.compute.poses.files.pose_files import read_camera_json, read_poses, read_spheres_json
 from service.core.geometry import inverse
 
 RESULTS = Path(__file__).parent / "results"

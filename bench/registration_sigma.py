@@ -16,11 +16,11 @@ from bench.accuracy import Capture, read_capture
 from bench.identity import CAMERA
 from bench.machine import commit, machine
 from bench.scenes import CACHE, render_scene
+from service.compute.evaluation.accuracy import evaluate, leave_one_out, true_error_m
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.records import Evidence, SphereOutline, outline_from_cone
 from service.compute.pipeline import detect_all, register_images
-from service.compute.registration.evaluation import evaluate, leave_one_out, true_error_m
 from service.compute.registration.identity import Assignment
 from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors
 from service.compute.registration.solve import RegistrationResult, register

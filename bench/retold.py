@@ -6,10 +6,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from service.core.model import Event, JobEnqueued, JobFinished, OperatorAction, Payload, RunStarted, SessionStarted
-from service.core.protocol import parse_protocol
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import (
+    Event,
+    JobEnqueued,
+    JobFinished,
+    OperatorAction,
+    Payload,
+    RunStarted,
+    SessionStarted,
+)
 from service.rig import Rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.store import Store

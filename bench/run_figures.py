@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from service.compute.planning.motion_plan import turn_times_s
-from service.core.model import (
+from service.core.protocol.models import Protocol
+from service.core.records.events import (
     Event,
     JobFinished,
     RunCompleted,
@@ -19,7 +20,6 @@ from service.core.model import (
     StepStarted,
     ViewpointCaptured,
 )
-from service.core.protocol import Protocol
 from service.dataset.summary import RunSummary
 
 _PATIENCE_S = 3.0  # a longer overhead is a pause, a retry or another part of the step

@@ -16,12 +16,12 @@ from typing import Any
 from PIL import Image
 
 from bench.retold import retell
-from service.core.gates import evaluate_gates
-from service.core.model import ItemTicked, OperatorAction, RecordCorrected, ViewpointCaptured
-from service.people.people import People
+from service.core.gates.verdict import evaluate_gates
+from service.core.records.events import ItemTicked, OperatorAction, RecordCorrected, ViewpointCaptured
 from service.people.roles import Role
+from service.people.sessions import People
 from service.rig import Rig, load_rig
-from service.runs import recorded_run
+from service.run_start import recorded_run
 from service.store.store import Store
 from tests.support.attended import attended
 from tests.support.browser import DESKTOP, PASSWORD, TABLET, Screen, add_people, chromium, screen, served

@@ -21,12 +21,12 @@ from scipy.spatial.transform import Rotation
 from bench.accuracy import Capture, read_capture
 from bench.machine import commit, machine
 from bench.scenes import CACHE, render_scene
-from service.compute.locating import detect_all
+from service.compute.evaluation.accuracy import true_error_m
+from service.compute.markers.search.image_files import detect_all
 from service.compute.pipeline import register_images
-from service.compute.poses.hybrid import hybrid_poses
-from service.compute.poses.sfm import SfmModel, reconstruct
-from service.compute.poses.sfm_options import Effort, Mapper, options_for
-from service.compute.registration.evaluation import true_error_m
+from service.compute.poses.hybrid.estimate import hybrid_poses
+from service.compute.poses.sfm.estimate import SfmModel, reconstruct
+from service.compute.poses.sfm.options import Effort, Mapper, options_for
 from service.core.geometry import Array, align_points, apply, inverse
 
 RESULTS = Path(__file__).parent / "results"

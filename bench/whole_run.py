@@ -18,11 +18,11 @@ import psutil
 
 from bench.machine import REPOSITORY
 from bench.run_figures import run_figures
-from service.cli.demo import true_errors_mm
-from service.core.model import RunReleased
+from service.cli.run.demo import true_errors_mm
+from service.core.records.events import RunReleased
 from service.dataset.summary import RunSummary, summarise
-from service.runs import recorded_run
-from service.store.signing import checkpoint
+from service.run_start import recorded_run
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 
 SECOND_PERSON = "second person of the bench"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from service.core.entered import NoteTaken, paragraphs
 from service.core.errors import DataError, IllegalTransitionError
-from service.core.model import Event
-from service.evidence import RunLog
+from service.core.records.entered import NoteTaken, paragraphs
+from service.core.records.events import Event
+from service.run_record import RunRecord
 from service.store.records import NewArtefact
 
 PHOTOGRAPH_BYTES = 16_000_000
@@ -27,7 +27,7 @@ class Photograph:
 
 
 def take_note(
-    log: RunLog,
+    log: RunRecord,
     text: str,
     photograph: Photograph | None,
     *,
@@ -91,7 +91,7 @@ def _checked(photograph: Photograph) -> tuple[str, str]:
     import cv2  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
 
-    from service.compute.images import check_jpeg, check_png  # noqa: PLC0415
+    from service.compute.images.files import check_jpeg, check_png  # noqa: PLC0415
 
     content, name = photograph.content, _plain(photograph.name)
     require_size(len(content), name)

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from service.core.checked_yaml import checked, decoded, problem_of, refuse
 from service.core.errors import ConfigurationError, DataError, ProtocolError
-from service.core.imported import ImportList
-from service.core.json_text import parse_json
-from service.core.model import Record
-from service.core.yaml_tree import NO_LINES, FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
+from service.core.records.events import Record
+from service.core.records.import_list import ImportList
+from service.core.text.checked_yaml import checked, decoded, problem_of, refuse
+from service.core.text.json_text import parse_json
+from service.core.text.yaml_tree import NO_LINES, FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
 
 _REMEDY = "Compare it with the example in docs/howto/your_hardware.md"
 

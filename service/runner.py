@@ -16,23 +16,12 @@ from typing import Protocol as Interface
 
 from drivers.errors import DeviceError
 from drivers.interfaces import DeviceReport
-from service.core.actions import refuse
-from service.core.clocks import clock_readings
-from service.core.decide import (
-    AbortRun,
-    Accept,
-    AskOperator,
-    EvaluateGates,
-    FinishRun,
-    Halt,
-    Retry,
-    RunStep,
-    decide,
-    evaluate_gates,
-)
+from service.core.equipment.clocks import clock_readings
+from service.core.equipment.disk_space import Forecast, Verdict
 from service.core.errors import OrthocaptureError, StoreError
-from service.core.gates import describe_judged
-from service.core.model import (
+from service.core.gates.verdict import describe_judged
+from service.core.protocol.models import Protocol
+from service.core.records.events import (
     ActionRefused,
     DeviceOpened,
     DeviceTrouble,
@@ -48,21 +37,32 @@ from service.core.model import (
     StepRetried,
     StepStarted,
 )
-from service.core.protocol import Protocol
-from service.core.recovery import recovery_policy
-from service.core.run_state import RunState
-from service.core.space import Forecast, Verdict
-from service.evidence import RunFollower, StepEvidence
+from service.core.recovery.policy import recovery_policy
+from service.core.run.actions import refuse
+from service.core.run.decide import (
+    AbortRun,
+    Accept,
+    AskOperator,
+    EvaluateGates,
+    FinishRun,
+    Halt,
+    Retry,
+    RunStep,
+    decide,
+    evaluate_gates,
+)
+from service.core.run.state import RunState
 from service.logs.where import at
 from service.monitor.host_clock import host_clock
 from service.monitor.snapshot import Doing
+from service.run_record import RunFollower, StepEvidence
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
-from service.store.leases import RunLease
-from service.store.signature_copy import keep_elsewhere
-from service.store.space import forecast_of, require_space
+from service.store.files.space_used import forecast_of, require_space
+from service.store.queue.leases import RunLease
+from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.timestamps import Authority, stamp_end
 from service.store.store import Store
-from service.store.timestamping import Authority, stamp_end
 
 _LEASE_S = 30.0
 _POLL_S = 0.1

@@ -26,9 +26,9 @@ from drivers.interfaces import (
     Transform,
 )
 from drivers.plugin import DriverConfig, DriverSpec
-from service.core.checked_yaml import problem_of, refuse
 from service.core.errors import ConfigurationError
-from service.core.imported import ImportList
+from service.core.records.import_list import ImportList
+from service.core.text.checked_yaml import problem_of, refuse
 from service.rig import CollisionSection, LensSection, OpticsSection, Rig
 from service.steps.context import LeaveToMove, StationLayout
 

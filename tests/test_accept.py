@@ -22,25 +22,25 @@ from service.audit.bundle.export import export_bundle
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
 from service.audit.report.output.html import render_html
-from service.cli.hands import SimulatedHands
 from service.cli.main import app
-from service.cli.operators import Display, TerminalOperator
-from service.core.actions import allowed_actions, unmet_requirements
-from service.core.decide import AskOperator
-from service.core.dependence import dependent_steps, depends_on
+from service.cli.run.hands import SimulatedHands
+from service.cli.run.operators import Display, TerminalOperator
 from service.core.errors import ProtocolError
-from service.core.fold import fold
-from service.core.model import ActionRefused, OperatorAction, RunCompleted
-from service.core.protocol import load_protocol
-from service.core.protocol_rules import NEVER_ACCEPTED
-from service.core.run_state import RunState
+from service.core.gates.dependence import dependent_steps, depends_on
+from service.core.protocol.models import load_protocol
+from service.core.protocol.rules import NEVER_ACCEPTED
+from service.core.records.events import ActionRefused, OperatorAction, RunCompleted
+from service.core.run.actions import allowed_actions, unmet_requirements
+from service.core.run.decide import AskOperator
+from service.core.run.fold import fold
+from service.core.run.state import RunState
 from service.dataset.export import export_dataset
 from service.monitor.reporter import OpenDevices, Reporter
-from service.people.people import People
+from service.people.sessions import People
 from service.runner import Spoken
 from service.steps import params_models
-from service.store.audit import verify
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.bench_rig import BenchRig
 from tests.support.bench_run import PROTOCOL, Bench, begin_run
 from tests.support.core import TOY, Log, load, toy_protocol

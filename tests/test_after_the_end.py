@@ -9,10 +9,10 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.model import ActionAfterEnd, ActionRefused
-from service.store.audit import verify
+from service.core.records.events import ActionAfterEnd, ActionRefused
 from service.store.records import SITE
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.web import WebSite, password_of, web_site
 
 

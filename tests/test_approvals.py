@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import ConfigurationError
-from service.core.model import ProtocolApproved
-from service.core.protocol import LoadedProtocol, parse_protocol
+from service.core.protocol.models import LoadedProtocol, parse_protocol
+from service.core.records.events import ProtocolApproved
 from service.people.approvals import approve, difference, standing_of
 from service.steps import params_models
-from service.store.audit import verify
 from service.store.records import SITE
+from service.store.verification.verify import verify
 from tests.support.bench_run import PROTOCOL
 from tests.support.web import WebSite, password_of, web_site
 

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.model import FilesKept, StepStarted
+from service.core.records.events import FilesKept, StepStarted
 from service.store.records import NewArtefact
 from service.web.page.rendering import local_time
 from tests.support.reported_run import record_reported_run

@@ -22,14 +22,14 @@ from service.audit.provenance.graph import graphs, origin
 from service.audit.record import artefact_queries, queries
 from service.audit.record.queries import EventFilter, EventPage
 from service.core.errors import DataError
-from service.core.fold import fold
-from service.core.model import StepNote
-from service.core.run_state import RunState
+from service.core.records.events import StepNote
+from service.core.run.fold import fold
+from service.core.run.state import RunState
 from service.people.roles import may
-from service.runs import recorded_run
-from service.store.audit import verify
+from service.run_start import recorded_run
 from service.store.errors import UnknownRunError
 from service.store.store import Store
+from service.store.verification.verify import verify
 from service.web.audit import pages as audit_pages
 from tests.support.large_run import Sizes, write_large_run
 from tests.support.recorded_run import record_run

@@ -22,12 +22,12 @@ from service.audit.report.content import report_content
 from service.audit.report.output.html import render_html
 from service.cli.main import app
 from service.core.errors import StoreError
-from service.core.model import Event, EvidenceExported, RunReleased
+from service.core.records.events import Event, EvidenceExported, RunReleased
 from service.people.accounts import Accounts
-from service.people.passwords import Passwords
-from service.store.audit import verify
-from service.store.signing import checkpoint
+from service.people.credentials.passwords import Passwords
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.reported_run import record_reported_run
 from tests.support.web import PIN, QUICK_HASHES, password_of
 
@@ -259,7 +259,7 @@ def test_command_records_what_leaves_before_it_is_there(tmp_path: Path, monkeypa
     assert event.payload.sha256 == hashlib.sha256(html.read_bytes()).hexdigest()
     assert head in html.read_text()
     monkeypatch.setattr(
-        "service.cli.audit_report._writable", lambda _data: False
+        "service.cli.evidence.audit_report._writable", lambda _data: False
     )  # a copy on a medium that cannot be written
     assert json.loads(CliRunner().invoke(app, words).stdout)["recorded"] is False
     assert len(told()) == 1

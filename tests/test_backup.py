@@ -15,15 +15,15 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.errors import StoreError
-from service.core.model import DataRestored, ViewpointCaptured
-from service.store.audit import verify
-from service.store.backup import back_up
-from service.store.backup_folder import BackupFolder
+from service.core.records.events import DataRestored, ViewpointCaptured
+from service.store.backup.backup import back_up
+from service.store.backup.folder import BackupFolder
+from service.store.backup.restore import restore
+from service.store.durable_effects import DurableFiles, RandomIds
 from service.store.records import SITE
-from service.store.restore import restore
-from service.store.seam import DurableFiles, RandomIds
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.bench_run import record_runs
 from tests.support.store import Crash, CrashingFiles, capture, files_of, rows, start_run, tamper
 from tests.support.tampering import cut

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.model import ViewpointCaptured
+from service.core.records.events import ViewpointCaptured
 from service.store.store import Store
 from tests.support.rig import REPOSITORY, command, orthocapture, simulated_rig
 from tests.support.short_protocol import short_protocol

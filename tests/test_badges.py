@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from service.core.model import AccountChanged, OperatorAction
+from service.core.records.events import AccountChanged, OperatorAction
 from service.people.errors import AccountError, SignInRefusedError
-from service.people.people import FREE_FAILURES, KnownBy
 from service.people.roles import Role
+from service.people.sessions import FREE_FAILURES, KnownBy
 from service.rig import load_rig
-from service.store.audit import verify
-from service.store.database import database_path
+from service.store.database.engine import database_path
 from service.store.records import SITE
+from service.store.verification.verify import verify
 from tests.support.at_the_table import left_at
 from tests.support.bench_run import PROTOCOL, Bench
 from tests.support.waiting import until

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import psutil
 
-from service.cli.beside import worker_beside
-from service.core.model import JobFailed
+from service.cli.run.beside import worker_beside
+from service.core.records.events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store
 from tests.support.store import start_run

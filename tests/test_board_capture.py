@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service.core.model import GatesEvaluated, StepMeasured, StepNote, StepRetried
+from service.core.records.events import GatesEvaluated, StepMeasured, StepNote, StepRetried
 from service.store.store import Store
 from tests.support.bench_rig import answer
 from tests.support.bench_run import Bench, begin_run

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.board import Board, BoardView
-from service.compute.calibration.board_candidates import PoseWishes, board_candidates
-from service.compute.calibration.board_design import NOTHING, Aims, as_taken, choose_poses, predict
-from service.compute.calibration.board_knowledge import (
+from service.compute.arm.kinematics import increment
+from service.compute.calibration.board.board import Board, BoardView
+from service.compute.calibration.board_poses.candidates import PoseWishes, board_candidates
+from service.compute.calibration.board_poses.design import NOTHING, Aims, as_taken, choose_poses, predict
+from service.compute.calibration.board_poses.knowledge import (
     BoardKnowledge,
     Tolerances,
     nominal_knowledge,
     refined_knowledge,
 )
-from service.compute.calibration.intrinsics import calibrate_intrinsics
-from service.compute.calibration.kinematics import increment
-from service.compute.calibration.uncertainty import board_distance_m, projection_uncertainty
+from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics
+from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform, apply, inverse, transform
 from service.steps.board_plan import FIRST

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.calibration.board import Board
-from service.compute.calibration.board_images import find_boards
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board.images import find_boards
 from tests.support.board_folder import BoardFolder, board_folder
 
 BOARD = Board(9, 6, 0.02)

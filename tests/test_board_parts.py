@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.board import find_board
-from service.compute.calibration.board_images import BoardImage
-from service.compute.calibration.board_knowledge import BoardKnowledge
-from service.compute.calibration.board_parts import find_part, with_parts
+from service.compute.calibration.board.board import find_board
+from service.compute.calibration.board.images import BoardImage
+from service.compute.calibration.board.parts import find_part, with_parts
+from service.compute.calibration.board_poses.knowledge import BoardKnowledge
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from tests.support.board_bench import BOARD, LENS, Picture

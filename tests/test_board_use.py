@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from service.core.model import StepStarted
-from service.core.protocol import parse_protocol
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import StepStarted
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewJob
 from service.web.record.board_images import board_uses

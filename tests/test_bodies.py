@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.core.bodies import bodies_of
+from service.core.equipment.camera_bodies import bodies_of
 
 SONY = {"kind": "camera", "serial": "3282933005318008"}
 

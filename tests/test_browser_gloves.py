@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, FloatRect, Locator, Page, expect
 
-from service.core.model import OperatorAction, StepNote
-from service.core.protocol import parse_protocol
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import OperatorAction, StepNote
 from service.monitor.snapshot import write_frame
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
 from service.store.store import Store
 from tests.support.at_the_table import STANDING, at_the_table, left_at, record

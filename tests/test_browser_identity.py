@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
-from service.core.entered import NoteTaken
-from service.core.model import RunStarted
-from service.store.audit import verify
+from service.core.records.entered import NoteTaken
+from service.core.records.events import RunStarted
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.bench_run import PROTOCOL
 from tests.support.browser import add_people, chromium, screen, served
 

@@ -11,7 +11,7 @@ from playwright.sync_api import Page, expect
 from service.audit.record.run import read_run
 from service.audit.report.content import report_content
 from service.audit.report.output.html import write_html
-from service.store.audit import verify
+from service.store.verification.verify import verify
 from tests.support.browser import chromium
 from tests.support.reported_run import record_reported_run
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from service.core.model import OperatorAction, StepFailed, StepStarted
+from service.core.records.events import OperatorAction, StepFailed, StepStarted
 from tests.support.at_the_table import at_the_table, record
 from tests.support.browser import Served, chromium, served
 from tests.support.shown_site import skip

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, FloatRect, Page, expect
 
-from service.core.model import OperatorAction, StepFailed, StepStarted
+from service.core.records.events import OperatorAction, StepFailed, StepStarted
 from tests.support.at_the_table import at_the_table, record
 from tests.support.browser import Served, chromium, screen, served
 from tests.support.shown_site import skip

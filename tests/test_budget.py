@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.budget.closure import Alignment, compare_in_frame, compare_shapes, locate_in_images
-from service.compute.budget.error_budget import (
+from service.compute.evaluation.closure import Alignment, compare_in_frame, compare_shapes, locate_in_images
+from service.compute.evaluation.error_budget import (
     ErrorBudget,
     MeasuredSpheres,
     Observation,

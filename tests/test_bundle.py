@@ -26,14 +26,14 @@ from typer.testing import CliRunner
 from service.audit.bundle.export import export_bundle
 from service.audit.bundle.report import bundle_report
 from service.audit.verify import bundle_verifier
-from service.cli.audit import audit_app
+from service.cli.evidence.audit import audit_app
 from service.core.errors import DataError, IllegalTransitionError, IntegrityError
-from service.core.model import EvidenceExported, RunReleased, StepNote
-from service.store.artefacts import hash_file
-from service.store.audit import verify
+from service.core.records.events import EvidenceExported, RunReleased, StepNote
+from service.store.files.artefacts import hash_file
 from service.store.records import NewArtefact, NewJob
-from service.store.signing import checkpoint, public_keys, rotate_key
+from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.bench_run import PROTOCOL, begin_run
 
 RECORDS = ("events.jsonl", "site_events.jsonl", "artefacts.jsonl", "jobs.jsonl", "checkpoints.jsonl", "keys.jsonl")

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.compute.calibration.hand_eye import BoardCorners, calibrate_hand_eye
+from service.compute.calibration.hand_eye.estimate import BoardCorners, calibrate_hand_eye
 from service.compute.camera_covariance import CameraCovariance, read_camera_covariance
 from service.compute.camera_model import CameraModel
-from service.compute.poses.bundle import Data, Sigmas, State, linearise, moved, normal_equations
-from service.compute.poses.pose_covariance import blocks, similarity_covariance
-from service.compute.poses.tracks import Tracks
+from service.compute.poses.files.pose_covariance import blocks, similarity_covariance
+from service.compute.poses.hybrid.bundle import Data, Sigmas, State, linearise, moved, normal_equations
+from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import DataError
 from service.core.geometry import Array, align_points
 from tests.support.board_sessions import BOARD, CAMERA, T_FLANGE_CAMERA, locate, noisy_session

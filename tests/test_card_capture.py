@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
-from service.core.model import CaptureAsked, StepMeasured, ViewHeld, ViewpointFailed
+from service.core.records.events import CaptureAsked, StepMeasured, ViewHeld, ViewpointFailed
 from service.store.store import Store
 from simulators.hand import follow
 from tests.support.bench_rig import BenchRig

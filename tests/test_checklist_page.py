@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.protocol import load_protocol
+from service.core.protocol.models import load_protocol
 from service.steps import params_models
 from tests.support.web import Browser, web_site
 

@@ -19,7 +19,7 @@ from typer.testing import CliRunner, Result
 
 from service.cli.common import console
 from service.cli.main import app
-from service.core.model import ActionRefused, OperatorAction
+from service.core.records.events import ActionRefused, OperatorAction
 from service.store.store import Store
 from tests.support.bench_run import PROTOCOL, record_runs
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from drivers.interfaces import DeviceReport
-from service.core.clocks import ClockReading, clock_readings
-from service.core.model import DeviceOpened, HostClock, Payload, SessionStarted
+from service.core.equipment.clocks import ClockReading, clock_readings
+from service.core.records.events import DeviceOpened, HostClock, Payload, SessionStarted
 from service.monitor.host_clock import host_clock
 from service.store.records import NewArtefact
 from service.store.store import Store

@@ -10,8 +10,22 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from service.core.actions import refuse
-from service.core.decide import (
+from service.core.errors import IntegrityError
+from service.core.records.events import (
+    OperatorAction,
+    Payload,
+    RunAborted,
+    RunCompleted,
+    StepFailed,
+    StepMeasured,
+    StepPassed,
+    StepRetried,
+    StepStarted,
+    ViewpointFailed,
+)
+from service.core.recovery.policy import recovery_policy
+from service.core.run.actions import refuse
+from service.core.run.decide import (
     AbortRun,
     Accept,
     AskOperator,
@@ -28,21 +42,7 @@ from service.core.decide import (
     record_to_sign,
     redoable_steps,
 )
-from service.core.errors import IntegrityError
-from service.core.lifecycle import lifecycle
-from service.core.model import (
-    OperatorAction,
-    Payload,
-    RunAborted,
-    RunCompleted,
-    StepFailed,
-    StepMeasured,
-    StepPassed,
-    StepRetried,
-    StepStarted,
-    ViewpointFailed,
-)
-from service.core.recovery import recovery_policy
+from service.core.run.lifecycle import lifecycle
 from tests.support.core import Log, captured, toy_protocol
 
 PROTOCOL = toy_protocol()

@@ -6,26 +6,10 @@ import pytest
 
 import drivers.errors as device_errors
 import service.core.errors as core_errors
-from service.core.decide import (
-    AbortRun,
-    Accept,
-    AskOperator,
-    EvaluateGates,
-    FinishRun,
-    Halt,
-    Retry,
-    RunStep,
-    allowed_actions,
-    check_action,
-    decide,
-    evaluate_gates,
-    fold,
-    initial_state,
-    redoable_steps,
-)
 from service.core.errors import IllegalTransitionError, IntegrityError
-from service.core.gates import describe
-from service.core.model import (
+from service.core.gates.verdict import describe
+from service.core.protocol.models import Recovery
+from service.core.records.events import (
     ActionRefused,
     DeviceTrouble,
     GatesEvaluated,
@@ -45,8 +29,24 @@ from service.core.model import (
     Uncertainty,
     ViewpointFailed,
 )
-from service.core.protocol import Recovery
-from service.core.recovery import NEEDS_A_PERSON, PASSING, recovery_policy
+from service.core.recovery.policy import NEEDS_A_PERSON, PASSING, recovery_policy
+from service.core.run.decide import (
+    AbortRun,
+    Accept,
+    AskOperator,
+    EvaluateGates,
+    FinishRun,
+    Halt,
+    Retry,
+    RunStep,
+    allowed_actions,
+    check_action,
+    decide,
+    evaluate_gates,
+    fold,
+    initial_state,
+    redoable_steps,
+)
 from tests.support.core import GOOD, TOY, Log, captured, imported, toy_protocol
 from tests.support.counting import calls_of
 

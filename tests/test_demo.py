@@ -15,7 +15,7 @@ import pytest
 import trimesh
 import yaml
 
-from service.cli.demo import free_address
+from service.cli.run.demo import free_address
 from tests.support.package import installed_package
 from tests.support.rig import RIG_LOCK, command, orthocapture
 

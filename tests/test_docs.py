@@ -20,8 +20,8 @@ import pytest
 import trimesh
 
 from docs.generate.pages import REFERENCE, pages
-from service.compute.poses.pose_files import write_camera_json, write_poses_csv
-from service.core.model import JobFailed
+from service.compute.poses.files.pose_files import write_camera_json, write_poses_csv
+from service.core.records.events import JobFailed
 from service.store.records import NewJob
 from service.store.store import Store
 from tests.support.bench_run import record_runs

@@ -46,7 +46,7 @@ def test_doctor_tells_what_a_device_reports(
 ) -> None:
     who = DeviceIdentity("camera", "model", "serial", "firmware", "driver", "1", "address")
     devices = _Devices({"camera": DeviceReport(who, **report)})
-    monkeypatch.setattr("service.cli.doctor.Station", lambda _rig: devices)
+    monkeypatch.setattr("service.cli.site.doctor.Station", lambda _rig: devices)
     rig = tmp_path / "rig.yaml"
     rig.write_text("name: bare\ndevices:\n  camera: {driver: gphoto}\n")
     words_typed = ["doctor", "--rig", str(rig), "--data", str(tmp_path / "data")]

@@ -18,8 +18,8 @@ from drivers import errors as device_errors
 from drivers.ur.link import probe
 from service.core import errors as core_errors
 from service.core.errors import OrthocaptureError
-from service.store.audit import verify
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.bench_run import PROTOCOL, begin_run
 
 ROOT = Path(__file__).parents[1]
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 SPEAKING = [
     *(ROOT / "drivers").rglob("*.py"),
     *(ROOT / "service" / "steps").rglob("*.py"),
-    ROOT / "service/evidence.py",
+    ROOT / "service/run_record.py",
 ]
 CLASSES = {
     name

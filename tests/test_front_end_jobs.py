@@ -10,9 +10,9 @@ import pytest
 
 from service.audit.record.run import RecordedFiles
 from service.audit.replay.replay import ScratchStore
-from service.compute.poses.front_end import pairs_of
-from service.compute.poses.sfm_options import SfmOptions
-from service.core.model import ArtefactRef
+from service.compute.poses.sfm.front_end import pairs_of
+from service.compute.poses.sfm.options import SfmOptions
+from service.core.records.events import ArtefactRef
 from service.worker.job import JobContext
 from service.worker.loop import HANDLERS
 from tests.support.textured_scene import camera_of_width, render, ring_of_poses, slabs

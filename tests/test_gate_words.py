@@ -17,11 +17,11 @@ from service.audit.report.content import report_content
 from service.audit.report.output.html import render_html
 from service.cli.common import console
 from service.cli.main import app
-from service.core.gates import describe, describe_judged, figure, quantity, standing
-from service.core.model import GateVerdict, Uncertainty
+from service.core.gates.verdict import describe, describe_judged, figure, quantity, standing
+from service.core.records.events import GateVerdict, Uncertainty
 from service.dataset.export import export_dataset
-from service.store.audit import verify
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.calibrated_run import begin_calibrated_run
 from tests.support.reported_run import record_reported_run
 from tests.support.waiting import until

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.compute.hand_bundle import Bundle, Reading, adjust_together
+from service.compute.capture.hand_bundle import Bundle, Reading, adjust_together
 from service.core.geometry import Array, Transform, align_points, apply, inverse, look_at, rotation_angle_rad
 from tests.support.sphere_images import Scene, exact_outlines
 from tests.test_live import SPHERES_M, camera

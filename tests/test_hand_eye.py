@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.board import half_turn
-from service.compute.calibration.hand_eye import Method, calibrate_hand_eye, place_board
+from service.compute.calibration.board.board import half_turn
+from service.compute.calibration.hand_eye.estimate import Method, calibrate_hand_eye, place_board
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, inverse, look_at, rotation_angle_rad, transform
 

@@ -12,15 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from service.cli.calibrate import calibrate_app
-from service.compute.calibration.arm_correction import ArmCorrection, corrected_T_base_flange
-from service.compute.calibration.board import Board
-from service.compute.calibration.board_plan import suggest_board_poses
-from service.compute.calibration.board_plan_plot import draw_board_plan
-from service.compute.calibration.hand_eye import BoardCorners, HandEyeResult, calibrate_hand_eye
-from service.compute.calibration.hand_eye_record import hand_eye_record, read_arm_correction
-from service.compute.calibration.joint_file import read_joints_csv
-from service.compute.calibration.kinematics import (
+from service.cli.compute.calibrate import calibrate_app
+from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
+from service.compute.arm.joint_file import read_joints_csv
+from service.compute.arm.kinematics import (
     arm_model,
     chain,
     dh_jacobian,
@@ -28,7 +23,12 @@ from service.compute.calibration.kinematics import (
     matching_arm,
     solve_joints,
 )
-from service.compute.poses.pose_files import write_poses_csv
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board_poses.plan import suggest_board_poses
+from service.compute.calibration.board_poses.plan_plot import draw_board_plan
+from service.compute.calibration.hand_eye.estimate import BoardCorners, HandEyeResult, calibrate_hand_eye
+from service.compute.calibration.hand_eye.record import hand_eye_record, read_arm_correction
+from service.compute.poses.files.pose_files import write_poses_csv
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, inverse
 from simulators.ur_controller.kinematics import MODELS

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.calibration.board import Board
+from service.compute.calibration.board.board import Board
 from service.core.geometry import Array, inverse
 from tests.support.board_folder import T_BASE_BOARD, T_FLANGE_CAMERA, BoardFolder, board_folder
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.core.model import DeviceOpened, DeviceTrouble
+from service.core.records.events import DeviceOpened, DeviceTrouble
 from service.monitor.snapshot import Snapshot, write_snapshot
 from service.store.records import NewJob
 from tests.support.bench_run import Bench

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.errors import DeviceUnavailableError
 from drivers.interfaces import RobotArm, RobotSample, SafetyState
-from service.core.run_state import RunState
+from service.core.run.state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
 from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot, write_snapshot
 from service.store.store import Store

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_covariance import CameraCovariance
-from service.compute.poses.bundle import Data, Sigmas, SphereSightings, State, linearise, moved, width
-from service.compute.poses.hybrid import HybridOptions, HybridPoses, hybrid_poses
-from service.compute.poses.pose_covariance import similarity_covariance
+from service.compute.poses.files.pose_covariance import similarity_covariance
+from service.compute.poses.hybrid.bundle import Data, Sigmas, SphereSightings, State, linearise, moved, width
+from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, align_points, inverse, transform
 from tests.support.sphere_images import RADIUS_M, REGISTRATION_M

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.compute.image_quality import image_quality
+from service.compute.images.quality import image_quality
 from service.steps.spoilt import IN_A_ROW, LookedAt, last_in_a_row, why_spoilt
 from tests.support.sphere_images import REGISTRATION_M, render, scene
 

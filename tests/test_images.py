@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from service.compute.images import read_grey
+from service.compute.images.files import read_grey
 from service.core.errors import DataError
 from service.web.record.pictures import reduced_jpeg
 

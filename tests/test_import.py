@@ -17,21 +17,21 @@ import yaml
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.compute.registration.evaluation import true_error_m
+from service.compute.evaluation.accuracy import true_error_m
 from service.core.errors import DataError
 from service.core.geometry import inverse
-from service.core.imported import FileRole, PhotographRole
-from service.core.model import OperatorAction, RunStarted, ViewImported, ViewpointCaptured
-from service.core.protocol import load_protocol
+from service.core.protocol.models import load_protocol
+from service.core.records.events import OperatorAction, RunStarted, ViewImported, ViewpointCaptured
+from service.core.records.import_list import FileRole, PhotographRole
 from service.dataset.export import export_dataset
 from service.dataset.summary import summarise
-from service.importing import find_places, import_rig, list_import
-from service.runs import recorded_rig, recorded_run, start_run
+from service.import_folder import find_places, import_rig, list_import
+from service.run_start import recorded_rig, recorded_run, start_run
 from service.steps import params_models
 from service.steps.image_import import settings_agree
-from service.store.audit import verify
-from service.store.database import database_path
+from service.store.database.engine import database_path
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.import_folder import Photographer, around, over_the_board
 from tests.support.rig import REPOSITORY, command, orthocapture
 from tests.support.web import web_site

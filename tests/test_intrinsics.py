@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.adjustment import LensModel
-from service.compute.calibration.board import Board, BoardView, board_points, find_board, half_turn
-from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_view
-from service.compute.calibration.uncertainty import projection_uncertainty
-from service.compute.calibration.validation import calibration_warnings, cross_validate
+from service.compute.calibration.board.board import Board, BoardView, board_points, find_board, half_turn
+from service.compute.calibration.intrinsics.adjustment import LensModel
+from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
+from service.compute.calibration.intrinsics.uncertainty import projection_uncertainty
+from service.compute.calibration.intrinsics.validation import calibration_warnings, cross_validate
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, align_points, apply, inverse, look_at, transform

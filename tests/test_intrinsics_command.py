@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.calibration.board import Board
-from service.compute.calibration.optics import Optics, compare_optics
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.intrinsics.optics import Optics, compare_optics
 from service.compute.camera_model import CameraModel
-from service.compute.poses.pose_files import read_camera_json
+from service.compute.poses.files.pose_files import read_camera_json
 from service.core.errors import DataError
 from service.core.geometry import transform
-from service.core.model import ViewpointCaptured
-from service.core.protocol import load_protocol
+from service.core.protocol.models import load_protocol
+from service.core.records.events import ViewpointCaptured
 from service.steps import params_models
 from service.steps.context import StepContext
 from service.steps.optics import departing_images, optics_departures

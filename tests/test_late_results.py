@@ -25,12 +25,12 @@ from service.audit.bundle.report import bundle_report
 from service.audit.overview import first_page
 from service.audit.overview.digest import Digest, digests
 from service.audit.verify.bundle_verifier import main as verify_bundle
-from service.cli.operators import Display
-from service.cli.waiting import wait_for_results
-from service.core.fold import fold
-from service.core.gates import evaluate_gates
-from service.core.late import late_results
-from service.core.model import (
+from service.cli.run.operators import Display
+from service.cli.run.waiting import wait_for_results
+from service.core.gates.verdict import evaluate_gates
+from service.core.jobs.priorities import LATER
+from service.core.protocol.models import Protocol, parse_protocol
+from service.core.records.events import (
     FilesKept,
     OperatorAction,
     Payload,
@@ -40,19 +40,19 @@ from service.core.model import (
     StepPassed,
     StepStarted,
 )
-from service.core.priorities import LATER
-from service.core.protocol import Protocol, parse_protocol
-from service.core.registered import shared_adjustment_note
-from service.evidence import RunLog, read_log
+from service.core.results.late import late_results
+from service.core.results.registrations import shared_adjustment_note
+from service.core.run.fold import fold
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_record import RunRecord, read_log
+from service.run_start import start_run
 from service.steps import params_models
 from service.steps.sources import PLANNED
 from service.steps.time_left import missing_results
-from service.store.audit import verify
 from service.store.records import NewArtefact, NewJob
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.reported_run import evaluation
 from tests.support.rig import REPOSITORY, command, orthocapture
 from tests.support.store import rows
@@ -116,7 +116,7 @@ class Run:
         measured = StepMeasured(step=step, attempt=1, measures=measures, result=result)
         return self.add(measured, evaluate_gates(self.protocol.step(step), 1, measures))
 
-    def log(self) -> RunLog:
+    def log(self) -> RunRecord:
         return read_log(self.store, self.run_id, self.protocol)
 
     def digest(self) -> Digest:

@@ -16,12 +16,12 @@ from typer.testing import CliRunner
 from bench.layout_gate import judge
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
+from service.compute.layout.ambiguity import REQUIRED_MARGIN_M, check_layout
+from service.compute.layout.photo_adjustment import LensPrior, Photograph
+from service.compute.layout.photographs import layout_from_photographs
+from service.compute.layout.sphere_moves import Move, suggest_moves
+from service.compute.layout.words import show_move
 from service.compute.markers.cones import Cone, cone_of_sphere, fit_cone
-from service.compute.registration.layout import REQUIRED_MARGIN_M, check_layout
-from service.compute.registration.layout_moves import Move, suggest_moves
-from service.compute.registration.layout_words import show_move
-from service.compute.registration.photo_adjustment import LensPrior, Photograph
-from service.compute.registration.photo_layout import layout_from_photographs
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse, transform
 from simulators.rig_world import HELD_CAMERAS

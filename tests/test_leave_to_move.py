@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
-from service.core.decide import AskOperator, Retry, RunStep, check_action
 from service.core.errors import IllegalTransitionError
-from service.core.model import OperatorAction, SessionStarted, StepFailed, StepStarted
-from service.core.recovery import recovery_policy
+from service.core.records.events import OperatorAction, SessionStarted, StepFailed, StepStarted
+from service.core.recovery.policy import recovery_policy
+from service.core.run.decide import AskOperator, Retry, RunStep, check_action
 from tests.support.core import TOY, Log, captured, toy_protocol
 
 CHECKED = TOY.replace("    title: Capture\n", "    title: Capture\n    checklist: [nobody in reach]\n")

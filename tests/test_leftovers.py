@@ -9,11 +9,11 @@ import sys
 import time
 from pathlib import Path
 
-from service.core.model import ArtefactRef, LeftoversRemoved
-from service.store.audit import verify
-from service.store.leftovers import leftovers, remove_leftovers
+from service.core.records.events import ArtefactRef, LeftoversRemoved
+from service.store.files.leftovers import leftovers, remove_leftovers
 from service.store.records import SITE, NewArtefact, NewJob
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.rig import REPOSITORY, orthocapture
 from tests.support.store import capture, captured, files_of, put_image, start_run
 

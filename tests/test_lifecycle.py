@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import pytest
 
+from service.core.documents.protocol_docs import lifecycle_text
 from service.core.errors import IllegalTransitionError
-from service.core.lifecycle import (
+from service.core.run.lifecycle import (
     ABORTED,
     COMPLETED,
     PHASES,
@@ -17,7 +18,6 @@ from service.core.lifecycle import (
     state_name,
     transition_table,
 )
-from service.core.protocol_docs import lifecycle_text
 from tests.support.core import toy_protocol
 
 STEPS = ("capture", "spray_on", "scan")

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from bench.soak.large_record import STEP, LargeRecord
-from service.core.model import StepNote
-from service.evidence import RunFollower, StepEvidence, read_log
-from service.runs import recorded_run
-from service.store.audit import show
+from service.core.records.events import StepNote
+from service.run_record import RunFollower, StepEvidence, read_log
+from service.run_start import recorded_run
+from service.store.verification.verify import show
 from service.web.capture.view import views_of
 from tests.support.counting import lines_of
 

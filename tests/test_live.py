@@ -17,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from drivers.errors import DeviceFaultError
 from drivers.interfaces import CameraSettings, CtSource, Mesh, ScanExport, ScannedMesh
-from service.compute.calibration.arm_correction import ArmCorrection, corrected_T_base_flange
-from service.compute.calibration.kinematics import arm_model
-from service.compute.live import LiveView, clipped_fraction, find_spheres, paired, register_station, sharpness
+from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
+from service.compute.arm.inverse_kinematics import postures
+from service.compute.arm.kinematics import arm_model
+from service.compute.capture.live import LiveView, clipped_fraction, find_spheres, paired, register_station, sharpness
 from service.compute.planning.coverage import (
     CoverageLimits,
     CoverageSurface,
@@ -36,11 +37,10 @@ from service.compute.planning.information import (
     target_error,
     view_information,
 )
-from service.compute.planning.inverse import postures
-from service.compute.planning.next_best_view import Candidate, Present, next_best_views
+from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
-from service.core.model import GatesEvaluated, StepNote
+from service.core.records.events import GatesEvaluated, StepNote
 from service.store.store import Store
 from service.worker.job import JobAnswer, JobContext
 from service.worker.live import coverage_points, live_summary, live_view
@@ -144,12 +144,12 @@ def test_an_error_of_the_mounting_moves_the_scan_with_the_cameras() -> None:
 # --- next best view -------------------------------------------------------------------------------------------
 
 
-def choice(made: Scene, taken: int) -> tuple[Present, list[Candidate]]:
+def choice(made: Scene, taken: int) -> tuple[CurrentInformation, list[Candidate]]:
     centre = apply(made.T_world_scan, CENTRE_M)
     views = informations(made)
     P = np.diag([1e-7] * 3 + [1e-8] * 3)
     targets = apply(made.T_world_scan, SPHERES_M) - centre
-    present = Present(tuple(v.information for v in views[:taken]), P, targets, np.zeros(4, dtype=np.int64))
+    present = CurrentInformation(tuple(v.information for v in views[:taken]), P, targets, np.zeros(4, dtype=np.int64))
     rng = np.random.default_rng(0)
     rest = [Candidate(f"x{i}", v.information, rng.random(4) > 0.5, float(i)) for i, v in enumerate(views[taken:])]
     return present, rest

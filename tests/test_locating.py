@@ -12,14 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from service.compute.images import read_image, read_reduced
-from service.compute.locating import LocatedOutlines, detect_all, locate_outlines, spread_views
+from service.compute.evaluation.accuracy import true_error_m
+from service.compute.images.files import read_image, read_reduced
 from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline
+from service.compute.markers.search.image_files import LocatedOutlines, detect_all, locate_outlines, spread_views
+from service.compute.markers.search.predicted import (
+    WIDE,
+    Prediction,
+    fit_pose,
+    locate_predicted,
+    tone_of,
+    visible_cones,
+)
 from service.compute.pipeline import PipelineResult, register_images
-from service.compute.predicting import WIDE, Prediction, fit_pose, locate_predicted, tone_of, visible_cones
-from service.compute.registration.evaluation import true_error_m
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse, look_at, transform
 from tests.support.sphere_images import (

@@ -10,7 +10,7 @@ import pytest
 
 from drivers.interfaces import CameraSettings
 from service.core.geometry import inverse
-from service.core.model import CaptureAsked, StepFailed, StepMeasured, ViewHeld
+from service.core.records.events import CaptureAsked, StepFailed, StepMeasured, ViewHeld
 from service.store.store import Store
 from simulators.hand import Grip
 from tests.support.bench_rig import answer

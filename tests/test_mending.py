@@ -15,16 +15,16 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from service.cli.hands import SimulatedHands
-from service.cli.operators import AutomaticOperator, Display
+from service.cli.run.hands import SimulatedHands
+from service.cli.run.operators import AutomaticOperator, Display
 from service.core.errors import OrthocaptureError
-from service.core.model import OperatorAction, StepNote
-from service.core.protocol import parse_protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import OperatorAction, StepNote
+from service.core.run.state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import load_rig
+from service.run_start import recorded_run, start_run
 from service.runner import Runner
-from service.runs import recorded_run, start_run
 from service.steps import params_models, viewpoint_capture
 from service.steps.context import StepContext
 from service.store.store import Store

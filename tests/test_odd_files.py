@@ -13,8 +13,8 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from service.cli.main import app
-from service.compute.calibration.board import Board
-from service.compute.image_folder import image_folder
+from service.compute.calibration.board.board import Board
+from service.compute.images.folder import image_folder
 from service.core.errors import DataError
 from tests.support.board_folder import CAMERA, BoardFolder, board_folder
 

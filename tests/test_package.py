@@ -11,7 +11,7 @@ from urllib.request import urlopen
 
 import pytest
 
-from service.core.model import ServiceStarted
+from service.core.records.events import ServiceStarted
 from service.store.records import SITE
 from service.store.store import Store
 from tests.support.package import PACKAGES, Package, installed_package

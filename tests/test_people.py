@@ -16,7 +16,7 @@ from argon2.low_level import Type
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.core.model import AccountChanged, SignInRecorded
+from service.core.records.events import AccountChanged, SignInRecorded
 from service.people.errors import (
     AccountError,
     LinkError,
@@ -25,13 +25,13 @@ from service.people.errors import (
     PinRefusedError,
     SignInRefusedError,
 )
-from service.people.people import People, wait_after_s
 from service.people.person import Person
 from service.people.roles import ROLES, may
-from service.store.audit import verify
-from service.store.database import database_path
+from service.people.sessions import People, wait_after_s
+from service.store.database.engine import database_path
 from service.store.records import SITE
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.store import CrashingFiles, SteppedClock
 from tests.support.web import PIN, QUICK_HASHES, password_of, populate
 

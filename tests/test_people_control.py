@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from service.core.model import ControlTaken
+from service.core.records.events import ControlTaken
 from service.people.control import Control, Holder
 from service.people.errors import AccountError, ControlError, NotAllowedError
-from service.people.people import People
 from service.people.person import Person
-from service.store.audit import verify
+from service.people.sessions import People
 from service.store.errors import UnknownRunError
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.store import SteppedClock, start_run
 from tests.support.web import QUICK_HASHES, password_of, populate
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from service.compute.camera_model import CameraModel
-from service.compute.images import read_image
+from service.compute.evaluation.accuracy import true_error_m
+from service.compute.images.files import read_image
 from service.compute.markers.records import SphereOutline
 from service.compute.overlay import draw_overlay
 from service.compute.pipeline import detect_all, register_images
-from service.compute.registration.evaluation import true_error_m
 from service.core.errors import DataError
 from service.core.geometry import inverse
 from tests.support.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, Scene, render, scene

@@ -17,10 +17,10 @@ from hypothesis.extra.numpy import arrays
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.compute.calibration.kinematics import arm_model, forward
+from service.compute.arm.inverse_kinematics import nearest_posture, postures
+from service.compute.arm.kinematics import arm_model, forward
 from service.compute.planning.capsules import segment_box_distance_m, segment_distance_m
 from service.compute.planning.collision import Capsule, nearest_contacts
-from service.compute.planning.inverse import nearest_posture, postures
 from service.compute.planning.motion_plan import (
     MotionPlan,
     Situation,
@@ -31,7 +31,7 @@ from service.compute.planning.motion_plan import (
 )
 from service.compute.planning.optics import depth_of_field
 from service.core.geometry import Array, Transform, inverse, look_at, transform
-from service.core.protocol import Motion, load_protocol
+from service.core.protocol.models import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
 from service.steps import params_models, viewpoint_capture

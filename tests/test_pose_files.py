@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.pose_files import (
+from service.compute.poses.files.pose_files import (
     read_camera_json,
     read_poses,
     read_spheres_json,

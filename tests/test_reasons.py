@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import ProtocolError
-from service.core.model import OperatorAction
-from service.core.reasons import Reasons
+from service.core.records.events import OperatorAction
+from service.core.recovery.reasons import Reasons
 from tests.support.bench_run import PROTOCOL, Bench
 from tests.support.core import TOY, load
 from tests.support.web import Browser, WebSite, web_site

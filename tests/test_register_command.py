@@ -17,7 +17,7 @@ from typer.testing import CliRunner, Result
 
 from service.cli.main import app
 from service.compute.camera_model import CameraModel
-from service.compute.poses.pose_files import (
+from service.compute.poses.files.pose_files import (
     write_camera_json,
     write_colmap_text,
     write_poses_csv,
@@ -99,7 +99,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 @pytest.fixture
 def few(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Three of the photographs, looked at in this process: workers take longer to start than these take."""
-    monkeypatch.setattr("service.cli.register.os.cpu_count", lambda: 1)
+    monkeypatch.setattr("service.cli.compute.register.os.cpu_count", lambda: 1)
     folder = tmp_path / "few"
     folder.mkdir()
     for name in ("DSC00001.JPG", "DSC00003.JPG", "DSC00005.JPG"):

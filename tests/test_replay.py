@@ -18,7 +18,7 @@ from service.audit.replay.differences import compare_data, compare_files
 from service.audit.replay.replay import ReplayReport, replay
 from service.cli.main import app
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError
-from service.core.model import ArtefactRef
+from service.core.records.events import ArtefactRef
 from service.worker import loop
 from service.worker.job import Handler, JobAnswer, JobContext
 from service.worker.registering import register

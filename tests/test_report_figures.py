@@ -16,7 +16,7 @@ from service.audit.record.run import read_run
 from service.audit.report.content import report_content
 from service.audit.report.output.html import render_html
 from service.cli.main import app
-from service.store.audit import verify
+from service.store.verification.verify import verify
 from tests.support.reported_run import record_reported_run
 
 _SVG = "{http://www.w3.org/2000/svg}"

@@ -14,7 +14,7 @@ from service.audit.record.run import read_run
 from service.audit.report.blocks import Report
 from service.audit.report.content import report_content
 from service.audit.report.output.pdf import render_pdf
-from service.store.audit import verify
+from service.store.verification.verify import verify
 from tests.support.pdf_text import fonts_of, pages_of, reader_of, root_of, tags_of
 from tests.support.reported_run import record_reported_run
 

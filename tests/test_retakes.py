@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from drivers.interfaces import CameraSettings
-from service.core.model import StepNote
+from service.core.records.events import StepNote
 from service.store.store import Store
 from tests.support.bench_rig import answer, other_settings
 from tests.support.bench_run import PROTOCOL, Bench, begin_run

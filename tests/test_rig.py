@@ -18,7 +18,7 @@ import psutil
 import pytest
 import yaml
 
-from service.core.model import ViewpointCaptured
+from service.core.records.events import ViewpointCaptured
 from service.rig import load_rig
 from service.station import Station
 from service.store.store import Store

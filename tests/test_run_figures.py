@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from bench.run_figures import run_figures
-from service.core.protocol import load_protocol
+from service.core.protocol.models import load_protocol
 from service.dataset.summary import summarise
-from service.runs import recorded_run
+from service.run_start import recorded_run
 from service.steps import params_models
 from service.store.store import Store
 from tests.support.bench_run import record_runs

@@ -23,10 +23,10 @@ from service.audit.report.output.pdf import write_pdf
 from service.audit.runs.search import RunWanted, find_runs
 from service.audit.verify import bundle_verifier
 from service.cli.main import app
-from service.core.entered import NoteTaken
-from service.core.model import PAYLOAD, RunAborted, RunStarted
-from service.store.audit import verify
-from service.store.signing import checkpoint
+from service.core.records.entered import NoteTaken
+from service.core.records.events import PAYLOAD, RunAborted, RunStarted
+from service.store.signatures.signing import checkpoint
+from service.store.verification.verify import verify
 from tests.support.web import Browser, WebSite, web_site
 
 ENTERED = {

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import IntegrityError
-from service.core.model import StepNote, StepPassed
-from service.evidence import RunFollower
-from service.runs import recorded_run
+from service.core.records.events import StepNote, StepPassed
+from service.run_record import RunFollower
+from service.run_start import recorded_run
 from service.store.store import Store
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.web import WebSite, web_site

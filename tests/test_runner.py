@@ -10,9 +10,8 @@ import pytest
 
 from drivers.errors import DeviceBusyError, DeviceTimeoutError, DeviceUnavailableError
 from drivers.interfaces import SafetyState
-from service.core.decide import AskOperator
 from service.core.errors import ComputeError, ConfigurationError, StoreError
-from service.core.model import (
+from service.core.records.events import (
     ActionRefused,
     DeviceOpened,
     DeviceTrouble,
@@ -26,13 +25,14 @@ from service.core.model import (
     ViewpointCaptured,
     ViewpointFailed,
 )
-from service.core.run_state import RunState
-from service.runs import recorded_rig, recorded_run
-from service.store import timestamping
-from service.store.audit import verify
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
+from service.run_start import recorded_rig, recorded_run
 from service.store.errors import LeaseHeldError
 from service.store.records import Checkpoint
+from service.store.signatures import timestamps as timestamping
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.bench_rig import Answer, answer, other_settings
 from tests.support.bench_run import PROTOCOL, Bench, begin_run
 

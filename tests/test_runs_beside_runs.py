@@ -16,9 +16,9 @@ from typer.testing import CliRunner, Result
 
 from service.audit.runs.history import by_instrument, history
 from service.cli.main import app
-from service.core.model import DeviceOpened
-from service.store.audit import verify
+from service.core.records.events import DeviceOpened
 from service.store.store import Store
+from service.store.verification.verify import verify
 from service.web.home.time_charts import TimePoint, time_chart
 from tests.support.reported_run import record_reported_run
 from tests.support.web import WebSite, web_site

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from service.core.decide import record_to_sign
-from service.core.fold import fold
-from service.core.model import ItemTicked, OperatorAction
-from service.core.protocol import Protocol, load_protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import Protocol, load_protocol
+from service.core.records.events import ItemTicked, OperatorAction
+from service.core.run.decide import record_to_sign
+from service.core.run.fold import fold
+from service.core.run.state import RunState
 from service.monitor.snapshot import ask_for_frames, frame_path, read_snapshot
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
-from service.store.audit import verify
 from service.store.store import Store
+from service.store.verification.verify import verify
 from service.web.launch import Launcher
 from tests.support.rig import press_pedal, simulated_rig
 from tests.support.short_protocol import short_protocol

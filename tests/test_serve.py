@@ -10,10 +10,10 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from service.core.model import ServiceStarted
-from service.store.audit import verify
+from service.core.records.events import ServiceStarted
 from service.store.records import SITE
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.certificates import self_signed
 from tests.support.rig import orthocapture
 from tests.support.serving import serving

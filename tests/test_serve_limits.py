@@ -14,7 +14,7 @@ import httpx
 import psutil
 import pytest
 
-from service.core.model import SignInRecorded
+from service.core.records.events import SignInRecorded
 from service.store.records import SITE
 from service.store.store import Store
 from service.web.server.open_streams import OpenStream, OpenStreams

@@ -11,16 +11,16 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.errors import IntegrityError
-from service.core.model import StepPassed, StepStarted
+from service.core.records.events import StepPassed, StepStarted
 from service.rig import load_rig
-from service.runs import signature_copy
-from service.store.audit import verify
-from service.store.database import database_path
+from service.run_start import signature_copy
+from service.store.database.engine import database_path
 from service.store.records import SITE
-from service.store.signature_copy import bring_up_to_date, keep_elsewhere
-from service.store.signature_log import NAME, read_log
-from service.store.signing import checkpoint, rotate_key
+from service.store.signatures.log import NAME, read_log
+from service.store.signatures.log_copy import bring_up_to_date, keep_elsewhere
+from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.store import CountedIds, SteppedClock, capture, start_run, tamper
 from tests.support.tampering import WORDS_AGAIN, cut, rewrite_to_the_end, without_signatures_from
@@ -216,7 +216,7 @@ def test_a_signature_whose_line_a_crash_prevented_is_written_down_with_the_next(
     data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patched:
-        patched.setattr("service.store.signature_log.SignatureLog.add", lambda *_: None)
+        patched.setattr("service.store.signatures.log.SignatureLog.add", lambda *_: None)
         sign_again(data)
     assert faults(data) == []
     assert any("is not in signatures.jsonl yet" in note for note in verify(data).notes)

@@ -14,17 +14,17 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.audit import audit_app
+from service.cli.evidence.audit import audit_app
 from service.core.errors import IntegrityError
-from service.core.model import SignInRecorded
-from service.store import signing
-from service.store.audit import verify
-from service.store.checkpoints import signed_by, statement
+from service.core.records.events import SignInRecorded
 from service.store.errors import SigningKeyError, UnknownRunError
-from service.store.keys import KeyFolder
 from service.store.records import SITE
-from service.store.signing import checkpoint, public_keys, rotate_key
+from service.store.signatures import signing
+from service.store.signatures.checkpoints import signed_by, statement
+from service.store.signatures.keys import KeyFolder
+from service.store.signatures.signing import checkpoint, public_keys, rotate_key
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.store import CountedIds, SteppedClock, capture, rows, start_run, tamper
 from tests.support.tampering import WORDS_AGAIN, alter_row, rewrite_to_the_end
 
@@ -276,7 +276,8 @@ def test_a_crash_while_the_key_is_changed_leaves_one_key(
 
 def test_several_processes_sign_with_one_key(store: Store) -> None:
     code = (
-        "import sys, pathlib\nfrom service.store.store import Store\nfrom service.store.signing import checkpoint\n"
+        "import sys, pathlib\nfrom service.store.store import Store\n"
+        "from service.store.signatures.signing import checkpoint\n"
         "with Store.open(pathlib.Path(sys.argv[1])) as store: checkpoint(store, sys.argv[2])"
     )
     processes = [

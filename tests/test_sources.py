@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.cli.run import status_record
-from service.core.arrival import late_s, late_words
-from service.core.fold import fold, initial_state
+from service.cli.run.commands import status_record
 from service.core.geometry import look_at
-from service.core.model import ArtefactRef, JobEnqueued, JobFinished
-from service.core.priorities import LATER, REDUCED, WAITED
-from service.core.protocol import LoadedProtocol, Protocol, load_protocol, parse_protocol
-from service.core.registered import better_later, evaluated, own_registration, registrations
-from service.core.run_state import JobState, Note, RunState
-from service.runs import recorded_run
+from service.core.jobs.priorities import LATER, REDUCED, WAITED
+from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
+from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished
+from service.core.results.arrival import late_s, late_words
+from service.core.results.registrations import better_later, evaluated, own_registration, registrations
+from service.core.run.fold import fold, initial_state
+from service.core.run.state import JobState, Note, RunState
+from service.run_start import recorded_run
 from service.steps import params_models
 from service.steps.sources import PLANNED, decisive, due, registration_ways
 from service.steps.time_left import missing_results
-from service.store.audit import verify
 from service.store.records import NewJob
 from service.store.store import Store
+from service.store.verification.verify import verify
 from service.worker.loop import work
 from tests.support.recorded_run import record_run
 

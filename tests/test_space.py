@@ -11,17 +11,17 @@ import pytest
 from typer.testing import CliRunner
 
 from service.cli.main import app
-from service.core.decide import AskOperator
+from service.core.equipment.disk_space import LEAST_FREE_BYTES, Usage, forecast
 from service.core.errors import SpaceShortError
-from service.core.model import OperatorAction, StepFailed, StepNote
-from service.core.protocol import Protocol, parse_protocol
-from service.core.run_state import RunState
-from service.core.space import LEAST_FREE_BYTES, Usage, forecast
+from service.core.protocol.models import Protocol, parse_protocol
+from service.core.records.events import OperatorAction, StepFailed, StepNote
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
+from service.store.files.space_used import forecast_of
 from service.store.records import NewJob
-from service.store.space import forecast_of
 from service.store.store import Store
 from service.worker.loop import work
 from tests.support.bench_run import PROTOCOL, Bench, begin_run

@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 import pytest
 import yaml
 
-from service.core.fold import fold
-from service.core.model import OperatorAction, StepNote, StepRetried, ViewpointCaptured
-from service.core.run_state import RunState
-from service.runs import recorded_run
+from service.core.records.events import OperatorAction, StepNote, StepRetried, ViewpointCaptured
+from service.core.run.fold import fold
+from service.core.run.state import RunState
+from service.run_start import recorded_run
 from service.store.store import Store
 from tests.support.rig import REPOSITORY, orthocapture, simulated_rig
 

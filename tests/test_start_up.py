@@ -10,12 +10,12 @@ import pytest
 from service.audit.record import starts
 from service.audit.record.starts import record_start
 from service.core.errors import ConfigurationError
-from service.core.model import RunAborted, ServiceStarted
+from service.core.records.events import RunAborted, ServiceStarted
 from service.rig import Rig, load_rig
-from service.store.audit import verify
 from service.store.records import SITE
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.store import CountedIds, SteppedClock, capture, start_run, tamper
 
 

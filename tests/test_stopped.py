@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from service.core.decide import AskOperator, decide, evaluate_gates
-from service.core.model import GateVerdict, StepFailed, StepMeasured, StepNote, StepStarted
-from service.core.protocol import Protocol
+from service.core.protocol.models import Protocol
+from service.core.records.events import GateVerdict, StepFailed, StepMeasured, StepNote, StepStarted
+from service.core.run.decide import AskOperator, decide, evaluate_gates
 from service.web.page.run_words import needs, stopped_words
 from tests.support.attended import attended
 from tests.support.bench_run import Bench

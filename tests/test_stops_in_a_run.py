@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from drivers.host import HostedDevice
 from drivers.interfaces import Camera, Device, Lightbox
-from service.core.decide import AskOperator
-from service.core.model import OperatorAction, StepFailed, ViewpointCaptured
-from service.core.protocol import parse_protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import OperatorAction, StepFailed, ViewpointCaptured
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
 from service.rig import load_rig
+from service.run_start import recorded_run, start_run
 from service.runner import Runner
-from service.runs import recorded_run, start_run
 from service.station import Station
 from service.steps import params_models
 from service.store.store import Store

@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from service.cli.audit import audit_app
+from service.cli.evidence.audit import audit_app
 from service.core.errors import OrthocaptureError, StoreError
-from service.core.model import StepNote
-from service.store.audit import show, verify
-from service.store.database import database_path
+from service.core.records.events import StepNote
+from service.store.database.engine import database_path
 from service.store.errors import UnknownRunError
 from service.store.events import event_sha256
 from service.store.records import SITE, NewArtefact, NewJob
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
+from service.store.verification.verify import show, verify
 from tests.support.store import CountedIds, SteppedClock, capture, rows, start_run, tamper
 
 RUN = "20261121-120000-000003"

@@ -23,16 +23,16 @@ from hypothesis import strategies as st
 from sqlalchemy import create_engine
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.model import ActionRefused, JobEnqueued, StepNote
-from service.store import database
-from service.store.audit import verify
-from service.store.database import database_path
+from service.core.records.events import ActionRefused, JobEnqueued, StepNote
+from service.store.database import engine as database
+from service.store.database.engine import database_path
+from service.store.database.tables import APPEND_ONLY, metadata
 from service.store.errors import StoreVersionError, UnknownRunError
 from service.store.events import ROOT, canonical, canonical_parsed, event_sha256, parse_canonical
 from service.store.records import NewArtefact
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
-from service.store.tables import APPEND_ONLY, metadata
+from service.store.verification.verify import verify
 from tests.support.store import CountedIds, SteppedClock, capture, captured, put_image, rows, start_run, tamper
 
 ROOT_DIR = Path(__file__).parents[1]
@@ -203,7 +203,7 @@ def test_opening_prints_nothing_and_needs_no_ini(tmp_path: Path, capfd: pytest.C
 
 def test_the_known_revisions_are_those_of_the_migrations() -> None:
     config = Config()
-    config.set_main_option("script_location", "service.store:migrations")
+    config.set_main_option("script_location", "service.store.database:migrations")
     config.set_main_option("path_separator", "os")
     scripts = ScriptDirectory.from_config(config).walk_revisions()
     assert tuple(reversed([script.revision for script in scripts])) == database.REVISIONS
@@ -307,8 +307,8 @@ def test_putting_twice_keeps_one_read_only_file(store: Store, tmp_path: Path) ->
 WRITER = """
 import sys
 from pathlib import Path
-from service.core.model import StepNote
-from service.store.signing import checkpoint
+from service.core.records.events import StepNote
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 with Store.open(Path(sys.argv[1])) as store:
     run = store.find_run("latest")

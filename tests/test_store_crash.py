@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import StoreError
-from service.core.model import Event
-from service.store.audit import AuditReport, verify
+from service.core.records.events import Event
+from service.store.durable_effects import DurableFiles
 from service.store.records import NewArtefact, NewJob
-from service.store.seam import DurableFiles
 from service.store.store import Store
+from service.store.verification.verify import AuditReport, verify
 from tests.support.store import (
     CountedIds,
     Crash,

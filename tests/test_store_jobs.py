@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import DataError, StoreError
-from service.core.model import JobFailed, JobFinished, StepNote
-from service.store.audit import verify
+from service.core.records.events import JobFailed, JobFinished, StepNote
 from service.store.errors import LeaseHeldError, LeaseLostError
-from service.store.leases import RunLease
+from service.store.queue.leases import RunLease
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.store import CountedIds, SteppedClock, start_run
 from tests.support.waiting import until
 

@@ -10,18 +10,18 @@ from pathlib import Path
 import pytest
 
 from service.core.errors import StoreError
-from service.core.model import StepNote
+from service.core.records.events import StepNote
+from service.people.credentials.passwords import token_sha256
 from service.people.errors import LinkError, NotSignedInError, PinRefusedError, SignInRefusedError
-from service.people.passwords import token_sha256
-from service.people.people import People
 from service.people.person import Person
-from service.store.audit import verify
-from service.store.database import database_path
+from service.people.sessions import People
+from service.store.database.engine import database_path
 from service.store.records import SITE, NewArtefact, NewJob
-from service.store.signature_log import NAME
-from service.store.signing import checkpoint
+from service.store.signatures.log import NAME
+from service.store.signatures.signing import checkpoint
+from service.store.signatures.timestamps import Authority, timestamp
 from service.store.store import Store
-from service.store.timestamping import Authority, timestamp
+from service.store.verification.verify import verify
 from tests.support.store import SteppedClock, capture, rows, start_run, tamper
 from tests.support.time_stamp_authority import time_stamp_authority
 from tests.support.web import PIN, QUICK_HASHES, password_of, populate

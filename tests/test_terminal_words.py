@@ -18,13 +18,13 @@ from rich.table import Table
 from typer.testing import CliRunner
 
 from service.cli.common import print_table
-from service.cli.demo import free_address
-from service.cli.hands import SimulatedHands
 from service.cli.main import app
-from service.cli.operators import Display, TerminalOperator
-from service.core.decide import AskOperator
-from service.core.protocol import load_protocol
-from service.core.terms import term
+from service.cli.run.demo import free_address
+from service.cli.run.hands import SimulatedHands
+from service.cli.run.operators import Display, TerminalOperator
+from service.core.protocol.models import load_protocol
+from service.core.run.decide import AskOperator
+from service.core.text.terms import term
 from service.steps import params_models
 from service.steps.live import seen_words
 

@@ -10,14 +10,14 @@ import pytest
 
 from service.audit.bundle.export import export_bundle
 from service.audit.verify import bundle_verifier
-from service.core.model import DeviceTrouble
+from service.core.records.events import DeviceTrouble
 from service.rig import load_rig
-from service.runs import time_stamp_authority as time_stamp_authority_of
-from service.store.audit import verify
+from service.run_start import time_stamp_authority as time_stamp_authority_of
 from service.store.errors import TimestampError
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
+from service.store.signatures.timestamps import Authority, stamp_end, timestamp
 from service.store.store import Store
-from service.store.timestamping import Authority, stamp_end, timestamp
+from service.store.verification.verify import verify
 from tests.support.bench_run import PROTOCOL, begin_run, record_runs
 from tests.support.store import rows, tamper
 from tests.support.time_stamp_authority import TimeStampAuthority, make_certificates, time_stamp_authority

@@ -32,7 +32,7 @@ CHOSEN = (
 )
 SILENT = """
 import sys
-import service.store.database as database
+import service.store.database.engine as database
 from bench.torture.faults.__main__ import main
 database._advise = lambda _error: ""  # a store that says what is wrong, and not what to do
 sys.exit(main())

@@ -13,7 +13,7 @@ import pytest
 from bench.torture.fuzz.table import GROUPS, targets_of
 from bench.torture.fuzz.target import fault_of
 from bench.torture.fuzz.watch import Sweep
-from service.compute.images import read_image
+from service.compute.images.files import read_image
 from service.core.errors import DataError
 
 FOUND = Path(__file__).parent / "data" / "fuzz"  # by target, inputs that showed a fault once

@@ -17,13 +17,13 @@ from drivers import errors as device_errors
 from drivers.errors import DeviceFaultError
 from service.cli.main import app
 from service.core import errors as core_errors
-from service.core.decide import AskOperator
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError
-from service.core.model import OperatorAction, OperatorVerb
-from service.core.recovery import NEEDS_A_PERSON
-from service.core.run_state import RunState
-from service.core.ways_on import WayOn, takes_words, ways_on
-from service.core.ways_words import AGAIN, REMEDIES
+from service.core.records.events import OperatorAction, OperatorVerb
+from service.core.recovery.policy import NEEDS_A_PERSON
+from service.core.recovery.ways_on import WayOn, takes_words, ways_on
+from service.core.recovery.words import AGAIN, REMEDIES
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
 from service.runner import Spoken
 from service.steps import step_kinds
 from service.steps.context import StepContext, StepOutcome

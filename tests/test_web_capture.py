@@ -16,7 +16,7 @@ import pytest
 
 from bench.soak.large_record import LargeRecord
 from service.core.geometry import apply, inverse, look_at
-from service.core.model import StepNote, ViewpointFailed
+from service.core.records.events import StepNote, ViewpointFailed
 from service.dataset.scene_view import Scene, SceneSphere, figure_json, scene_figure, viewing_frame
 from service.steps.context import StationLayout
 from service.web.calibration.board_advice import empty_regions

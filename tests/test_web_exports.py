@@ -15,11 +15,11 @@ import trimesh
 
 from service.audit.export.process import export
 from service.audit.verify import bundle_verifier
-from service.compute.poses.pose_files import read_poses_csv
+from service.compute.poses.files.pose_files import read_poses_csv
 from service.core.errors import StoreError
-from service.core.model import EvidenceExported, RunReleased
-from service.store.audit import verify
+from service.core.records.events import EvidenceExported, RunReleased
 from service.store.store import Store
+from service.store.verification.verify import verify
 from service.web.audit.exports import MEANINGS
 from tests.support.bench_run import PROTOCOL
 from tests.support.reported_run import T_SCAN_CAMERA, record_reported_run

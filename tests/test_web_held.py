@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from drivers.photo_watch import PhotoWatch, PhotoWatchConfig
 from service.cli.main import app
-from service.core.model import CaptureAsked, DeviceOpened
+from service.core.records.events import CaptureAsked, DeviceOpened
 from tests.support.bench_run import Bench
 from tests.support.held_run import left_held_run
 from tests.support.web import Browser, WebSite, password_of, web_site

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from service.core.errors import DataError
-from service.core.model import FilesKept
+from service.core.records.events import FilesKept
 from service.monitor.snapshot import frame_path, frames_wanted, write_frame
 from service.store.records import NewArtefact
 from service.web.record.pictures import Mark, cached, draw_marks, nearest_width, picture_size, reduced_jpeg, safe_name

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.model import OperatorAction, RunAborted
+from service.core.records.events import OperatorAction, RunAborted
 from service.monitor.snapshot import Snapshot, write_snapshot
 from service.store.records import SITE
 from tests.support.web import Browser, WebSite, web_site

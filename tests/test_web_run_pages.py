@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.core.model import ItemTicked, OperatorAction, RunAborted
+from service.core.records.events import ItemTicked, OperatorAction, RunAborted
 from service.monitor.snapshot import Message, Snapshot, write_snapshot
 from service.people.roles import ROLES, Role
 from tests.support.web import WebSite, web_site

@@ -10,10 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from service.core.decide import AskOperator, decide, evaluate_gates
-from service.core.fold import fold
-from service.core.gates import quantity
-from service.core.model import (
+from service.core.gates.verdict import quantity
+from service.core.protocol.models import Protocol, load_protocol
+from service.core.records.events import (
     ItemTicked,
     OperatorVerb,
     SessionStarted,
@@ -22,7 +21,8 @@ from service.core.model import (
     StepPassed,
     StepRetried,
 )
-from service.core.protocol import Protocol, load_protocol
+from service.core.run.decide import AskOperator, decide, evaluate_gates
+from service.core.run.fold import fold
 from service.monitor.snapshot import Message, Snapshot
 from service.steps import params_models
 from service.web.page.run_frame import robot_banner

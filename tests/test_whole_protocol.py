@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from service.cli.demo import true_errors_mm
-from service.core.model import OperatorAction
+from service.cli.run.demo import true_errors_mm
+from service.core.records.events import OperatorAction
 from service.dataset.summary import RunSummary, summarise
-from service.runs import recorded_run
+from service.run_start import recorded_run
 from service.store.store import Store
 from tests.support.rig import REPOSITORY, orthocapture, simulated_rig
 from tests.support.shortened import shortened

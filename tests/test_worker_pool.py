@@ -14,11 +14,11 @@ import psutil
 import pytest
 
 from service.core.errors import ComputeError, StoreError
-from service.core.model import JobFailed, JobFinished, StepNote
-from service.core.priorities import EARLY, LATER, LIVE, WAITED
-from service.store.audit import verify
+from service.core.jobs.priorities import EARLY, LATER, LIVE, WAITED
+from service.core.records.events import JobFailed, JobFinished, StepNote
 from service.store.records import Job, NewJob
 from service.store.store import Store
+from service.store.verification.verify import verify
 from service.worker import loop
 from service.worker.job import JobAnswer, JobContext
 from service.worker.loop import work

@@ -20,12 +20,12 @@ import psutil
 import yaml
 
 from bench.soak.creep import CHILD, Sample, judge
-from service.core.model import Payload, ViewpointCaptured
-from service.core.run_state import RunState
-from service.evidence import RunFollower
-from service.runs import recorded_run
-from service.store.audit import verify
+from service.core.records.events import Payload, ViewpointCaptured
+from service.core.run.state import RunState
+from service.run_record import RunFollower
+from service.run_start import recorded_run
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
 from tests.support.serving import Server, serving
 

@@ -19,8 +19,8 @@ from typer.testing import CliRunner
 from bench.soak.fit import Took, exponent
 from bench.soak.large_record import STEP, TIMED, LargeRecord
 from service.cli.main import app
-from service.core.model import StepNote
-from service.store.audit import verify
+from service.core.records.events import StepNote
+from service.store.verification.verify import verify
 from tests.support.web import Browser, web_site
 
 MOST_EXPONENT = 1.15

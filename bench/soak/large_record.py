@@ -14,10 +14,10 @@ from pathlib import Path
 
 from bench.soak.fit import Took
 from bench.soak.sparse import SparseFiles, sparse_photograph
-from service.core.model import ViewpointCaptured
-from service.core.protocol import parse_protocol
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import ViewpointCaptured
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from service.cli.main import app
 from service.core.errors import OrthocaptureError
-from service.core.model import StepNote
+from service.core.records.events import StepNote
 from service.logs.file_log import file_log
 from service.store.records import NewJob
 from service.store.store import Store

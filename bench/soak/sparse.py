@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from service.store.seam import DurableFiles
+from service.store.durable_effects import DurableFiles
 
 _BLOCK_BYTES = 16384
 _ZEROS = bytes(_BLOCK_BYTES)

@@ -17,9 +17,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from service.store.audit import verify
 from service.store.records import NewArtefact
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.store import captured, start_run
 
 LEAST = 0.8  # minimum speed as a fraction of the tools' speed

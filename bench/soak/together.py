@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from bench.machine import REPOSITORY
-from service.core.protocol import parse_protocol
+from service.core.protocol.models import parse_protocol
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
-from service.store.audit import verify
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.bench_run import PROTOCOL
 from tests.support.serving import serving
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from service.core.protocol import load_protocol
-from service.core.protocol_docs import lifecycle_text, schema_text
-from service.core.ways_docs import ways_text
+from service.core.documents.protocol_docs import lifecycle_text, schema_text
+from service.core.documents.ways_docs import ways_text
+from service.core.protocol.models import load_protocol
 from service.steps import params_models
 
 REFERENCE = Path(__file__).parents[1] / "reference"

@@ -12,9 +12,9 @@ import numpy as np
 
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
-from service.core.file_text import file_text
 from service.core.geometry import Array
-from service.core.json_text import parse_json
+from service.core.text.file_text import file_text
+from service.core.text.json_text import parse_json
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.locating import detect_all, locate_outlines
+from service.compute.evaluation.accuracy import Evaluation, evaluate
 from service.compute.markers.records import SphereOutline
+from service.compute.markers.search.image_files import detect_all, locate_outlines
 from service.compute.registration.cost import Cost
-from service.compute.registration.evaluation import Evaluation, evaluate
 from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment, identify
 from service.compute.registration.solve import OutlineResidual, RegistrationResult, register

@@ -11,14 +11,14 @@ import numpy as np
 import trimesh
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.pose_files import write_camera_json, write_poses_csv, write_transforms_json
-from service.core.dependence import accepted_gates
+from service.compute.poses.files.pose_files import write_camera_json, write_poses_csv, write_transforms_json
 from service.core.errors import DataError
-from service.core.gates import BOUNDS_HOLD, describe, standing
+from service.core.gates.dependence import accepted_gates
+from service.core.gates.verdict import BOUNDS_HOLD, describe, standing
 from service.core.geometry import Transform
-from service.core.imported import imported_sentence
-from service.core.late import late_results
-from service.core.registered import shared_adjustment_note
+from service.core.records.import_list import imported_sentence
+from service.core.results.late import late_results
+from service.core.results.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary
 
 

@@ -10,11 +10,10 @@ from typing import Protocol as Interface
 
 import numpy as np
 
-from service.core.fold import fold
 from service.core.geometry import Array
-from service.core.model import ArtefactRef, Event, JobFinished, RunStarted, View
-from service.core.protocol import Protocol
-from service.core.registered import (
+from service.core.protocol.models import Protocol
+from service.core.records.events import ArtefactRef, Event, JobFinished, RunStarted, View
+from service.core.results.registrations import (
     better_later,
     budgets,
     evaluated,
@@ -22,7 +21,8 @@ from service.core.registered import (
     own_registration,
     registrations,
 )
-from service.core.run_state import RunState
+from service.core.run.fold import fold
+from service.core.run.state import RunState
 from service.store.store import Store
 
 
@@ -95,5 +95,5 @@ def summarise(store: Store, run_id: str, protocol: Protocol) -> RunSummary:
     """Read a run."""
     events = store.events(run_id)
     root = events[0].payload
-    assert isinstance(root, RunStarted)  # service.runs has read it the same way
+    assert isinstance(root, RunStarted)  # service.run_start has read it the same way
     return RunSummary(run_id, protocol, root, fold(protocol, events), events, store)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import BinaryIO
 
-from service.core.space import LEAST_FREE_BYTES
+from service.core.equipment.disk_space import LEAST_FREE_BYTES
 
 NAME = "orthocapture.jsonl"
 FILE_BYTES = 10_000_000

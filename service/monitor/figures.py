@@ -12,13 +12,13 @@ from typing import Any
 
 from sqlalchemy import Connection, case, func, select
 
-from service.core.priorities import EARLY
+from service.core.jobs.priorities import EARLY
 from service.monitor.snapshot import Doing, RobotPhase, read_snapshot
 from service.monitor.worker_sign import living_workers
+from service.store.database.tables import event_index, events, jobs, runs
 from service.store.events import parse_canonical
 from service.store.records import SITE
 from service.store.store import Store, read_open_runs
-from service.store.tables import event_index, events, jobs, runs
 
 CAPTURED = ("viewpoint_captured", "view_held", "view_imported")
 _LAST_CAPTURES = 21  # of which the seconds a viewpoint are the median

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from sqlalchemy import text
 
+from service.core.equipment.disk_space import LEAST_FREE_BYTES
 from service.core.errors import OrthocaptureError
-from service.core.space import LEAST_FREE_BYTES
 from service.monitor.snapshot import read_snapshot
 from service.monitor.worker_sign import living_workers
 from service.store.store import Store

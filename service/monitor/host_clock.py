@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 
-from service.core.model import HostClock
+from service.core.records.events import HostClock
 
 _SYSTEM_TIME = re.compile(r"^System time\s*:\s*([0-9.]+) seconds (fast|slow) of NTP time", re.MULTILINE)
 _LEAP = re.compile(r"^Leap status\s*:\s*(.+?)\s*$", re.MULTILINE)

@@ -16,7 +16,7 @@ from typing import Any
 from drivers.errors import DeviceError, LeaveNeededError, SafetyStopError
 from drivers.interfaces import Camera, Lightbox, RobotArm, SafetyState, TowerLight
 from service.core.errors import OrthocaptureError
-from service.core.run_state import WAITING_FOR_HAND
+from service.core.run.state import WAITING_FOR_HAND
 from service.monitor.alarm import Alarm
 from service.monitor.heartbeat import Heartbeat
 from service.monitor.snapshot import (

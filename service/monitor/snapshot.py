@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from pydantic import ValidationError
 
-from service.core.model import Record
+from service.core.records.events import Record
 
 STALE_S = 5.0
 STARTING_S = 120.0  # in which a runner that was started has loaded what it needs, on a busy machine too

@@ -12,7 +12,7 @@ from pathlib import Path
 import psutil
 from pydantic import ValidationError
 
-from service.core.model import Record
+from service.core.records.events import Record
 
 _EVERY_S = 2.0
 _STALE_S = 15.0

@@ -7,8 +7,8 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, func, insert, select, update
 
+from service.people.credentials.passwords import Passwords, new_token, require_password, require_pin, token_sha256
 from service.people.errors import AccountError, LinkError
-from service.people.passwords import Passwords, new_token, require_password, require_pin, token_sha256
 from service.people.person import Account, Invitation, Person
 from service.people.roles import ROLES, Role
 from service.people.rows import (
@@ -23,8 +23,8 @@ from service.people.rows import (
     require_reason,
     to_account,
 )
+from service.store.database.tables import accounts, invitations
 from service.store.store import Store
-from service.store.tables import accounts, invitations
 
 FIRST_LINK_S = 24 * 3600.0
 INVITATION_S = 72 * 3600.0

@@ -8,12 +8,12 @@ from difflib import unified_diff
 from sqlalchemy import select
 
 from service.core.errors import ConfigurationError
-from service.core.model import Event, Identified, ProtocolApproved
-from service.core.protocol import LoadedProtocol
+from service.core.protocol.models import LoadedProtocol
+from service.core.records.events import Event, Identified, ProtocolApproved
+from service.store.database.tables import event_index, events
 from service.store.events import to_event
 from service.store.records import SITE
 from service.store.store import Store
-from service.store.tables import event_index, events
 
 
 @dataclass(frozen=True, slots=True)

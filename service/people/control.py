@@ -8,12 +8,12 @@ from typing import Any, Literal
 from sqlalchemy import Connection, select
 from sqlalchemy.dialects.sqlite import insert
 
-from service.core.model import ControlTaken
+from service.core.records.events import ControlTaken
 from service.people.errors import ControlError, NotAllowedError
 from service.people.person import Person
 from service.people.rows import SESSION_S, require_reason
+from service.store.database.tables import accounts, control, runs, sessions
 from service.store.store import Store
-from service.store.tables import accounts, control, runs, sessions
 
 UNANSWERED_S = 60.0  # after which a question to a locked screen counts as answered
 

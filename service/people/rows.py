@@ -8,14 +8,14 @@ from typing import Any, Literal, cast
 
 from sqlalchemy import Connection, Row, delete, select
 
-from service.core.model import AccountChanged, Event, SignInRecorded
+from service.core.records.events import AccountChanged, Event, SignInRecorded
 from service.people.errors import AccountError
 from service.people.person import Account, Person
 from service.people.roles import Role
-from service.store.audit_people import session_sha256
+from service.store.database.tables import accounts, sessions
 from service.store.events import sha256_text
 from service.store.store import Store
-from service.store.tables import accounts, sessions
+from service.store.verification.people_checks import session_sha256
 
 SERVICE = "web"  # actor of what happens without anybody signed in
 SESSION_S = 12 * 3600.0

@@ -7,7 +7,7 @@ import pkgutil
 from functools import cache
 from typing import Any
 
-from service.core.model import Record
+from service.core.records.events import Record
 from service.steps.context import StepKind
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from drivers.errors import DeviceTimeoutError
 from drivers.interfaces import ScannedMesh
-from service.core.model import ArtefactRef, FilesKept
+from service.core.records.events import ArtefactRef, FilesKept
 from service.steps.context import StepContext
 from service.store.records import NewArtefact
 

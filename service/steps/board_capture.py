@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.calibration.board import Board
-from service.compute.calibration.board_design import Aims, Prediction, Taken
-from service.compute.calibration.board_knowledge import BoardKnowledge, refined_knowledge
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board_poses.design import Aims, Prediction, Taken
+from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
 from service.compute.camera_model import CameraModel
 from service.compute.planning.motion_plan import able_postures
-from service.core.count_words import counted
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
+from service.core.text.counts import counted
 from service.steps.board_looks import BoardLooks, Look
 from service.steps.board_plan import (
     NOTE,

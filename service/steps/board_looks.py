@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.calibration.board import Board, BoardView
-from service.core.model import ViewpointCaptured
-from service.core.run_state import JobState
+from service.compute.calibration.board.board import Board, BoardView
+from service.core.records.events import ViewpointCaptured
+from service.core.run.state import JobState
 from service.steps.context import JobRequest, StepContext
 from service.steps.spoilt import LookedAt, row_to_stop_for, stop_for_lens, why_spoilt
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from service.compute.calibration.board_design import Prediction
-from service.core.count_words import counted
-from service.core.gates import describe, evaluate_gates
-from service.core.model import GateVerdict
+from service.compute.calibration.board_poses.design import Prediction
+from service.core.gates.verdict import describe, evaluate_gates
+from service.core.records.events import GateVerdict
+from service.core.text.counts import counted
 from service.steps.board_capture import BoardCapture
 from service.steps.context import StepContext
 from service.steps.retakes import TAKEN_AGAIN

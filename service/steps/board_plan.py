@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from service.compute.calibration.board import Board
-from service.compute.calibration.board_candidates import PoseWishes, board_candidates
-from service.compute.calibration.board_design import (
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board_poses.candidates import PoseWishes, board_candidates
+from service.compute.calibration.board_poses.design import (
     NOTHING,
     Aims,
     Prediction,
@@ -20,10 +20,10 @@ from service.compute.calibration.board_design import (
     choose_poses,
     predict,
 )
-from service.compute.calibration.board_knowledge import BoardKnowledge, Tolerances, nominal_knowledge
+from service.compute.calibration.board_poses.knowledge import BoardKnowledge, Tolerances, nominal_knowledge
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform, inverse
-from service.core.model import Record
+from service.core.records.events import Record
 from service.rig import LensSection
 from service.steps.context import StationLayout
 

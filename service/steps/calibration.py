@@ -8,10 +8,10 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from service.compute.calibration.board import Board
+from service.compute.calibration.board.board import Board
 from service.core.errors import ConfigurationError
-from service.core.model import Record
-from service.core.protocol import MovingParams
+from service.core.protocol.models import MovingParams
+from service.core.records.events import Record
 from service.steps.board_capture import BoardCapture
 from service.steps.board_looks import board_arguments
 from service.steps.board_mend import mend_calibration

@@ -18,7 +18,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, SettleReport
 from service.core.geometry import Array, Transform
-from service.core.model import ViewpointFailed
+from service.core.records.events import ViewpointFailed
 from service.logs.where import at
 from service.steps.context import StepContext
 from service.steps.exposure import Shot, environment_now, expose, expose_when_free, record_shot, wanted_settings

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.core.model import Record
+from service.core.records.events import Record
 from service.steps.context import StepContext, StepKind, StepOutcome
 
 

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeVar
 
 from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox, RobotArm, Scanner, Transform
-from service.core.decide import RunState, StepState
 from service.core.errors import OrthocaptureError
-from service.core.imported import ImportList
-from service.core.model import ArtefactRef, Payload, Record, StepNote, Uncertainty, View
-from service.core.priorities import WAITED
-from service.core.protocol import Protocol as LabProtocol
-from service.core.protocol import Step
-from service.core.run_state import JobState
+from service.core.jobs.priorities import WAITED
+from service.core.protocol.models import Protocol as LabProtocol
+from service.core.protocol.models import Step
+from service.core.records.events import ArtefactRef, Payload, Record, StepNote, Uncertainty, View
+from service.core.records.import_list import ImportList
+from service.core.run.decide import RunState, StepState
+from service.core.run.state import JobState
 from service.rig import CollisionSection, LensSection, OpticsSection
 from service.store.records import NewArtefact
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from drivers.interfaces import CtSource
-from service.core.model import ArtefactRef, Record
+from service.core.records.events import ArtefactRef, Record
 from service.steps.arrivals import keep, keep_array, keep_mesh, wait_for
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.layouts import layout_uncertainties

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.core.model import Record
+from service.core.records.events import Record
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, result_of
 from service.steps.sources import registration_ways

@@ -16,7 +16,7 @@ from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, 
 from drivers.stillness import PoseSpread, pose_spread
 from service.core.errors import ConfigurationError, DataError
 from service.core.geometry import Array, Transform
-from service.core.model import ArtefactRef, Matrix4, ViewpointCaptured
+from service.core.records.events import ArtefactRef, Matrix4, ViewpointCaptured
 from service.steps.context import StepContext
 from service.steps.motion import settle_criteria
 from service.steps.viewpoints import Viewpoint

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.poses.front_end import pairs_of
-from service.compute.poses.sfm_options import SfmOptions
+from service.compute.poses.sfm.front_end import pairs_of
+from service.compute.poses.sfm.options import SfmOptions
 from service.core.errors import ConfigurationError
 from service.core.geometry import Transform
-from service.core.job_keys import job_key
-from service.core.model import ViewpointCaptured
-from service.core.priorities import EARLY
-from service.core.protocol import Protocol, Step
-from service.core.run_state import JobState, RunState
+from service.core.jobs.keys import job_key
+from service.core.jobs.priorities import EARLY
+from service.core.protocol.models import Protocol, Step
+from service.core.records.events import ViewpointCaptured
+from service.core.run.state import JobState, RunState
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import result_of
 from service.steps.viewpoints import Viewpoint

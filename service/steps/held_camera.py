@@ -16,8 +16,8 @@ from drivers.errors import (
     UnreadableFileError,
 )
 from drivers.interfaces import Camera, CapturedImage
-from service.core.model import ViewHeld, ViewpointFailed
-from service.core.run_state import WAITING_FOR_HAND
+from service.core.records.events import ViewHeld, ViewpointFailed
+from service.core.run.state import WAITING_FOR_HAND
 from service.steps.capture import WORTH_ANOTHER_TRY, photograph
 from service.steps.context import StepContext
 from service.steps.exposure import camera_record, environment_now, settings_agree, wanted_settings

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from service.core.errors import ConfigurationError, DataError
-from service.core.imported import ImportedFile, ImportedView, ImportList, PhotographRole
-from service.core.model import ArtefactRef, Record, ViewImported
-from service.core.protocol import CameraSection
+from service.core.protocol.models import CameraSection
+from service.core.records.events import ArtefactRef, Record, ViewImported
+from service.core.records.import_list import ImportedFile, ImportedView, ImportList, PhotographRole
 from service.steps.context import StepContext, StepKind, StepOutcome
 from service.steps.optics import departing_images, optics_departures
 from service.store.records import NewArtefact

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from service.core.errors import ConfigurationError
-from service.core.model import ArtefactRef, View, ViewHeld, ViewpointCaptured
+from service.core.records.events import ArtefactRef, View, ViewHeld, ViewpointCaptured
 from service.steps.context import StepContext
 
 

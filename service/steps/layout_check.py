@@ -10,8 +10,8 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from drivers.errors import ReleasedElsewhereError
-from service.core.gates import evaluate_gates
-from service.core.model import ArtefactRef, GateVerdict, Record
+from service.core.gates.verdict import evaluate_gates
+from service.core.records.events import ArtefactRef, GateVerdict, Record
 from service.steps.arrivals import keep
 from service.steps.capture import photograph
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from service.core.model import Uncertainty
+from service.core.records.events import Uncertainty
 
 
 def layout_uncertainties(layout: Mapping[str, Any]) -> dict[str, Uncertainty]:
-    """Of the measures of a layout's record (service.compute.registration.layout.layout_record)."""
+    """Of the measures of a layout's record (service.compute.layout.ambiguity.layout_record)."""
     return {name: Uncertainty.model_validate(bounds) for name, bounds in layout.get("bounds", {}).items()}

@@ -10,11 +10,11 @@ import numpy as np
 from pydantic import Field
 
 from service.core.errors import ComputeError, ConfigurationError
-from service.core.gates import limits as gate_text
-from service.core.model import Record, View
-from service.core.priorities import LIVE
-from service.core.protocol import Gate
-from service.core.run_state import JobState
+from service.core.gates.verdict import limits as gate_text
+from service.core.jobs.priorities import LIVE
+from service.core.protocol.models import Gate
+from service.core.records.events import Record, View
+from service.core.run.state import JobState
 from service.steps.context import JobRequest, StepContext
 from service.steps.inputs import artefact_of, hand_eye_of, result_of, robot_pose_of
 from service.steps.spoilt import SPOILT, LookedAt, row_to_stop_for, stop_for_lens, why_spoilt

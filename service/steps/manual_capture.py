@@ -11,9 +11,9 @@ from pydantic import Field
 
 from drivers.errors import DeviceTimeoutError
 from service.core.errors import ConfigurationError
-from service.core.gates import evaluate_gates
-from service.core.model import Record, ViewHeld
-from service.core.run_state import JobState
+from service.core.gates.verdict import evaluate_gates
+from service.core.records.events import Record, ViewHeld
+from service.core.run.state import JobState
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.exposure import wanted_settings
 from service.steps.held_camera import HeldCamera

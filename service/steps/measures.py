@@ -10,8 +10,8 @@ import difflib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from service.core.protocol import Gate, LoadedProtocol, Step
-from service.core.yaml_tree import FieldPath, Plain, Problem, field_name, parse_yaml
+from service.core.protocol.models import Gate, LoadedProtocol, Step
+from service.core.text.yaml_tree import FieldPath, Plain, Problem, field_name, parse_yaml
 from service.rig import RigSection
 from service.steps.sources import Wanted
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from service.compute.calibration.optics import Optics, OpticsDeparture, compare_optics, summary
-from service.core.model import View
+from service.compute.calibration.intrinsics.optics import Optics, OpticsDeparture, compare_optics, summary
+from service.core.records.events import View
 from service.steps.context import StepContext
 
 _STATED = (

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.calibration.kinematics import ArmModel, arm_model
+from service.compute.arm.inverse_kinematics import nearest_posture
+from service.compute.arm.kinematics import ArmModel, arm_model
 from service.compute.planning.collision import Capsule, Obstacles, universal_robot_body
-from service.compute.planning.inverse import nearest_posture
 from service.compute.planning.motion_plan import (
     MotionPlan,
     Order,
@@ -23,7 +23,7 @@ from service.compute.planning.motion_plan import (
 from service.compute.planning.optics import depth_of_field
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
-from service.core.protocol import Motion
+from service.core.protocol.models import Motion
 from service.rig import CollisionSection, OpticsSection
 from service.steps.context import StationLayout, StepContext
 from service.steps.viewpoints import Viewpoint

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.calibration.board import Board
-from service.compute.calibration.board_design import Aims
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board_poses.design import Aims
 from service.compute.planning.motion_plan import able_postures
 from service.core.geometry import Array, Transform, apply
-from service.core.protocol import Protocol, Step
+from service.core.protocol.models import Protocol, Step
 from service.rig import Rig
 from service.steps import calibration
 from service.steps.board_plan import (

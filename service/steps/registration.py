@@ -12,9 +12,9 @@ from typing import Any, Literal
 from pydantic import field_validator
 
 from service.core.errors import ComputeError, ConfigurationError
-from service.core.job_keys import arguments_name
-from service.core.model import Record
-from service.core.terms import term
+from service.core.jobs.keys import arguments_name
+from service.core.records.events import Record
+from service.core.text.terms import term
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, hand_eye_of, intrinsics_covariance_of, result_of
 from service.steps.sources import DEFAULT_SOURCES, PLANNED, Source, Wanted, Ways, decisive, posed, ways

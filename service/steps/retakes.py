@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from service.core.gates import describe, evaluate_gates
+from service.core.gates.verdict import describe, evaluate_gates
 from service.steps.context import StepContext
 from service.steps.spoilt import CLEAN, spoilt_before
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
-from service.core.model import Record
+from service.core.records.events import Record
 from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import result_of

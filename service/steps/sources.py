@@ -14,13 +14,13 @@ import numpy as np
 from pydantic import BaseModel
 
 from service.compute.camera_model import CameraModel
-from service.compute.poses.front_end import pairs_of
-from service.compute.poses.sfm_options import SfmOptions
-from service.compute.resolution import camera_at
-from service.core.job_keys import arguments_name, job_key, newest_job
-from service.core.priorities import LATER, REDUCED, WAITED
-from service.core.protocol import Protocol, Step
-from service.core.run_state import JobState, RunState
+from service.compute.images.resolution import camera_at
+from service.compute.poses.sfm.front_end import pairs_of
+from service.compute.poses.sfm.options import SfmOptions
+from service.core.jobs.keys import arguments_name, job_key, newest_job
+from service.core.jobs.priorities import LATER, REDUCED, WAITED
+from service.core.protocol.models import Protocol, Step
+from service.core.run.state import JobState, RunState
 from service.steps.context import JobRequest
 from service.steps.front_end import IMAGES_A_JOB, PAIRS_A_JOB, Early, chunks, early_matches, found_early
 from service.store.records import NewJob

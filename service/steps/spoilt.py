@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.core.errors import ImagesSpoiltError
-from service.core.run_state import JobState
+from service.core.run.state import JobState
 from service.steps.context import StepContext
 
 SPOILT = "spoilt images"  # name of the note that a retry of the step reads

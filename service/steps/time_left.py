@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from service.core.priorities import WAITED
-from service.core.protocol import Protocol, Step
-from service.core.run_state import JobState, RunState
+from service.core.jobs.priorities import WAITED
+from service.core.protocol.models import Protocol, Step
+from service.core.run.state import JobState, RunState
 from service.steps.sources import Task, Wanted, Ways, evaluation_tasks, registration_ways
 
 _NAMES = {

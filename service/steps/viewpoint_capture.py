@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Literal
 
 from service.compute.planning.motion_plan import Order
-from service.core.model import Record
-from service.core.protocol import MovingParams
+from service.core.protocol.models import MovingParams
+from service.core.records.events import Record
 from service.steps.capture import CaptureTotals, capture_viewpoints
 from service.steps.context import StepContext, StepKind, StepOutcome
 from service.steps.front_end import EarlyFeatures

@@ -10,7 +10,7 @@ from pydantic import model_validator
 
 from service.core.errors import OrthocaptureError
 from service.core.geometry import Array, Transform, inverse, look_at, transform
-from service.core.model import Record
+from service.core.records.events import Record
 from service.steps.context import StationLayout
 
 

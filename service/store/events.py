@@ -14,9 +14,9 @@ from pydantic_core import PydanticSerializationError, ValidationError
 from sqlalchemy import Connection, Row, insert, select, update
 
 from service.core.errors import IntegrityError, StoreError
-from service.core.model import PAYLOAD, ArtefactRef, Event, Payload
-from service.store.seam import Clock, utc_text
-from service.store.tables import events, heads
+from service.core.records.events import PAYLOAD, ArtefactRef, Event, Payload
+from service.store.database.tables import events, heads
+from service.store.durable_effects import Clock, utc_text
 
 ROOT = "0" * 64  # previous_sha256 of the first event
 _SAFE = 2**53 - 1

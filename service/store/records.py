@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from service.core.model import ArtefactRef
-from service.core.priorities import WAITED
+from service.core.jobs.priorities import WAITED
+from service.core.records.events import ArtefactRef
 
 SITE = "site"  # name of the chain that holds what happens outside of runs: sign-ins, accounts, keys, starts
 

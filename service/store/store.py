@@ -12,19 +12,19 @@ from typing import Any, Self
 from sqlalchemy import Connection, case, func, insert, select
 
 from service.core.errors import IntegrityError, OrthocaptureError, StoreError
-from service.core.model import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
-from service.core.priorities import Lane
-from service.store import jobs as queue
-from service.store.artefacts import ArtefactFiles, chunks_of, insert_artefacts, read_artefacts
-from service.store.checkpoints import read_checkpoints, read_timestamps
-from service.store.database import LOOK, RESTORE, Database, database_path, open_database
+from service.core.jobs.priorities import Lane
+from service.core.records.events import ArtefactRef, Event, JobFinished, Payload, RunStarted, SiteOpened
+from service.store.database.engine import LOOK, RESTORE, Database, database_path, open_database
+from service.store.database.tables import artefacts, event_index, events, heads, runs
+from service.store.durable_effects import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock
 from service.store.errors import UnknownRunError
 from service.store.events import ROOT, append, read_events, to_event
-from service.store.leases import RunLease, acquire, check_lease, held_runs, is_held
+from service.store.files.artefacts import ArtefactFiles, chunks_of, insert_artefacts, read_artefacts
+from service.store.logged_events import tell
+from service.store.queue import jobs as queue
+from service.store.queue.leases import RunLease, acquire, check_lease, held_runs, is_held
 from service.store.records import SITE, Artefact, Checkpoint, Job, NewArtefact, NewJob, RunRow, Timestamp
-from service.store.seam import Clock, DurableFiles, Files, Ids, RandomIds, SystemClock
-from service.store.tables import artefacts, event_index, events, heads, runs
-from service.store.told import tell
+from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
 
 _ENDS = ("run_completed", "run_aborted")
 _OWN_KINDS = frozenset({"run_started", "site_opened", "job_enqueued", "job_finished", "job_failed"})
@@ -289,7 +289,7 @@ class Store:
             return connection.execute(found).first() is not None
 
     def checkpoints(self, run_id: str) -> list[Checkpoint]:
-        """All signatures over a run's chain (or the site's), oldest first; service.store.signing makes them."""
+        """All signatures over a run's chain (or the site's), oldest first; signatures.signing makes them."""
         with self._database.reading() as connection:
             return read_checkpoints(connection, run_id)
 

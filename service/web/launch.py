@@ -12,7 +12,7 @@ from threading import Lock
 
 from service.core.errors import ConfigurationError
 from service.monitor.snapshot import Snapshot, log_path, write_snapshot
-from service.runs import recorded_run, require_rig_free
+from service.run_start import recorded_run, require_rig_free
 from service.store.store import Store
 
 

@@ -9,10 +9,10 @@ from typing import Annotated, cast
 
 from fastapi import Depends, Request
 
-from service.evidence import RunFollower, RunLog
-from service.people.people import People
+from service.people.sessions import People
 from service.rig import Rig
-from service.runs import recorded_run
+from service.run_record import RunFollower, RunRecord
+from service.run_start import recorded_run
 from service.store.store import Store
 from service.web.launch import Launcher
 from service.web.server.open_streams import OpenStreams
@@ -36,7 +36,7 @@ class Site:
     _runs: dict[str, RunFollower] = field(default_factory=dict[str, RunFollower])
     _lock: Lock = field(default_factory=Lock)
 
-    def run(self, run_id: str) -> RunLog:
+    def run(self, run_id: str) -> RunRecord:
         """A run's record as of now. Raises UnknownRunError, IntegrityError."""
         with self._lock:
             if run_id not in self._runs:

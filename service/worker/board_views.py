@@ -9,12 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from service.compute.calibration.board import Board, BoardView, find_board
-from service.compute.calibration.board_images import BoardImage, find_boards
-from service.compute.calibration.board_knowledge import BoardKnowledge
-from service.compute.calibration.board_parts import with_parts
-from service.compute.image_quality import image_quality
-from service.compute.images import read_grey
+from service.compute.calibration.board.board import Board, BoardView, find_board
+from service.compute.calibration.board.images import BoardImage, find_boards
+from service.compute.calibration.board.parts import with_parts
+from service.compute.calibration.board_poses.knowledge import BoardKnowledge
+from service.compute.images.files import read_grey
+from service.compute.images.quality import image_quality
 from service.core.errors import ComputeError
 from service.worker.job import JobAnswer, JobContext
 

@@ -7,15 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.calibration.board import Board
-from service.compute.calibration.board_images import UsableViews, usable_views
-from service.compute.calibration.hand_eye import calibrate_hand_eye
-from service.compute.calibration.hand_eye_record import board_corners, hand_eye_record
-from service.compute.calibration.intrinsics import calibrate_intrinsics, locate_view
-from service.compute.calibration.intrinsics_record import intrinsics_record
-from service.compute.calibration.kinematics import matching_arm
-from service.compute.calibration.uncertainty import board_distance_m, projection_uncertainty
-from service.compute.calibration.validation import MIN_VIEWS_TO_VALIDATE, calibration_warnings, cross_validate
+from service.compute.arm.kinematics import matching_arm
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board.images import UsableViews, usable_views
+from service.compute.calibration.hand_eye.estimate import calibrate_hand_eye
+from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
+from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
+from service.compute.calibration.intrinsics.record import intrinsics_record
+from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
+from service.compute.calibration.intrinsics.validation import (
+    MIN_VIEWS_TO_VALIDATE,
+    calibration_warnings,
+    cross_validate,
+)
 from service.compute.camera_model import CameraModel
 from service.worker.board_views import board_of, boards_of
 from service.worker.job import JobAnswer, JobContext

@@ -10,8 +10,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from service.compute.budget.closure import Alignment, compare_shapes, locate_in_images
-from service.compute.budget.error_budget import (
+from service.compute.camera_model import CameraModel
+from service.compute.evaluation.accuracy import evaluate as evaluate_controls
+from service.compute.evaluation.closure import Alignment, compare_shapes, locate_in_images
+from service.compute.evaluation.error_budget import (
     CONTROL_SPHERES,
     ErrorBudget,
     MeasuredSpheres,
@@ -20,20 +22,18 @@ from service.compute.budget.error_budget import (
     control_observation,
     loop_observations,
 )
-from service.compute.camera_model import CameraModel
-from service.compute.images import read_image
+from service.compute.images.files import read_image
+from service.compute.images.resolution import resample
 from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
 from service.compute.overlay import draw_overlay
 from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE, Detection
-from service.compute.registration.evaluation import evaluate as evaluate_controls
 from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment
-from service.compute.resolution import resample
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
-from service.core.model import ArtefactRef
+from service.core.records.events import ArtefactRef
 from service.worker.job import JobAnswer, JobContext
 
 _COMMON = ("common", "intrinsics")  # components that move all spheres alike

@@ -7,14 +7,14 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial, reduce
 
-from service.core.arrival import late_s
 from service.core.errors import OrthocaptureError, StoreError
-from service.core.fold import advance
-from service.core.model import Event
-from service.evidence import RunFollower, recorded_protocol, recorded_root
+from service.core.records.events import Event
+from service.core.results.arrival import late_s
+from service.core.run.fold import advance
+from service.run_record import RunFollower, recorded_protocol, recorded_root
 from service.steps.sources import due
 from service.store.records import Job, NewArtefact, NewJob
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.worker.job import JobAnswer
 

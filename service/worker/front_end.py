@@ -9,10 +9,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from service.compute.poses.colmap_process import ColmapProcess
-from service.compute.poses.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
-from service.compute.poses.front_end import FrontEnd, pairs_of
-from service.compute.poses.sfm_options import SfmOptions
+from service.compute.poses.colmap.process import ColmapProcess
+from service.compute.poses.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
+from service.compute.poses.sfm.front_end import FrontEnd, pairs_of
+from service.compute.poses.sfm.options import SfmOptions
 from service.worker.job import JobAnswer, JobContext
 from service.worker.photographs import photographs
 

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.calibration.board import Board, find_board
-from service.compute.calibration.intrinsics import coverage_map_of, locate_view
+from service.compute.calibration.board.board import Board, find_board
+from service.compute.calibration.intrinsics.estimate import coverage_map_of, locate_view
 from service.compute.camera_model import CameraModel
-from service.compute.hand_bundle import Reading, adjust_together
-from service.compute.hand_view import look_at_image
-from service.compute.images import read_grey, read_image
-from service.compute.live import expected_spheres
+from service.compute.capture.hand_bundle import Reading, adjust_together
+from service.compute.capture.hand_view import look_at_image
+from service.compute.capture.live import expected_spheres
+from service.compute.images.files import read_grey, read_image
 from service.compute.markers.detectors import options_for
 from service.compute.planning.coverage import CoverageLimits, CoverageSurface, covered_fraction, seen
 from service.compute.planning.hand_guidance import (
@@ -31,7 +31,7 @@ from service.compute.planning.hand_guidance import (
     words,
 )
 from service.compute.planning.information import predicted_information
-from service.compute.planning.next_best_view import Candidate, Present, next_best_views
+from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse
 from service.worker.job import JobAnswer, JobContext
@@ -248,14 +248,14 @@ def _totals(
 
 def _present(
     context: JobContext, good: Sequence[_Earlier], spheres: Array, surface: CoverageSurface | None
-) -> Present:
+) -> CurrentInformation:
     """The images as measurements of the scan's pose, whose cameras structure from motion will place."""
     arguments = context.arguments
     sigma_m, sigma_rad = float(arguments["pose_sigma_m"]), float(arguments["pose_sigma_rad"])
     targets = spheres if surface is None else surface.points_m[:: max(1, len(surface.points_m) // 200)]
     points = 0 if surface is None else len(surface.points_m)
     seen_by = np.array([e.seen for e in good], dtype=np.int64).reshape(len(good), points)
-    return Present(
+    return CurrentInformation(
         tuple(e.information for e in good),
         np.diag([sigma_m**2 / 3] * 3 + [sigma_rad**2 / 3] * 3),
         targets - spheres.mean(axis=0),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from service.compute.camera_model import CameraModel
-from service.core.model import ArtefactRef
+from service.core.records.events import ArtefactRef
 
 
 class ArtefactStore(Protocol):

@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.images import read_image
-from service.compute.markers.detect import detect_spheres
-from service.compute.markers.records import SphereOutline
-from service.compute.registration.layout import (
+from service.compute.images.files import read_image
+from service.compute.layout.ambiguity import (
     REQUIRED_MARGIN_M,
     LayoutReport,
     check_layout,
@@ -21,10 +19,12 @@ from service.compute.registration.layout import (
     layout_measures,
     layout_record,
 )
-from service.compute.registration.layout_moves import innermost, suggest_moves
-from service.compute.registration.layout_words import ShownMove, show_move
-from service.compute.registration.photo_adjustment import LensPrior, Photograph
-from service.compute.registration.photo_layout import PhotoLayout, layout_from_photographs
+from service.compute.layout.photo_adjustment import LensPrior, Photograph
+from service.compute.layout.photographs import PhotoLayout, layout_from_photographs
+from service.compute.layout.sphere_moves import innermost, suggest_moves
+from service.compute.layout.words import ShownMove, show_move
+from service.compute.markers.detect import detect_spheres
+from service.compute.markers.records import SphereOutline
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.worker.job import JobAnswer, JobContext

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.image_quality import image_quality
-from service.compute.images import read_image
-from service.compute.live import (
+from service.compute.capture.live import (
     LiveView,
     Provisional,
     clipped_fraction,
@@ -25,6 +23,8 @@ from service.compute.live import (
     register_station,
     sharpness,
 )
+from service.compute.images.files import read_image
+from service.compute.images.quality import image_quality
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.planning.coverage import (
     CoverageLimits,
@@ -42,7 +42,7 @@ from service.compute.planning.information import (
     predicted_information,
     view_information,
 )
-from service.compute.planning.next_best_view import Candidate, Present, next_best_views
+from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.worker.job import JobAnswer, JobContext
@@ -192,7 +192,7 @@ def live_summary(context: JobContext) -> JobAnswer:
     here = stations.get(str(arguments["station"]))
     if here is not None:
         counts = np.array(masks, dtype=np.int64).sum(axis=0)
-        present = Present(
+        present = CurrentInformation(
             tuple(v.information for v in here.informations),
             here.P,
             here.targets_m,

@@ -15,10 +15,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from service.core.equipment.disk_space import LEAST_FREE_BYTES
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
-from service.core.priorities import Lane
-from service.core.space import LEAST_FREE_BYTES
-from service.core.terms import term
+from service.core.jobs.priorities import Lane
+from service.core.text.terms import term
 from service.logs.where import at
 from service.store.errors import LeaseLostError
 from service.store.records import Job

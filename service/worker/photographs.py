@@ -13,8 +13,8 @@ from typing import Any
 import cv2
 
 from service.compute.camera_model import CameraModel
-from service.compute.images import read_image
-from service.compute.resolution import resample
+from service.compute.images.files import read_image
+from service.compute.images.resolution import resample
 from service.worker.job import JobContext
 
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]

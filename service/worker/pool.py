@@ -22,7 +22,7 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 from service.compute.memory import keep_freed_memory
-from service.core.priorities import Lane
+from service.core.jobs.priorities import Lane
 from service.logs.file_log import file_log
 from service.monitor.worker_sign import SignOfLife
 from service.store.store import Store

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from service.compute.markers.archive import outline_from_record
-from service.compute.poses.hybrid import HybridPoses, hybrid_poses
-from service.compute.poses.pose_covariance import blocks
-from service.compute.poses.sfm import SfmModel, reconstruct, reconstruct_from
-from service.compute.poses.sfm_options import Mapper, SfmOptions
-from service.compute.poses.tracks import Tracks
+from service.compute.poses.files.pose_covariance import blocks
+from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
+from service.compute.poses.sfm.estimate import SfmModel, reconstruct, reconstruct_from
+from service.compute.poses.sfm.options import Mapper, SfmOptions
+from service.compute.poses.sfm.tracks import Tracks
 from service.core.geometry import Array
 from service.worker.front_end import read_features, read_matches
 from service.worker.job import JobAnswer, JobContext

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.budget.closure import Alignment
 from service.compute.camera_model import CameraModel
-from service.compute.locating import detect_all, locate_outlines, searched_whole
-from service.compute.marker_files import detect_file_by_masks
+from service.compute.evaluation.accuracy import leave_one_out
+from service.compute.evaluation.closure import Alignment
 from service.compute.markers.archive import outline_from_record, outline_record
 from service.compute.markers.detectors import options_for
 from service.compute.markers.records import SphereOutline
+from service.compute.markers.search.image_files import detect_all, locate_outlines, searched_whole
+from service.compute.markers.search.paper_files import detect_file_by_masks
 from service.compute.pipeline import register_images
-from service.compute.registration.evaluation import leave_one_out
 from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.registration.result import RegistrationResult
 from service.core.errors import ComputeError

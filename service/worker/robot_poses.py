@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.calibration.hand_eye_record import read_arm_correction
+from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.core.geometry import Array
 
 

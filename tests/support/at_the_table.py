@@ -8,9 +8,9 @@ from contextlib import contextmanager
 
 from playwright.sync_api import Browser, expect
 
-from service.core.decide import AskOperator
-from service.core.model import OperatorAction, Payload
-from service.core.run_state import RunState
+from service.core.records.events import OperatorAction, Payload
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
 from service.store.store import Store
 from tests.support.attended import attended
 from tests.support.bench_run import PROTOCOL, Bench

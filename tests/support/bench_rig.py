@@ -35,12 +35,12 @@ from drivers.interfaces import (
     SettleReport,
     TowerLight,
 )
-from service.core.decide import AskOperator
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, from_rotation_vector, to_rotation_vector, transform
-from service.core.imported import ImportList
-from service.core.model import OperatorAction
-from service.core.run_state import RunState
+from service.core.records.events import OperatorAction
+from service.core.records.import_list import ImportList
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
 from service.runner import Spoken

@@ -8,17 +8,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from service.core.fold import fold
-from service.core.model import OperatorAction, ViewpointCaptured
-from service.core.protocol import parse_protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import OperatorAction, ViewpointCaptured
+from service.core.run.fold import fold
+from service.core.run.state import RunState
 from service.rig import load_rig
+from service.run_start import recorded_run, start_run
 from service.runner import Runner
-from service.runs import recorded_run, start_run
 from service.steps import params_models
-from service.store.audit import verify
+from service.store.signatures.timestamps import Authority
 from service.store.store import Store
-from service.store.timestamping import Authority
+from service.store.verification.verify import verify
 from tests.support.bench_rig import Answer, BenchRig, ScriptedOperator
 
 PROTOCOL = """\

@@ -12,9 +12,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from service.compute.calibration.board import Board
-from service.compute.calibration.board_design import Aims
-from service.compute.calibration.reprojection import BoardCorners
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board_poses.design import Aims
+from service.compute.calibration.hand_eye.reprojection import BoardCorners
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, align_points, apply, inverse, look_at, transform
 from service.rig import LensSection

@@ -21,8 +21,8 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
 
-from service.people.people import People
 from service.people.roles import Role
+from service.people.sessions import People
 from service.store.store import Store
 from tests.support.rig import REPOSITORY, command
 

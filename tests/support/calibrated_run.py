@@ -10,15 +10,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from service.compute.calibration.board import BoardView
-from service.compute.calibration.hand_eye import calibrate_hand_eye
-from service.compute.calibration.hand_eye_record import hand_eye_record
-from service.compute.calibration.intrinsics import calibrate_intrinsics
-from service.compute.calibration.intrinsics_record import intrinsics_record
-from service.compute.calibration.uncertainty import board_distance_m, projection_uncertainty
-from service.compute.calibration.validation import calibration_warnings, cross_validate
-from service.core.gates import evaluate_gates
-from service.core.model import (
+from service.compute.calibration.board.board import BoardView
+from service.compute.calibration.hand_eye.estimate import calibrate_hand_eye
+from service.compute.calibration.hand_eye.record import hand_eye_record
+from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics
+from service.compute.calibration.intrinsics.record import intrinsics_record
+from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
+from service.compute.calibration.intrinsics.validation import calibration_warnings, cross_validate
+from service.core.gates.verdict import evaluate_gates
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import (
     ArtefactRef,
     DeviceOpened,
     StepMeasured,
@@ -27,12 +28,11 @@ from service.core.model import (
     Uncertainty,
     ViewpointCaptured,
 )
-from service.core.protocol import parse_protocol
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from tests.support.board_sessions import BOARD, Session, noisy_session
 from tests.support.web import WebSite
 

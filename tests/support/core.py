@@ -8,8 +8,8 @@ from typing import Any
 
 from pydantic import Field
 
-from service.core.decide import AskOperator, Decision, RunState, advance, decide, evaluate_gates, initial_state
-from service.core.model import (
+from service.core.protocol.models import LoadedProtocol, MovingParams, Protocol, parse_protocol
+from service.core.records.events import (
     ArtefactRef,
     Event,
     OperatorAction,
@@ -23,7 +23,7 @@ from service.core.model import (
     ViewImported,
     ViewpointCaptured,
 )
-from service.core.protocol import LoadedProtocol, MovingParams, Protocol, parse_protocol
+from service.core.run.decide import AskOperator, Decision, RunState, advance, decide, evaluate_gates, initial_state
 
 
 class ChecklistParams(Record):

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from drivers.interfaces import CameraSettings
-from service.compute.hand_view import HandView
+from service.compute.capture.hand_view import HandView
 from service.compute.planning.information import ViewInformation
 from service.core.errors import ComputeError
 from service.core.geometry import Array

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from service.audit.overview.digest import FOLDED
-from service.core.actions import record_to_sign
-from service.core.fold import advance, initial_state
-from service.core.gates import evaluate_gates
-from service.core.model import (
+from service.core.gates.verdict import evaluate_gates
+from service.core.protocol.models import Step, load_protocol
+from service.core.records.events import (
     ActionRefused,
     ArtefactRef,
     ControlTaken,
@@ -32,15 +31,16 @@ from service.core.model import (
     ViewpointCaptured,
     ViewpointFailed,
 )
-from service.core.protocol import Step, load_protocol
-from service.core.run_state import RunState
+from service.core.run.actions import record_to_sign
+from service.core.run.fold import advance, initial_state
+from service.core.run.state import RunState
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
-from service.store.database import database_path
+from service.store.database.engine import database_path
+from service.store.durable_effects import DurableFiles
 from service.store.records import NewArtefact, NewJob
-from service.store.seam import DurableFiles
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 
 PROTOCOL = Path(__file__).parents[2] / "protocols" / "demo.yaml"

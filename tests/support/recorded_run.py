@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from service.core.gates import evaluate_gates
-from service.core.model import (
+from service.core.gates.verdict import evaluate_gates
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import (
     ArtefactRef,
     FilesKept,
     OperatorAction,
@@ -20,13 +21,12 @@ from service.core.model import (
     StepPassed,
     StepStarted,
 )
-from service.core.protocol import parse_protocol
 from service.rig import load_rig
+from service.run_start import start_run
 from service.runner import software_versions
-from service.runs import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact, NewJob
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.worker.loop import work
 from tests.support.sphere_images import RADIUS_M, REGISTRATION_M, exact_outlines, scene

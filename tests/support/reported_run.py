@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 import trimesh
 
-from service.core.gates import evaluate_gates
-from service.core.model import (
+from service.core.gates.verdict import evaluate_gates
+from service.core.protocol.models import Protocol, parse_protocol
+from service.core.records.events import (
     ArtefactRef,
     DeviceOpened,
     DeviceTrouble,
@@ -28,12 +29,11 @@ from service.core.model import (
     ViewpointCaptured,
     ViewpointFailed,
 )
-from service.core.protocol import Protocol, parse_protocol
 from service.rig import load_rig
-from service.runs import start_run
+from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact
-from service.store.signing import checkpoint
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from tests.support.core import EYE
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from service.core.decide import AskOperator
-from service.core.model import ItemTicked, OperatorAction
-from service.core.run_state import RunState
+from service.core.records.events import ItemTicked, OperatorAction
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
 from tests.support.calibrated_run import begin_calibrated_run
 from tests.support.held_run import left_held_run
 from tests.support.recorded_run import record_run

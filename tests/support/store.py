@@ -8,10 +8,10 @@ from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from service.core.model import ArtefactRef, RunStarted, ViewpointCaptured
-from service.store.database import database_path
+from service.core.records.events import ArtefactRef, RunStarted, ViewpointCaptured
+from service.store.database.engine import database_path
+from service.store.durable_effects import DurableFiles
 from service.store.records import NewArtefact
-from service.store.seam import DurableFiles
 from service.store.store import Store
 
 IDENTITY4 = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))

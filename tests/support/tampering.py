@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from service.store.artefacts import record_sha256
 from service.store.events import event_sha256, parse_canonical
+from service.store.files.artefacts import record_sha256
 from tests.support.store import rows, tamper
 
 # Rebuilds the search index from the current events; tamper() has dropped the triggers before this runs.

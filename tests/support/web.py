@@ -13,14 +13,14 @@ import httpx
 from argon2 import PasswordHasher
 from fastapi import FastAPI
 
-from service.core.protocol import parse_protocol
+from service.core.protocol.models import parse_protocol
 from service.people.control import Control
-from service.people.people import People
 from service.people.person import Person
 from service.people.roles import ROLES, Role
+from service.people.sessions import People
 from service.rig import load_rig
 from service.steps import params_models
-from service.store.seam import Clock
+from service.store.durable_effects import Clock
 from service.store.store import Store
 from service.web.app import create_app
 from service.web.launch import Launcher

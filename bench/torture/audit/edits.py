@@ -14,8 +14,8 @@ from bench.torture.audit import outcome
 from bench.torture.audit.outcome import verdict
 from bench.torture.audit.record import Record, put_back
 from bench.torture.audit.tally import Tallies, Tally
-from service.store.database import database_path
-from service.store.tables import metadata
+from service.store.database.engine import database_path
+from service.store.database.tables import metadata
 
 TABLES = (*metadata.tables, "alembic_version")
 

@@ -11,9 +11,9 @@ from bench.torture.audit import outcome
 from bench.torture.audit.outcome import Verdict, verdict
 from bench.torture.audit.record import WAL_NAME, Record, put_back
 from bench.torture.audit.tally import Tallies, Tally
-from service.store.database import database_path
-from service.store.signature_log import NAME
-from service.store.wal import wal_findings
+from service.store.database.engine import database_path
+from service.store.database.wal import wal_findings
+from service.store.signatures.log import NAME
 
 
 @contextmanager

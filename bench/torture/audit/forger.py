@@ -17,15 +17,15 @@ from bench.torture.audit import outcome
 from bench.torture.audit.outcome import Verdict, verdict
 from bench.torture.audit.record import Record, put_back
 from bench.torture.audit.tally import Tallies, Tally
-from service.store.artefacts import record_sha256
-from service.store.checkpoints import RowsDigest, key_fingerprint
-from service.store.checkpoints import statement as signed_text
-from service.store.database import database_path
+from service.store.database.engine import database_path
+from service.store.durable_effects import DurableFiles
 from service.store.events import ROOT, canonical, event_sha256, parse_canonical
-from service.store.keys import public_bytes
+from service.store.files.artefacts import record_sha256
 from service.store.records import SITE, Checkpoint
-from service.store.seam import DurableFiles
-from service.store.signature_log import NAME, SignatureLog
+from service.store.signatures.checkpoints import RowsDigest, key_fingerprint
+from service.store.signatures.checkpoints import statement as signed_text
+from service.store.signatures.keys import public_bytes
+from service.store.signatures.log import NAME, SignatureLog
 from tests.support.tampering import WORDS_AGAIN
 
 CAN_WRITE = ("database", "site's chain", "log", "second place")

@@ -18,10 +18,15 @@ from sqlalchemy import Connection
 
 from bench.torture.audit.record import Record
 from service.core.errors import OrthocaptureError
-from service.store import audit, audit_checks, audit_signatures, audit_words, database, signature_log
-from service.store.audit_checks import Fault
-from service.store.database import database_path
-from service.store.signature_log import Line
+from service.store.database import engine as database
+from service.store.database.engine import database_path
+from service.store.signatures import log as signature_log
+from service.store.signatures.log import Line
+from service.store.verification import chain_checks as audit_checks
+from service.store.verification import search_checks as audit_words
+from service.store.verification import signature_checks as audit_signatures
+from service.store.verification import verify as audit
+from service.store.verification.chain_checks import Fault
 
 _WORDS_COME_FROM = (
     "SELECT * FROM event_words_data",

@@ -13,20 +13,20 @@ from pathlib import Path
 from service.audit.overview.corrections import correct
 from service.audit.record.starts import record_start
 from service.core.errors import DataError
-from service.core.model import EvidenceExported, OperatorAction, RunAborted, RunReleased
+from service.core.records.events import EvidenceExported, OperatorAction, RunAborted, RunReleased
 from service.people.control import Control
 from service.people.errors import SignInRefusedError
-from service.people.people import People
 from service.people.person import Person
+from service.people.sessions import People
 from service.rig import load_rig
-from service.store.database import database_path
+from service.store.database.engine import database_path
+from service.store.durable_effects import DurableFiles
 from service.store.records import SITE, NewArtefact, NewJob
-from service.store.seam import DurableFiles
-from service.store.signature_copy import bring_up_to_date
-from service.store.signature_log import NAME
-from service.store.signing import checkpoint, rotate_key
+from service.store.signatures.log import NAME
+from service.store.signatures.log_copy import bring_up_to_date
+from service.store.signatures.signing import checkpoint, rotate_key
+from service.store.signatures.timestamps import Authority
 from service.store.store import Store
-from service.store.timestamping import Authority
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.time_stamp_authority import time_stamp_authority
 from tests.support.web import PIN, QUICK_HASHES, password_of, populate

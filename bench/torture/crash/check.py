@@ -14,15 +14,15 @@ from typing import Any
 from bench.torture.crash.mortal import read_journal
 from bench.torture.crash.run import Place, Role
 from bench.torture.crash.scene import import_list, planned
-from service.core.model import Event, JobFinished, OperatorAction, SessionStarted, StepMeasured, View
-from service.evidence import read_log
-from service.runs import recorded_run
-from service.store.audit import verify
-from service.store.database import database_path
+from service.core.records.events import Event, JobFinished, OperatorAction, SessionStarted, StepMeasured, View
+from service.run_record import read_log
+from service.run_start import recorded_run
+from service.store.database.engine import database_path
 from service.store.errors import StoreVersionError
-from service.store.leftovers import leftovers, remove_leftovers
-from service.store.signature_log import NAME as LOG_NAME
+from service.store.files.leftovers import leftovers, remove_leftovers
+from service.store.signatures.log import NAME as LOG_NAME
 from service.store.store import Store
+from service.store.verification.verify import verify
 
 ROLES: tuple[Role, ...] = ("begin", "runner", "worker", "web")
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from service.store.database import database_path
-from service.store.seam import DurableFiles
+from service.store.database.engine import database_path
+from service.store.durable_effects import DurableFiles
 
 Where = Literal["before", "within", "after"]
 HALVED = ("write", "append")  # effects that a crash can leave half done
@@ -53,7 +53,7 @@ def read_journal(journal: Path) -> list[dict[str, Any]]:
 
 
 class MortalFiles:
-    """service.store.seam.Files that records every effect in a journal and dies at one point of one of them."""
+    """service.store.durable_effects.Files that records every effect in a journal and dies at one point of one of them."""
 
     def __init__(self, data: Path, journal: Path, die_at: Point | None) -> None:
         self._data = data

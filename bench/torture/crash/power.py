@@ -11,7 +11,7 @@ from random import Random
 from typing import Any
 
 from bench.torture.crash.mortal import read_journal
-from service.store.database import database_path
+from service.store.database.engine import database_path
 
 
 @dataclass

@@ -23,17 +23,17 @@ import numpy as np
 import psutil
 import yaml
 
-from service.core.actions import refuse
-from service.core.decide import AskOperator, decide
-from service.core.fold import fold
-from service.core.model import Event, OperatorAction, SessionStarted, ViewpointCaptured
-from service.core.protocol import Protocol, load_protocol
+from service.core.protocol.models import Protocol, load_protocol
+from service.core.records.events import Event, OperatorAction, SessionStarted, ViewpointCaptured
+from service.core.run.actions import refuse
+from service.core.run.decide import AskOperator, decide
+from service.core.run.fold import fold
 from service.rig import load_rig
-from service.runs import recorded_run, start_run
+from service.run_start import recorded_run, start_run
 from service.steps import params_models
-from service.store.audit import verify
-from service.store.leftovers import leftovers, remove_leftovers
+from service.store.files.leftovers import leftovers, remove_leftovers
 from service.store.store import Store
+from service.store.verification.verify import verify
 from tests.support.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
 
 _HOST = "127.0.0.71"

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from service.core.model import ArtefactRef
+from service.core.records.events import ArtefactRef
 from service.store.events import canonical
 from service.worker.job import ArtefactStore, Handler, JobAnswer, JobContext
 

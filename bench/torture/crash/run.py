@@ -17,16 +17,16 @@ from bench.torture.crash.mortal import MortalFiles, Point
 from bench.torture.crash.remembered import remembering
 from bench.torture.crash.scene import CAMERA, LAYOUT, VIEWPOINTS, CrashRig, prepare_files
 from service import runner
-from service.core.fold import fold
-from service.core.gates import evaluate_gates
-from service.core.model import RunReleased, StepMeasured, StepStarted
-from service.core.protocol import parse_protocol
-from service.core.release import refuse_release
+from service.core.gates.release import refuse_release
+from service.core.gates.verdict import evaluate_gates
+from service.core.protocol.models import parse_protocol
+from service.core.records.events import RunReleased, StepMeasured, StepStarted
+from service.core.run.fold import fold
 from service.rig import load_rig
-from service.runs import recorded_run, start_run
+from service.run_start import recorded_run, start_run
 from service.steps import params_models
-from service.store.signature_copy import keep_elsewhere
-from service.store.signing import checkpoint
+from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.worker import loop
 from tests.support.bench_rig import ScriptedOperator
@@ -206,7 +206,7 @@ def _begin(store: Store, place: Place, _parent: int, person: str) -> None:
 
 
 def _run(store: Store, place: Place, parent: int, person: str) -> None:
-    """Run, as service.cli.run.drive does."""
+    """Run, as service.cli.run.commands.drive does."""
     run_id = store.find_run("latest")
     protocol, _ = recorded_run(store, run_id)
     rig = CrashRig(folder=place.files, motions=place.motions)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from sqlalchemy.exc import OperationalError
 
-from service.store.seam import DurableFiles, SystemClock
+from service.store.durable_effects import DurableFiles, SystemClock
 
 # SQLite's messages for system errors, as for its codes SQLITE_FULL, SQLITE_READONLY, SQLITE_IOERR.
 _SQLITE = {
@@ -23,7 +23,7 @@ _SQLITE = {
 
 @dataclass
 class FaultyDisk:
-    """service.store.seam.Files on a disk that fails from one call on, until somebody repairs it.
+    """service.store.durable_effects.Files on a disk that fails from one call on, until somebody repairs it.
 
     Attributes:
         effect: the kind of call that fails; empty: all kinds.

@@ -8,9 +8,9 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from service.core.decide import AskOperator
-from service.core.model import OperatorAction
-from service.core.run_state import RunState
+from service.core.records.events import OperatorAction
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 from service.runner import Spoken
 from tests.support.bench_rig import ScriptedOperator, agree, answer

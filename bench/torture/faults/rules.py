@@ -10,7 +10,7 @@ from pathlib import Path
 from bench.torture.faults.person import Motions
 from drivers import errors as _device_errors
 from service.core.errors import OrthocaptureError
-from service.core.model import (
+from service.core.records.events import (
     DeviceOpened,
     Event,
     OperatorAction,
@@ -18,7 +18,7 @@ from service.core.model import (
     ViewpointCaptured,
     ViewpointFailed,
 )
-from service.store.audit import verify
+from service.store.verification.verify import verify
 
 _SAYS = re.compile(r"^.+ \[[^\]]+\]\. .+$", re.DOTALL)  # what, [place], remedy
 _NOTICE_S = 0.1  # between a motion and a sample of it, or a stop and its sample

@@ -23,14 +23,14 @@ from bench.torture.faults.material import FIVE, ct_folder, make_material, scan_f
 from bench.torture.faults.person import ArmEye, LeftError, Motions, Person
 from bench.torture.faults.proxy import RunningProxy, Wire, start_proxy
 from bench.torture.faults.verdict import Verdict, errors_of, first_words, listed, masked, policy_of
-from service.core.decide import AskOperator, initial_state
 from service.core.errors import OrthocaptureError
-from service.core.protocol import parse_protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import parse_protocol
+from service.core.run.decide import AskOperator, initial_state
+from service.core.run.state import RunState
+from service.run_start import recorded_run, start_run
 from service.runner import Runner
-from service.runs import recorded_run, start_run
 from service.steps import params_models
-from service.store.database import database_path
+from service.store.database.engine import database_path
 from service.store.store import Store
 from service.worker import loop
 from tests.support.bench_rig import BenchArm, BenchCamera

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from service.core.decide import AskOperator
-from service.core.model import DeviceOpened, Event, StepFailed, ViewpointFailed
+from service.core.records.events import DeviceOpened, Event, StepFailed, ViewpointFailed
+from service.core.run.decide import AskOperator
 
 _DIGITS = re.compile(r"\d+(?:[.,]\d+)*")
 

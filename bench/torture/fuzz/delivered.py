@@ -18,9 +18,9 @@ from drivers.dicom_folder import DicomFolder, DicomFolderConfig
 from drivers.mesh_file import read_mesh_file
 from drivers.photo_file import check_jpeg_complete, read_exif, taken_utc_s
 from drivers.point_cloud import is_point_cloud, read_point_cloud
-from service.compute.images import read_grey, read_image
-from service.compute.poses.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
-from service.importing import camera_record
+from service.compute.images.files import read_grey, read_image
+from service.compute.poses.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
+from service.import_folder import camera_record
 from service.store.events import canonical
 from service.web.record.pictures import reduced_jpeg
 from simulators.ct_suite import write_series
@@ -216,7 +216,7 @@ TARGETS: tuple[Target, ...] = (
         lambda data, folder: check_jpeg_complete(_put(folder, "DSC00007.JPG", data)),
         _jpegs,
     ),
-    Target("image", "service.compute.images:read_image", _image, _pictures, memory_mib=1536, pace=2.0),
+    Target("image", "service.compute.images.files:read_image", _image, _pictures, memory_mib=1536, pace=2.0),
     Target("web_picture", "service.web.record.pictures:reduced_jpeg", _web_picture, _pictures, memory_mib=1024),
     Target("mesh_ply", "drivers.mesh_file:read_mesh_file", _mesh("ply"), _plys, (*BYTES, *TEXT)),
     Target("mesh_stl", "drivers.mesh_file:read_mesh_file", _mesh("stl"), _stls, (*BYTES, *TEXT)),
@@ -229,14 +229,14 @@ TARGETS: tuple[Target, ...] = (
     Target("dicom", "drivers.dicom_folder:DicomFolder", _series, _slices, (*BYTES, *TEXT), pace=0.5),
     Target(
         "image_features",
-        "service.compute.poses.features:ImageFeatures.from_bytes",
+        "service.compute.poses.sfm.features:ImageFeatures.from_bytes",
         lambda data, _: ImageFeatures.from_bytes(data),
         _features,
         says_place=False,
     ),
     Target(
         "image_matches",
-        "service.compute.poses.features:unpack_matches",
+        "service.compute.poses.sfm.features:unpack_matches",
         lambda data, _: unpack_matches(data),
         _matches,
         says_place=False,

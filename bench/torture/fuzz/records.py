@@ -26,17 +26,17 @@ from service.audit.bundle.export import export_bundle
 from service.audit.verify import bundle_verifier
 from service.audit.verify.verifications import Verifications
 from service.monitor.snapshot import Snapshot, read_snapshot, write_snapshot
-from service.store.audit import verify
-from service.store.checkpoints import key_fingerprint
+from service.store.durable_effects import DurableFiles, SystemClock
 from service.store.events import to_event
-from service.store.keys import KeyFolder, public_bytes
 from service.store.records import Checkpoint, Timestamp
-from service.store.seam import DurableFiles, SystemClock
-from service.store.signature_copy import bring_up_to_date
-from service.store.signature_log import NAME, log_findings, read_log
-from service.store.signing import checkpoint, rotate_key
+from service.store.signatures.checkpoints import key_fingerprint
+from service.store.signatures.keys import KeyFolder, public_bytes
+from service.store.signatures.log import NAME, log_findings, read_log
+from service.store.signatures.log_copy import bring_up_to_date
+from service.store.signatures.signing import checkpoint, rotate_key
+from service.store.signatures.timestamps import stamped_bytes, timestamp_findings
 from service.store.store import Store
-from service.store.timestamping import stamped_bytes, timestamp_findings
+from service.store.verification.verify import verify
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.time_stamp_authority import time_stamp_authority
 from tests.support.web import Browser, web_site
@@ -357,19 +357,23 @@ TARGETS: tuple[Target, ...] = (
         pace=0.5,
         **_VERIFIER,
     ),
-    Target("time_stamp", "service.store.timestamping:timestamp_findings", _token, _tokens, pace=0.5, **_VERIFIER),
+    Target(
+        "time_stamp", "service.store.signatures.timestamps:timestamp_findings", _token, _tokens, pace=0.5, **_VERIFIER
+    ),
     Target(
         "certificates",
-        "service.store.timestamping:timestamp_findings",
+        "service.store.signatures.timestamps:timestamp_findings",
         _certificates,
         _certificate_files,
         TEXT,
         pace=0.5,
     ),
-    Target("signature_log", "service.store.signature_log:log_findings", _log, _logs, JSON),
-    Target("signing_key", "service.store.keys:KeyFolder.load", _key, _keys, TEXT),
+    Target("signature_log", "service.store.signatures.log:log_findings", _log, _logs, JSON),
+    Target("signing_key", "service.store.signatures.keys:KeyFolder.load", _key, _keys, TEXT),
     Target("event", "service.store.events:to_event", _event, _events, JSON),
-    Target("database", "service.store.audit:verify", _database, _databases, BYTES, seconds=10.0, pace=0.05),
+    Target(
+        "database", "service.store.verification.verify:verify", _database, _databases, BYTES, seconds=10.0, pace=0.05
+    ),
     Target("snapshot", "service.monitor.snapshot:read_snapshot", _snapshot, _snapshots, JSON, **_REFUSES_NOTHING),
     Target("web", "service.web.app:create_app", _web, _requests, JSON, pace=0.3, **_REFUSES_NOTHING),
 )

@@ -21,7 +21,7 @@ from bench.torture.fuzz.mutations import BYTES, JSON, TEXT
 from bench.torture.fuzz.target import MisbehavedError, Target
 from drivers.lightbox import LightboxConfig, SerialLightbox
 from drivers.ur.link import read_facts
-from service.cli.hands import SimulatedHands
+from service.cli.run.hands import SimulatedHands
 from service.store.events import canonical
 from simulators.faults import FaultPlan
 from simulators.lightbox import Lightbox
@@ -373,5 +373,5 @@ TARGETS: tuple[Target, ...] = (
     Target("fault_plan", "simulators.faults:FaultPlan.parse", _fault_plan, _fault_plans, JSON, **_SIMULATOR),
     Target("ur_facts", "drivers.ur.link:read_facts", _facts, _dashboard_answers, TEXT, pace=0.5),
     Target("lightbox_answers", "drivers.lightbox:SerialLightbox", _box_driver, _box_answers, _BOTH, pace=0.2),
-    Target("hands_answers", "service.cli.hands:SimulatedHands", _hands, _hands_answers, JSON, pace=0.5),
+    Target("hands_answers", "service.cli.run.hands:SimulatedHands", _hands, _hands_answers, JSON, pace=0.5),
 )

@@ -6,10 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from service.audit.bundle.zip_file import Listed
-from service.core.acceptance import describe_accepted
-from service.core.bodies import bodies
-from service.core.imported import imported_sentence
-from service.core.model import (
+from service.core.equipment.camera_bodies import bodies
+from service.core.gates.acceptance import describe_accepted
+from service.core.records.events import (
     ArtefactRef,
     DeviceOpened,
     Event,
@@ -20,7 +19,8 @@ from service.core.model import (
     ViewImported,
     ViewpointCaptured,
 )
-from service.core.run_state import RunState
+from service.core.records.import_list import imported_sentence
+from service.core.run.state import RunState
 from service.store.events import references
 from service.store.records import Artefact
 

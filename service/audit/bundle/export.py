@@ -19,23 +19,23 @@ from service.audit.bundle.crate import METADATA, crate
 from service.audit.bundle.zip_file import BundleZip, Listed, ZipTime, writing_bundle
 from service.audit.record.missing_results import not_in_yet
 from service.core.errors import IntegrityError
-from service.core.fold import fold
-from service.core.model import EvidenceExported, RunStarted
-from service.core.protocol import Protocol
-from service.core.release import refuse_export
+from service.core.gates.release import refuse_export
+from service.core.protocol.models import Protocol
+from service.core.records.events import EvidenceExported, RunStarted
+from service.core.run.fold import fold
 from service.people.rows import full_names
-from service.runs import recorded_run
-from service.store.artefacts import chunks_of, hash_file, read_artefacts
-from service.store.audit import AuditReport, verify
-from service.store.checkpoints import read_checkpoints, read_timestamps
+from service.run_start import recorded_run
+from service.store.database.tables import artefacts as artefact_table
+from service.store.database.tables import events as event_table
+from service.store.database.tables import jobs as job_table
 from service.store.events import canonical, event_text, parse_canonical, read_events
+from service.store.files.artefacts import chunks_of, hash_file, read_artefacts
+from service.store.files.space_used import require_export_space
 from service.store.records import SITE, Artefact
-from service.store.signing import PublicKey, checkpoint, public_keys, sign
-from service.store.space import require_export_space
+from service.store.signatures.checkpoints import read_checkpoints, read_timestamps
+from service.store.signatures.signing import PublicKey, checkpoint, public_keys, sign
 from service.store.store import Store
-from service.store.tables import artefacts as artefact_table
-from service.store.tables import events as event_table
-from service.store.tables import jobs as job_table
+from service.store.verification.verify import AuditReport, verify
 
 FORMAT = "orthocapture bundle v1"
 MANIFEST_PREFIX = b"orthocapture bundle manifest v1\n"

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
-from service.store.audit import AuditReport
+from service.store.verification.verify import AuditReport
 
 
 def bundle_report(data: Path, run_id: str, *, with_pictures: bool) -> Callable[[AuditReport, int], bytes]:

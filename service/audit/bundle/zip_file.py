@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.core.errors import DataError, StoreError
-from service.store.seam import DurableFiles
+from service.store.durable_effects import DurableFiles
 
 ZipTime = tuple[int, int, int, int, int, int]
 

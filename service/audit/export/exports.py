@@ -13,8 +13,8 @@ from threading import Lock, Thread
 from typing import Literal
 
 from service.core.errors import DataError, IllegalTransitionError
-from service.core.model import Event, EvidenceExported
-from service.store.seam import Clock, utc_text
+from service.core.records.events import Event, EvidenceExported
+from service.store.durable_effects import Clock, utc_text
 
 FOLDER = "exports"
 What = Literal["bundle", "hashes", "dataset", "report", "report_pdf"]

@@ -17,13 +17,13 @@ from service.audit.bundle.export import export_bundle, marked_name, record_expor
 from service.audit.bundle.report import bundle_report
 from service.audit.bundle.zip_file import writing_bundle
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.store.artefacts import chunks_of
-from service.store.space import require_export_space
+from service.store.files.artefacts import chunks_of
+from service.store.files.space_used import require_export_space
 from service.store.store import Store
 
 if TYPE_CHECKING:
     from service.audit.record.run import RecordedRun
-    from service.store.audit import AuditReport
+    from service.store.verification.verify import AuditReport
 
 Progress = Callable[[str, int, int], None]
 _OLDEST = (1980, 1, 1, 0, 0, 0)  # zip knows no earlier time; the files say themselves what they are of

@@ -9,8 +9,8 @@ from typing import Any
 from service.audit.overview.findings import value_at, value_text
 from service.audit.record.queries import one_event
 from service.core.errors import DataError
-from service.core.json_text import parse_json
-from service.core.model import Event, RecordCorrected
+from service.core.records.events import Event, RecordCorrected
+from service.core.text.json_text import parse_json
 from service.store.store import Store
 
 _UNCORRECTABLE = frozenset({"sha256", "size_bytes", "kind", "signed_sha256", "protocol_sha256"})

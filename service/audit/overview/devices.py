@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from sqlalchemy import Connection, text
 
 from service.audit.record.queries import EventRow, plain
-from service.core.bodies import Bodies, bodies_of
+from service.core.equipment.camera_bodies import Bodies, bodies_of
 
 _LOOKED_AT = 500  # photographs, the newest: one that states another body is an image that departs, which is judged
 

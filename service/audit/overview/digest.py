@@ -12,11 +12,19 @@ from sqlalchemy import Connection, text
 from service.audit.background.incremental import Computed, Step
 from service.audit.record.queries import Facets, head, root
 from service.core.errors import IntegrityError, OrthocaptureError
-from service.core.fold import advance, initial_state
-from service.core.late import LateResult, late_results
-from service.core.model import PAYLOAD, Event, GatesEvaluated, GateVerdict, Payload, ViewImported, ViewpointCaptured
-from service.core.protocol import Protocol, parse_protocol
-from service.core.run_state import Deviation, RunState
+from service.core.protocol.models import Protocol, parse_protocol
+from service.core.records.events import (
+    PAYLOAD,
+    Event,
+    GatesEvaluated,
+    GateVerdict,
+    Payload,
+    ViewImported,
+    ViewpointCaptured,
+)
+from service.core.results.late import LateResult, late_results
+from service.core.run.fold import advance, initial_state
+from service.core.run.state import Deviation, RunState
 from service.store.store import Store
 
 CHUNK = 300  # events between two looks at who waits

@@ -19,7 +19,7 @@ from service.audit.record.queries import (
     seqs_of_kind,
 )
 from service.core.errors import StoreError
-from service.core.gates import quantity, uncertain
+from service.core.gates.verdict import quantity, uncertain
 
 LISTED = 200  # of what is listed whole; the timeline has the rest
 

@@ -9,8 +9,8 @@ from service.audit.background.incremental import Progress
 from service.audit.overview.digest import Digest, FailedGate
 from service.audit.record.queries import RunBasics
 from service.audit.verify.verifications import Verification
-from service.core.gates import describe_judged
-from service.core.run_state import DeviationKind
+from service.core.gates.verdict import describe_judged
+from service.core.run.state import DeviationKind
 
 # Group on the page → its name, and the kinds of deviations in it.
 GROUPS: Mapping[str, tuple[str, frozenset[DeviationKind]]] = {

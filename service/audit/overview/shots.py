@@ -9,10 +9,10 @@ from sqlalchemy import Connection, text
 
 from service.audit.overview.digest import Digest
 from service.audit.record.queries import plain
-from service.core.count_words import counted
-from service.core.model import Event, ViewpointFailed
-from service.core.protocol import Protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import Protocol
+from service.core.records.events import Event, ViewpointFailed
+from service.core.run.state import RunState
+from service.core.text.counts import counted
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from service.core.model import Event
-from service.core.protocol import Protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import Protocol
+from service.core.records.events import Event
+from service.core.run.state import RunState
 from service.steps.time_left import missing_results
 
 

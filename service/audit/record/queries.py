@@ -11,11 +11,11 @@ from typing import Any
 from sqlalchemy import Connection, text
 
 from service.core.errors import IntegrityError
-from service.core.model import RunStarted
-from service.store.audit_checks import summary
+from service.core.records.events import RunStarted
 from service.store.errors import UnknownRunError
 from service.store.events import event_sha256, parse_canonical
 from service.store.records import SITE
+from service.store.verification.chain_checks import summary
 
 PAGE = 50  # events or artefacts on one page
 COUNT_LIMIT = 10_000  # beyond it a filter's matches are not counted

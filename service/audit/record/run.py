@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.core.errors import IntegrityError
-from service.core.fold import fold
-from service.core.model import Event, RunStarted
-from service.core.protocol import Protocol, parse_protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import Protocol, parse_protocol
+from service.core.records.events import Event, RunStarted
+from service.core.run.fold import fold
+from service.core.run.state import RunState
 from service.dataset.summary import RunSummary
 from service.people.rows import full_names, named
 from service.steps import params_models
-from service.store.artefacts import ArtefactFiles, read_artefacts
-from service.store.database import open_read_only
+from service.store.database.engine import open_read_only
+from service.store.durable_effects import DurableFiles, RandomIds
 from service.store.events import read_events
+from service.store.files.artefacts import ArtefactFiles, read_artefacts
 from service.store.records import Artefact
-from service.store.seam import DurableFiles, RandomIds
 from service.store.store import read_runs, resolve_run
 
 

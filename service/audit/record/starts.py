@@ -12,15 +12,15 @@ from pathlib import Path
 from sqlalchemy import Connection, func, select
 
 from service.core.errors import ConfigurationError
-from service.core.model import Event, ServiceStarted
+from service.core.records.events import Event, ServiceStarted
 from service.rig import Rig
 from service.runner import software_versions
+from service.store.database.tables import checkpoints, event_index, events, heads
+from service.store.durable_effects import Clock
 from service.store.events import to_event
-from service.store.leases import ProcessIdentity
+from service.store.queue.leases import ProcessIdentity
 from service.store.records import SITE
-from service.store.seam import Clock
 from service.store.store import Store, read_open_runs
-from service.store.tables import checkpoints, event_index, events, heads
 
 
 def record_start(store: Store, rig: Rig, protocols: Sequence[Path], address: str) -> ServiceStarted:

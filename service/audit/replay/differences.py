@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from service.core.geometry import Array
-from service.core.model import ArtefactRef
+from service.core.records.events import ArtefactRef
 
 TOLERANCE = 1e-9  # of the largest number of the same field: what another processor or library may round otherwise
 _SHOWN = 200  # fields of one comparison that are kept

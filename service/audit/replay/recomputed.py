@@ -9,9 +9,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from service.compute.registration.evaluation import true_error_m
+from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import apply
-from service.core.run_state import JobState
+from service.core.run.state import JobState
 from service.dataset.summary import RunSummary
 from service.worker.job import JobAnswer
 

@@ -16,12 +16,12 @@ from service.audit.record.run import RecordedFiles, RecordedRun
 from service.audit.replay.differences import Comparison, Difference, compare_data, compare_files
 from service.audit.replay.recomputed import Drift, Recomputed, drifts
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
-from service.core.gates import evaluate_gates
-from service.core.model import ArtefactRef, GateVerdict, JobFinished, SessionStarted
-from service.core.run_state import JobState
+from service.core.gates.verdict import evaluate_gates
+from service.core.records.events import ArtefactRef, GateVerdict, JobFinished, SessionStarted
+from service.core.run.state import JobState
 from service.runner import software_versions
-from service.store.audit import verify
 from service.store.events import parse_canonical, payload_text
+from service.store.verification.verify import verify
 from service.worker.job import JobAnswer, JobContext
 from service.worker.loop import HANDLERS
 

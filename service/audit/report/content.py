@@ -15,9 +15,9 @@ from service.audit.report.sections.notes import notes_section
 from service.audit.report.sections.origin import devices_section, software_section
 from service.audit.report.sections.photographs import pictures_section
 from service.audit.report.sections.verification import verification_section
-from service.core.count_words import counted
-from service.core.imported import imported_sentence
-from service.store.audit import AuditReport
+from service.core.records.import_list import imported_sentence
+from service.core.text.counts import counted
+from service.store.verification.verify import AuditReport
 
 
 def report_content(

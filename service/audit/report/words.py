@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 from service.audit.report.blocks import Cell
-from service.core.gates import Standing, figure, limits, standing
-from service.core.model import GateVerdict
-from service.core.terms import term
+from service.core.gates.verdict import Standing, figure, limits, standing
+from service.core.records.events import GateVerdict
+from service.core.text.terms import term
 
 
 def utc(text: str) -> str:

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from service.core.entered import ABOUT, RunAbout
 from service.core.errors import IntegrityError
-from service.core.gates import figure, limits, quantity, standing
-from service.core.model import Event, GateVerdict, RunStarted
-from service.core.protocol import Protocol
-from service.core.registered import evaluated
-from service.core.run_state import RunState, StepState
+from service.core.gates.verdict import figure, limits, quantity, standing
+from service.core.protocol.models import Protocol
+from service.core.records.entered import ABOUT, RunAbout
+from service.core.records.events import Event, GateVerdict, RunStarted
+from service.core.results.registrations import evaluated
+from service.core.run.state import RunState, StepState
 from service.people.approvals import difference
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "°", "_min": "min"}  # by the end of a measure's name

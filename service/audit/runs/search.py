@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 from pydantic import ValidationError
 from sqlalchemy import Connection, text
 
-from service.core.entered import RunAbout
+from service.core.records.entered import RunAbout
 from service.store.records import SITE
 from service.store.store import Store, read_open_runs
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from service.audit.verify.verifications import LISTED
 from service.core.errors import StoreError
-from service.store.audit import verify
+from service.store.verification.verify import verify
 
 
 def main(data: Path, run_id: str) -> None:

@@ -15,9 +15,9 @@ from threading import Lock, Thread
 
 from pydantic import ValidationError
 
-from service.core.model import Record
-from service.store.audit import AuditReport
-from service.store.seam import Clock, utc_text
+from service.core.records.events import Record
+from service.store.durable_effects import Clock, utc_text
+from service.store.verification.verify import AuditReport
 
 LISTED = 500  # faults that a result spells out
 

@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.candidates import Candidate, colour_gradient, edges, find_candidates
 from service.compute.markers.colours import ColourModel, given_colour, learn_colour
 from service.compute.markers.cones import Cone
-from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
-from service.compute.markers.refine import refine_outlines
-from service.compute.markers.rough import (
+from service.compute.markers.outlines.candidates import Candidate, colour_gradient, edges, find_candidates
+from service.compute.markers.outlines.refine import refine_outlines
+from service.compute.markers.outlines.rough import (
     CLEAN_INTERIOR,
     CLEAR,
     LEAST_UNAIDED,
@@ -22,6 +21,7 @@ from service.compute.markers.rough import (
     outermost,
     share,
 )
+from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.core.errors import DataError
 from service.core.geometry import Array
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.candidates import find_candidates
 from service.compute.markers.cones import Cone, angles_to, ransac_cone
+from service.compute.markers.outlines.candidates import find_candidates
 from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
 from service.core.geometry import Array
 

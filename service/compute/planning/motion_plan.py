@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from service.compute.calibration.kinematics import JOINT_LIMIT_RAD
+from service.compute.arm.inverse_kinematics import postures
+from service.compute.arm.kinematics import JOINT_LIMIT_RAD
 from service.compute.planning.collision import ArmBody, Obstacles, nearest_contacts, straight_path
-from service.compute.planning.inverse import postures
 from service.compute.planning.optics import DepthOfField, depths_m
 from service.core.geometry import Array, Transform, inverse, transform
 

@@ -26,7 +26,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Present:
+class CurrentInformation:
     """What the station's images have brought so far."""
 
     informations: tuple[Array, ...] = field(repr=False)
@@ -57,7 +57,12 @@ class Suggestion:
 
 
 def next_best_views(
-    present: Present, candidates: Sequence[Candidate], *, limit_m: float, min_coverage: float, at_most: int = 6
+    present: CurrentInformation,
+    candidates: Sequence[Candidate],
+    *,
+    limit_m: float,
+    min_coverage: float,
+    at_most: int = 6,
 ) -> tuple[Suggestion, ...]:
     """The shortest greedy list of viewpoints after which error and coverage keep their limits, or `at_most` of them.
 

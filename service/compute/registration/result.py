@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from service.compute.registration.cost import skew
-from service.compute.registration.normal import Blocks, Marginal
+from service.compute.registration.normal_equations import Blocks, Marginal
 from service.compute.registration.problem import Linearised, Problem, State
 from service.core.geometry import Array, Transform
 

@@ -14,7 +14,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost
 from service.compute.registration.identity import Assignment
-from service.compute.registration.normal import (
+from service.compute.registration.normal_equations import (
     Blocks,
     compress,
     inverse_symmetric,
@@ -25,7 +25,7 @@ from service.compute.registration.normal import (
 )
 from service.compute.registration.problem import CommonErrors, Linearised, Problem, State, assemble, linearise
 from service.compute.registration.result import OutlineResidual, RegistrationResult, Solution
-from service.compute.registration.variance import (
+from service.compute.registration.variance_components import (
     PoseNoise,
     estimate,
     given_pose_noise,

@@ -8,7 +8,7 @@ from fastapi.responses import HTMLResponse, Response
 from service.audit.overview import findings
 from service.audit.overview.devices import bodies_of_run
 from service.audit.record import queries
-from service.core.clocks import clock_of, clock_readings, offset_told
+from service.core.equipment.clocks import clock_of, clock_readings, offset_told
 from service.web.audit.frame import Auditing, audit_frame
 from service.web.page.rendering import render
 from service.web.security.guards import requires

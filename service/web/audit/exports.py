@@ -11,9 +11,9 @@ from fastapi.responses import FileResponse, HTMLResponse, RedirectResponse
 
 from service.audit.export.exports import Exports, What
 from service.core.errors import ConfigurationError
-from service.core.model import RunReleased
-from service.core.release import refuse_export, refuse_release
-from service.store.signing import checkpoint
+from service.core.gates.release import refuse_export, refuse_release
+from service.core.records.events import RunReleased
+from service.store.signatures.signing import checkpoint
 from service.web.audit.frame import Auditing, audit_frame
 from service.web.page.rendering import render
 from service.web.security.guards import Signed, requires

@@ -17,7 +17,7 @@ from service.audit.provenance.graph import Graph, graphs
 from service.audit.record import queries
 from service.audit.record.queries import RunBasics
 from service.audit.verify.verifications import Verification, Verifications, Verifying
-from service.core.imported import imported_sentence
+from service.core.records.import_list import imported_sentence
 from service.store.errors import UnknownRunError
 from service.web.site import Here, Site
 

@@ -12,9 +12,9 @@ from fastapi.responses import HTMLResponse, Response
 from service.audit.background.incremental import Progress
 from service.audit.overview import first_page
 from service.audit.overview.digest import Digest
-from service.core.protocol import Protocol
-from service.core.registered import evaluated, own_registration
-from service.core.run_state import RunState
+from service.core.protocol.models import Protocol
+from service.core.results.registrations import evaluated, own_registration
+from service.core.run.state import RunState
 from service.web.audit.frame import Auditing, audit_frame
 from service.web.page.rendering import render
 from service.web.run.figures import GateLine, gate_lines

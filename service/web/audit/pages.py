@@ -21,7 +21,7 @@ from service.audit.provenance.graph import origin
 from service.audit.record import artefact_queries, queries
 from service.audit.record.queries import EventFilter
 from service.audit.runs.search import RunWanted, find_runs
-from service.evidence import results_to_come
+from service.run_record import results_to_come
 from service.steps.time_left import Left
 from service.store.records import SITE
 from service.web.audit.frame import Audit, Auditing, audit_frame, close_audit, cut, link

@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from service.compute.calibration.arm_correction import corrected_T_base_flange
-from service.compute.calibration.board import Board
-from service.compute.calibration.board_plan import suggest_board_poses
-from service.compute.calibration.hand_eye import HandEyeAnswer
-from service.compute.calibration.hand_eye_record import read_arm_correction
+from service.compute.arm.correction import corrected_T_base_flange
+from service.compute.arm.inverse_kinematics import nearest_posture
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board_poses.plan import suggest_board_poses
+from service.compute.calibration.hand_eye.estimate import HandEyeAnswer
+from service.compute.calibration.hand_eye.record import read_arm_correction
 from service.compute.camera_model import CameraModel
-from service.compute.planning.inverse import nearest_posture
 from service.core.errors import OrthocaptureError
 from service.core.geometry import Transform, inverse
-from service.core.model import ViewpointCaptured
-from service.core.protocol import Board as BoardSection
+from service.core.protocol.models import Board as BoardSection
+from service.core.records.events import ViewpointCaptured
 from service.steps.planning import known_arm
 from service.web.record.pictures import cached
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from service.core.count_words import counted
 from service.core.errors import ConfigurationError, OrthocaptureError
-from service.evidence import RunLog
+from service.core.text.counts import counted
 from service.rig import Rig
+from service.run_record import RunRecord
 from service.steps.board_plan import NOTE, describe_prediction
 from service.steps.calibration import Params
 from service.steps.context import StationLayout
@@ -19,7 +19,7 @@ from service.web.record.pictures import cached
 from service.web.record.planned_poses import recorded_rig, station_of
 
 
-def board_plan_of(log: RunLog, step_id: str, data: Path) -> bytes:
+def board_plan_of(log: RunRecord, step_id: str, data: Path) -> bytes:
     """An SVG document; computed once for what is recorded of a step.
 
     Raises:

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse, Response
 
-from service.core.dependence import AcceptedGate, depends_on
 from service.core.errors import IllegalTransitionError
-from service.core.gates import figure
-from service.core.model import ViewpointCaptured
-from service.evidence import RunLog
+from service.core.gates.dependence import AcceptedGate, depends_on
+from service.core.gates.verdict import figure
+from service.core.records.events import ViewpointCaptured
+from service.run_record import RunRecord
 from service.web.calibration.view import (
     Calibration,
     calibration_of,
@@ -89,12 +89,12 @@ def certificate(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
     )
 
 
-def _depends(log: RunLog, found: Calibration) -> list[AcceptedGate]:
+def _depends(log: RunRecord, found: Calibration) -> list[AcceptedGate]:
     gates = (gate for step, _ in found.steps for gate in depends_on(log.protocol, log.state, step.id))
     return list(dict.fromkeys(gates))
 
 
-def _advice(site: Site, log: RunLog, found: Calibration) -> dict[str, object]:
+def _advice(site: Site, log: RunRecord, found: Calibration) -> dict[str, object]:
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.board_advice import advised_poses, empty_regions  # noqa: PLC0415
     from service.web.record.planned_poses import recorded_rig  # noqa: PLC0415

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from service.core.model import ArtefactRef, DeviceOpened, OperatorAction, View
-from service.core.protocol import Step
-from service.core.run_state import StepState
-from service.evidence import RunLog
+from service.core.protocol.models import Step
+from service.core.records.events import ArtefactRef, DeviceOpened, OperatorAction, View
+from service.core.run.state import StepState
+from service.run_record import RunRecord
 from service.web.page.charts import Dots, HeatMap, VectorField, dots, heat_map, vector_field
 from service.web.record.board_images import BoardUse, board_use
 from service.web.record.images import captures_of
@@ -70,7 +70,7 @@ class Charts:
     sigma_mm: HeatMap
 
 
-def calibration_of(log: RunLog) -> Calibration | None:
+def calibration_of(log: RunRecord) -> Calibration | None:
     """None before a calibration step has an answer."""
     solved = [
         (step, log.state.steps[step.id])
@@ -250,7 +250,7 @@ _STATED = (
 )  # fmt: skip
 
 
-def certificate_of(log: RunLog, calibration: Calibration) -> Certificate:
+def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
     """From the record alone."""
     state, (_, there) = log.state, calibration.steps[-1]
     first = calibration.captures[0] if calibration.captures else None

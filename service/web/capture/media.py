@@ -17,12 +17,12 @@ from fastapi.responses import FileResponse
 from sqlalchemy import select
 
 from service.core.errors import OrthocaptureError
-from service.core.model import ArtefactRef
-from service.evidence import RunLog
+from service.core.records.events import ArtefactRef
 from service.monitor.snapshot import ask_for_frames, frame_path
 from service.notes import NOTE_PHOTOGRAPH
-from service.store.artefacts import to_artefact
-from service.store.tables import artefacts
+from service.run_record import RunRecord
+from service.store.database.tables import artefacts
+from service.store.files.artefacts import to_artefact
 from service.web.record.images import Capture, find_capture
 from service.web.record.pictures import IMAGE_WIDTHS, PICTURES, cached, nearest_width, reduced_jpeg, safe_name
 from service.web.security.guards import requires
@@ -169,7 +169,7 @@ def recorded_file(site: Site, run_id: str, sha256: str) -> ArtefactRef:
     return to_artefact(row).ref
 
 
-def mark_source(log: RunLog, capture: Capture) -> str:
+def mark_source(log: RunRecord, capture: Capture) -> str:
     """Names what would be drawn over an image: changes when something better becomes known; "" for nothing."""
     from service.web.record.outlines import outlines_of  # noqa: PLC0415 - the matching of spheres, not needed to start
 
@@ -181,7 +181,7 @@ def _reduced(
     site: Site,
     ref: ArtefactRef,
     width: int,
-    log: RunLog | None = None,
+    log: RunRecord | None = None,
     capture: Capture | None = None,
     source: str = "",
 ) -> Path:

@@ -10,12 +10,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from service.core.actions import refuse
-from service.core.gates import limits
-from service.core.model import OperatorAction, ViewpointCaptured
-from service.core.protocol import Protocol, Step
-from service.core.run_state import StepState
-from service.evidence import RunLog
+from service.core.gates.verdict import limits
+from service.core.protocol.models import Protocol, Step
+from service.core.records.events import OperatorAction, ViewpointCaptured
+from service.core.run.actions import refuse
+from service.core.run.state import StepState
+from service.run_record import RunRecord
 from service.web.record.board_images import board_use, board_uses
 from service.web.record.images import Capture, captures_of, last_failures
 from service.web.record.planned_poses import Vector, nominal_T_flange_camera, place, planned_viewpoints
@@ -92,7 +92,7 @@ def capture_steps(protocol: Protocol) -> list[Step]:
     ]
 
 
-def step_to_show(log: RunLog, wanted: str) -> Step | None:
+def step_to_show(log: RunRecord, wanted: str) -> Step | None:
     """The step asked for; else the current one, the last one with images, or the first; None without any."""
     steps = {step.id: step for step in capture_steps(log.protocol)}
     if wanted in steps:
@@ -103,7 +103,7 @@ def step_to_show(log: RunLog, wanted: str) -> Step | None:
     return done[-1] if done else next(iter(steps.values()), None)
 
 
-def views_of(log: RunLog, step: Step) -> list[View]:
+def views_of(log: RunRecord, step: Step) -> list[View]:
     """Every viewpoint of a step in the order of capture: planned, suggested, and taken without either."""
     state = log.state.steps[step.id]
     planned = {v.name: v for v in planned_viewpoints(log, step)}
@@ -171,7 +171,7 @@ def _refused(state: StepState) -> dict[str, str]:
     return {str(v["viewpoint"]): str(v["reason"]) for v in views if v["outcome"] == "refused"}
 
 
-def _place(log: RunLog, capture: Capture) -> tuple[Vector, Vector] | tuple[None, None]:
+def _place(log: RunRecord, capture: Capture) -> tuple[Vector, Vector] | tuple[None, None]:
     """Where a camera stood that no plan names, by the drawing of its mount."""
     mount = nominal_T_flange_camera(log)
     if mount is None or not isinstance(capture.payload, ViewpointCaptured):
@@ -182,14 +182,14 @@ def _place(log: RunLog, capture: Capture) -> tuple[Vector, Vector] | tuple[None,
 # --- one image ---------------------------------------------------------------------------------------------------
 
 
-def verdicts_of(log: RunLog, step: Step, capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
+def verdicts_of(log: RunRecord, step: Step, capture: Capture, others: Sequence[Capture]) -> list[Verdict]:
     """Sharp, exposed, spheres, pose, settings: in words, with the figures behind them."""
     of_board = capture.payload.artefacts[0].kind == "board_image"
     found = [_board(log, step, capture)] if of_board else _found(capture, others)
     return [*found, *_taken(log.protocol, capture)]
 
 
-def _board(log: RunLog, step: Step, capture: Capture) -> Verdict:
+def _board(log: RunRecord, step: Step, capture: Capture) -> Verdict:
     """Whether the calibration uses an image of the board."""
     use, name = board_use(log.state.steps[step.id], capture.payload), capture.payload.viewpoint
     details: Any = log.state.steps[step.id].result.get("details", {})
@@ -298,7 +298,7 @@ def summary_of(step: Step, capture: Capture) -> list[Verdict]:
     return out
 
 
-def redo_of(log: RunLog, step: Step, view: View, account: str) -> Redo:
+def redo_of(log: RunRecord, step: Step, view: View, account: str) -> Redo:
     """Whether a viewpoint may be sent back now. While the step runs, the robot then drives there by itself."""
     action = OperatorAction(action="redo", step=step.id, viewpoint=view.name, reason="asked", via="web")
     refusal = refuse(log.protocol, log.state, action, account)
@@ -306,7 +306,7 @@ def redo_of(log: RunLog, step: Step, view: View, account: str) -> Redo:
     return Redo("" if refusal is None else ". ".join(filter(None, (refusal.what, refusal.remedy))), moves)
 
 
-def suggestions_of(log: RunLog, step: Step) -> tuple[str, list[dict[str, object]]]:
+def suggestions_of(log: RunRecord, step: Step) -> tuple[str, list[dict[str, object]]]:
     """What the step found wanting and the views that would help most; "" and none when nothing is wanting."""
     state = log.state.steps[step.id]
     notes = [note for note in state.notes if note.note == "suggested_viewpoints"]

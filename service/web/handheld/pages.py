@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, Depends, Form, Path, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
-from service.core.actions import capture_refusal
-from service.core.model import CaptureAsked
+from service.core.records.events import CaptureAsked
+from service.core.run.actions import capture_refusal
 from service.people.control import Control
 from service.people.person import Person
 from service.web.page.rendering import part_names, render

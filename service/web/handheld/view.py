@@ -9,11 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from service.core.gates import quantity
-from service.core.model import DeviceOpened, ViewHeld
-from service.core.protocol import Protocol, Step
-from service.core.run_state import JobState
-from service.evidence import RunLog
+from service.core.gates.verdict import quantity
+from service.core.protocol.models import Protocol, Step
+from service.core.records.events import DeviceOpened, ViewHeld
+from service.core.run.state import JobState
+from service.run_record import RunRecord
 from service.steps.manual_capture import failure_words
 from service.web.page.run_words import limit, measure_name
 from service.web.record.images import captures_of
@@ -78,7 +78,7 @@ def held_steps(protocol: Protocol) -> list[Step]:
     return [step for step in protocol.steps if step.kind == "manual_capture"]
 
 
-def step_to_show(log: RunLog, wanted: str) -> Step | None:
+def step_to_show(log: RunRecord, wanted: str) -> Step | None:
     """The step asked for, else the current one, else the last one that has begun; None without any."""
     steps = {step.id: step for step in held_steps(log.protocol)}
     if wanted in steps:
@@ -89,7 +89,7 @@ def step_to_show(log: RunLog, wanted: str) -> Step | None:
     return begun[-1] if begun else next(iter(steps.values()), None)
 
 
-def held_now(log: RunLog, step: Step) -> HeldNow:
+def held_now(log: RunRecord, step: Step) -> HeldNow:
     """All of it, from the record alone."""
     state = log.state.steps[step.id]
     jobs = {str(j.arguments["image"]["sha256"]): j for j in state.jobs.values() if j.kind in _KINDS}
@@ -120,7 +120,7 @@ def held_now(log: RunLog, step: Step) -> HeldNow:
     )
 
 
-def _photographs_from(log: RunLog) -> str:
+def _photographs_from(log: RunRecord) -> str:
     opened = (e.payload.report for e in reversed(log.events) if isinstance(e.payload, DeviceOpened))
     camera = next((report for report in opened if report["identity"]["kind"] == "camera"), {})
     return str(camera.get("details", {}).get("photographs_from", ""))

@@ -8,8 +8,8 @@ from fastapi import APIRouter, Depends, Path, Request
 from fastapi.responses import HTMLResponse
 
 from service.core.errors import ConfigurationError
-from service.core.model import RunStarted
-from service.core.protocol import Protocol, load_protocol
+from service.core.protocol.models import Protocol, load_protocol
+from service.core.records.events import RunStarted
 from service.steps import params_models
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame

@@ -10,16 +10,16 @@ from fastapi import APIRouter, Depends, Form, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse
 
 from service.audit.runs.search import RESULT_WORDS, RESULTS, RunWanted, find_runs
-from service.core.decide import AskOperator, decide
-from service.core.entered import RunAbout
 from service.core.errors import OrthocaptureError
-from service.core.model import RunStarted
-from service.core.protocol import LoadedProtocol, Protocol, load_protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
+from service.core.records.entered import RunAbout
+from service.core.records.events import RunStarted
+from service.core.run.decide import AskOperator, decide
+from service.core.run.state import RunState
 from service.people.approvals import ProtocolStanding, difference, standing_of
 from service.steps import params_models
+from service.store.files.space_used import forecast_of
 from service.store.records import RunRow
-from service.store.space import forecast_of
 from service.web.page.rendering import render
 from service.web.page.run_frame import driven_frames, robot_banner
 from service.web.page.run_words import stopped_words

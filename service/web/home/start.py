@@ -8,8 +8,8 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import HTMLResponse
 
 from service.audit.runs.search import RunWanted, find_runs
-from service.core.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
 from service.core.errors import ConfigurationError
+from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
 from service.web.home.pages import startable_of
 from service.web.page.rendering import render
 from service.web.security.guards import Signed, requires

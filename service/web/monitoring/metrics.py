@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric, SummaryMetricFamily
 from prometheus_client.registry import Collector
 
-from service.core.clocks import ClockReading
+from service.core.equipment.clocks import ClockReading
+from service.core.equipment.disk_space import Forecast
 from service.core.errors import OrthocaptureError
-from service.core.space import Forecast
 from service.monitor.figures import Figures
 from service.monitor.health import Health
 

@@ -9,12 +9,12 @@ from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
 
-from service.core.clocks import clock_readings
+from service.core.equipment.clocks import clock_readings
+from service.core.equipment.disk_space import Forecast
 from service.core.errors import StoreError
-from service.core.space import Forecast
 from service.monitor.figures import read_figures
 from service.monitor.health import read_health
-from service.store.space import forecast_of
+from service.store.files.space_used import forecast_of
 from service.web.monitoring.metrics import DataFolderMetrics
 from service.web.monitoring.request_counts import RequestCounts
 from service.web.security.guards import Guard

@@ -16,8 +16,8 @@ from pydantic import ValidationError
 if TYPE_CHECKING:
     from service.audit.record.queries import EventRow
 
-from service.core.count_words import counted
-from service.core.entered import RunAbout, about_rows
+from service.core.records.entered import RunAbout, about_rows
+from service.core.text.counts import counted
 from service.web.page.run_frame import LOST, driven_frames
 
 _FOLDERS = (

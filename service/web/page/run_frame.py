@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from service.core.decide import AskOperator, decide
 from service.core.errors import OrthocaptureError
-from service.core.imported import imported_sentence
-from service.core.model import RunStarted
-from service.core.protocol import Protocol
-from service.core.run_state import RunState
+from service.core.protocol.models import Protocol
+from service.core.records.events import RunStarted
+from service.core.records.import_list import imported_sentence
+from service.core.run.decide import AskOperator, decide
+from service.core.run.state import RunState
 from service.monitor.snapshot import STALE_S, STOPS, Snapshot, Standing, read_snapshot
 from service.web.page.run_words import stopped_words
 from service.web.site import Site

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from service.core.decide import AskOperator
-from service.core.gates import Standing, figure, standing
-from service.core.model import GateVerdict
-from service.core.protocol import Protocol, Step
-from service.core.run_state import RunState, StepState
-from service.core.ways_on import WayOn, planned_sets, planned_views
+from service.core.gates.verdict import Standing, figure, standing
+from service.core.protocol.models import Protocol, Step
+from service.core.records.events import GateVerdict
+from service.core.recovery.ways_on import WayOn, planned_sets, planned_views
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState, StepState
 
 _DRAWINGS_BY_ID = {
     "fixation": "fixation",

@@ -14,7 +14,7 @@ from service.core.errors import OrthocaptureError
 from service.people.accounts import INVITATION_S
 from service.people.errors import AccountError
 from service.people.roles import ROLES, Role
-from service.store.seam import utc_text
+from service.store.durable_effects import utc_text
 from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render
 from service.web.security.guards import Signed, requires

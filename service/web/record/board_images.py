@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.core.model import Event, View
-from service.core.run_state import RunState, StepState
+from service.core.records.events import Event, View
+from service.core.run.state import RunState, StepState
 
 BOARD_IMAGE = "board_image"
 _INSTEAD = "another pose was taken instead"

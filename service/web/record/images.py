@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from service.core.model import View, ViewpointFailed
-from service.core.run_state import JobState, StepState, Superseded
-from service.evidence import RunLog
+from service.core.records.events import View, ViewpointFailed
+from service.core.run.state import JobState, StepState, Superseded
+from service.run_record import RunRecord
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class Capture:
         return self.payload.artefacts[0].sha256
 
 
-def captures_of(log: RunLog, step: str) -> list[Capture]:
+def captures_of(log: RunRecord, step: str) -> list[Capture]:
     """Every exposure of a step, in order, the replaced ones included."""
     replaced = replaced_events(log)
     live = live_jobs(log.state.steps[step])
@@ -44,13 +44,13 @@ def captures_of(log: RunLog, step: str) -> list[Capture]:
     return out
 
 
-def valid_capture(log: RunLog, step: str, viewpoint: str) -> Capture | None:
+def valid_capture(log: RunRecord, step: str, viewpoint: str) -> Capture | None:
     """The exposure of a viewpoint that counts now."""
     seq = log.state.steps[step].captured.get(viewpoint)
     return None if seq is None else capture_at(log, seq)
 
 
-def capture_at(log: RunLog, seq: int) -> Capture | None:
+def capture_at(log: RunRecord, seq: int) -> Capture | None:
     """The exposure that an event records; None where the event is of another kind."""
     if not 1 <= seq <= len(log.events):
         return None
@@ -62,7 +62,7 @@ def capture_at(log: RunLog, seq: int) -> Capture | None:
 
 
 def find_capture(
-    log: RunLog, viewpoint: str, *, step: str = "", attempt: int | None = None, seq: int | None = None
+    log: RunRecord, viewpoint: str, *, step: str = "", attempt: int | None = None, seq: int | None = None
 ) -> Capture | None:
     """The exposure of a viewpoint: that of an event, the last of an attempt, or the valid one.
 
@@ -94,12 +94,12 @@ def live_jobs(state: StepState) -> Mapping[str, JobState]:
     return found
 
 
-def replaced_events(log: RunLog) -> Mapping[int, Superseded]:
+def replaced_events(log: RunRecord) -> Mapping[int, Superseded]:
     """By event number: what replaced an exposure."""
     return {seq: past for past in log.state.superseded for seq in past.captured.values()}
 
 
-def last_failures(log: RunLog, step: str) -> Mapping[str, str]:
+def last_failures(log: RunRecord, step: str) -> Mapping[str, str]:
     """By viewpoint: the words of its last failure in the current attempt."""
     attempt = log.state.steps[step].attempt
     return {

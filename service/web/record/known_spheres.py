@@ -12,8 +12,8 @@ import numpy as np
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply
-from service.core.registered import own_registration, registrations
-from service.evidence import RunLog
+from service.core.results.registrations import own_registration, registrations
+from service.run_record import RunRecord
 
 SphereKind = Literal["registration", "control", "sphere"]
 
@@ -38,7 +38,7 @@ class Registered:
     step: str
 
 
-def result_of_kind(log: RunLog, kind: str) -> tuple[str, Mapping[str, Any]]:
+def result_of_kind(log: RunRecord, kind: str) -> tuple[str, Mapping[str, Any]]:
     """Name and result of the last step of a kind that has one; "" and nothing if there is none."""
     for step in reversed(log.protocol.steps):
         result = log.state.steps[step.id].result
@@ -47,7 +47,7 @@ def result_of_kind(log: RunLog, kind: str) -> tuple[str, Mapping[str, Any]]:
     return "", {}
 
 
-def best_registration(log: RunLog) -> Registered | None:
+def best_registration(log: RunRecord) -> Registered | None:
     """None before there is one."""
     step, _ = result_of_kind(log, "registration")
     records = registrations(log.protocol, log.state)
@@ -60,7 +60,7 @@ def best_registration(log: RunLog) -> Registered | None:
     return Registered(name, full[name], step)
 
 
-def scan_spheres(log: RunLog, registered: Registered) -> tuple[Sphere, ...]:
+def scan_spheres(log: RunRecord, registered: Registered) -> tuple[Sphere, ...]:
     """Spheres of the registered scan, and the control spheres, in its frame."""
     params = log.protocol.step(registered.step).params.model_dump()
     scan = log.state.steps[params["scan"]].result if params["scan"] in log.state.steps else {}
@@ -73,7 +73,7 @@ def scan_spheres(log: RunLog, registered: Registered) -> tuple[Sphere, ...]:
     return (*_numbered(scan, "registration"), *(Sphere(f"C{i}", "control", c) for i, c in enumerate(extra)))
 
 
-def ct_spheres(log: RunLog) -> tuple[Sphere, ...]:
+def ct_spheres(log: RunRecord) -> tuple[Sphere, ...]:
     """Spheres of the CT, in its frame; all of them, for it does not say which are taken away later."""
     return _numbered(result_of_kind(log, "ct_import")[1], "sphere")
 

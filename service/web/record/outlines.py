@@ -17,7 +17,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE
 from service.compute.registration.hypotheses import match, sightings
 from service.core.geometry import Transform, apply, inverse
-from service.evidence import RunLog
+from service.run_record import RunRecord
 from service.web.record.images import Capture
 from service.web.record.known_spheres import Sphere, best_registration, ct_spheres, scan_spheres
 from service.web.record.pictures import Mark
@@ -41,7 +41,7 @@ class Found:
     live: bool
 
 
-def outlines_of(log: RunLog, capture: Capture) -> Found | None:
+def outlines_of(log: RunRecord, capture: Capture) -> Found | None:
     """The registration's outlines of a valid image, else what the live numbers found, else None."""
     registered = best_registration(log)
     if registered is not None and capture.replaced is None:
@@ -63,7 +63,7 @@ def outlines_of(log: RunLog, capture: Capture) -> Found | None:
     return Found(f"live-{job.artefacts[0].sha256[:16]}", job.artefacts[0].sha256, ct_spheres(log), camera, None, True)
 
 
-def marks_of(log: RunLog, capture: Capture) -> tuple[Mark, ...]:
+def marks_of(log: RunRecord, capture: Capture) -> tuple[Mark, ...]:
     """Outlines with numbers: registration spheres 0, 1, 2 …, control spheres C0, C1 …, and what is neither."""
     found = outlines_of(log, capture)
     if found is None:

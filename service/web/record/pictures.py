@@ -91,7 +91,7 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = (), *, upright:
     import cv2  # noqa: PLC0415 - a web process starts without it
     import numpy as np  # noqa: PLC0415
 
-    from service.compute.images import check_image  # noqa: PLC0415
+    from service.compute.images.files import check_image  # noqa: PLC0415
 
     data = np.fromfile(path, np.uint8)
     full = picture_size(data.tobytes())

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from service.core.geometry import Transform
-from service.core.model import RunStarted
-from service.core.protocol import Step
-from service.evidence import RunLog
+from service.core.protocol.models import Step
+from service.core.records.events import RunStarted
 from service.rig import RigSection, parse_recorded_rig
+from service.run_record import RunRecord
 from service.steps.context import StationLayout
 from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 
@@ -42,7 +42,7 @@ class Station:
     specimen_m: tuple[float, float]  # along the approach, across it
 
 
-def station_of(log: RunLog, name: str) -> Station | None:
+def station_of(log: RunRecord, name: str) -> Station | None:
     """Of the rig as it was when the run began; None when it has no such station."""
     section = recorded_rig(log)
     there = section.stations.get(name)
@@ -54,12 +54,12 @@ def station_of(log: RunLog, name: str) -> Station | None:
     return Station(layout, (size[0], size[1]))
 
 
-def planned_poses(log: RunLog, step: Step) -> tuple[Viewpoint, ...]:
+def planned_poses(log: RunRecord, step: Step) -> tuple[Viewpoint, ...]:
     """Those of the protocol, then those that an attempt of the step has suggested."""
     return _planned(log, step)[0]
 
 
-def planned_viewpoints(log: RunLog, step: Step) -> tuple[Planned, ...]:
+def planned_viewpoints(log: RunRecord, step: Step) -> tuple[Planned, ...]:
     """The same as places and directions."""
     return _planned(log, step)[1]
 
@@ -71,7 +71,7 @@ _KNOWN = 32  # plans that are kept: pages of a run under way ask for the same on
 _OF_PLANS = ("board_poses", "suggested_viewpoints")
 
 
-def _planned(log: RunLog, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[Planned, ...]]:
+def _planned(log: RunRecord, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[Planned, ...]]:
     """They follow from the root of the chain (protocol, rig) and the step's notes: computed once for each."""
     notes = tuple(note.seq for note in log.state.steps[step.id].notes if note.note in _OF_PLANS)
     key = (log.events[0].sha256, step.id, notes)
@@ -88,7 +88,7 @@ def _planned(log: RunLog, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[Plan
     return computed
 
 
-def _computed_poses(log: RunLog, step: Step) -> tuple[Viewpoint, ...]:
+def _computed_poses(log: RunRecord, step: Step) -> tuple[Viewpoint, ...]:
     sets: tuple[ViewpointSet, ...] = getattr(step.params, "viewpoints", ())
     board: Any = getattr(step.params, "board_poses", None)
     out: list[Viewpoint] = []
@@ -117,7 +117,7 @@ def place(T_base_camera: Transform) -> tuple[Vector, Vector]:
     return _vector(T_base_camera[:3, 3]), _vector(T_base_camera[:3, 2])
 
 
-def nominal_T_flange_camera(log: RunLog) -> tuple[tuple[float, float, float, float], ...] | None:
+def nominal_T_flange_camera(log: RunRecord) -> tuple[tuple[float, float, float, float], ...] | None:
     """The drawing of the camera's mount."""
     return recorded_rig(log).T_flange_camera_nominal
 
@@ -127,7 +127,7 @@ def _vector(values: Transform) -> Vector:
     return x, y, z
 
 
-def recorded_rig(log: RunLog) -> RigSection:
+def recorded_rig(log: RunRecord) -> RigSection:
     """The rig file as it was when the run began."""
     root = log.events[0].payload
     assert isinstance(root, RunStarted)  # the log was read the same way

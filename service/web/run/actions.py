@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Form, Path
 from fastapi.responses import RedirectResponse
 
-from service.core.actions import needs_leave, refuse
-from service.core.entered import NoteTaken, about_run
 from service.core.errors import ConfigurationError, IllegalTransitionError
-from service.core.model import (
+from service.core.protocol.models import load_protocol
+from service.core.records.entered import NoteTaken, about_run
+from service.core.records.events import (
     ActionRefused,
     ControlTaken,
     DeviceOpened,
@@ -25,17 +25,17 @@ from service.core.model import (
     StepNote,
     View,
 )
-from service.core.protocol import load_protocol
-from service.core.reasons import full_reason
-from service.core.run_state import RunState
-from service.evidence import RunLog
+from service.core.recovery.reasons import full_reason
+from service.core.run.actions import needs_leave, refuse
+from service.core.run.state import RunState
 from service.people.approvals import approve, standing_of
+from service.people.authorisation import identity_for
 from service.people.control import Control
 from service.people.errors import NotAllowedError
-from service.people.people import NAMES, KnownBy
-from service.people.proof import identity_for
+from service.people.sessions import NAMES, KnownBy
 from service.rig import load_rig
-from service.runs import record_refusal, require_rig_free, start_run
+from service.run_record import RunRecord
+from service.run_start import record_refusal, require_rig_free, start_run
 from service.steps import params_models
 from service.web.security.guards import Signed, requires
 from service.web.site import Here, Site
@@ -207,7 +207,7 @@ def _require_accepted(site: Site, known_by: KnownBy) -> None:
         )
 
 
-def _append(site: Site, log: RunLog, action: OperatorAction, actor: str) -> None:
+def _append(site: Site, log: RunRecord, action: OperatorAction, actor: str) -> None:
     refusal = refuse(log.protocol, log.state, action, actor)
     if refusal is not None:
         record_refusal(site.store, log.run_id, log.state, action, refusal, actor)
@@ -215,7 +215,7 @@ def _append(site: Site, log: RunLog, action: OperatorAction, actor: str) -> None
     site.store.record(log.run_id, [action], actor=actor)
 
 
-def _require_current(log: RunLog, step: str, attempt: int, seen_seq: int) -> None:
+def _require_current(log: RunRecord, step: str, attempt: int, seen_seq: int) -> None:
     """A page that shows an earlier question must not answer a later one."""
     state = log.state
     since = (event.payload for event in log.events[seen_seq:])

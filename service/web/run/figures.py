@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import median
 
-from service.core.clocks import ClockReading
-from service.core.gates import figure
-from service.core.model import Event, GateVerdict, SessionStarted, View
-from service.core.protocol import Gate, Protocol, Step
-from service.core.run_state import RunState, StepState
-from service.core.space import Forecast, size_words
+from service.core.equipment.clocks import ClockReading
+from service.core.equipment.disk_space import Forecast, size_words
+from service.core.gates.verdict import figure
+from service.core.protocol.models import Gate, Protocol, Step
+from service.core.records.events import Event, GateVerdict, SessionStarted, View
+from service.core.run.state import RunState, StepState
 from service.monitor.snapshot import Snapshot
 from service.web.page.run_words import gate_word, limit, measure_name, planned_views
 

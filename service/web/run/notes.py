@@ -11,9 +11,9 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import RedirectResponse
 from starlette.datastructures import UploadFile
 
-from service.core.entered import NoteTaken
 from service.core.errors import DataError
-from service.core.model import ArtefactRef, Event
+from service.core.records.entered import NoteTaken
+from service.core.records.events import ArtefactRef, Event
 from service.notes import Photograph, require_size, take_note
 from service.web.security.guards import Signed, requires
 from service.web.site import Here

@@ -11,15 +11,15 @@ from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
-from service.core.dependence import accepted_gates
-from service.core.entered import about_rows
-from service.core.model import RunStarted
-from service.core.registered import evaluated, shared_adjustment_note
-from service.evidence import RunLog, results_to_come
+from service.core.gates.dependence import accepted_gates
+from service.core.records.entered import about_rows
+from service.core.records.events import RunStarted
+from service.core.results.registrations import evaluated, shared_adjustment_note
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Person
-from service.store.space import forecast_of
+from service.run_record import RunRecord, results_to_come
+from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.run.notes import notes_of
@@ -90,13 +90,13 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
     }
 
 
-def _about(log: RunLog) -> list[tuple[str, str]]:
+def _about(log: RunRecord) -> list[tuple[str, str]]:
     """What was entered of the run when it began."""
     root = log.events[0].payload
     return about_rows(root.about) if isinstance(root, RunStarted) else []
 
 
-def _board_plan(log: RunLog, step: str) -> int:
+def _board_plan(log: RunRecord, step: str) -> int:
     """Version of the plan of a step's board images: one more than the plans that are recorded; 0 for other steps."""
     if getattr(log.protocol.step(step).params, "board_poses", None) is None:
         return 0

@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 from typing import Protocol as Interface
 
-from service.core.acceptance import acceptors, demanded_role, failed_gates
-from service.core.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
-from service.core.clocks import clock_readings
-from service.core.decide import AskOperator, decide
-from service.core.dependence import AcceptedGate, dependent_steps, depends_on
-from service.core.model import Event, OperatorVerb
-from service.core.protocol import Protocol, Step
-from service.core.registered import evaluated
-from service.core.run_state import Deviation, RunState
-from service.core.space import Forecast
-from service.core.ways_on import WayOn, takes_words
+from service.core.equipment.clocks import clock_readings
+from service.core.equipment.disk_space import Forecast
+from service.core.gates.acceptance import acceptors, demanded_role, failed_gates
+from service.core.gates.dependence import AcceptedGate, dependent_steps, depends_on
+from service.core.protocol.models import Protocol, Step
+from service.core.records.events import Event, OperatorVerb
+from service.core.recovery.ways_on import WayOn, takes_words
+from service.core.results.registrations import evaluated
+from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
+from service.core.run.decide import AskOperator, decide
+from service.core.run.state import Deviation, RunState
 from service.monitor.snapshot import STOPS, Snapshot
 from service.web.page.run_words import (
     count,
@@ -37,7 +37,7 @@ from service.web.run.figures import GateLine, Progress, Reading, capture_progres
 
 
 class Recorded(Interface):
-    """A run's record: service.evidence.RunLog."""
+    """A run's record: service.run_record.RunRecord."""
 
     @property
     def protocol(self) -> Protocol:

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.budget.closure import Alignment
+from service.compute.evaluation.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
-from service.core.model import ArtefactRef, ViewpointCaptured
-from service.core.registered import registrations
+from service.core.records.events import ArtefactRef, ViewpointCaptured
+from service.core.results.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
-from service.evidence import RunLog
+from service.run_record import RunRecord
 from service.web.record.images import captures_of
 from service.web.record.known_spheres import (
     Registered,
@@ -66,7 +66,7 @@ class MeshFacts:
     size_mm: tuple[float, float, float]
 
 
-def scene_of(log: RunLog) -> SceneNow:
+def scene_of(log: RunRecord) -> SceneNow:
     """The best that the record has."""
     registered = best_registration(log)
     if registered is not None:
@@ -78,7 +78,7 @@ def scene_of(log: RunLog) -> SceneNow:
 # --- after the registration -------------------------------------------------------------------------------------
 
 
-def _registered(log: RunLog, registered: Registered) -> SceneNow:
+def _registered(log: RunRecord, registered: Registered) -> SceneNow:
     record = registered.record
     cameras = {name: np.array(T, dtype=np.float64) for name, T in record["T_scan_camera"].items()}
     spheres = scan_spheres(log, registered)
@@ -108,7 +108,7 @@ def _registered(log: RunLog, registered: Registered) -> SceneNow:
     )
 
 
-def _bases(log: RunLog, record: Mapping[str, Any]) -> tuple[dict[str, Transform], list[str]]:
+def _bases(log: RunRecord, record: Mapping[str, Any]) -> tuple[dict[str, Transform], list[str]]:
     """T_scan_base by station: from this registration, or from one of the same run that keeps the stations apart."""
     known_registrations = registrations(log.protocol, log.state)
     known = [record, *(known_registrations[n] for n in _WITH_STATIONS if n in known_registrations)]
@@ -122,7 +122,7 @@ def _bases(log: RunLog, record: Mapping[str, Any]) -> tuple[dict[str, Transform]
 # --- while images are being taken ---------------------------------------------------------------------------------
 
 
-def _live(log: RunLog) -> SceneNow | None:
+def _live(log: RunRecord) -> SceneNow | None:
     """In the frame of the CT, by the newest provisional registration of each station; None while there is none."""
     records: dict[str, dict[str, Any]] = {}
     for step in log.protocol.steps:
@@ -162,7 +162,7 @@ def _live(log: RunLog) -> SceneNow | None:
     )
 
 
-def _to_come(log: RunLog) -> list[tuple[str, str, Transform]]:
+def _to_come(log: RunRecord) -> list[tuple[str, str, Transform]]:
     """Viewpoints of the current step that are still to be taken: name, station, T_base_camera."""
     state = log.state.step
     if log.state.terminal:
@@ -175,7 +175,7 @@ def _to_come(log: RunLog) -> list[tuple[str, str, Transform]]:
 # --- before anything has been placed ----------------------------------------------------------------------------
 
 
-def _planned(log: RunLog) -> SceneNow:
+def _planned(log: RunRecord) -> SceneNow:
     """One station in its base frame: where the camera was, by the drawing of its mount, and where it will be."""
     captured = _all_captures(log)
     to_come = _to_come(log)
@@ -211,7 +211,7 @@ def _table(centre_m: tuple[float, float, float]) -> SceneMesh:
     return SceneMesh(np.array(centre_m) + offsets, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def _all_captures(log: RunLog) -> list[Any]:
+def _all_captures(log: RunRecord) -> list[Any]:
     found = [c for step in log.protocol.steps for c in captures_of(log, step.id) if c.replaced is None]
     return [c.payload for c in sorted(found, key=lambda c: c.seq)]
 
@@ -219,7 +219,7 @@ def _all_captures(log: RunLog) -> list[Any]:
 # --- the surface --------------------------------------------------------------------------------------------------
 
 
-def with_mesh(now: SceneNow, log: RunLog, data: Path) -> Scene:
+def with_mesh(now: SceneNow, log: RunRecord, data: Path) -> Scene:
     """The scene with its surface, decimated once and then kept in DIR/cache; coloured by the predicted error."""
     if now.mesh is None:
         return now.scene
@@ -234,12 +234,12 @@ def predicted_error_mm(registered: Registered, points_m: Array) -> Array:
     return np.asarray(1e3 * np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2)), dtype=np.float64)
 
 
-def mesh_facts(now: SceneNow, log: RunLog, data: Path) -> MeshFacts | None:
+def mesh_facts(now: SceneNow, log: RunRecord, data: Path) -> MeshFacts | None:
     """None without a surface."""
     return None if now.mesh is None else _surface(log, now.mesh, data)[2]
 
 
-def _surface(log: RunLog, ref: ArtefactRef, data: Path) -> tuple[Array, NDArray[np.int64], MeshFacts]:
+def _surface(log: RunRecord, ref: ArtefactRef, data: Path) -> tuple[Array, NDArray[np.int64], MeshFacts]:
     def make() -> bytes:
         with np.load(log.store.artefact_path(ref.sha256, verify=True), allow_pickle=False) as mesh:
             vertices, faces = mesh["vertices_m"], mesh["faces"]

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from fastapi import APIRouter, Depends, Path, Query, Request
 from fastapi.responses import HTMLResponse
 
-from service.core.dependence import accepted_gates
+from service.core.gates.dependence import accepted_gates
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
 from service.web.security.guards import requires

@@ -9,7 +9,7 @@ import numpy as np
 
 from service.core.geometry import Array
 from service.dataset.scene_view import viewing_frame
-from service.evidence import RunLog
+from service.run_record import RunRecord
 from service.web.scene.data import MeshFacts, mesh_facts, predicted_error_mm, scene_of
 
 Vector = tuple[float, float, float]
@@ -63,7 +63,7 @@ class SceneTables:
     error_at_spheres_mm: tuple[float, float] | None  # predicted, least and most
 
 
-def scene_tables(log: RunLog, data: Path) -> SceneTables:
+def scene_tables(log: RunRecord, data: Path) -> SceneTables:
     """Positions in the frame that the record uses, not in that of the picture."""
     now = scene_of(log)
     T_view = viewing_frame(now.scene)

@@ -10,10 +10,10 @@ from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
 from service.people.control import Control
+from service.people.credentials.tries import failed_tries
 from service.people.errors import NotAllowedError, NotSignedInError, ScreenLockedError
 from service.people.person import Person
 from service.people.roles import Permission
-from service.people.tries import failed_tries
 from service.web.page.errors import install_errors
 from service.web.security.shield import TRIES_WINDOW_S, Limiter, Shield
 from service.web.server.connections import Connection

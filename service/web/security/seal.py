@@ -9,11 +9,11 @@ from fastapi import Request
 from fastapi.concurrency import run_in_threadpool
 
 from service.core.errors import OrthocaptureError
-from service.runs import signature_copy
+from service.run_start import signature_copy
 from service.store.errors import UnknownRunError
 from service.store.records import SITE
-from service.store.signature_copy import keep_elsewhere
-from service.store.signing import checkpoint
+from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.signing import checkpoint
 from service.web.site import Here, Site
 
 _log = logging.getLogger("orthocapture.web")

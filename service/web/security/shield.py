@@ -14,7 +14,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.people.errors import TooManyTriesError
-from service.store.seam import Clock
+from service.store.durable_effects import Clock
 
 BODY_LIMIT_BYTES = 1_000_000
 PHOTOGRAPH_LIMIT_BYTES = 16_200_000  # of a note with its photograph; read only for people who are signed in

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.audit.report.blocks import Box, Drawing, Label, Line, Raster, Scene, Shape
-from service.compute.budget.closure import Alignment
-from service.core.count_words import counted
+from service.compute.evaluation.closure import Alignment
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, apply
+from service.core.text.counts import counted
 from service.dataset import scene_view
 from service.dataset.summary import RunSummary
 

@@ -10,9 +10,9 @@ import numpy as np
 from service.audit.record.missing_results import not_in_yet
 from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
 from service.audit.report.words import mm, utc, words
-from service.core.dependence import depends_on
-from service.core.late import late_results
-from service.core.registered import shared_adjustment_note
+from service.core.gates.dependence import depends_on
+from service.core.results.late import late_results
+from service.core.results.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary
 
 PAPER_LIMIT_MM = 0.35

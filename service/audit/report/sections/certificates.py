@@ -11,8 +11,8 @@ from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Cell, Column, Drawings, Facts, Heading, Paragraph, Section, Table
 from service.audit.report.drawings.charts import bars_drawing, coverage_drawing, residual_drawing, uncertainty_drawing
 from service.audit.report.words import judged, limit, measured, utc
-from service.core.dependence import depends_on
-from service.core.model import View
+from service.core.gates.dependence import depends_on
+from service.core.records.events import View
 
 _INVARIANTS = ("settings_departures", "optics_departures")
 

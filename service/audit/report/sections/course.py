@@ -9,9 +9,8 @@ from service.audit.overview.shots import Shots, failed_exposures, shots_by_step
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Cell, Column, Paragraph, Section, Table
 from service.audit.report.words import clock, duration, judged, limit, measured, utc, words
-from service.core.count_words import counted
-from service.core.gates import BOUNDS_HOLD, describe_judged
-from service.core.model import (
+from service.core.gates.verdict import BOUNDS_HOLD, describe_judged
+from service.core.records.events import (
     DeviceTrouble,
     GatesEvaluated,
     OperatorAction,
@@ -20,7 +19,8 @@ from service.core.model import (
     StepFailed,
     ViewpointFailed,
 )
-from service.core.run_state import StepState
+from service.core.run.state import StepState
+from service.core.text.counts import counted
 
 
 @dataclass(frozen=True, slots=True)

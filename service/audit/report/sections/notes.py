@@ -8,7 +8,7 @@ from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Cell, Column, Heading, Pictures, Section, Table
 from service.audit.report.drawings.pictures import picture
 from service.audit.report.words import utc
-from service.core.entered import NoteTaken, about_rows
+from service.core.records.entered import NoteTaken, about_rows
 
 _WIDTH_PX = 500
 _PIECE_CHARACTERS = 900

@@ -10,11 +10,11 @@ import numpy as np
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
 from service.audit.report.words import clock
-from service.core.bodies import bodies
-from service.core.clocks import clock_of, clock_readings, offset_told
-from service.core.count_words import counted
-from service.core.model import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
-from service.core.terms import term
+from service.core.equipment.camera_bodies import bodies
+from service.core.equipment.clocks import clock_of, clock_readings, offset_told
+from service.core.records.events import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
+from service.core.text.counts import counted
+from service.core.text.terms import term
 
 _COMPUTES = ("orthocapture", "numpy", "scipy", "opencv-python-headless", "pycolmap", "trimesh", "scikit-image")
 

@@ -10,7 +10,7 @@ from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Pictures, Section, Table
 from service.audit.report.drawings.pictures import LARGE_PX, THUMBNAIL_PX, picture
 from service.audit.report.drawings.scene import report_scene
-from service.core.model import View
+from service.core.records.events import View
 
 
 def pictures_section(run: RecordedRun, *, turning: bool) -> Section:

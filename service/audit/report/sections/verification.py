@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Cell, Column, Facts, Heading, Paragraph, Section, Table
-from service.core.count_words import counted
-from service.store.audit import AuditReport
+from service.core.text.counts import counted
+from service.store.verification.verify import AuditReport
 
 _FAULTS_SHOWN = 20
 

@@ -1,0 +1,1 @@
+"""The commands that compute from files, without a run."""

@@ -1,0 +1,16 @@
+"""`orthocapture calibrate`: the camera's intrinsics and the hand-eye from anyone's board images, without a run."""
+
+from __future__ import annotations
+
+import typer
+
+from service.cli.compute.calibrate_hand_eye import hand_eye_command
+from service.cli.compute.calibrate_intrinsics import intrinsics_command
+
+calibrate_app = typer.Typer(
+    help="Calibrate a camera and its mounting from images of a board.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+calibrate_app.command("intrinsics")(intrinsics_command)
+calibrate_app.command("hand-eye")(hand_eye_command)

@@ -1,0 +1,107 @@
+"""`orthocapture layout`: can the spheres be told from one another as they are placed?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from drivers.mesh_file import MeshUnit
+from service.cli.common import JsonOption, console, print_json, print_table, reporting_errors
+from service.cli.compute.spheres import spheres_of
+from service.compute.images.files import read_image
+from service.compute.layout.ambiguity import LayoutReport, check_layout, layout_record
+from service.compute.layout.photo_adjustment import CALIBRATED, Photograph
+from service.compute.layout.photographs import layout_from_photographs
+from service.compute.layout.sphere_moves import Move, suggest_moves
+from service.compute.markers.detect import detect_spheres
+from service.compute.poses.files.pose_files import read_camera_json, read_spheres_json
+from service.core.errors import ComputeError
+from service.core.geometry import Array
+
+
+def layout_command(
+    spheres: Annotated[Path | None, typer.Option("--spheres", help="spheres.json.")] = None,
+    mesh: Annotated[Path | None, typer.Option("--mesh", help="Scan, CT mesh or point cloud.")] = None,
+    photo: Annotated[
+        list[Path] | None, typer.Option("--photo", help="Photograph that shows all spheres; may be repeated.")
+    ] = None,
+    camera: Annotated[Path | None, typer.Option("--camera", help="camera.json of the photographs.")] = None,
+    radius_mm: Annotated[float | None, typer.Option("--radius-mm", help="Radius of the spheres.")] = None,
+    mesh_unit: Annotated[MeshUnit, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
+    json: JsonOption = False,
+) -> None:
+    """Say how well every sphere can be told from every other, and which to move. Status 1: move some first."""
+    with reporting_errors(json):
+        centres, covariances, radius_m = _centres(spheres, mesh, photo or [], camera, radius_mm, mesh_unit)
+        report = check_layout(centres, covariances, radius_m=radius_m)
+        if json:
+            print_json(layout_record(report))
+        else:
+            _show(report, centres, radius_m)
+    if not report.passed:
+        raise typer.Exit(1)
+
+
+def _centres(
+    spheres: Path | None,
+    mesh: Path | None,
+    photos: list[Path],
+    camera: Path | None,
+    radius_mm: float | None,
+    mesh_unit: MeshUnit,
+) -> tuple[Array, Array | None, float]:
+    if (spheres is not None) + (mesh is not None) + bool(photos) != 1:
+        raise typer.BadParameter("give one of --spheres, --mesh and --photo")
+    if spheres is not None:
+        known = read_spheres_json(spheres)
+        return np.concatenate([known.registration_m, known.control_m]), None, known.radius_m
+    if radius_mm is None:
+        raise typer.BadParameter("--mesh and --photo need --radius-mm")
+    radius_m = radius_mm / 1e3
+    if mesh is not None:
+        found = spheres_of(mesh, radius_m, mesh_unit, None, None)
+        return np.array([s.centre_m for s in found]), np.array([s.covariance for s in found]), radius_m
+    if camera is None:
+        raise typer.BadParameter("--photo needs --camera")
+    model = read_camera_json(camera)
+    seen = [Photograph.of(model, detect_spheres(read_image(path), model)) for path in photos]
+    found = layout_from_photographs(seen, radius_m, CALIBRATED)
+    return found.centres_m, found.covariance, radius_m
+
+
+def _show(report: LayoutReport, centres: Array, radius_m: float) -> None:
+    table = Table("sphere", "x mm", "y mm", "z mm", "margin mm")
+    for number, (centre, margin) in enumerate(zip(centres, report.sphere_margins_m, strict=True)):
+        shown = f"{1e3 * margin:.2f}" if np.isfinite(margin) else "more"
+        table.add_row(str(number), *(f"{1e3 * v:.1f}" for v in centre), shown)
+    print_table(table)
+    if report.margin.upper_m > report.margin.lower_m:
+        margin = report.margin
+        console.print(
+            f"margin {1e3 * margin.value_m:.2f} mm, {1e3 * margin.lower_m:.2f} to {1e3 * margin.upper_m:.2f}"
+        )
+    seen = ", ".join(f"{k}: {1e3 * v:.1f}" for k, v in report.margin_by_count_m.items() if np.isfinite(v))
+    console.print(f"least misfit in mm of a wrong assignment, by spheres seen: {seen}")
+    for problem in report.problems:
+        console.print(f"[bold red]to do:[/] {problem}")
+    for move in _moves(centres, radius_m) if report.problems else ():
+        x, y, z = 1e3 * move.by_m
+        console.print(
+            f"  move sphere {move.sphere} by about ({x:.0f}, {y:.0f}, {z:.0f}) mm: "
+            f"the margin is then {1e3 * move.margin_m:.2f} mm"
+        )
+    if report.passed:
+        console.print("[bold green]The spheres can be told apart.[/]")
+
+
+def _moves(centres: Array, radius_m: float) -> tuple[Move, ...]:
+    """What to move; nothing where no single move helps, which the problems say as well."""
+    _, _, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
+    try:
+        return suggest_moves(centres, up=axes[2], radius_m=radius_m)
+    except ComputeError:
+        return ()

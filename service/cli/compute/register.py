@@ -1,0 +1,220 @@
+"""`orthocapture register`: register anyone's posed images with a scan, without a run."""
+
+from __future__ import annotations
+
+import json as json_module
+import os
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import typer
+
+from drivers.mesh_file import MeshUnit
+from service.cli.common import (
+    JsonOption,
+    StrictOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+    require_writable,
+    tell_left_out,
+)
+from service.cli.compute.spheres import SeedsOption, spheres_of
+from service.compute.images.folder import image_folder
+from service.compute.markers.detectors import options_for
+from service.compute.markers.search.image_files import (
+    DetectFile,
+    LocatedOutlines,
+    detect_all,
+    locate_outlines,
+    searched_whole,
+)
+from service.compute.markers.search.paper_files import detect_file_by_masks, read_boxes
+from service.compute.pipeline import register_images
+from service.compute.poses.files.pose_files import posed_images, read_camera_json, read_spheres_json
+from service.core.errors import ConfigurationError
+from service.core.geometry import Array
+
+DetectorName = Literal["classical", "paper"]
+
+
+def register_command(
+    images: Annotated[Path, typer.Option("--images", help="Folder of the images.")],
+    camera: Annotated[
+        Path, typer.Option("--camera", help="camera.json: width, height, fx, fy, cx, cy, k1, k2, p1, p2.")
+    ],
+    poses: Annotated[
+        Path,
+        typer.Option("--poses", help="Poses CSV (T_world_camera, metres), transforms.json or COLMAP model folder."),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="The result file to write.")],
+    mesh: Annotated[Path | None, typer.Option("--mesh", help="The scan with the spheres in it.")] = None,
+    spheres: Annotated[Path | None, typer.Option("--spheres", help="spheres.json, instead of a mesh.")] = None,
+    radius_mm: Annotated[float | None, typer.Option("--radius-mm", help="Radius of the spheres.")] = None,
+    mesh_unit: Annotated[MeshUnit, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
+    control: Annotated[
+        str, typer.Option("--control", help="Indices of the mesh's spheres that only serve the evaluation: 3,7,9.")
+    ] = "",
+    seeds: SeedsOption = None,
+    estimate_scale: Annotated[bool, typer.Option("--estimate-scale", help="The poses are not metric.")] = False,
+    workers: Annotated[
+        int | None, typer.Option("--workers", min=1, help="Processes that look at images; one a core by default.")
+    ] = None,
+    full_search: Annotated[
+        bool, typer.Option("--full-search", help="Search every image whole, not only where the poses say.")
+    ] = False,
+    sphere_colour: Annotated[
+        str | None,
+        typer.Option(
+            "--sphere-colour", help="white, grey, green, orange or #rrggbb; learnt in each image by default."
+        ),
+    ] = None,
+    largest_sphere: Annotated[
+        float | None,
+        typer.Option(
+            "--largest-sphere",
+            help="Radius of the largest sphere looked for, over the image's width; without: 0.13.",
+            min=0.02,
+            max=0.7,
+        ),
+    ] = None,
+    detector: Annotated[
+        DetectorName, typer.Option("--detector", help="paper: the published chain, for comparison; searches whole.")
+    ] = "classical",
+    boxes: Annotated[
+        Path | None,
+        typer.Option(
+            "--boxes",
+            help="For --detector paper: JSON of another detector, boxes (left, top, right, bottom) by image.",
+        ),
+    ] = None,
+    strict: StrictOption = False,
+    json: JsonOption = False,
+) -> None:
+    """Register posed images with a scan by the spheres that both show, and say how well it fits."""
+    with reporting_errors(json):
+        require_writable(out)
+        model = read_camera_json(camera)
+        folder = image_folder(images, size=(model.width, model.height), strict=strict)
+        known, folder = posed_images(poses, folder, images, strict=strict)
+        files = list(folder.files)
+        tell_left_out(folder.left_out)
+        options = options_for(sphere_colour, largest_sphere)
+        detect = _file_detector(detector, boxes, [file.name for file in files])
+        registration_m, control_m, radius_m = _spheres(mesh, spheres, radius_mm, mesh_unit, control, seeds)
+        T_world_camera = np.array([known[file.name] for file in files])
+        processes = min(len(files), workers or os.cpu_count() or 1)
+        with progress_bar(quiet=json) as progress:
+
+            def show(done: int, total: int) -> None:
+                progress("spheres in images", done, total)
+
+            if full_search or detector == "paper":
+                detected = detect_all(files, model, options, processes, show, detect=detect)
+                located = searched_whole(detected)
+            else:
+                located = locate_outlines(
+                    files,
+                    model,
+                    T_world_camera,
+                    registration_m,
+                    radius_m,
+                    control_centres_m=control_m,
+                    metric=not estimate_scale,
+                    options=options,
+                    workers=processes,
+                    progress=show,
+                )
+        result = register_images(
+            located.outlines,
+            T_world_camera,
+            model,
+            registration_m,
+            radius_m,
+            control_centres_m=control_m,
+            estimate_scale=estimate_scale,
+            names=[file.name for file in files],
+            assignments=located.assignments,
+        )
+        record = result.as_json(model)
+        record["spheres_mm"] = {
+            "registration": (registration_m * 1e3).tolist(),
+            "control": (control_m * 1e3).tolist(),
+        }
+        record["left_out"] = folder.left_out
+        record["search"] = _search(located, [file.name for file in files])
+        out.write_text(json_module.dumps(record, indent=1), encoding="utf-8")
+        if json:
+            print_json(record)
+            return
+        console.print(
+            f"{record['n_images']} images, {len(result.markers)} spheres, {result.registration.rms_px:.3f} px rms, "
+            f"predicted error at their centre {record['predicted_error_mm']:.3f} mm"
+        )
+        if result.evaluation is not None:
+            evaluation = result.evaluation
+            console.print(
+                f"control spheres: {evaluation.mean_radial_error_mm:.3f} mm mean radial error, "
+                f"{evaluation.mean_reprojection_error_px:.2f} px mean reprojection error"
+            )
+        console.print(f"written: {out}")
+
+
+def _file_detector(detector: DetectorName, boxes: Path | None, names: list[str]) -> DetectFile | None:
+    """What looks at one file; None for the default."""
+    if detector == "classical":
+        if boxes is not None:
+            raise typer.BadParameter("--boxes needs --detector paper")
+        return None
+    return partial(detect_file_by_masks, boxes=None if boxes is None else read_boxes(boxes, names))
+
+
+def _search(located: LocatedOutlines, names: list[str]) -> dict[str, object]:
+    """How many images were searched whole, in how many only predicted places, and what was not found there."""
+    return {
+        "images_searched": located.count("searched"),
+        "images_predicted": located.count("predicted"),
+        "anchors": [names[i] for i in located.anchors],
+        "spheres_expected": sum(image.expected for image in located.images),
+        "spheres_missing": [
+            {"image": name, "sphere": sphere, "reason": reason}
+            for name, image in zip(names, located.images, strict=True)
+            for sphere, reason in sorted(image.missing.items())
+        ],
+    }
+
+
+def _spheres(
+    mesh: Path | None,
+    spheres: Path | None,
+    radius_mm: float | None,
+    mesh_unit: MeshUnit,
+    control: str,
+    seeds: str | None,
+) -> tuple[Array, Array, float]:
+    """Registration and control centres (M, 3), (C, 3) and the radius, metres."""
+    if (mesh is None) == (spheres is None):
+        raise typer.BadParameter("give either --mesh or --spheres")
+    if spheres is not None:
+        known = read_spheres_json(spheres)
+        return known.registration_m, known.control_m, known.radius_m if radius_mm is None else radius_mm / 1e3
+    if radius_mm is None:
+        raise typer.BadParameter("--mesh needs --radius-mm")
+    assert mesh is not None
+    found = spheres_of(mesh, radius_mm / 1e3, mesh_unit, None, seeds)
+    centres = np.array([sphere.centre_m for sphere in found])
+    try:
+        chosen = sorted({int(word) for word in control.split(",") if word.strip()})
+    except ValueError as error:
+        raise typer.BadParameter(f"--control takes indices such as 3,7,9, not {control!r}") from error
+    if chosen and not 0 <= chosen[0] <= chosen[-1] < len(centres):
+        raise ConfigurationError(
+            f"--control names sphere {chosen[-1]}, the mesh has {len(centres)} (0 … {len(centres) - 1})",
+            where=str(mesh),
+            remedy="Run without --control once: result.json lists the spheres in their order",
+        )
+    rest = [i for i in range(len(centres)) if i not in chosen]
+    return centres[rest], centres[chosen], radius_mm / 1e3

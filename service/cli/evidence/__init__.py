@@ -1,0 +1,1 @@
+"""The commands that read, verify, replay, report and keep what was recorded."""

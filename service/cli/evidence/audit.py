@@ -1,0 +1,287 @@
+"""`orthocapture audit`: look at the recorded evidence of a run, and check that nobody has changed it."""
+
+from __future__ import annotations
+
+import base64
+import getpass
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from service.audit.verify.verifications import keep_verification, verification_of
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    print_json,
+    print_table,
+    progress_bar,
+    reporting_errors,
+)
+from service.cli.evidence.audit_figures import figures_command
+from service.cli.evidence.audit_report import report_command
+from service.core.text.counts import counted
+from service.store.durable_effects import utc_text
+from service.store.records import Artefact
+from service.store.signatures.signing import PublicKey, checkpoint, public_keys, rotate_key
+from service.store.store import Store, resolve_run
+from service.store.verification import verify as audit
+from service.store.verification.verify import AuditReport, EvidenceRecord
+
+audit_app = typer.Typer(
+    name="audit",
+    help="Look at the recorded evidence of a run, or check that nothing of it was changed.",
+    no_args_is_help=True,
+)
+
+_RUN_HELP = "Name of the run, its first characters, or `latest`."
+
+RunArgument = Annotated[str, typer.Argument(help=_RUN_HELP)]
+
+
+def _existing_file(text: str) -> Any:
+    return typer.Option(metavar="FILE", help=text, exists=True, dir_okay=False)
+
+
+CertificatesOption = Annotated[
+    Path | None,
+    _existing_file("Certificates of the time-stamp authority (PEM), to check its signatures too."),
+]
+SignaturesOption = Annotated[
+    Path | None,
+    _existing_file("Copy of signatures.jsonl that was kept elsewhere: what was cut off since shows against it."),
+]
+
+
+@audit_app.command("show")
+def show_command(
+    run: Annotated[str, typer.Argument(help=_RUN_HELP)] = "latest",
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """List everything that was recorded: what happened, when, by whom, and the files that belong to it."""
+    with reporting_errors(json):
+        run_id = resolve_run(audit.list_runs(data), run)
+        records = audit.show(data, run_id)
+        if json:
+            print_json({"run": run_id, "events": [_record_json(record) for record in records]})
+        else:
+            _print_records(run_id, records)
+
+
+@audit_app.command("verify")
+def verify_command(
+    run: Annotated[str, typer.Argument(help=_RUN_HELP + " `all` checks every run of the folder.")] = "latest",
+    data: DataOption = DEFAULT_DATA,
+    certificates: CertificatesOption = None,
+    signatures: SignaturesOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Check the evidence: read every file again, follow the chain, check the signatures, and name the first fault.
+
+    The exit status is 0 when all is as it was recorded, and 1 when anything differs.
+    """
+    with reporting_errors(json):
+        run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
+        with progress_bar(quiet=json) as report_progress:
+            begun_s = time.monotonic()
+            report = audit.verify(
+                data, run_id, report_progress, certificates=certificates, signatures_copy=signatures
+            )
+        _tell_the_pages(data, report, time.monotonic() - begun_s)
+    if json:
+        print_json(report_json(report))
+    else:
+        _print_report(report)
+    if not report.ok:
+        raise typer.Exit(1)
+
+
+def _tell_the_pages(data: Path, report: AuditReport, took_s: float) -> None:
+    """So that the audit's pages know of it. A folder that can only be read is none the worse for it."""
+    by, at_utc = f"{getpass.getuser()} (command line)", utc_text(datetime.now(UTC))
+    for run_id in report.runs:
+        with suppress(OSError):
+            found = verification_of(report, run_id, by=by, at_utc=at_utc, duration_s=took_s)
+            keep_verification(data, run_id, found)
+
+
+@audit_app.command("checkpoint")
+def checkpoint_command(
+    run: RunArgument = "latest", data: DataOption = DEFAULT_DATA, json: JsonOption = False
+) -> None:
+    """Sign the end of a run's chain now, so that everything up to it can no longer be rewritten."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        made = checkpoint(store, store.find_run(run))
+    if json:
+        print_json(asdict(made))
+    else:
+        console.print(f"Run {made.run_id} is signed up to event {made.seq} with key {made.key_id}.")
+
+
+@audit_app.command("keys")
+def keys_command(data: DataOption = DEFAULT_DATA, json: JsonOption = False) -> None:
+    """Show the fingerprints of the keys that sign. Write them down elsewhere: a bundle is checked against them."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        keys = public_keys(store)
+    if json:
+        print_json({"keys": [_key_json(key) for key in keys]})
+        return
+    if not keys:
+        console.print("No key has signed anything in this folder yet.")
+    for key in keys:
+        state = "in use" if key.replaced_seq is None else "replaced"
+        gap = "" if key.introduced or key is keys[0] else ", [yellow]not vouched for by the key before it[/]"
+        console.print(f"{key.key_id}  {state}{gap}  ({escape(key.reason)})")
+
+
+@audit_app.command("rotate-key")
+def rotate_key_command(
+    reason: Annotated[str, typer.Option(help="Why the key is replaced; it is recorded.")],
+    data: DataOption = DEFAULT_DATA,
+    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    lost: Annotated[
+        bool, typer.Option("--lost", help="The old key's file is gone and cannot vouch for the new one.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Replace the signing key. The old one signs the new one as its last act, and its file is destroyed."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        key = rotate_key(store, reason=reason, actor=operator or getpass.getuser(), lost=lost)
+    if json:
+        print_json(_key_json(key))
+    else:
+        console.print(f"The key is now {key.key_id}. Write this fingerprint down elsewhere.")
+
+
+@audit_app.command("export")
+def export_command(
+    run: RunArgument,
+    bundle: Annotated[
+        Path, typer.Argument(help="The zip file to write; that of a simulated run gets SIMULATED in its name.")
+    ],
+    data: DataOption = DEFAULT_DATA,
+    hashes_only: Annotated[
+        bool, typer.Option("--hashes-only", help="Leave the recorded files out; the records hold their hashes.")
+    ] = False,
+    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    json: JsonOption = False,
+) -> None:
+    """Write a run's evidence into one file that anybody can verify elsewhere, with a report and the verifier inside.
+
+    Refused when the evidence does not verify, and when the protocol asks for a release that was not given.
+    """
+    # These load the numerics, which `verify` does without.
+    from service.audit.bundle.export import export_bundle  # noqa: PLC0415
+    from service.audit.bundle.report import bundle_report  # noqa: PLC0415
+
+    with (
+        reporting_errors(json),
+        Store.open(data, create=False) as store,
+        progress_bar(quiet=json) as report_progress,
+    ):
+        run_id = store.find_run(run)
+        made = export_bundle(
+            store,
+            run_id,
+            bundle,
+            actor=operator or getpass.getuser(),
+            hashes_only=hashes_only,
+            report=bundle_report(data, run_id, with_pictures=not hashes_only),
+            progress=report_progress,
+        )
+    if json:
+        print_json({**asdict(made), "path": str(made.path)})
+        return
+    console.print(f"{escape(str(made.path))}: {made.size_bytes / 1e6:.1f} MB, SHA-256 {made.sha256}")
+    console.print(f"  signed with key {made.key_id}")
+    console.print(f"  To verify it anywhere: python verify.py {escape(made.path.name)} --key {made.key_id}")
+
+
+def _key_json(key: PublicKey) -> dict[str, Any]:
+    return {
+        "key_id": key.key_id,
+        "public_key": base64.b64encode(key.public_key).decode(),
+        "in_use": key.replaced_seq is None,
+        "introduced_by_predecessor": key.introduced,
+        "reason": key.reason,
+    }
+
+
+def report_json(report: AuditReport) -> dict[str, Any]:
+    """A report as plain data, with `ok` and `first_fault` on top."""
+    first = None if report.first_fault is None else {**asdict(report.first_fault), "text": str(report.first_fault)}
+    return {"ok": report.ok, "first_fault": first, **asdict(report)}
+
+
+def _record_json(record: EvidenceRecord) -> dict[str, Any]:
+    return {**asdict(record), "artefacts": [_artefact_json(artefact) for artefact in record.artefacts]}
+
+
+def _artefact_json(artefact: Artefact) -> dict[str, Any]:
+    return {
+        **artefact.ref.model_dump(),
+        "device": artefact.device,
+        "step": artefact.step,
+        "attempt": artefact.attempt,
+        "viewpoint": artefact.viewpoint,
+        "who": artefact.who,
+        "at_utc": artefact.at_utc,
+        "monotonic_s": artefact.monotonic_s,
+    }
+
+
+def _print_records(run_id: str, records: Sequence[EvidenceRecord]) -> None:
+    table = Table(title=f"Run {run_id}: {counted(len(records), 'event')}", title_justify="left")
+    for heading in ("no.", "time (UTC)", "who", "what", "details"):
+        table.add_column(heading, overflow="fold")
+    for record in records:
+        lines = [escape(record.summary)]
+        lines += [
+            f"[dim]file[/] {escape(artefact.ref.original_name)} ({artefact.ref.kind}, "
+            f"{artefact.ref.size_bytes} bytes, from {escape(artefact.device)}, SHA-256 {artefact.ref.sha256[:12]}…)"
+            for artefact in record.artefacts
+        ]
+        table.add_row(
+            str(record.seq),
+            record.at_utc[:23].replace("T", " "),
+            escape(record.actor),
+            record.kind.replace("_", " "),
+            "\n".join(line for line in lines if line),
+        )
+    print_table(table)
+
+
+def _print_report(report: AuditReport) -> None:
+    console.print(
+        f"Checked {counted(len(report.runs), 'run')} in {escape(report.data_dir)}: "
+        f"{counted(report.events, 'event')}, {counted(report.artefacts, 'recorded file')} "
+        f"({report.bytes_hashed / 1e6:.1f} MB read again), {counted(report.jobs, 'job')}, "
+        f"{counted(report.checkpoints, 'signature')}."
+    )
+    for run_id, head in report.heads.items():
+        console.print(f"  {run_id} ends with {head}")
+    for key_id in report.key_ids:
+        console.print(f"  signed with key {key_id}")
+    for note in report.notes:
+        console.print(f"  [yellow]note:[/] {escape(note)}")
+    if report.first_fault is None:
+        console.print("[bold green]Verified:[/] everything is as it was recorded.")
+        return
+    console.print(f"[bold red]NOT verified.[/] First fault: {escape(str(report.first_fault))}")
+    if len(report.faults) > 1:
+        console.print(f"  and {len(report.faults) - 1} more; all of them with --json")
+    console.print("  Keep this folder as it is, and compare it with a copy made earlier.")
+
+
+audit_app.command("report")(report_command)
+audit_app.command("figures")(figures_command)

@@ -1,0 +1,119 @@
+"""`orthocapture audit report`: a run as a document that a person outside can read."""
+
+from __future__ import annotations
+
+import getpass
+import os
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    error_console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+)
+from service.core.errors import ConfigurationError
+from service.store.database.engine import database_path
+from service.store.store import Store, resolve_run
+from service.store.verification import verify as audit
+
+
+def report_command(
+    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    data: DataOption = DEFAULT_DATA,
+    pdf: Annotated[
+        Path | None, typer.Option("--pdf", metavar="FILE", help="Write it as PDF.", dir_okay=False)
+    ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(
+            "--html", metavar="FILE", help="Write it as one HTML file, with the scene in 3D.", dir_okay=False
+        ),
+    ] = None,
+    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    json: JsonOption = False,
+) -> None:
+    """Write a report of a run: deviations first, accuracy, gates, signatures, certificates, pictures, verification.
+
+    The evidence is verified first. The exit status is 1 when it does not verify; the report then says so on top.
+    That a report was made is recorded in the run, unless its evidence does not verify or the folder is read-only.
+    A run that awaits its release is reported too, and the report says that it was not released.
+    """
+    with reporting_errors(json):
+        if pdf is None and html is None:
+            raise ConfigurationError("no file to write", remedy="Say --pdf FILE, --html FILE, or both")
+        run_id = resolve_run(audit.list_runs(data), run)
+        with progress_bar(quiet=json) as progress:
+            verified = audit.verify(data, run_id, progress)
+            # Numerics, pictures and fonts take a second to load: `audit verify` must not wait for them.
+            from service.audit.record.run import read_run  # noqa: PLC0415
+            from service.audit.report.content import report_content  # noqa: PLC0415
+            from service.audit.report.output.html import write_html  # noqa: PLC0415
+            from service.audit.report.output.pdf import write_pdf  # noqa: PLC0415
+
+            progress("writing the report", 0, 1)
+            report = report_content(read_run(data, run_id), verified, with_scene=html is not None)
+            recorded = verified.ok and _writable(data)
+            for path, write in ((pdf, write_pdf), (html, write_html)):
+                if path is not None:
+                    leave = partial(_record, data, run_id, report.head_sha256, operator or getpass.getuser())
+                    _write(path, partial(write, report), leave if recorded else None)
+    written = [str(path) for path in (pdf, html) if path is not None]
+    if json:
+        print_json(
+            {
+                "run": run_id,
+                "verified": verified.ok,
+                "written": written,
+                "recorded": recorded,
+                "head": report.head_sha256,
+            }
+        )
+    else:
+        console.print(f"Report of run {run_id}: {escape(', '.join(written))}")
+        if not recorded:
+            why = "its evidence does not verify" if not verified.ok else "the data folder is read-only"
+            console.print(f"  Not recorded in the run that it was made, because {why}.")
+    if not verified.ok:
+        if not json:
+            error_console.print(f"[bold red]The evidence does NOT verify:[/] {escape(str(verified.first_fault))}")
+        raise typer.Exit(1)
+
+
+def _write(path: Path, write: Callable[[Path], None], leave: Callable[[Path, str], None] | None) -> None:
+    """Write a file that gets its name only once it is recorded: where that fails, no report appears."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".report-") as folder:
+            part = Path(folder) / path.name
+            write(part)
+            if leave is not None:
+                leave(part, path.name)
+            part.replace(path)
+    except OSError as error:
+        raise ConfigurationError(
+            f"the report cannot be written: {error.strerror}", where=str(error.filename or path)
+        ) from error
+
+
+def _record(data: Path, run_id: str, head_sha256: str, actor: str, part: Path, file_name: str) -> None:
+    from service.audit.bundle.export import record_export  # noqa: PLC0415  # with the rest of what `verify` does without
+
+    with Store.open(data, create=False) as store:
+        record_export(store, run_id, part, file_name=file_name, what="report", head_sha256=head_sha256, actor=actor)
+
+
+def _writable(data: Path) -> bool:
+    """Whether anything can be recorded: an auditor may have a copy on a medium that cannot be written."""
+    return os.access(data, os.W_OK) and os.access(database_path(data), os.W_OK)

@@ -1,0 +1,175 @@
+"""`orthocapture replay`: compute again what a run recorded, and say whether it comes out the same."""
+
+from __future__ import annotations
+
+import json as json_module
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from service.audit.record.run import read_run
+from service.audit.replay.differences import Difference
+from service.audit.replay.replay import DEFAULT_KINDS, JobReplay, ReplayReport, replay
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    fail,
+    print_json,
+    print_table,
+    progress_bar,
+)
+from service.core.errors import OrthocaptureError
+from service.core.gates.verdict import describe
+from service.core.text.terms import term
+from service.worker.loop import HANDLERS
+
+_COULD_NOT = 2
+_STATUS = {"identical": 0, "within_tolerance": 0, "different": 1, "not_replayed": _COULD_NOT}
+_SHOWN = 8  # differences of a job
+_WORDS = {
+    "identical": "[bold green]equal, bit for bit[/]",
+    "within_tolerance": "[bold green]equal[/] within rounding (1e-9)",
+    "different": "[bold yellow]different[/]",
+    "not_replayed": "[bold red]could not be replayed[/]",
+}
+
+
+def replay_command(
+    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    data: DataOption = DEFAULT_DATA,
+    step: Annotated[str | None, typer.Option("--step", help="Only what this step computed.")] = None,
+    jobs: Annotated[
+        str,
+        typer.Option(
+            "--jobs",
+            metavar="KINDS",
+            help="Kinds of jobs, with commas between: calibrate,register. `all` adds the looks at each live image.",
+        ),
+    ] = ",".join(DEFAULT_KINDS),
+    end_to_end: Annotated[
+        bool,
+        typer.Option(
+            "--end-to-end", help="Give each job the recomputed results of those before it; report the drift."
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Keep the recomputed files and replay.json in this folder.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Compute calibration, registration and evaluation again from the recorded files, and compare.
+
+    The recorded parameters are used, and nothing is written into the evidence. The exit status is 0 when everything
+    comes out equal, 1 when something differs, and 2 when it could not be replayed.
+    """
+    try:
+        kinds = list(HANDLERS) if jobs == "all" else [kind.strip() for kind in jobs.split(",") if kind.strip()]
+        recorded = read_run(data, run)
+        with progress_bar(quiet=json) as progress:
+            report = replay(recorded, kinds=kinds, step=step, end_to_end=end_to_end, out=out, progress=progress)
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            text = json_module.dumps(report_json(report), indent=1, ensure_ascii=False, allow_nan=False)
+            (out / "replay.json").write_text(text + "\n", encoding="utf-8")
+    except OrthocaptureError as error:
+        fail(error, json=json)  # says what is wrong; its status 1 would mean a difference
+        raise typer.Exit(_COULD_NOT) from error
+    if json:
+        print_json(report_json(report))
+    else:
+        _print(report)
+    raise typer.Exit(_STATUS[report.verdict])
+
+
+def report_json(report: ReplayReport) -> dict[str, Any]:
+    """A report as plain data with the verdicts on top."""
+    plain: dict[str, Any] = {"verdict": report.verdict, **asdict(report)}
+    for job, shown in zip(report.jobs, plain["jobs"], strict=True):
+        shown["differences"] = [_plain(difference) for difference in job.differences]
+        for part in ("measures", "result"):
+            shown[part] = {"compared": shown[part]["compared"], "identical": not shown[part]["differences"]}
+        for artefact in shown["artefacts"]:
+            artefact["identical"] = artefact["recorded_sha256"] == artefact["recomputed_sha256"]
+            del artefact["content"]
+    for gate, shown in zip(report.gates, plain["gates"], strict=True):
+        shown["recorded"] = [verdict.model_dump() for verdict in gate.recorded]
+        shown["recomputed"] = [verdict.model_dump() for verdict in gate.recomputed]
+        shown["changed"] = [describe(new) for _, new in gate.changed]
+    return plain
+
+
+def _plain(difference: Difference) -> dict[str, Any]:
+    """Without infinities, which JSON does not have."""
+    plain = {**asdict(difference), "within_tolerance": difference.within_tolerance}
+    for name in ("difference", "relative"):
+        if plain[name] == float("inf"):
+            plain[name] = None
+    return plain
+
+
+def _print(report: ReplayReport) -> None:
+    console.print(f"Replay of run {report.run_id}, whose chain ends with {report.head_sha256}")
+    console.print(
+        f"Evidence verified first: {report.files_verified} files, {report.bytes_verified / 1e6:.1f} MB read again."
+    )
+    if report.versions:
+        console.print(f"{len(report.versions)} installed distributions are not what they were:")
+        for change in report.versions:
+            console.print(f"  {escape(change.name)} {change.recorded or 'none'} → {change.now or 'none'}")
+    else:
+        console.print("Every installed distribution has the version that was recorded.")
+    table = Table(box=None, pad_edge=False)
+    for heading in ("step", "computed again", "comes out", "files the same", "took"):
+        table.add_column(heading, justify="right" if heading == "took" else "left", overflow="fold")
+    for job in report.jobs:
+        same = sum(artefact.recorded_sha256 == artefact.recomputed_sha256 for artefact in job.artefacts)
+        table.add_row(
+            job.step,
+            " ".join(filter(None, (term(job.kind), job.label))),
+            _WORDS[job.verdict],
+            f"{same} of {len(job.artefacts)}" if job.artefacts else "",
+            f"{job.duration_s:.1f} s",
+        )
+    print_table(table)
+    for job in report.jobs:
+        if job.error or job.differences:
+            _print_job(job)
+    changed = [(gate.step, old, new) for gate in report.gates for old, new in gate.changed]
+    console.print(
+        f"Gates: {report.gates_judged} verdicts follow from the recorded measures; with the recomputed ones "
+        + (f"{len(changed)} come out otherwise:" if changed else "none comes out otherwise.")
+    )
+    for step, old, new in changed:
+        console.print(f"  {step}: {escape(describe(old))} → {escape(describe(new))}")
+    for drift in report.drifts:
+        world = "" if drift.in_world_mm is None else f"{drift.in_world_mm:.6f} mm in the world, "
+        console.print(
+            f"Drift of {drift.registration} at the scene's centre: {world}"
+            f"{drift.against_cameras_mm:.6f} mm against the cameras"
+        )
+    console.print(f"[bold]The run is[/] {_WORDS[report.verdict]}")
+
+
+def _print_job(job: JobReplay) -> None:
+    console.print(f"\n[bold]{escape(f'{job.step}: {job.kind} {job.label}'.strip())}[/]")
+    if job.error:
+        console.print(f"  {escape(job.error)}")
+    shown: Sequence[Difference] = job.differences[:_SHOWN]
+    for d in shown:
+        off = [] if d.difference is None else [f"difference {d.difference:.3g} {d.unit}".strip()]
+        off += [] if d.relative is None else [f"relative {d.relative:.1e}"]
+        off += [f"{d.values} values differ"] if d.values > 1 else []
+        console.print(f"  {escape(d.path)}: {_value(d.recorded)} → {_value(d.recomputed)}  {', '.join(off)}")
+    if len(job.differences) > len(shown):
+        console.print(f"  and {len(job.differences) - len(shown)} more fields; all of them with --json")
+
+
+def _value(value: Any) -> str:
+    return f"{value:.12g}" if isinstance(value, float) else escape(str(value))

@@ -1,0 +1,174 @@
+"""`orthocapture runs`, `compare` and `history`: finding runs, and holding them against one another."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from datetime import date
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from service.audit.runs.comparison import ComparedRun, RunComparison, compare_runs
+from service.audit.runs.history import history, history_csv
+from service.audit.runs.search import RESULT_WORDS, RESULTS, FoundRun, RunWanted, find_runs
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    print_json,
+    print_table,
+    reporting_errors,
+    require_writable,
+)
+from service.run_record import read_log
+from service.run_start import recorded_run
+from service.store.store import Store
+
+
+def runs_command(
+    search: Annotated[
+        str,
+        typer.Option("--search", help="Words of specimen, purpose, site, people, remarks, notes or protocol."),
+    ] = "",
+    since: Annotated[str, typer.Option("--since", help="First day, as 2026-11-21.", metavar="DAY")] = "",
+    until: Annotated[str, typer.Option("--until", help="Last day.", metavar="DAY")] = "",
+    result: Annotated[str, typer.Option("--result", help=f"One of {', '.join(RESULTS)}.")] = "",
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """List the recorded runs, newest first; all of them, or those that fit."""
+    if result and result not in RESULTS:
+        raise typer.BadParameter(f"{result!r} is none of {', '.join(RESULTS)}", param_hint="--result")
+    wanted = RunWanted(search, _day(since, "--since"), _day(until, "--until"), result)
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        found = find_runs(store, wanted)
+    if json:
+        print_json([_record(run) for run in found])
+        return
+    if not found:
+        console.print("No run fits." if wanted.active else "No run has been recorded here yet.")
+        return
+    table = Table(box=None, pad_edge=False)
+    for heading in ("run", "begun (UTC)", "specimen", "purpose", "protocol", "by", "result"):
+        table.add_column(heading)
+    for run in found:
+        cells = (run.about.specimen, run.about.purpose, f"{run.protocol} {run.version}", by(run), result_words(run))
+        table.add_row(run.run_id, run.created_utc[:16].replace("T", " "), *map(escape, cells))
+    print_table(table)
+
+
+def by(run: FoundRun) -> str:
+    """Who worked at the rig, or at least who began the run."""
+    return run.about.operator or run.begun_by
+
+
+def result_words(run: FoundRun) -> str:
+    """`completed, 0.213 mm (within), released`."""
+    words = [RESULT_WORDS[run.status]]
+    if run.accuracy is not None:
+        words.append(run.accuracy.words)
+    return ", ".join([*words, *(["released"] if run.released else [])]) + (" · simulated" if run.simulated else "")
+
+
+def _record(run: FoundRun) -> dict[str, object]:
+    return {
+        "run": run.run_id,
+        "created_utc": run.created_utc,
+        "simulated": run.simulated,
+        "protocol": run.protocol,
+        "version": run.version,
+        "begun_by": run.begun_by,
+        "about": run.about.model_dump(),
+        "notes": list(run.notes),
+        "status": run.status,
+        "released": run.released,
+        "accuracy": None if run.accuracy is None else asdict(run.accuracy),
+    }
+
+
+def _day(given: str, option: str) -> str:
+    try:
+        return date.fromisoformat(given).isoformat() if given else ""
+    except ValueError as error:
+        raise typer.BadParameter(f"{given!r} is no day such as 2026-11-21", param_hint=option) from error
+
+
+def compare_command(
+    first: Annotated[str, typer.Argument(help="A run: its name, its first characters, or `latest`.")],
+    second: Annotated[str, typer.Argument(help="The run to hold against it.")],
+    everything: Annotated[bool, typer.Option("--all", help="Also what is the same in both.")] = False,
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """Hold two runs side by side: protocol, gates, figures, accuracy, calibration, durations, deviations."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        comparison = compare_runs(_compared(store, first), _compared(store, second))
+    if json:
+        print_json(_comparison_record(comparison))
+        return
+    one, other = comparison.first.run_id, comparison.second.run_id
+    if comparison.same_protocol:
+        console.print(f"The same protocol, SHA-256 {comparison.first.root.protocol_sha256}")
+    else:
+        console.print(f"{len(comparison.protocol_changes)} lines of the protocol differ (− {one}, + {other}):")
+        for line in comparison.protocol_changes:
+            console.print(f"  {escape(line)}")
+    for part in _PARTS:
+        rows = [row for row in getattr(comparison, part) if everything or row.differs]
+        if not rows:
+            continue
+        table = Table(title=part.capitalize(), title_justify="left", box=None, pad_edge=False)
+        for heading in ("", one, other, "change"):
+            table.add_column(heading)
+        for row in rows:
+            name = " ".join(filter(None, (row.step, row.name))).replace("_", " ")
+            table.add_row(*map(escape, (name, row.first, row.second, row.change)))
+        print_table(table)
+    for run_id, lines in zip((one, other), comparison.deviations, strict=True):
+        console.print(f"Deviations of {run_id}: {len(lines) or 'none'}")
+        for line in lines:
+            console.print(f"  {escape(line)}")
+
+
+_PARTS = ("about", "accuracy", "gates", "calibration", "durations", "measures")
+
+
+def _compared(store: Store, name: str) -> ComparedRun:
+    run_id = store.find_run(name)
+    protocol, root = recorded_run(store, run_id)
+    source = store.artefact_path(root.protocol.sha256, verify=True).read_text("utf-8")
+    log = read_log(store, run_id, protocol)
+    return ComparedRun(run_id, root, protocol, source, log.events, log.state)
+
+
+def _comparison_record(comparison: RunComparison) -> dict[str, object]:
+    parts = {part: [asdict(row) for row in getattr(comparison, part)] for part in _PARTS}
+    return {
+        "first": comparison.first.run_id,
+        "second": comparison.second.run_id,
+        "same_protocol": comparison.same_protocol,
+        "protocol_changes": list(comparison.protocol_changes),
+        **parts,
+        "deviations": [list(lines) for lines in comparison.deviations],
+    }
+
+
+def history_command(
+    out: Annotated[Path | None, typer.Option("--out", help="Write into this file.", dir_okay=False)] = None,
+    data: DataOption = DEFAULT_DATA,
+) -> None:
+    """Calibration and accuracy over time for each camera, lens and arm, as CSV."""
+    with reporting_errors(), Store.open(data, create=False) as store:
+        if out is not None:
+            require_writable(out)
+        rows = history(store)
+        content = history_csv(rows)
+    if out is None:
+        typer.echo(content, nl=False)
+        return
+    out.write_text(content, encoding="utf-8", newline="")
+    console.print(f"{len(rows)} runs with figures: {escape(str(out))}")

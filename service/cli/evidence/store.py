@@ -1,0 +1,76 @@
+"""`orthocapture store`: the folder in which the evidence lies."""
+
+from __future__ import annotations
+
+import getpass
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    print_json,
+    reporting_errors,
+)
+from service.cli.evidence.store_backup import backup_command, restore_command
+from service.people.authorisation import who_acts
+from service.people.sessions import People
+from service.store.files.leftovers import USUAL_AGE_S, leftovers, remove_leftovers
+from service.store.records import SITE
+from service.store.signatures.signing import checkpoint
+from service.store.store import Store
+
+store_app = typer.Typer(name="store", help="Look after the folder that holds the evidence.", no_args_is_help=True)
+
+
+@store_app.callback()
+def store() -> None:
+    """Look after the folder that holds the evidence."""
+
+
+store_app.command("backup")(backup_command)
+store_app.command("restore")(restore_command)
+
+
+@store_app.command("gc")
+def gc_command(
+    data: DataOption = DEFAULT_DATA,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove them; without it they are only listed.")] = False,
+    min_age_min: Annotated[
+        float, typer.Option("--min-age-min", min=0, help="Leave what is younger than this many minutes.")
+    ] = USUAL_AGE_S / 60,
+    operator: Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")] = "",
+    json: JsonOption = False,
+) -> None:
+    """List what crashes have left: files that no record refers to. With --remove they are removed, and that recorded.
+
+    Recorded files are never touched. Files that a process at work may still record are left, too.
+    """
+    with reporting_errors(json), Store.open(data, create=False) as opened:
+        age_s = 60 * min_age_min
+        gone = []
+        if remove:
+            name = operator or getpass.getuser()
+            who = who_acts(People(opened), name, lambda: getpass.getpass(f"Password of {name}: "))
+            gone = remove_leftovers(opened, actor=who.name, min_age_s=age_s)
+            if gone:
+                checkpoint(opened, SITE)
+        left = leftovers(opened, min_age_s=age_s)
+    if json:
+        print_json({"removed": [asdict(one) for one in gone], "left": [asdict(one) for one in left]})
+        return
+    for one in gone:
+        console.print(f"removed: {escape(one.path)} ({one.size_bytes} bytes, written {one.written_utc})")
+    for one in left:
+        why = f"stays: {one.stays}" if one.stays else "may be removed"
+        console.print(f"{escape(one.path)} ({one.size_bytes} bytes, written {one.written_utc}): {escape(why)}")
+    removable = sum(not one.stays for one in left)
+    if not gone and not left:
+        console.print("Nothing is left over: a record refers to every file.")
+    elif removable:
+        console.print(f"{removable} of these can be removed: add --remove. No record refers to them.")

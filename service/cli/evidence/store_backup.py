@@ -1,0 +1,133 @@
+"""`orthocapture store backup` and `restore`: a copy of a data folder elsewhere, and a data folder from such a one."""
+
+from __future__ import annotations
+
+import getpass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    print_json,
+    progress_bar,
+    reporting_errors,
+)
+from service.core.text.counts import counted
+from service.store.backup.backup import BackupReport, back_up
+from service.store.backup.restore import RestoreReport, restore
+
+
+def backup_command(
+    destination: Annotated[
+        Path, typer.Argument(metavar="BACKUP", help="Folder of backups: empty, new, or with earlier ones.")
+    ],
+    data: DataOption = DEFAULT_DATA,
+    with_keys: Annotated[
+        bool, typer.Option("--with-keys", help="Copy the private signing key too: whoever reads it can sign.")
+    ] = False,
+    read_all: Annotated[
+        bool, typer.Option("--read-all", help="Read what earlier backups have copied again, and mend it.")
+    ] = False,
+    keep: Annotated[int | None, typer.Option("--keep", help="Keep this many states; else all.", min=1)] = None,
+    json: JsonOption = False,
+) -> None:
+    """Copy the data folder, also during a run; after the first time only what is new.
+
+    Repeat it after an interruption: it goes on where it was. The exit status is 1 when there is no backup, and when
+    what was copied does not verify.
+    """
+    with reporting_errors(json), progress_bar(quiet=json) as progress:
+        made = back_up(data, destination, with_keys=with_keys, read_all=read_all, keep=keep, progress=progress)
+    if json:
+        print_json(_backup_json(made))
+    else:
+        _print_backup(made)
+    if made.state.faults:
+        raise typer.Exit(1)
+
+
+def restore_command(
+    backup: Annotated[Path, typer.Argument(metavar="BACKUP", help="The folder of backups.")],
+    destination: Annotated[Path, typer.Argument(metavar="DIR", help="The new data folder: empty, or not there yet.")],
+    state: Annotated[str, typer.Option("--state", help="Which backup; else the newest.")] = "",
+    operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
+    json: JsonOption = False,
+) -> None:
+    """Make a data folder as it was when the backup was made, and verify it.
+
+    The exit status is 1 when anything of it is missing or does not verify.
+    """
+    with reporting_errors(json), progress_bar(quiet=json) as progress:
+        made = restore(backup, destination, name=state, actor=operator or getpass.getuser(), progress=progress)
+    if json:
+        print_json(_restore_json(made))
+    else:
+        _print_restore(made)
+    if not made.ok:
+        raise typer.Exit(1)
+
+
+def _backup_json(made: BackupReport) -> dict[str, Any]:
+    return {
+        "ok": not made.state.faults,
+        "folder": str(made.folder),
+        "name": made.name,
+        "copied": made.copied,
+        "copied_bytes": made.copied_bytes,
+        "present": made.present,
+        "state": made.state.model_dump(mode="json"),
+    }
+
+
+def _restore_json(made: RestoreReport) -> dict[str, Any]:
+    return {
+        "ok": made.ok,
+        "folder": str(made.folder),
+        "name": made.name,
+        "lost": list(made.lost),
+        "faults": [str(fault) for fault in made.audit.faults],
+        "state": made.state.model_dump(mode="json"),
+    }
+
+
+def _print_backup(made: BackupReport) -> None:
+    state = made.state
+    console.print(
+        f"Backup {made.name} is in {escape(str(made.folder))}: {counted(len(state.heads), 'chain')}, "
+        f"{counted(state.artefacts, 'file')}, {state.artefact_bytes / 1e9:.2f} GB."
+    )
+    console.print(
+        f"  Copied this time and read again: {counted(made.copied, 'file')}, {made.copied_bytes / 1e9:.2f} GB; "
+        f"{made.present} were there."
+    )
+    if not state.with_keys:
+        console.print(
+            "  The signing key is not in it: keep the folder keys/ elsewhere (see docs/howto/operating.md)."
+        )
+    if state.faults:
+        console.print(f"[bold red]What was copied does not verify.[/] First fault: {escape(state.faults[0])}")
+        console.print("  Older backups are kept. Run: orthocapture audit verify all")
+
+
+def _print_restore(made: RestoreReport) -> None:
+    state = made.state
+    console.print(f"{escape(str(made.folder))} is as {escape(state.data_folder)} was at {state.at_utc}.")
+    if not state.with_keys:
+        console.print(
+            "  The signing key was not in the backup: put the folder keys/ back, or say that it is lost with"
+        )
+        console.print("  orthocapture audit rotate-key --lost --reason ...")
+    for line in made.lost:
+        console.print(f"  [red]{escape(line)}[/]")
+    if made.ok:
+        console.print("[bold green]Verified:[/] everything is as it was recorded.")
+    elif made.audit.first_fault is not None:
+        console.print(f"[bold red]NOT verified.[/] First fault: {escape(str(made.audit.first_fault))}")
+        if state.faults:
+            console.print(f"  The data folder had a fault when it was copied: {escape(state.faults[0])}")

@@ -1,0 +1,150 @@
+"""`orthocapture act` and `note`: what people do to a run, or write down of it, that another terminal drives."""
+
+from __future__ import annotations
+
+import getpass
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from service.cli.common import DEFAULT_DATA, DataOption, JsonOption, console, print_json, reporting_errors
+from service.cli.run.commands import OperatorOption, PasswordOption, typed_password
+from service.core.errors import ConfigurationError, IllegalTransitionError
+from service.core.protocol.models import Protocol
+from service.core.records.events import CaptureAsked, OperatorAction
+from service.core.run.actions import VERBS, capture_refusal, record_to_sign, refuse
+from service.core.run.fold import fold
+from service.core.run.state import RunState
+from service.notes import Photograph, require_size, take_note
+from service.people.authorisation import Identity, identity_for, who_acts
+from service.people.sessions import People
+from service.run_record import read_log
+from service.run_start import record_refusal, recorded_run
+from service.store.store import Store
+
+_OF_A_CAPTURE = ("release", "finish")
+
+
+def act_command(
+    verb: Annotated[
+        str,
+        typer.Argument(
+            help="confirm, sign, redo, skip, accept, pause, resume or abort; of a capture by hand: release or finish."
+        ),
+    ],
+    run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
+    step: Annotated[str | None, typer.Option("--step", help="The step, if it is not the current one.")] = None,
+    viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo this viewpoint alone.")] = None,
+    reason: Annotated[str, typer.Option("--reason", help="Why; needed for redo, skip, accept and abort.")] = "",
+    meaning: Annotated[str, typer.Option("--meaning", help="What a signature says.")] = "",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist."""
+    if verb not in (*VERBS, *_OF_A_CAPTURE):
+        raise typer.BadParameter(f"{verb!r} is none of {', '.join((*VERBS, *_OF_A_CAPTURE))}", param_hint="VERB")
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        run_id = store.find_run(run)
+        protocol, _ = recorded_run(store, run_id)
+        state = fold(protocol, store.events(run_id))
+        name = operator or getpass.getuser()
+        if verb in _OF_A_CAPTURE:
+            name = who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin)).name
+            asked = step or state.current
+            _ask_capture(
+                store,
+                run_id,
+                protocol,
+                state,
+                CaptureAsked.model_validate({"step": asked, "attempt": state.step.attempt, "what": verb}),
+                name,
+            )
+            _report_recorded(run_id, verb, asked, name, json=json)
+            return
+        identity = identity_for(
+            People(store), protocol, state, verb, name, partial(typed_password, name, from_stdin=password_stdin)
+        )
+        if identity is None and verb == "pause":  # the safe direction: nobody is kept from it
+            identity = Identity(name, "", "claimed")
+        identity = identity or who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin))
+        name = identity.name
+        action = OperatorAction(
+            action=verb,
+            step=step or state.current,
+            viewpoint=viewpoint,
+            reason=reason,
+            checklist=protocol.step(state.current).checklist if verb == "confirm" else (),
+            meaning=meaning,
+            signed_sha256=signed_by_verb(verb, protocol, state),
+            role=identity.role,
+            identified=identity.identified,
+        )
+        refusal = refuse(protocol, state, action, name)
+        if refusal is not None:
+            record_refusal(store, run_id, state, action, refusal, name)
+            raise refusal
+        store.record(run_id, [action], actor=name)
+        _report_recorded(run_id, verb, action.step, name, json=json)
+
+
+def _ask_capture(
+    store: Store, run_id: str, protocol: Protocol, state: RunState, asked: CaptureAsked, name: str
+) -> None:
+    """Ask a capture by hand for a release of the shutter, or to end with what it has."""
+    if asked.step not in protocol.step_ids:
+        raise IllegalTransitionError(f"there is no step {asked.step!r}", where=asked.what)
+    refusal = capture_refusal(protocol, state, asked.step, asked.attempt)
+    if refusal is not None:
+        raise refusal
+    store.record(run_id, [asked], actor=name)
+
+
+def _report_recorded(run_id: str, verb: str, step: str | None, name: str, *, json: bool, seq: int = 0) -> None:
+    if json:
+        print_json({"run": run_id, "recorded": verb, "step": step} | ({"event": seq} if seq else {}))
+    else:
+        console.print(f"Recorded: {verb} of {step} by {escape(name)}")
+
+
+def signed_by_verb(verb: str, protocol: Protocol, state: RunState) -> str:
+    """SHA-256 of the event that an action binds; "" for one that is no signature."""
+    if verb == "accept":
+        return state.step.gates_sha256
+    return record_to_sign(protocol, state) if verb == "sign" else ""
+
+
+def note_command(
+    text: Annotated[str, typer.Argument(help="What to write down; may be left out with a photograph.")] = "",
+    photo: Annotated[Path | None, typer.Option("--photo", help="A photograph, JPEG or PNG.", dir_okay=False)] = None,
+    run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
+    step: Annotated[str, typer.Option("--step", help="The step, if it is not the current one.")] = "",
+    operator: OperatorOption = "",
+    password_stdin: PasswordOption = False,
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """Write a note on a step of a run, with or without a photograph. It is recorded and changes nothing else."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        run_id = store.find_run(run)
+        protocol, _ = recorded_run(store, run_id)
+        photograph = None if photo is None else _photograph(photo)
+        name = operator or getpass.getuser()
+        name = who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin)).name
+        log = read_log(store, run_id, protocol)
+        event = take_note(log, text, photograph, step=step, actor=name, via="cli")
+        _report_recorded(run_id, "note", step or log.state.current, name, json=json, seq=event.seq)
+
+
+def _photograph(path: Path) -> Photograph:
+    try:
+        require_size(path.stat().st_size, path.name)
+        return Photograph(path.read_bytes(), path.name)
+    except OSError as error:
+        raise ConfigurationError(
+            f"the photograph cannot be read: {error.strerror}", where=str(path), remedy="Check --photo"
+        ) from error

@@ -1,0 +1,319 @@
+"""`orthocapture run`, `resume` and `status`: a protocol from its first step to its last."""
+
+from __future__ import annotations
+
+import getpass
+import signal
+import sys
+from contextlib import nullcontext
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from drivers.interfaces import Camera, Lightbox, RobotArm
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    error_console,
+    print_json,
+    print_table,
+    reporting_errors,
+)
+from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
+from service.cli.run.beside import worker_beside
+from service.cli.run.hands import SimulatedHands
+from service.cli.run.import_operator import ImportOperator
+from service.cli.run.operators import AutomaticOperator, Display, ScreenOperator, TerminalOperator
+from service.cli.run.waiting import wait_for_results
+from service.core.errors import ConfigurationError
+from service.core.gates.verdict import Standing, describe, standing
+from service.core.protocol.models import Protocol, load_protocol
+from service.core.records.entered import about_rows, about_run
+from service.core.records.events import GateVerdict
+from service.core.recovery.ways_on import takes_words, ways_on
+from service.core.run.fold import fold
+from service.core.run.state import RunState, StepState
+from service.logs.file_log import file_log
+from service.monitor.alarm import alarm_of
+from service.monitor.reporter import OpenDevices, Reporter
+from service.people.approvals import approve
+from service.people.authorisation import Identity, who_acts
+from service.people.sessions import People
+from service.rig import Rig, load_rig
+from service.run_record import read_log, results_to_come
+from service.run_start import (
+    recorded_rig,
+    recorded_run,
+    require_rig_free,
+    require_simulated,
+    signature_copy,
+    start_run,
+    time_stamp_authority,
+)
+from service.runner import Runner
+from service.station import Station, layout_of
+from service.steps import params_models
+from service.steps.live import describe_view
+from service.steps.preview import preview_board_poses, preview_plans
+from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.timestamps import stamp_end
+from service.store.store import Store
+
+RigOption = Annotated[Path, typer.Option("--rig", help="The rig file: devices and stations of this site.")]
+OperatorOption = Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")]
+AutoOption = Annotated[
+    bool, typer.Option("--auto-confirm", help="Answer every question automatically; simulated rigs only.")
+]
+PasswordOption = Annotated[
+    bool, typer.Option("--password-stdin", help="Where an action demands a role: read the password from stdin.")
+]
+WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
+
+
+def run_command(
+    protocol: Annotated[Path, typer.Argument(help="The protocol file, such as protocols/exvivo_spine.yaml.")],
+    rig: RigOption,
+    data: DataOption = DEFAULT_DATA,
+    operator: OperatorOption = "",
+    auto_confirm: AutoOption = False,
+    worker: WorkerOption = True,
+    password_stdin: PasswordOption = False,
+    approve_change: Annotated[
+        str,
+        typer.Option("--approve-change", help="Why a content other than the approved one is right."),
+    ] = "",
+    specimen: SpecimenOption = "",
+    purpose: PurposeOption = "",
+    site: SiteOption = "",
+    remarks: RemarksOption = "",
+    json: JsonOption = False,
+) -> None:
+    """Run a protocol step by step. Nothing moves before you have confirmed it."""
+    with reporting_errors(json):
+        about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
+        loaded = load_protocol(protocol, params_models())
+        rig_file = load_rig(rig)
+        with Store.open(data) as store:
+            name = operator or getpass.getuser()
+            who = who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin))
+            if not auto_confirm:  # which is for simulated rigs
+                approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
+            run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm, about=about)
+            state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
+        _report_end(run_id, state, json=json)
+
+
+def resume_command(
+    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    data: DataOption = DEFAULT_DATA,
+    auto_confirm: AutoOption = False,
+    worker: WorkerOption = True,
+    screens: Annotated[
+        bool, typer.Option("--screens", help="Questions are answered in the browser (`orthocapture serve`).")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Go on with a run after a crash, a power cut or a pause: nothing captured is lost or taken twice."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        run_id = store.find_run(run)
+        _, root = recorded_run(store, run_id)
+        rig = recorded_rig(store, root)
+        state = drive(store, run_id, rig, data=data, auto_confirm=auto_confirm, worker=worker, screens=screens)
+        _report_end(run_id, state, json=json)
+
+
+def typed_password(name: str, *, from_stdin: bool) -> str:
+    """A password from the keyboard, or the next line of stdin. Raises ConfigurationError where none is given."""
+    if from_stdin:
+        return sys.stdin.readline().rstrip("\n")
+    try:
+        return getpass.getpass(f"Password of {name}: ")
+    except EOFError as error:
+        raise ConfigurationError("no password was given", remedy="Type it, or give --password-stdin") from error
+
+
+def status_command(
+    run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
+    data: DataOption = DEFAULT_DATA,
+    json: JsonOption = False,
+) -> None:
+    """Show how far a run is: steps, gates, deviations."""
+    with reporting_errors(json), Store.open(data, create=False) as store:
+        run_id = store.find_run(run)
+        protocol, root = recorded_run(store, run_id)
+        log = read_log(store, run_id, protocol)
+        state, missing = log.state, [left.text for left in results_to_come(log)]
+    if json:
+        ways = [asdict(way) for way in ways_on(protocol, state)]
+        about = None if root.about is None else root.about.model_dump()
+        print_json(status_record(run_id, state) | {"about": about, "still_to_come": missing, "ways_on": ways})
+        return
+    table = Table(title=f"Run {run_id}: {state.status}", title_justify="left")
+    for heading in ("step", "state", "attempt", "views", "gates"):
+        table.add_column(heading)
+    for step in protocol.steps:
+        now = state.steps[step.id]
+        gates = "\n".join(f"{describe(v)}: {_STANDINGS[_standing(v, now)]}" for v in now.verdicts)
+        phase = "skipped" if now.skipped else now.phase.replace("_", " ")
+        table.add_row(step.id, phase, str(now.attempt), str(len(now.captured) or ""), escape(gates))
+    print_table(table)
+    for name, entered in about_rows(root.about):
+        console.print(f"{name}: {escape(entered)}")
+    live = [job for job in state.step.jobs.values() if job.kind == "live_view" and job.status != "enqueued"]
+    for job in live[-3:]:
+        console.print(escape(describe_view(job)))
+    for line in missing:
+        console.print(f"result to come: {escape(line)}")
+    for way in ways_on(protocol, state):
+        can = f"takes {takes_words(way.minutes)}, loses: {way.loses}" if way.available else f"no: {way.why_not}"
+        console.print(f"way on: {way.verb} {way.step}: {escape(way.words)}; {escape(can)}")
+    for deviation in state.deviations:
+        if not deviation.is_note:
+            console.print(f"deviation: {escape(deviation.text)}")
+
+
+_STANDINGS: dict[Standing, str] = {
+    "within": "ok",
+    "not_decided": "NOT DECIDED",
+    "accepted": "ACCEPTED",
+    "outside": "FAILED",
+}
+
+
+def _standing(verdict: GateVerdict, step: StepState) -> Standing:
+    return standing(verdict, accepted=step.accepted is not None)
+
+
+def status_record(run_id: str, state: RunState) -> dict[str, Any]:
+    """A run's state as plain data."""
+    return {
+        "run": run_id,
+        "status": state.status,
+        "current": state.current,
+        "deviations": [d.text for d in state.deviations if not d.is_note],
+        "steps": {
+            name: {
+                "phase": s.phase,
+                "attempt": s.attempt,
+                "captured": sorted(s.captured),
+                "measures": dict(s.measures),
+                "gates": [v.model_dump() | {"standing": _standing(v, s), "text": describe(v)} for v in s.verdicts],
+                "live": [
+                    {"viewpoint": job.result["viewpoint"], **job.measures}
+                    for job in s.jobs.values()
+                    if job.kind == "live_view" and job.status == "finished"
+                ],
+            }
+            for name, s in state.steps.items()
+        },
+        "next_best_views": next_best_views(state),
+    }
+
+
+def next_best_views(state: RunState) -> list[dict[str, Any]]:
+    """Of the newest summary of the images; none before the first one."""
+    jobs = [job for step in state.steps.values() for job in step.jobs.values()]
+    done = [job for job in jobs if job.kind == "live_summary" and job.status == "finished"]
+    newest = max(done, key=lambda job: job.enqueued_seq, default=None)
+    return [] if newest is None else list(newest.result["next_best_views"])
+
+
+def drive(
+    store: Store,
+    run_id: str,
+    rig: Rig,
+    *,
+    data: Path,
+    auto_confirm: bool,
+    worker: bool,
+    screens: bool = False,
+    who: Identity | None = None,
+) -> RunState:
+    """Run the runner in this process, with a worker beside it, until the run ends.
+
+    Args:
+        store: of the data folder `data`.
+        run_id: the run.
+        rig: its devices.
+        data: the data folder.
+        auto_confirm: a simulated technician answers every question.
+        worker: compute here.
+        screens: people answer in the browser.
+        who: the person at this terminal, where it is known; else the run's operator, who is asked for a password.
+    """
+    protocol, root = recorded_run(store, run_id)
+    require_rig_free(store, rig.path, run_id=run_id)
+    station = Station(rig)
+    reporter = Reporter(data, run_id, partial(open_devices, station), station.camera, alarm_of(rig, run_id))
+    display = Display(error_console, reporter)
+    hands = SimulatedHands(rig.section.hands if rig.section.simulated else None)
+    if auto_confirm:
+        require_simulated(rig)
+        operator = AutomaticOperator(root.operator, protocol, display, hands)
+    elif screens:
+        operator = ScreenOperator(root.operator, protocol, display, hands)
+    elif rig.section.imported is not None:
+        operator = ImportOperator(root.operator, protocol, display, hands, listing=rig.section.imported)
+    else:
+        preview = partial(_preview, protocol, rig)
+        people = People(store)
+        who = who or who_acts(people, root.operator, partial(typed_password, root.operator, from_stdin=False))
+        operator = TerminalOperator(who.name, protocol, display, hands, preview=preview, people=people, who=who)
+    # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        beside = worker_beside(data, error_console.print) if worker else nullcontext()
+        with file_log(data, "runner", run=run_id), beside:
+            authority, copy = time_stamp_authority(rig), signature_copy(rig)
+            reporter.begin()
+            try:
+                state = Runner(store, run_id, protocol, station, operator, authority, copy).run()
+                reporter.outcome = f"it is {state.status}: {state.stop_reason}".removesuffix(": ")
+            finally:
+                reporter.end()
+                display.clear()
+                operator.close()
+                station.close()
+            if worker and state.status == "completed":
+                wait_for_results(store, run_id, protocol, display)
+                stamp_end(store, run_id, authority)
+                keep_elsewhere(data, copy, error_console.print)
+                state = fold(protocol, store.events(run_id))
+            return state
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def open_devices(station: Station) -> OpenDevices:
+    """What is open now, for the screens."""
+    return OpenDevices(
+        robots=cast(dict[str, RobotArm], station.opened("robot")),
+        cameras=cast(dict[str, Camera], station.opened("camera")),
+        lightboxes=cast(dict[str, Lightbox], station.opened("lightbox")),
+    )
+
+
+def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
+    """What a capture step is going to do, for the person who is asked to release it."""
+    try:
+        plans = preview_plans(protocol, protocol.step(step), rig, partial(layout_of, rig))
+        board = preview_board_poses(protocol, protocol.step(step), rig, partial(layout_of, rig))
+    except ConfigurationError as error:
+        return str(error)
+    return "; ".join([plan.text for plan in plans] + ([board.text] if board is not None else []))
+
+
+def _report_end(run_id: str, state: RunState, *, json: bool) -> None:
+    if json:
+        print_json(status_record(run_id, state))
+    else:
+        console.print(f"Run {run_id} is {state.status}; {state.deviations_told}. Evidence: audit verify")
+    if state.status != "completed":
+        raise typer.Exit(1)

@@ -1,0 +1,211 @@
+"""`orthocapture demo`: a whole run on a simulated rig, from specimen to registered data set, over the real wires."""
+
+from __future__ import annotations
+
+import json as json_module
+import selectors
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from service.audit.record.missing_results import not_in_yet
+from service.audit.record.run import read_run
+from service.audit.report.content import report_content
+from service.audit.report.output.html import write_html
+from service.cli.common import (
+    JsonOption,
+    console,
+    error_console,
+    print_json,
+    print_table,
+    progress_bar,
+    reporting_errors,
+)
+from service.cli.run.commands import drive
+from service.cli.shipped_protocols import shipped_protocols
+from service.compute.evaluation.accuracy import true_error_m
+from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.geometry import inverse
+from service.core.protocol.models import load_protocol
+from service.core.results.registrations import shared_adjustment_note
+from service.dataset.export import export_dataset
+from service.dataset.summary import RunSummary, summarise
+from service.rig import load_rig
+from service.run_start import start_run
+from service.steps import params_models
+from service.store.store import Store
+from service.store.verification.verify import verify
+
+_ARM_PORTS = (29999, 30003, 30004)  # of a Universal Robots controller
+
+
+def demo_command(
+    out: Annotated[Path, typer.Option("--out", help="Folder for the rig, the evidence and the report.")] = Path(
+        "demo-run"
+    ),
+    scene: Annotated[int, typer.Option("--scene", help="Seed of the simulated scene.")] = 7,
+    image_width: Annotated[int, typer.Option("--image-width", help="Width of the simulated photographs.")] = 1280,
+    host: Annotated[
+        str | None,
+        typer.Option("--host", help="Address of the simulated arm, such as 127.0.0.2; without: one with free ports."),
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Run the demonstration protocol on a simulated rig and show what comes out. Takes a few minutes."""
+    started_s = time.monotonic()
+    with reporting_errors(json):
+        folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
+        with _simulated_rig(folder / "rig", scene, image_width, host or free_address()) as ready:
+            rig = load_rig(Path(ready["rig"]))
+            loaded = load_protocol(shipped_protocols() / "demo.yaml", params_models())
+            data = folder / "data"
+            with Store.open(data) as store:
+                run_id = start_run(store, loaded, rig, operator="demo", auto_confirm=True)
+                state = drive(store, run_id, rig, data=data, auto_confirm=True, worker=True)
+                if state.status != "completed":
+                    raise OrthocaptureError(f"the demo is {state.status}: {state.stop_reason}", where=state.current)
+        with Store.open(data) as store, progress_bar(quiet=json) as progress:
+            summary = summarise(store, run_id, loaded.protocol)
+            audit = verify(data, run_id, progress)
+            truth = true_errors_mm(summary, Path(ready["truth"]))
+            report = folder / "report.html"
+            write_html(report_content(read_run(data, run_id), audit, true_error_mm=truth), report)
+            dataset = folder / "dataset"
+            export_dataset(summary, dataset, not_in_yet(summary.protocol, summary.state, summary.events))
+            table = [{**row, "true_error_mm": truth[row["poses"]]} for row in summary.table()]
+            database = str(store.database_path)
+    result = {
+        "run": run_id,
+        "data_dir": str(data),
+        "database": database,
+        "artefacts": str(data / "artefacts"),
+        "dataset": str(dataset),
+        "report": str(report),
+        "audit_ok": audit.ok,
+        "duration_s": round(time.monotonic() - started_s, 1),
+        "table": table,
+        "table_note": shared_adjustment_note(summary.protocol, summary.state),
+    }
+    if json:
+        print_json(result)
+    else:
+        _print(result)
+    if not audit.ok:
+        raise typer.Exit(1)
+
+
+def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
+    """True registration error at the scene centre for each source of poses, from the simulator's own record.
+
+    Read after the run, by the demo and tests alone.
+    """
+    truth = json_module.loads(truth_file.read_text())
+    exposures = [
+        json_module.loads(line)
+        for line in (truth_file.parent / "truth_exposures.jsonl").read_text().splitlines()
+        if line.strip()
+    ]
+    T_world_camera = {exposure["sha256"]: np.array(exposure["T_world_camera"]) for exposure in exposures}
+    T_scan_world = inverse(np.array(truth["scans"][-1]["T_world_scan"]))
+    photographs = {capture.viewpoint: capture.artefacts[0].sha256 for capture in summary.captures()}
+    centre_scan_m = np.array(summary.result("scan_import")["spheres_m"]).mean(axis=0)
+    errors: dict[str, float] = {}
+    for source, registration in summary.registrations().items():
+        cameras: Mapping[str, Any] = registration["T_scan_camera"]
+        estimated = np.array([cameras[name] for name in cameras])
+        true = np.array([T_scan_world @ T_world_camera[photographs[name]] for name in cameras])
+        errors[source] = 1e3 * true_error_m(estimated, true, centre_scan_m)
+    return errors
+
+
+def free_address() -> str:
+    """The first address of this machine at which a simulated arm's ports are free; its clients know no other ports.
+
+    Raises:
+        ConfigurationError: none is.
+    """
+    for last in range(1, 255):
+        address = f"127.0.0.{last}"
+        if all(_is_free(address, port) for port in _ARM_PORTS):
+            return address
+    raise ConfigurationError(
+        f"the ports {', '.join(map(str, _ARM_PORTS))} of a simulated arm are in use at every address of this machine",
+        remedy="End the other simulated rigs, or name an address with --host",
+    )
+
+
+def _is_free(address: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((address, port))
+        except OSError:
+            return False
+    return True
+
+
+@contextmanager
+def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Generator[dict[str, Any]]:
+    """A rig process around one scene; ended with this block."""
+    folder.mkdir(parents=True)
+    command = [
+        sys.executable, "-m", "simulators", "rig", "--scene", str(scene), "--dir", str(folder),
+        "--image-width", str(image_width), "--speed-up", "10", "--ct-voxel-mm", "1.0", "--with-parent",
+        "--host", host,
+    ]  # fmt: skip
+    log = folder / "rig.log"
+    with log.open("w") as errors:
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, text=True
+        )
+    try:
+        yield _ready(process, log, timeout_s=120)
+    finally:
+        process.terminate()
+        process.wait(timeout=30)
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _ready(process: subprocess.Popen[str], log: Path, *, timeout_s: float) -> dict[str, Any]:
+    assert process.stdout is not None
+    with selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        line = process.stdout.readline() if selector.select(timeout_s) else ""
+    if not line:
+        raise OrthocaptureError(
+            "the simulated rig did not start", where=str(log), remedy="Read that log; is another rig running?"
+        )
+    return json_module.loads(line)
+
+
+def _print(result: Mapping[str, Any]) -> None:
+    error_console.print()
+    table = Table(title="Registration error on the control spheres", title_justify="left")
+    table.add_column("camera poses")
+    for heading in ("mean radial error (mm)", "mean reprojection error (px)", "true error (mm)"):
+        table.add_column(heading, justify="right")
+    for row in result["table"]:
+        table.add_row(
+            row["poses"],
+            f"{row['mean_radial_error_mm']:.3f}",
+            f"{row['mean_reprojection_error_px']:.2f}",
+            f"{row['true_error_mm']:.3f}",
+        )
+    print_table(table)
+    if result["table_note"]:
+        console.print(escape(result["table_note"]))
+    for name in ("run", "database", "artefacts", "dataset", "report"):
+        console.print(f"{name:<10} {result[name]}")
+    console.print(f"{'audit':<10} {'verified' if result['audit_ok'] else 'FAILED'}")
+    console.print(f"{'took':<10} {result['duration_s']:.0f} s")

@@ -1,0 +1,69 @@
+"""The hands of a simulated technician: on a simulated rig, a confirmation also does what it confirms."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from service.core.errors import OrthocaptureError
+from service.core.protocol.models import Step
+from service.core.text.json_text import parse_json
+
+_ASKS_FOR_A_PHOTOGRAPH = ("next: ", "take the photograph now")  # how such words begin
+_LONGEST_ANSWER = 1 << 20  # characters
+_PATIENCE_S = 900  # a CT volume or a scan of the whole scene takes minutes on a busy machine
+
+
+@dataclass
+class SimulatedHands:
+    """Acts on the simulated world through its control socket; without an address (a real rig) it does nothing."""
+
+    address: str | None  # HOST:PORT
+    _done: set[tuple[str, int]] = field(default_factory=set[tuple[str, int]])
+
+    def do(self, step: Step, attempt: int) -> None:
+        """What a technician does before confirming this step; once for each attempt."""
+        self.act(step.id, attempt, [action.model_dump(exclude_none=True) for action in step.simulated_hands])
+
+    def act(self, step: str, attempt: int, actions: Sequence[Mapping[str, Any]]) -> None:
+        """Do these actions (the vocabulary of simulators/rig_world.py) one after the other; once for each attempt.
+
+        Raises OrthocaptureError when the simulated world does not answer or cannot do one of them.
+        """
+        if self.address is None or (step, attempt) in self._done:
+            return
+        for action in actions:
+            answer = _ask_world(self.address, {**action, "op": "act"})
+            if not answer.get("ok"):
+                raise OrthocaptureError(
+                    f"the simulated technician could not {action.get('action')}: {answer.get('error')}",
+                    where=f"step {step}",
+                    remedy="Give the step an action that simulators/rig_world.py lists",
+                )
+        self._done.add((step, attempt))
+
+    def read(self, message: str) -> None:
+        """The technician reads what the screen says."""
+        if self.address is not None and message.startswith(_ASKS_FOR_A_PHOTOGRAPH):
+            _ask_world(self.address, {"op": "act", "action": "read", "words": message})
+
+
+def _ask_world(address: str, request: dict[str, Any]) -> dict[str, Any]:
+    host, _, port = address.rpartition(":")
+    deadline_s = time.monotonic() + _PATIENCE_S
+    try:
+        with socket.create_connection((host, int(port)), timeout=10) as link:
+            link.settimeout(deadline_s - time.monotonic())
+            link.sendall(json.dumps(request).encode() + b"\n")
+            with link.makefile("r", encoding="utf-8", errors="replace") as answers:
+                line = answers.readline(_LONGEST_ANSWER) or '{"ok": false, "error": "no answer"}'
+                answer = parse_json(line, name=address, remedy="Start the rig again")
+                return answer if isinstance(answer, dict) else {}
+    except (OSError, ValueError) as error:
+        raise OrthocaptureError(
+            f"the simulated technician does not answer: {error}", where=address, remedy="Start the rig again"
+        ) from error

@@ -1,0 +1,262 @@
+"""`orthocapture import`: photographs, scan and CT that were captured earlier become a run, as imported."""
+
+from __future__ import annotations
+
+import getpass
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    error_console,
+    print_json,
+    print_table,
+    progress_bar,
+    reporting_errors,
+)
+from service.cli.run.about_options import PurposeOption, RemarksOption, SiteOption, SpecimenOption
+from service.cli.run.commands import OperatorOption, WorkerOption, drive
+from service.cli.run.import_operator import part_of
+from service.cli.shipped_protocols import shipped_protocols
+from service.core.errors import ConfigurationError
+from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
+from service.core.records.entered import RunAbout, about_run
+from service.core.records.import_list import FileRole, ImportedView, ImportList, PhotographRole
+from service.core.results.registrations import shared_adjustment_note
+from service.dataset.summary import summarise
+from service.import_folder import find_places, import_rig, list_import
+from service.rig import Rig
+from service.run_record import recorded_root
+from service.run_start import start_run
+from service.steps import params_models
+from service.store.store import Store
+
+_PROTOCOL = shipped_protocols() / "import_spine.yaml"
+_SHOWN = 12  # files left out that are shown one by one
+_PARTS: dict[PhotographRole, str] = {
+    "calibration": "calibration images",
+    "image": "images",
+    "control_image": "control images",
+}
+
+
+def import_command(
+    folder: Annotated[Path, typer.Argument(help="Folder with calibration/, images/, control/, scan/ and so on.")],
+    protocol: Annotated[
+        Path,
+        typer.Option(
+            "--protocol", help="The protocol of the import.", show_default="import_spine.yaml, which comes with it"
+        ),
+    ] = _PROTOCOL,
+    calibration_images: Annotated[
+        Path | None, typer.Option("--calibration-images", metavar="DIR", help="Images of the board.")
+    ] = None,
+    images: Annotated[Path | None, typer.Option("--images", metavar="DIR", help="Images of the data set.")] = None,
+    control_images: Annotated[
+        Path | None, typer.Option("--control-images", metavar="DIR", help="Images that show the control spheres.")
+    ] = None,
+    scan: Annotated[Path | None, typer.Option("--scan", help="The mesh, or the folder of the only one.")] = None,
+    control_scan: Annotated[
+        Path | None, typer.Option("--control-scan", help="The mesh that still holds the control spheres.")
+    ] = None,
+    ct: Annotated[Path | None, typer.Option("--ct", metavar="DIR", help="Folder of one DICOM series.")] = None,
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="The files come from simulators: everything is marked so.")
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Show what would be imported, and import nothing.")
+    ] = False,
+    again: Annotated[bool, typer.Option("--again", help="Import what was imported before as one more run.")] = False,
+    data: DataOption = DEFAULT_DATA,
+    operator: OperatorOption = "",
+    worker: WorkerOption = True,
+    specimen: SpecimenOption = "",
+    purpose: PurposeOption = "",
+    site: SiteOption = "",
+    remarks: RemarksOption = "",
+    json: JsonOption = False,
+) -> None:
+    """Import photographs, scan and CT that were captured earlier; register and evaluate them as a run.
+
+    Interrupted, the same command goes on where it stopped.
+    """
+    given: dict[PhotographRole | FileRole, Path | None] = {
+        "calibration": calibration_images,
+        "image": images,
+        "control_image": control_images,
+        "scan": scan,
+        "control_scan": control_scan,
+        "ct": ct,
+    }
+    with reporting_errors(json):
+        about = about_run(specimen=specimen, purpose=purpose, site=site, text=remarks)
+        loaded = load_protocol(protocol, params_models())
+        with progress_bar(quiet=json) as progress:
+            parts: set[PhotographRole | FileRole] = set()
+            for step in loaded.protocol.step_ids:
+                part = part_of(loaded.protocol, step)
+                if part is not None:
+                    parts.add(part)
+            listing = list_import(find_places(folder, given, parts), progress)
+        _require_wanted(loaded.protocol, listing)
+        if not json:
+            _show(listing)
+        if dry_run:
+            if json:
+                print_json(listing_record(listing))
+            return
+        rig = import_rig(listing, simulated=simulated)
+        with Store.open(data) as store:
+            name = operator or getpass.getuser()
+            run_id = _run_of(store, loaded, rig, operator=name, again=again, about=about)
+            state = drive(store, run_id, rig, data=data, auto_confirm=False, worker=worker)
+            summary = summarise(store, run_id, loaded.protocol)
+            table, note = summary.table(), shared_adjustment_note(loaded.protocol, summary.state)
+        if json:
+            print_json(
+                {"run": run_id, "status": state.status, "table": table, "table_note": note, **listing_record(listing)}
+            )
+        else:
+            _show_result(run_id, state.status, state.deviation_count, table, note)
+        if state.status != "completed":
+            raise typer.Exit(1)
+
+
+def _require_wanted(protocol: Protocol, listing: ImportList) -> None:
+    """Before anything is recorded: what the protocol cannot do without must be there."""
+    for step in protocol.steps:
+        part = part_of(protocol, step.id)
+        if part is not None and not step.skippable and not listing.holds(part):
+            raise ConfigurationError(
+                f"the protocol needs {part.replace('_', ' ')} (step {step.id!r}), and the folder holds none",
+                where=listing.folder,
+                remedy="Name it by its option, see --help; or use a protocol in which that step may be skipped",
+            )
+
+
+def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, again: bool, about: RunAbout) -> str:
+    """The run of this very list that has not ended, or a new one.
+
+    Raises ConfigurationError when the list was imported before, or when its files come from a simulated run.
+    """
+    listing = hashlib.sha256(rig.source).hexdigest()
+    ours = {file.sha256 for file in rig.section.imported.all_files()} if rig.section.imported is not None else set()
+    unfinished = store.open_runs()
+    for row in reversed(store.runs()):
+        theirs = store.artefacts(row.run_id)
+        root = recorded_root(store, row.run_id)
+        if root.rig.sha256 == listing and root.protocol_sha256 == loaded.sha256 and not again:
+            if row.run_id in unfinished:
+                error_console.print(f"Going on with run {row.run_id}, which was interrupted.")
+                return row.run_id
+            raise ConfigurationError(
+                f"these files were imported before: run {row.run_id}",
+                where=str(store.database_path),
+                remedy="Read that run, or import them as one more run with --again",
+            )
+        if row.simulated and not rig.section.simulated and any(file.ref.sha256 in ours for file in theirs):
+            raise ConfigurationError(
+                f"files of this folder were made by simulators, in run {row.run_id}",
+                where=str(rig.path.parent),
+                remedy="Import them with --simulated, which marks the run",
+            )
+    return start_run(store, loaded, rig, operator=operator, auto_confirm=False, about=about)
+
+
+# --- what is shown ----------------------------------------------------------------------------------------------
+
+
+def listing_record(listing: ImportList) -> dict[str, Any]:
+    """What was found, as plain data."""
+    return {
+        "folder": listing.folder,
+        "photographs": {role: photographs_record(listing, role) for role in _PARTS if listing.holds(role)},
+        "files": {role: [file.model_dump() for file in files] for role, files in listing.files.items()},
+        "left_out": [one.model_dump() for one in listing.left_out],
+    }
+
+
+def photographs_record(listing: ImportList, role: PhotographRole) -> dict[str, Any]:
+    """Counts, camera, lens, dates and sizes of the photographs of one kind."""
+    views = listing.of(role)
+    times = sorted(str(view.camera["exif_time"]) for view in views if view.camera.get("exif_time"))
+    return {
+        "count": len(views),
+        "raw_files": sum(len(view.raws) for view in views),
+        "cameras": _stated(views, ("make", "model", "body_serial")),
+        "lenses": _stated(views, ("lens", "lens_serial")),
+        "focal_lengths_mm": sorted({v.camera["focal_length_mm"] for v in views if "focal_length_mm" in v.camera}),
+        "sizes": sorted({f"{v.camera.get('width')} × {v.camera.get('height')}" for v in views}),
+        "first": times[0] if times else "",
+        "last": times[-1] if times else "",
+        "bytes": sum(file.size_bytes for view in views for file in (view.photograph, *view.raws)),
+    }
+
+
+def _stated(views: Sequence[ImportedView], names: Sequence[str]) -> list[str]:
+    texts = (" ".join(str(view.camera[name]) for name in names if name in view.camera) for view in views)
+    return sorted({text or "not stated" for text in texts})
+
+
+def _show(listing: ImportList) -> None:
+    table = Table(title=f"Found in {escape(listing.folder)}", title_justify="left")
+    for heading in ("what", "files", "camera and lens", "px", "taken, as the files say", "MB"):
+        table.add_column(heading, justify="right" if heading in ("files", "MB") else "left")
+    for role, words in _PARTS.items():
+        if not listing.holds(role):
+            continue
+        found = photographs_record(listing, role)
+        raws = f" + {found['raw_files']} raw" if found["raw_files"] else ""
+        optics = "; ".join(dict.fromkeys([*found["cameras"], *found["lenses"]]))
+        dates = _dates(found["first"], found["last"])
+        size = f"{found['bytes'] / 1e6:.1f}"
+        table.add_row(words, f"{found['count']}{raws}", escape(optics), ", ".join(found["sizes"]), dates, size)
+    for role, files in listing.files.items():
+        megabytes = f"{sum(file.size_bytes for file in files) / 1e6:.1f}"
+        name = "DICOM series" if role == "ct" else Path(files[0].path).name
+        written = f"written {files[0].modified_utc[:16].replace('T', ' ')}"
+        table.add_row(role.replace("_", " "), str(len(files)), escape(name), "", written, megabytes)
+    print_table(table)
+    for one in listing.left_out[:_SHOWN]:
+        console.print(f"left out: {escape(one.path)}: {escape(one.reason)}")
+    if len(listing.left_out) > _SHOWN:
+        console.print(f"left out: {len(listing.left_out) - _SHOWN} more files; --json lists them all")
+
+
+def _dates(first: str, last: str) -> str:
+    """Two times of EXIF (`2024:03:01 10:14:00.000+00:00`), as far as people want to know them."""
+    if not first:
+        return "not stated"
+    begin, end = (f"{text[:10].replace(':', '-')} {text[11:16]}" for text in (first, last))
+    return begin if begin == end else f"{begin} to {end[11:] if end[:10] == begin[:10] else end}"
+
+
+def _show_result(run_id: str, status: str, deviations: int, rows: Sequence[Mapping[str, Any]], note: str) -> None:
+    if rows:
+        table = Table(title="Registration error", title_justify="left")
+        for heading in ("camera poses", "images", "evaluated on", "mean radial error (mm)", "reprojection (px)"):
+            table.add_column(heading, justify="right" if "(" in heading else "left")
+        for row in rows:
+            table.add_row(
+                row["poses"],
+                str(row["images"]),
+                row["evaluated_on"],
+                f"{row['mean_radial_error_mm']:.3f}",
+                f"{row['mean_reprojection_error_px']:.2f}",
+            )
+        print_table(table)
+        if note:
+            console.print(escape(note))
+    console.print(
+        f"Run {run_id} is {status}; {deviations} deviations. Its photographs are imported: how they were captured is "
+        "not in evidence."
+    )

@@ -1,0 +1,61 @@
+"""Who answers an import's questions: what was brought is imported, what was not is skipped; a person does more."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+from service.cli.run.operators import TerminalOperator
+from service.core.errors import OrthocaptureError
+from service.core.protocol.models import Protocol
+from service.core.records.events import OperatorAction
+from service.core.records.import_list import FileRole, ImportList, PhotographRole
+from service.core.run.decide import AskOperator
+from service.core.run.state import RunState
+from service.core.text.terms import term
+from service.runner import Spoken
+
+
+def part_of(protocol: Protocol, step_id: str) -> PhotographRole | FileRole | None:
+    """Which part of an import a step brings in; None for a step that brings nothing."""
+    step = protocol.step(step_id)
+    match step.kind:
+        case "image_import":
+            return step.params.model_dump()["photographs"]
+        case "scan_import":
+            return step.params.model_dump()["device"] or "scan"
+        case "ct_import":
+            return "ct"
+        case _:
+            return None
+
+
+@dataclass
+class ImportOperator(TerminalOperator):
+    """The person who gave the command: with it they confirmed the import of what the list holds, and nothing else."""
+
+    listing: ImportList | None = None
+    _retried: bool = False
+
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
+        """Confirm or skip the import of a part; ask for anything else, where there is a terminal."""
+        part = part_of(self.protocol, question.step)
+        if question.for_ == "confirm" and part is not None and self.listing is not None:
+            if self.listing.holds(part):
+                return OperatorAction(action="confirm", step=question.step, checklist=question.checklist)
+            if "skip" in question.options:
+                return OperatorAction(action="skip", step=question.step, reason=f"no {_words(part)} among the files")
+        if question.for_ == "recovery" and "confirm" in question.options and state.sessions > 1 and not self._retried:
+            self._retried = True  # whoever gives the command again wants what had failed tried again, once
+            return OperatorAction(action="confirm", step=question.step)
+        if not os.isatty(self.descriptor):
+            raise OrthocaptureError(
+                question.text,
+                where=f"step {question.step}",
+                remedy="Nothing is lost: give the same command in a terminal and decide, or `orthocapture resume`",
+            )
+        return super().poll(question, state)
+
+
+def _words(part: str) -> str:
+    return term(part)

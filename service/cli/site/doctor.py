@@ -1,0 +1,167 @@
+"""`orthocapture doctor`: open every device of a rig and say what is there and what is wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import shutil
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from drivers.errors import DeviceError
+from drivers.interfaces import DeviceIdentity, DeviceReport
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    error_record,
+    print_json,
+    progress_bar,
+    reporting_errors,
+)
+from service.cli.run.commands import RigOption
+from service.core.equipment.clocks import DEVICE_LIMIT_S, HOST_LIMIT_S, offset_told
+from service.core.equipment.disk_space import Forecast, Usage, forecast
+from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.protocol.models import Protocol, load_protocol
+from service.core.records.events import HostClock
+from service.monitor.host_clock import host_clock
+from service.rig import load_rig
+from service.station import Station
+from service.steps import params_models
+from service.store.database.engine import database_path
+from service.store.files.space_used import forecast_of
+from service.store.store import Store
+
+# Libraries without a ready-made package for every Python and machine, and what cannot be done without them.
+_PARTS = {
+    "rtde_control": "ur-rtde: arms of Universal Robots cannot be driven",
+    "pycolmap": "pycolmap: camera poses cannot be found from images alone",
+    "embreex": "embreex: rigs cannot be simulated",
+}
+_LOW_DISK_BYTES = 20e9  # a full capture of RAW and JPEG with its scans
+
+
+def doctor_command(
+    rig: RigOption,
+    data: DataOption = DEFAULT_DATA,
+    protocol: Annotated[
+        Path | None, typer.Option("--protocol", help="Say whether the disk will do for a run of this protocol.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Open every device of a rig: versions, clock offsets, free space, and what is wrong."""
+    found: dict[str, DeviceReport | OrthocaptureError] = {}
+    with reporting_errors(json):
+        rig_file = load_rig(rig)
+        loaded = None if protocol is None else load_protocol(protocol, params_models()).protocol
+        station = Station(rig_file)
+        try:
+            with progress_bar(quiet=json) as progress:
+                for i, name in enumerate(station.names()):
+                    progress(f"opening {name}", i, len(station.names()))
+                    try:
+                        found[name] = station.device(name).report()
+                    except (DeviceError, ConfigurationError) as error:
+                        found[name] = error
+        finally:
+            station.close()
+        existing = next(folder for folder in (data.resolve(), *data.resolve().parents) if folder.exists())
+        free_bytes = shutil.disk_usage(existing).free
+        space = None if loaded is None else _foresee(data, loaded, free_bytes, simulated=rig_file.section.simulated)
+    healthy = all(isinstance(r, DeviceReport) and not r.problems for r in found.values())
+    healthy = healthy and (space is None or space.verdict == "enough")
+    clock = host_clock()
+    missing = [what for module, what in _PARTS.items() if importlib.util.find_spec(module) is None]
+    if json:
+        devices = {name: _record(report) for name, report in found.items()}
+        folder: dict[str, Any] = {"folder": str(data), "free_bytes": free_bytes}
+        if space is not None:
+            folder["forecast"] = dataclasses.asdict(space) | {"verdict": space.verdict, "words": space.words}
+        found_clock = clock.model_dump()
+        print_json({"ok": healthy, "devices": devices, "data": folder, "host_clock": found_clock, "missing": missing})
+    else:
+        for what in missing:
+            console.print(f"[bold yellow]![/] not installed: {escape(what)} (see docs/howto/installation.md)")
+        for name, report in found.items():
+            _print(name, report)
+        note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"
+        console.print(f"[bold]data folder[/] {escape(str(data))}: {free_bytes / 1e9:.1f} GB free{note}")
+        console.print(f"[bold]this machine's clock[/] {escape(_clock_words(clock))}")
+        if space is not None:
+            colour = {"enough": "green", "short": "yellow", "stop": "red"}[space.verdict]
+            console.print(f"    [{colour}]{escape(space.words)}[/]")
+    if not healthy:
+        raise typer.Exit(1)
+
+
+def _clock_words(clock: HostClock) -> str:
+    if clock.offset_s is not None:
+        beyond = f", more than {HOST_LIMIT_S:g} s" if abs(clock.offset_s) > HOST_LIMIT_S else ""
+        return f"{clock.offset_s:+.6f} s against the network's time (chrony){beyond}"
+    if clock.synchronised:
+        error = "" if clock.error_s is None else f", within {clock.error_s:.3f} s by its own word"
+        return f"is set by the network's time{error}"
+    return "is not known to be set" if clock.synchronised is None else "is not set by the network's time"
+
+
+def _offset_words(offset_s: float, clock: str, *, late: bool) -> str:
+    if clock == "uptime":
+        return (
+            f"its clock counts from when it was switched on, {offset_s:+.3f} s from this machine's count: that is as "
+            "it should be, for only a change during a run matters"
+        )
+    words = f"clock {offset_told(offset_s, clock)}"
+    if not late:
+        return words
+    return (
+        f"[yellow]{words}, more than {DEVICE_LIMIT_S:g} s: set it before a run, or the times in its files are wrong "
+        "by that[/]"
+    )
+
+
+def _foresee(data: Path, protocol: Protocol, free_bytes: int, *, simulated: bool) -> Forecast:
+    if not database_path(data).is_file():
+        return forecast(protocol, None, Usage(), None, free_bytes, simulated=simulated)
+    with Store.open(data, create=False) as store:
+        return forecast_of(store, protocol, simulated=simulated)
+
+
+def _record(report: DeviceReport | OrthocaptureError) -> dict[str, Any]:
+    if isinstance(report, OrthocaptureError):
+        return {"ok": False, "error": error_record(report)}
+    return {"ok": not report.problems, **dataclasses.asdict(report)}
+
+
+def _serial_note(who: DeviceIdentity) -> str:
+    """A camera's number over USB may have digits before that of the body, which its photographs state alone."""
+    known = who.kind == "camera" and who.serial
+    return " (as USB states it; its photographs may state its end alone)" if known else ""
+
+
+def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
+    if isinstance(report, OrthocaptureError):
+        console.print(f"[bold red]✗ {escape(name)}[/] {escape(str(report))}")
+        return
+    who = report.identity
+    late = report.clock == "utc" and abs(report.clock_offset_s or 0.0) > DEVICE_LIMIT_S
+    mark = "[bold yellow]!" if report.problems or late else "[bold green]✓"
+    console.print(
+        f"{mark} {escape(name)}[/] {escape(who.model)}, serial {escape(who.serial)}{_serial_note(who)}, "
+        f"{escape(who.firmware)}"
+    )
+    console.print(f"    {escape(who.driver)} {escape(who.driver_version)} at {escape(who.address)}")
+    if report.clock_offset_s is not None:
+        console.print(f"    {_offset_words(report.clock_offset_s, report.clock, late=late)}")
+    if report.free_bytes is not None:
+        console.print(f"    {report.free_bytes / 1e9:.1f} GB free")
+    if report.battery_fraction is not None:
+        console.print(f"    battery {report.battery_fraction:.0%}")
+    for key, value in report.details.items():
+        console.print(f"    {escape(key)}: {escape(value)}")
+    for problem in report.problems:
+        console.print(f"    [yellow]{escape(problem)}[/]")

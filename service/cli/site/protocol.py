@@ -1,0 +1,71 @@
+"""`orthocapture protocol`: check a protocol file, write its schema and its diagram."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from service.cli.common import JsonOption, console, print_json, reporting_errors
+from service.core.documents.protocol_docs import lifecycle_text, schema_text
+from service.core.documents.ways_docs import ways_text
+from service.core.errors import ProtocolError
+from service.core.protocol.models import load_protocol
+from service.core.text.counts import counted
+from service.rig import load_rig
+from service.steps import params_models
+from service.steps.measures import implausible
+
+protocol_app = typer.Typer(name="protocol", help="Check a protocol file before it is used.", no_args_is_help=True)
+
+
+@protocol_app.command("check")
+def check_command(
+    file: Annotated[Path, typer.Argument(help="The protocol file.")],
+    rig: Annotated[Path | None, typer.Option("--rig", help="Check it together with this rig file: stations.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Read a protocol and say everything that is wrong with it, by file, line and field."""
+    with reporting_errors(json):
+        loaded = load_protocol(file, params_models())
+        protocol = loaded.protocol
+        problems = implausible(loaded, None if rig is None else load_rig(rig).section)
+        if problems:
+            listed = "\n".join(f"  {file}:{p.line} {p.field}: {p.message}" for p in problems)
+            raise ProtocolError(
+                f"{len(problems)} of its numbers or names cannot be meant:\n{listed}\n",
+                where=f"{file}:{problems[0].line}",
+                remedy="Correct the measure, its unit or its limit; docs/reference/steps.md lists the measures",
+            )
+        if json:
+            steps = [{"id": s.id, "kind": s.kind, "irreversible": s.irreversible} for s in protocol.steps]
+            print_json({"id": protocol.id, "version": protocol.version, "sha256": loaded.sha256, "steps": steps})
+            return
+        console.print(
+            f"{escape(str(file))} is sound: {protocol.id} {protocol.version}, {counted(len(protocol.steps), 'step')}"
+        )
+        for step in protocol.steps:
+            marks = ", ".join(m for m, on in (("irreversible", step.irreversible), ("signed", step.sign)) if on)
+            console.print(f"  {step.id:<26} {step.kind:<20} {marks}")
+
+
+@protocol_app.command("schema")
+def schema_command() -> None:
+    """Print the JSON Schema of protocol files, for editors."""
+    typer.echo(schema_text(params_models()), nl=False)
+
+
+@protocol_app.command("diagram")
+def diagram_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
+    """Print the state machine of a protocol as a page with Mermaid diagrams."""
+    with reporting_errors():
+        typer.echo(lifecycle_text(load_protocol(file, params_models()).protocol), nl=False)
+
+
+@protocol_app.command("ways")
+def ways_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
+    """Print what can be done about every failure of a protocol's steps, with cost and loss, as a page of tables."""
+    with reporting_errors():
+        typer.echo(ways_text(load_protocol(file, params_models()).protocol), nl=False)

@@ -1,0 +1,175 @@
+"""`orthocapture serve`: the guided screen and the auditor's view, in the browser."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from service.audit.record.starts import record_start
+from service.cli.common import (
+    DEFAULT_DATA,
+    DataOption,
+    JsonOption,
+    console,
+    error_console,
+    print_json,
+    reporting_errors,
+)
+from service.cli.shipped_protocols import shipped_protocols
+from service.core.errors import ConfigurationError
+from service.logs.file_log import file_log
+from service.people.sessions import People
+from service.rig import load_rig
+from service.run_start import signature_copy
+from service.steps import params_models
+from service.store.records import SITE
+from service.store.signatures.log_copy import keep_elsewhere
+from service.store.signatures.signing import checkpoint
+from service.store.store import Store
+from service.web.app import create_app
+from service.web.launch import Launcher
+from service.web.server.connections import ConnectionLimits
+from service.web.server.http import known_proxies, listening, server
+from service.web.server.listener import affordable_connections
+from service.web.server.sparing_log import sparing_log, told
+from service.web.site import Site
+
+_PROTOCOLS = shipped_protocols()
+_LIMITS = ConnectionLimits()
+
+
+def serve_command(
+    rig: Annotated[Path, typer.Option("--rig", help="The rig file: devices and stations of this site.")],
+    data: DataOption = DEFAULT_DATA,
+    protocols: Annotated[
+        Path,
+        typer.Option(
+            "--protocols", help="Folder with the protocols to offer.", show_default="those that come with it"
+        ),
+    ] = _PROTOCOLS,
+    host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", help="0 takes a free one.", min=0, max=65535)] = 8000,
+    tls_certificate: Annotated[Path | None, typer.Option("--tls-certificate", help="PEM, chain included.")] = None,
+    tls_key: Annotated[Path | None, typer.Option("--tls-key", help="PEM file of its private key.")] = None,
+    insecure_lan: Annotated[
+        bool, typer.Option("--insecure-lan", help="Other machines without TLS: passwords can be read on the way.")
+    ] = False,
+    name: Annotated[
+        list[str] | None, typer.Option("--name", help="Further host name by which browsers reach this machine.")
+    ] = None,
+    idle_lock_min: Annotated[
+        float, typer.Option("--idle-lock-min", help="Minutes without a touch until the PIN is asked for.", min=0.05)
+    ] = 10.0,
+    trusted_proxy: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--trusted-proxy",
+            help="Address of a proxy before this one, whose word on where requests come from counts.",
+        ),
+    ] = None,
+    connections: Annotated[
+        int, typer.Option("--connections", help="Most connections at once, in all.", min=1)
+    ] = _LIMITS.in_all,
+    address_connections: Annotated[
+        int, typer.Option("--address-connections", help="Most connections at once from one address.", min=1)
+    ] = _LIMITS.per_address,
+    client_wait_s: Annotated[
+        float,
+        typer.Option(
+            "--client-wait-s", help="Seconds that a client may take to send a request, and to go on reading.", min=0.1
+        ),
+    ] = _LIMITS.wait_s,
+    json: JsonOption = False,
+) -> None:
+    """Serve the guided screen and the audit. Runs go on when this ends; stop them on the screen."""
+    with reporting_errors(json):
+        tls = _tls(tls_certificate, tls_key)
+        lan = _leaves_this_machine(host)
+        if lan and tls is None and not insecure_lan:
+            raise ConfigurationError(
+                f"{host} is not this machine alone, and there is no TLS",
+                where="--host",
+                remedy="Give --tls-certificate and --tls-key, or say --insecure-lan in a network you trust",
+            )
+        rig_file = load_rig(rig)
+        proxies = known_proxies(trusted_proxy or [])
+        limits = ConnectionLimits(affordable_connections(connections), address_connections, client_wait_s)
+        with (
+            listening(host, port, limits, proxies) as listener,
+            Store.open(data) as store,
+            sparing_log() as log,
+            file_log(data, "web", admits=told),
+        ):
+            address = f"{'https' if tls else 'http'}://{_shown(host)}:{listener.getsockname()[1]}"
+            people = People(store)
+            site = Site(
+                data=data.resolve(),
+                rig=rig_file,
+                protocols=protocols,
+                store=store,
+                people=people,
+                launcher=Launcher(data.resolve(), store),
+                secure=tls is not None or not lan,
+                idle_lock_s=60 * idle_lock_min,
+                hosts=_names(host, name or []),
+            )
+            record_start(store, rig_file, site.protocol_files(), address)
+            link = people.first_link()
+            checkpoint(store, SITE)
+            keep_elsewhere(data, signature_copy(rig_file), error_console.print)
+            http = server(create_app(site), listener, proxies, tls, log)
+            with http.capture_signals():
+                _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
+                # The numerics behind steps and protocols take seconds to load: while the first page is being read.
+                threading.Thread(target=params_models, daemon=True).start()
+                http.run(sockets=[listener])
+            checkpoint(store, SITE)
+            keep_elsewhere(data, signature_copy(rig_file), error_console.print)
+
+
+def _announce(address: str, set_up: str, *, json: bool) -> None:
+    if json:
+        print_json({"url": address, "set_up": set_up})
+        return
+    console.print(f"orthocapture is ready at {escape(address)}")
+    if set_up:
+        console.print(f"First set-up, once and within a day: {escape(set_up)}")
+
+
+def _tls(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None:
+    if (certificate is None) != (key is None):
+        raise ConfigurationError("TLS needs a certificate and its key", where="--tls-certificate, --tls-key")
+    if certificate is None or key is None:
+        return None
+    for path in (certificate, key):
+        if not path.is_file():
+            raise ConfigurationError("the file for TLS is not there", where=str(path))
+    return certificate, key
+
+
+def _leaves_this_machine(host: str) -> bool:
+    try:
+        return not ip_address(host).is_loopback
+    except ValueError:
+        return host != "localhost"
+
+
+def _names(host: str, more: list[str]) -> tuple[str, ...]:
+    own = {"127.0.0.1", "localhost", "[::1]", *more}
+    if host in ("0.0.0.0", "::"):
+        own |= {socket.gethostname(), socket.getfqdn()}
+    else:
+        own.add(_shown(host))
+    return tuple(sorted(own))
+
+
+def _shown(host: str) -> str:
+    if host in ("0.0.0.0", "::"):
+        return socket.gethostname()
+    return f"[{host}]" if ":" in host else host

@@ -1,0 +1,1 @@
+"""The arm: forward and inverse kinematics, and the correction of its systematic errors."""

@@ -1,0 +1,151 @@
+"""The systematic part of an arm's error: small DH deltas and periodic gear errors, and poses corrected by them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from service.compute.arm.kinematics import ArmModel, arm_model, chain, dh_jacobian, pose_gap
+from service.core.errors import DataError
+from service.core.geometry import Array
+
+HARMONICS = np.arange(1, 11)  # periods a revolution; faster ones cannot be told from noise with tens of poses
+# What arms of this kind are built to (a, d, α, θ of a joint); only the ratios matter, the scale is estimated.
+DH_TOLERANCE = np.array([0.2e-3, 0.2e-3, np.radians(0.015), np.radians(0.04)])
+GEAR_TOLERANCE_RAD = np.radians(0.01)  # of one harmonic
+N_DH = 24
+N_GEAR = 6 * 2 * len(HARMONICS)
+_MODEL_GAP_M, _MODEL_GAP_RAD = 0.02, np.radians(3.0)
+
+
+_PLACE = "arm_correction of the hand-eye calibration"
+_REMEDY = "Calibrate hand and eye again"
+
+
+@dataclass(frozen=True, slots=True)
+class ArmCorrection:
+    """Where the flange is, beside where the controller says it is, as a function of the joints.
+
+    Attributes:
+        arm: name of the model whose nominal parameters these are added to.
+        dh_deltas: (6, 4) added to a, d (metres), α, θ (radians) of each joint.
+        gear_cos_rad: (6, H) amplitudes of cos(k q), k = 1 … H, added to each joint's angle.
+        gear_sin_rad: (6, H) of sin(k q).
+        observed: (6,) share of each joint's error that the images determine, 0 … 1 (1 - posterior / prior variance,
+            over the terms in use).
+    """
+
+    arm: str
+    dh_deltas: Array
+    gear_cos_rad: Array
+    gear_sin_rad: Array
+    observed: Array
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain data for a file or an event."""
+        return {
+            "model": "dh_deltas + gear harmonics" if self.gear_cos_rad.any() else "dh_deltas",
+            "arm": self.arm,
+            "dh_deltas": self.dh_deltas.tolist(),
+            "gear_cos_rad": self.gear_cos_rad.tolist(),
+            "gear_sin_rad": self.gear_sin_rad.tolist(),
+            "observed": self.observed.tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, record: Mapping[str, Any]) -> ArmCorrection:
+        """What `as_json` wrote.
+
+        Raises:
+            DataError: a field is missing or has another shape.
+        """
+        try:
+            found = cls(
+                str(record["arm"]),
+                np.array(record["dh_deltas"], dtype=np.float64),
+                np.array(record["gear_cos_rad"], dtype=np.float64),
+                np.array(record["gear_sin_rad"], dtype=np.float64),
+                np.array(record["observed"], dtype=np.float64),
+            )
+        except (KeyError, ValueError, TypeError, OverflowError) as error:
+            raise DataError(f"not an arm correction: {error!r}", where=_PLACE, remedy=_REMEDY) from error
+        if (
+            found.dh_deltas.shape != (6, 4)
+            or found.gear_cos_rad.ndim != 2
+            or found.gear_cos_rad.shape[0] != 6
+            or found.gear_cos_rad.shape != found.gear_sin_rad.shape
+        ):
+            raise DataError("not an arm correction: shapes do not belong together", where=_PLACE, remedy=_REMEDY)
+        return found
+
+
+def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction: ArmCorrection) -> Array:
+    """Poses as the arm really took them: the reported ones times what the corrected model differs from the nominal.
+
+    Args:
+        joints_rad: (6,) or (N, 6), as the controller read them.
+        T_base_flange: (4, 4) or (N, 4, 4), as the controller reported them.
+        correction: from a hand-eye calibration of the same arm.
+
+    Returns:
+        poses of the shape of `T_base_flange`.
+
+    Raises:
+        DataError: joints and poses do not belong together, or not to this arm.
+    """
+    joints, poses = np.asarray(joints_rad, dtype=np.float64), np.asarray(T_base_flange, dtype=np.float64)
+    if poses.ndim == 2:
+        return corrected_T_base_flange(joints[None], poses[None], correction)[0]
+    arm = arm_model(correction.arm)
+    check_arm(arm, joints, poses)
+    nominal = arm.joint_values(joints)
+    k = np.arange(1, correction.gear_cos_rad.shape[1] + 1)
+    phase = joints[:, :, None] * k
+    gears = np.sum(correction.gear_cos_rad * np.cos(phase) + correction.gear_sin_rad * np.sin(phase), axis=2)
+    real = nominal + correction.dh_deltas
+    real[:, :, 3] += gears
+    before, after = chain(nominal)[:, 6], chain(real)[:, 6]
+    R_t = np.swapaxes(before[:, :3, :3], 1, 2)
+    gap = np.broadcast_to(np.eye(4), before.shape).copy()
+    gap[:, :3, :3] = R_t @ after[:, :3, :3]
+    gap[:, :3, 3] = np.einsum("nij,nj->ni", R_t, after[:, :3, 3] - before[:, :3, 3])
+    return poses @ gap
+
+
+def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
+    """Refuse joints that are another arm's, or poses of a tool instead of the flange.
+
+    Raises:
+        DataError: forward kinematics and reported poses are far apart.
+    """
+    distance_m, angle_rad = pose_gap(arm, joints_rad, T_base_flange)
+    if distance_m > _MODEL_GAP_M or angle_rad > _MODEL_GAP_RAD:
+        raise DataError(
+            f"the poses are {1e3 * distance_m:.0f} mm and {np.degrees(angle_rad):.1f}° off what the joints of a "
+            f"{arm.name} give",
+            remedy="check the arm's model, that the poses are the flange's (tool centre point zero), and radians",
+        )
+
+
+def correction_design(arm: ArmModel, joints_rad: Array) -> Array:
+    """(N, 6, 24 + 120) derivative of the flange's pose with respect to all parameters, each over its tolerance.
+
+    Columns: DH deltas joint after joint (a, d, α, θ), then for each joint cos(k q), sin(k q), k = 1 … 10.
+    """
+    J = dh_jacobian(chain(arm.joint_values(joints_rad)))
+    phase = joints_rad[:, :, None] * HARMONICS
+    waves = np.stack([np.cos(phase), np.sin(phase)], axis=2)  # (N, 6, 2, H)
+    gears = J[:, :, 3::4, None, None] * waves[:, None]  # (N, 6 rows, 6 joints, 2, H)
+    dh = J * np.tile(DH_TOLERANCE, 6)
+    return np.concatenate([dh, gears.reshape(len(J), 6, -1) * GEAR_TOLERANCE_RAD], axis=2)
+
+
+def correction_of(arm: ArmModel, scaled: Array, observed: Array) -> ArmCorrection:
+    """The correction of scaled parameters (24 + 120,) as `correction_design` orders them."""
+    gears = scaled[N_DH:].reshape(6, 2, len(HARMONICS)) * GEAR_TOLERANCE_RAD
+    return ArmCorrection(
+        arm.name, scaled[:N_DH].reshape(6, 4) * DH_TOLERANCE, gears[:, 0].copy(), gears[:, 1].copy(), observed
+    )

@@ -1,0 +1,53 @@
+"""Reads joint angles recorded with images: CSV image,q1,…,q6 in radians."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from service.core.errors import DataError
+from service.core.geometry import Array
+from service.core.text.file_text import csv_rows
+
+_HEADER = ("image", "q1", "q2", "q3", "q4", "q5", "q6")
+_LARGEST_RAD = 4 * np.pi  # no arm turns further; degrees do
+
+
+def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
+    """Joints (6,) in radians of each of these images.
+
+    Raises:
+        DataError: the file is missing or malformed (with file:line), in degrees, or lacks an image.
+    """
+    rows = csv_rows(path)
+    header = tuple(cell.strip() for cell in next(rows, (1, []))[1])
+    if header != _HEADER:
+        raise DataError(
+            f"the first line is {','.join(header)!r}", where=f"{path}:1", remedy=f"it must be {','.join(_HEADER)}"
+        )
+    joints: dict[str, Array] = {}
+    for line, row in rows:
+        if not any(cell.strip() for cell in row):
+            continue
+        where = f"{path}:{line}"
+        try:
+            values = np.array([float(cell) for cell in row[1:]])
+        except ValueError:
+            raise DataError("a field is not a number", where=where, remedy="correct the line") from None
+        if values.shape != (6,) or not np.isfinite(values).all():
+            raise DataError("not six finite numbers after the name", where=where, remedy="correct the line")
+        if np.abs(values).max() > _LARGEST_RAD:
+            raise DataError(f"{np.abs(values).max():.0f} rad is no joint angle", where=where, remedy="write radians")
+        if row[0].strip() in joints:
+            raise DataError(f"image {row[0].strip()} has two rows", where=where, remedy="remove one of them")
+        joints[row[0].strip()] = values
+    missing = [image for image in images if image not in joints]
+    if missing:
+        raise DataError(
+            f"{len(missing)} images have no joints: {', '.join(missing[:5])}",
+            where=str(path),
+            remedy="add their rows, or leave the images out",
+        )
+    return {image: joints[image] for image in images}

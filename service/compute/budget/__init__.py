@@ -1,1 +1,0 @@
-"""What an error is made of, and whether independent measurements agree with what was predicted."""

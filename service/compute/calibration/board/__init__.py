@@ -1,0 +1,1 @@
+"""Calibration boards and their corners in images."""

@@ -1,0 +1,245 @@
+"""Why a board is not found: found out by trying what people confuse, counts, printing, dictionary, frame."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from service.compute.calibration.board.board import Board, Grey
+from service.core.geometry import Array
+
+_WIDTH = 1200  # px, of the copies on which it is tried
+_CHARUCO_WIDTH = 1600
+_LEAST = 3  # corners a side that a board must show to be one
+_FEWEST_MARKERS = 4
+_BORDER = 1.6  # distances of corners between the last one seen and the frame: the next one would be outside
+_FEWEST_CORNERS = 8
+_DICTIONARIES = tuple(
+    sorted(
+        (name for name in dir(cv2.aruco) if name.startswith("DICT_") and "APRILTAG" not in name),
+        key=lambda name: (name.rsplit("_", 1)[0], len(name), name),
+    )
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What an image shows instead of the board that was described.
+
+    Attributes:
+        words: for people, without a full stop.
+        remedy: what to do.
+        of_board: the description is wrong, for every image; else it is this image alone.
+    """
+
+    words: str
+    remedy: str
+    of_board: bool
+
+
+def diagnose(image: Grey, board: Board) -> Diagnosis | None:
+    """What may be wrong where `find_board` finds nothing; None where nothing that was tried explains it.
+
+    Takes a fraction of a second for a checkerboard, and some seconds for a ChArUco board.
+    """
+    if board.pattern == "checkerboard":
+        return _checkerboard(image, board)
+    return _charuco(image, board) if board.pattern == "charuco" else _circles(image, board)
+
+
+def wrong_board(images: Sequence[Grey], board: Board) -> Diagnosis | None:
+    """The mistake in the board's description on which two of these images agree; None when any shows the board.
+
+    One image alone may show a board that is covered in part, unless there is no other.
+    """
+    said: list[Diagnosis] = []
+    for image in images:
+        if _is_seen(image, board):
+            return None
+        found = diagnose(image, board)
+        if found is not None and found.of_board:
+            if found in said or len(images) == 1:
+                return found
+            said.append(found)
+    return None
+
+
+def _is_seen(image: Grey, board: Board) -> bool:
+    if board.pattern == "checkerboard":
+        seen = _seen(_small(image, _WIDTH))
+        return seen is not None and sorted(seen[0]) == sorted((board.columns, board.rows))
+    if board.pattern == "charuco":
+        return _corners(_small(image, _CHARUCO_WIDTH), board) >= _FEWEST_CORNERS
+    size = (board.columns, board.rows)
+    return cv2.findCirclesGrid(_small(image, _WIDTH), size, flags=cv2.CALIB_CB_ASYMMETRIC_GRID)[0]
+
+
+def _small(image: Grey, width: int) -> Grey:
+    factor = width / max(image.shape)
+    if factor >= 1:
+        return image
+    size = (round(image.shape[1] * factor), round(image.shape[0] * factor))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+# --- checkerboard -----------------------------------------------------------------------------------------
+
+
+def _seen(image: Grey) -> tuple[tuple[int, int], Array] | None:
+    """Columns and rows of the largest grid of corners that is seen, and the corners (rows, columns, 2)."""
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+    found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (_LEAST, _LEAST), flags)
+    if not found:
+        return None
+    rows, columns = meta.shape[:2]
+    return (columns, rows), np.asarray(corners, dtype=np.float64).reshape(rows, columns, 2)
+
+
+def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
+    small = _small(image, _WIDTH)
+    seen = _seen(small)
+    wanted, given = sorted((board.columns, board.rows)), f"{board.columns} × {board.rows}"
+    if seen is None:
+        if _best_dictionary(_small(image, _CHARUCO_WIDTH))[1] >= _FEWEST_MARKERS:
+            return Diagnosis("markers lie in the squares: it is a ChArUco board", "Give --pattern charuco", True)
+        return None
+    (columns, rows), corners = seen
+    found = sorted((columns, rows))
+    if found == wanted:
+        return None  # it is there; find_board's own reason stands
+    if _at_frame(corners, small.shape) and all(a <= b for a, b in zip(found, wanted, strict=True)):
+        return Diagnosis(
+            f"the board is cut by the frame: {columns} × {rows} of its {given} inner corners are seen",
+            "The whole board must be in the image",
+            False,
+        )
+    # The board has the order that the description has.
+    first, second = found if board.columns <= board.rows else found[::-1]
+    words = f"the board has {first} × {second} inner corners, not {given}"
+    if found == [wanted[0] - 1, wanted[1] - 1]:
+        words += ", which counts its squares"
+    return Diagnosis(words, f"Inner corners are where four squares meet: give {first}x{second}", True)
+
+
+def _at_frame(corners: Array, shape: tuple[int, ...]) -> bool:
+    """Whether the next row or column of corners would lie outside of the image."""
+    spacing = max(
+        float(np.median(np.linalg.norm(np.diff(corners, axis=0), axis=2))),
+        float(np.median(np.linalg.norm(np.diff(corners, axis=1), axis=2))),
+    )
+    flat = corners.reshape(-1, 2)
+    gap = min(float(flat.min()), float((np.array(shape[1::-1]) - flat).min()))
+    return gap < _BORDER * spacing
+
+
+# --- ChArUco ----------------------------------------------------------------------------------------------
+
+
+def _charuco(image: Grey, board: Board) -> Diagnosis | None:
+    small = _small(image, _CHARUCO_WIDTH)
+    name, best = _best_dictionary(small)
+    own = _markers(small, board.dictionary)
+    if best >= _FEWEST_MARKERS and best > 2 * own:
+        return Diagnosis(
+            f"the markers are of {name}, not of {board.dictionary}",
+            f"Give --dictionary {name}",
+            True,
+        )
+    if own < _FEWEST_MARKERS:
+        seen = _seen(_small(image, _WIDTH))
+        if seen is not None and min(seen[0]) > _LEAST:
+            return Diagnosis("a board without markers is seen", "Give --pattern checkerboard", True)
+        return None
+    now = _corners(small, board)
+    for other, words, remedy in _variants(board):
+        if _corners(small, other) >= max(_FEWEST_CORNERS, 2 * now):
+            return Diagnosis(words, remedy, True)
+    return None
+
+
+def _variants(board: Board) -> list[tuple[Board, str, str]]:
+    """Boards that are taken for one another, with words and what to give."""
+    c, r = board.columns, board.rows
+    counts = (
+        ((c, r), ""),
+        ((r, c), "columns and rows are swapped"),
+        ((c - 1, r - 1), "squares were counted, not inner corners"),
+        ((r - 1, c - 1), "squares were counted, and columns and rows are swapped"),
+    )
+    out: list[tuple[Board, str, str]] = []
+    for (columns, rows), words in counts:
+        for legacy in (board.legacy, not board.legacy):
+            if min(columns, rows) < _LEAST or ((columns, rows) == (c, r) and legacy == board.legacy):
+                continue
+            other = dataclasses.replace(board, columns=columns, rows=rows, legacy=legacy)
+            printed = "" if legacy == board.legacy else _LEGACY_WORDS[legacy]
+            give = "" if (columns, rows) == (c, r) else f"--board {columns}x{rows}"
+            switch = "" if legacy == board.legacy else "--legacy" if legacy else "no --legacy"
+            out.append(
+                (
+                    other,
+                    ", and ".join(part for part in (words, printed) if part),
+                    "Give " + " and ".join(part for part in (give, switch) if part),
+                )
+            )
+    return out
+
+
+_LEGACY_WORDS = {
+    True: "it is printed as OpenCV did before version 4.6",
+    False: "it is printed as OpenCV does since version 4.6",
+}
+
+
+def _corners(image: Grey, board: Board) -> int:
+    """Corners that lie on one plane as this board has them."""
+    try:
+        found, identifiers, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(image)
+    except cv2.error:
+        return 0
+    if identifiers is None or len(identifiers) < 4:  # pyright: ignore[reportUnnecessaryComparison]
+        return 0
+    points = board.points()[np.asarray(identifiers, dtype=np.int64).ravel(), :2]
+    pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    _, inlier = cv2.findHomography(points, pixels, cv2.RANSAC, 3.0)
+    return 0 if inlier is None else int(np.count_nonzero(inlier))  # pyright: ignore[reportUnnecessaryComparison]
+
+
+def _markers(image: Grey, dictionary: str) -> int:
+    identifier = getattr(cv2.aruco, dictionary, None)
+    if not isinstance(identifier, int):
+        return 0
+    found = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(identifier)).detectMarkers(image)[1]
+    return 0 if found is None else len(np.unique(found))  # pyright: ignore[reportUnnecessaryComparison]
+
+
+def _best_dictionary(image: Grey) -> tuple[str, int]:
+    """The dictionary of most markers in the image; of those with as many, the smallest."""
+    best = ("", 0)
+    for name in _DICTIONARIES:
+        if (count := _markers(image, name)) > best[1]:
+            best = (name, count)
+    return best
+
+
+# --- circles ----------------------------------------------------------------------------------------------
+
+
+def _circles(image: Grey, board: Board) -> Diagnosis | None:
+    small = _small(image, _WIDTH)
+    if cv2.findCirclesGrid(small, (board.rows, board.columns), flags=cv2.CALIB_CB_ASYMMETRIC_GRID)[0]:
+        return Diagnosis(
+            "columns and rows are swapped",
+            f"Give --board {board.rows}x{board.columns}: the circles of one row, then the rows",
+            True,
+        )
+    for size in ((board.columns, board.rows), (board.rows, board.columns)):
+        if cv2.findCirclesGrid(small, size, flags=cv2.CALIB_CB_SYMMETRIC_GRID)[0]:
+            return Diagnosis(
+                "the circles lie in a symmetric grid", "Print an asymmetric one; symmetric ones are not read", True
+            )
+    return None

@@ -1,0 +1,163 @@
+"""A board that the image shows in part: its corners are looked for where the arm's pose says that they are.
+
+A checkerboard that is cut by the frame, or covered in part, cannot be counted. Where camera, mount and board are
+known well enough to say where each corner lies to a fraction of a square, it need not be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.calibration.board.board import Board, BoardView, Grey, half_window, refine_corners
+from service.compute.calibration.board.images import BoardImage
+from service.compute.calibration.board_poses.knowledge import BoardKnowledge
+from service.compute.calibration.intrinsics.adjustment import fit_pose, pose_matrix, start_pose
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, apply, inverse
+
+_FEWEST = 24  # corners
+_FEWEST_LINES = 3  # rows, and columns
+_NEAR = 0.25  # of a square: by so much the board may lie elsewhere; from half a square on a corner has another name
+_DOUBT, _DRAWS = 0.5, 32
+_CONTRAST = 0.25  # least difference of dark and bright squares at a corner, over that of the whole board
+_OUTLIER = 4.0  # times the median distance from the fit
+_OUTLIER_FLOOR_PX = 0.3
+
+
+def find_part(image: Grey, board: Board, known: BoardKnowledge, T_base_camera: Transform) -> BoardView:
+    """The corners of a checkerboard that the image shows, told apart by where they must lie.
+
+    Each is refined from where it is expected and stays only if it is a crossing of four squares of the right colours
+    and fits one pose of the board with the others; all of them together may be off by a quarter of a square.
+
+    Args:
+        image: grey, 8 bits.
+        board: a checkerboard.
+        known: camera, mount and board, from other images.
+        T_base_camera: of this image, by the arm's pose and the mount.
+
+    Raises:
+        ComputeError: too little of the board, or not where it must be.
+    """
+    T_camera_board = inverse(T_base_camera) @ known.T_base_board
+    points = apply(T_camera_board, board.points())
+    if not (points[:, 2] > 0).all():
+        raise ComputeError("the board lies behind the camera")
+    expected = known.camera.project(points)
+    grid = expected.reshape(board.rows, board.columns, 2)
+    spacing = float(np.median(np.linalg.norm(np.diff(grid, axis=1), axis=2)))
+    if _doubt_px(board, known, T_base_camera) > _DOUBT * spacing:
+        raise ComputeError("camera, mount and board are not known to half a square yet")
+    half = half_window(spacing, board.reach())
+    inside = ((expected > half + 1) & (expected < np.array(image.shape[::-1]) - 2 - half)).all(axis=1)
+    which = np.flatnonzero(inside)
+    if len(which) < _FEWEST:
+        raise _too_little(len(which))
+    found, good = refine_corners(image, expected[which], half)
+    good &= _crossings(image, grid, which, found, dark_first=(board.columns + board.rows) % 2 == 1)
+    which, found = which[good], found[good]
+    if len(which) < _FEWEST:
+        raise _too_little(len(which))
+    shift = np.linalg.norm(np.median(found - expected[which], axis=0))
+    if shift > _NEAR * spacing:
+        raise ComputeError(
+            f"the board is {shift / spacing:.2f} squares from where it must be: which corner is which?"
+        )
+    view = _one_plane(BoardView(which, found), board, known)
+    rows, columns = np.divmod(view.indices, board.columns)
+    if len(view.indices) < _FEWEST or min(len(set(rows)), len(set(columns))) < _FEWEST_LINES:
+        raise _too_little(len(view.indices))
+    return view
+
+
+def with_parts(
+    images: Sequence[BoardImage],
+    greys: Sequence[Grey | None],
+    board: Board,
+    known: BoardKnowledge,
+    T_base_flange: Array,
+) -> tuple[BoardImage, ...]:
+    """The images, those without a whole board searched again for a part of it; reasons say what became of that.
+
+    Args:
+        images: (N) as from `find_boards`.
+        greys: (N) of those without a view; None for the others.
+        board: a checkerboard.
+        known: from the images with a view.
+        T_base_flange: (N, 4, 4).
+    """
+    out: list[BoardImage] = []
+    for image, grey, flange in zip(images, greys, T_base_flange, strict=True):
+        if image.view is not None or grey is None or image.size != (known.camera.width, known.camera.height):
+            out.append(image)
+            continue
+        try:
+            view = find_part(grey, board, known, flange @ known.T_flange_camera)
+            out.append(replace(image, view=view, reason=""))
+        except ComputeError as error:
+            out.append(replace(image, reason=f"{image.reason}; in part: {error.what}"))
+    return tuple(out)
+
+
+def _too_little(count: int) -> ComputeError:
+    return ComputeError(f"only {count} corners of the board can be seen", remedy="more of the board must be visible")
+
+
+def _doubt_px(board: Board, known: BoardKnowledge, T_base_camera: Transform) -> float:
+    """How far the corners may lie from where they are expected, px: the largest of some draws of what is possible."""
+    hands, boards, _, _ = known.draws(_DRAWS)
+    flange = T_base_camera @ inverse(known.T_flange_camera)
+    ends = board.points()[[0, board.columns - 1, -board.columns, -1]]
+    expected = known.camera.project(apply(inverse(T_base_camera) @ known.T_base_board, ends))
+    off = [
+        np.linalg.norm(known.camera.project(apply(inverse(flange @ X) @ B, ends)) - expected, axis=1).mean()
+        for X, B in zip(hands, boards, strict=True)
+    ]
+    return float(np.max(off))
+
+
+def _crossings(
+    image: Grey, grid: Array, which: NDArray[np.int64], found: Array, *, dark_first: bool
+) -> NDArray[np.bool_]:
+    """(M,) corners where two dark squares meet two bright ones, as everywhere on the board.
+
+    With `dark_first` the board is of the kind whose first square is dark (`find_board` numbers it so): a grid that is
+    off by one square has the wrong colours.
+    """
+    columns = grid.shape[1]
+    step_x, step_y = np.gradient(grid, axis=1).reshape(-1, 2)[which], np.gradient(grid, axis=0).reshape(-1, 2)[which]
+
+    def at(x: float, y: float) -> Array:
+        places = (found + x * step_x + y * step_y).round().astype(int)
+        u, v = np.clip(places, 0, np.array(image.shape[::-1]) - 1).T
+        return image[v, u].astype(np.float64)
+
+    first, second = (at(-0.3, -0.3), at(0.3, 0.3)), (at(-0.3, 0.3), at(0.3, -0.3))
+    difference = (first[0] + first[1] - second[0] - second[1]) / 2
+    difference = difference * np.where((which // columns + which % columns) % 2, -1, 1)
+    usual = float(np.median(difference))
+    if dark_first and usual > 0:
+        return np.zeros(len(which), dtype=np.bool_)
+    alike = np.maximum(np.abs(first[0] - first[1]), np.abs(second[0] - second[1])) < np.abs(difference)
+    return (difference * np.sign(usual) > _CONTRAST * abs(usual)) & alike & (abs(usual) > 8)
+
+
+def _one_plane(view: BoardView, board: Board, known: BoardKnowledge) -> BoardView:
+    """Without the corners that do not fit the board's pose with the others."""
+    points = board.points()
+    for _ in range(3):
+        pose, _ = fit_pose(view, points, known.camera, start_pose(view, points, known.camera))
+        off = np.linalg.norm(_reprojected(view, points, known, pose) - view.corners, axis=1)
+        good = off < max(_OUTLIER * float(np.median(off)), _OUTLIER_FLOOR_PX)
+        if good.all() or good.sum() < _FEWEST:
+            break
+        view = BoardView(view.indices[good], view.corners[good])
+    return view
+
+
+def _reprojected(view: BoardView, points: Array, known: BoardKnowledge, pose: Array) -> Array:
+    return known.camera.project(apply(pose_matrix(pose), points[view.indices]))

@@ -1,0 +1,1 @@
+"""Where to put the camera for a calibration: candidates, their information, and the choice."""

@@ -1,0 +1,258 @@
+"""The choice of board poses: the image covered, and the camera and its mount determined as well as they can be.
+
+Greedy on the linearised problems, as optimal designs are found: first the poses that reach new cells of the image,
+then those that lower the predicted variances most. Each later pick looks at a random part of what is open
+("stochastic greedy", Mirzasoleiman et al., "Lazier than lazy greedy", AAAI 2015), which also keeps the poses apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board_poses.candidates import Candidates, expected_pixels
+from service.compute.calibration.board_poses.information import (
+    hand_eye_information,
+    inverse_of,
+    lens_field,
+    lens_information,
+    lens_prior,
+    uncertainty_mm,
+)
+from service.compute.calibration.board_poses.knowledge import BoardKnowledge
+from service.compute.calibration.intrinsics.estimate import COVERAGE_GRID, coverage_map_of
+from service.core.geometry import Array, Transform, inverse
+
+_CELLS = COVERAGE_GRID[0] * COVERAGE_GRID[1]
+_CELL_SHARE = 0.8  # of a cell's sides: a corner nearer to its edge may turn out to lie in the next one
+_LEVER_M = 0.7  # from the camera to what it looks at
+_OPEN = 50  # candidates that a later pick looks at
+_TRIED = 40  # of the best ones, for one that the arm can take
+
+
+@dataclass(frozen=True, slots=True)
+class Aims:
+    """What the images are for, and what is wanted of them."""
+
+    intrinsics: bool = True
+    hand_eye: bool = True
+    coverage: float = 0.97  # share of the image's cells
+    corner_sigma_px: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What a set of images will come to.
+
+    Attributes:
+        images: how many.
+        coverage: share of the image's cells with a corner.
+        coverage_map: (8, 12) corners in each cell.
+        uncertainty_mm: of a projected point at the board's distance, worst in the image; NaN where the images do not
+            determine the camera.
+        tilt_deg: largest tilt of the board.
+        rotation_spread_deg: largest rotation between two images.
+        hand_eye_sigma_mm, hand_eye_sigma_deg: of T_flange_camera.
+    """
+
+    images: int
+    coverage: float
+    coverage_map: NDArray[np.int64]
+    uncertainty_mm: float
+    tilt_deg: float
+    rotation_spread_deg: float
+    hand_eye_sigma_mm: float
+    hand_eye_sigma_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """Images that are there, or decided: T_base_camera (N, 4, 4) and the pixels of their corners (N) (M, 2)."""
+
+    T_base_camera: Array
+    pixels: tuple[Array, ...] = ()
+
+    def plus(self, poses: Array, pixels: Sequence[Array]) -> Taken:
+        """With further ones."""
+        return Taken(np.concatenate([self.T_base_camera, poses.reshape(-1, 4, 4)]), (*self.pixels, *pixels))
+
+
+NOTHING = Taken(np.zeros((0, 4, 4)))
+
+
+def choose_poses(
+    candidates: Candidates,
+    count: int,
+    known: BoardKnowledge,
+    board: Board,
+    aims: Aims,
+    *,
+    taken: Taken = NOTHING,
+    feasible: Callable[[Transform], bool] = lambda _T: True,
+    enough: Callable[[Prediction], bool] | None = None,
+    seed: int = 0,
+) -> Array:
+    """Up to `count` of the candidates' poses (K, 4, 4), in the order of what they bring.
+
+    Args:
+        candidates: to choose from.
+        count: at most.
+        known: where board and camera are.
+        board: what is seen.
+        aims: for what.
+        taken: images that count already.
+        feasible: whether the arm can go there; asked for the best only.
+        enough: judged after each pose; no more are chosen once it says so.
+        seed: of the random part of later picks.
+    """
+    rng = np.random.default_rng([seed, 0x9A5E])
+    worth = _Worth(known, board, aims)
+    cells = _cells(candidates.pixels, known, _CELL_SHARE)
+    covered = _covered(taken.pixels, known)
+    gains = worth.gains(candidates.T_base_camera)
+    so_far = worth.start(taken.T_base_camera)
+    open_ = np.ones(len(cells), dtype=bool)
+    chosen: list[int] = []
+    while len(chosen) < count and open_.any():
+        fresh = (cells & ~covered).sum(axis=1)
+        wanted = covered.mean() < aims.coverage and bool((fresh[open_] > 0).any())
+        pool = np.flatnonzero(open_)
+        if not wanted and len(pool) > _OPEN:
+            pool = rng.choice(pool, _OPEN, replace=False)
+        cost = worth.cost(so_far, gains, pool)
+        order = np.lexsort((cost, -fresh[pool])) if wanted else np.argsort(cost)
+        best = -1
+        for k in pool[order[:_TRIED]].tolist():
+            if feasible(candidates.T_base_camera[k]):
+                best = k
+                break
+            open_[k] = False
+        if best < 0:
+            continue
+        open_[best] = False
+        chosen.append(best)
+        covered |= cells[best]
+        so_far = worth.plus(so_far, gains, best)
+        if enough is not None and enough(_of_chosen(candidates, chosen, known, board, aims, taken)):
+            break
+    return candidates.T_base_camera[chosen]
+
+
+def _of_chosen(
+    candidates: Candidates, chosen: list[int], known: BoardKnowledge, board: Board, aims: Aims, taken: Taken
+) -> Prediction:
+    more = candidates.take(np.array(chosen, dtype=np.int64))
+    return predict(taken.plus(more.T_base_camera, list(more.pixels)), known, board, aims)
+
+
+def as_taken(known: BoardKnowledge, board: Board, T_base_camera: Array) -> Taken:
+    """Poses as if their images were there, the board seen where it is expected."""
+    poses = T_base_camera.reshape(-1, 4, 4)
+    return Taken(poses, tuple(expected_pixels(known, board, poses)))
+
+
+def predict(taken: Taken, known: BoardKnowledge, board: Board, aims: Aims) -> Prediction:
+    """What images of these poses will come to."""
+    counts = _counts(taken.pixels, known)
+    boards = np.array([inverse(T) @ known.T_base_board for T in taken.T_base_camera]).reshape(-1, 4, 4)
+    worst_mm = uncertainty_mm(boards, known.camera, board, aims.corner_sigma_px) if len(boards) >= 3 else np.nan
+    sigma_mm = sigma_deg = np.nan
+    if len(boards) >= 3:
+        information = hand_eye_information(taken.T_base_camera, known, board, aims.corner_sigma_px).sum(axis=0)
+        covariance = inverse_of(information[None])[0]
+        sigma_mm = 1e3 * float(np.sqrt(np.trace(covariance[:3, :3])))
+        sigma_deg = float(np.degrees(np.sqrt(np.trace(covariance[3:6, 3:6]))))
+    tilts = np.degrees(np.arccos(np.clip(np.abs(boards[:, 2, 2]), 0, 1)))
+    return Prediction(
+        images=len(boards),
+        coverage=float(np.count_nonzero(counts)) / counts.size,
+        coverage_map=counts,
+        uncertainty_mm=worst_mm,
+        tilt_deg=float(tilts.max(initial=0.0)),
+        rotation_spread_deg=_spread_deg(boards),
+        hand_eye_sigma_mm=sigma_mm,
+        hand_eye_sigma_deg=sigma_deg,
+    )
+
+
+class _Worth:
+    """Information of poses, and the variance that a set of them leaves."""
+
+    def __init__(self, known: BoardKnowledge, board: Board, aims: Aims) -> None:
+        self.known, self.board, self.aims = known, board, aims
+        self.prior = lens_prior(known.camera)
+        self.field = lens_field(known.camera)
+
+    def gains(self, T_base_camera: Array) -> tuple[Array, Array]:
+        """(C, 8, 8) of the camera and (C, 12, 12) of mount and board."""
+        count = len(T_base_camera)
+        lens = np.zeros((count, *self.prior.shape))
+        mount = np.zeros((count, 12, 12))
+        if not count:
+            return lens, mount
+        if self.aims.intrinsics:
+            boards = np.array([inverse(T) @ self.known.T_base_board for T in T_base_camera])
+            lens = lens_information(boards, self.known.camera, self.board, self.aims.corner_sigma_px)
+        if self.aims.hand_eye:
+            mount = hand_eye_information(T_base_camera, self.known, self.board, self.aims.corner_sigma_px)
+        return lens, mount
+
+    def start(self, T_base_camera: Array) -> tuple[Array, Array]:
+        """What is known from images that count already, on top of the nominal values."""
+        lens, mount = self.gains(T_base_camera)
+        weak = np.diag(1 / np.array([*[0.01] * 3, *[0.05] * 3, *[0.05] * 3, *[0.2] * 3]) ** 2)
+        return self.prior + lens.sum(axis=0), weak + mount.sum(axis=0)
+
+    def plus(self, so_far: tuple[Array, Array], gains: tuple[Array, Array], k: int) -> tuple[Array, Array]:
+        """With one more."""
+        return so_far[0] + gains[0][k], so_far[1] + gains[1][k]
+
+    def cost(self, so_far: tuple[Array, Array], gains: tuple[Array, Array], pool: NDArray[np.int64]) -> Array:
+        """(K,) logarithm of the variance that is left with one more of the pool."""
+        cost = np.zeros(len(pool))
+        if self.aims.intrinsics:
+            covariance = inverse_of(so_far[0] + gains[0][pool])
+            cost += np.log(np.einsum("ij,nji->n", self.field, covariance))
+        if self.aims.hand_eye:
+            covariance = inverse_of(so_far[1] + gains[1][pool])
+            shift = np.trace(covariance[:, :3, :3], axis1=1, axis2=2)
+            turn = np.trace(covariance[:, 3:6, 3:6], axis1=1, axis2=2)
+            cost += np.log(shift + _LEVER_M**2 * turn)
+        return cost
+
+
+def _cells(pixels: Array, known: BoardKnowledge, share: float) -> NDArray[np.bool_]:
+    """(C, 96) cells that hold a corner (C, P, 2) within the inner share of their sides."""
+    if not len(pixels):
+        return np.zeros((0, COVERAGE_GRID[0] * COVERAGE_GRID[1]), dtype=bool)
+    place = (pixels + 0.5) / [known.camera.width, known.camera.height] * COVERAGE_GRID
+    index = np.clip(np.floor(place).astype(np.int64), 0, np.array(COVERAGE_GRID) - 1)
+    inner = (np.abs(place - index - 0.5) <= share / 2).all(axis=2)
+    flat = index[..., 1] * COVERAGE_GRID[0] + index[..., 0] + np.arange(len(pixels))[:, None] * _CELLS
+    counts = np.bincount(flat[inner], minlength=len(pixels) * _CELLS)
+    return counts.reshape(len(pixels), -1) > 0
+
+
+def _covered(pixels: Sequence[Array], known: BoardKnowledge) -> NDArray[np.bool_]:
+    """(96,) cells that hold a corner of images that count already."""
+    return _counts(pixels, known).ravel() > 0
+
+
+def _counts(pixels: Sequence[Array], known: BoardKnowledge) -> NDArray[np.int64]:
+    """(8, 12) corners in each cell."""
+    if not pixels:
+        return np.zeros(COVERAGE_GRID[::-1], dtype=np.int64)
+    return coverage_map_of(pixels, (known.camera.width, known.camera.height))
+
+
+def _spread_deg(boards: Array) -> float:
+    """Largest rotation between two views."""
+    if len(boards) < 2:
+        return 0.0
+    turns = Rotation.from_matrix(boards[:, :3, :3])
+    return float(np.degrees(max(float((turns[i].inv() * turns).magnitude().max()) for i in range(len(boards)))))

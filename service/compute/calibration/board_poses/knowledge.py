@@ -1,0 +1,249 @@
+"""Where the calibration board lies and how the camera is mounted, as far as is known, and how far each may be off."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from service.compute.arm.kinematics import increment
+from service.compute.calibration.board.board import Board, BoardView
+from service.compute.calibration.hand_eye.weighted import cross, linearise
+from service.compute.calibration.intrinsics.adjustment import parameters_of
+from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
+from service.compute.camera_model import CameraModel
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array, Transform, inverse, transform
+
+_ARM_M, _ARM_RAD = 0.7e-3, 1e-3  # for each axis: what the poses of an uncalibrated arm err by
+_ROUNDS = 6
+_SAFETY = 1.3 * np.sqrt(3.0)  # bound over standard deviation; a uniform error within ± b has b / √3
+_LENS_VIEWS = 5  # from so many images the lens is known better than from its engraving
+_REFINED_FOCAL, _REFINED_CENTRE = 0.006, 0.003
+_ON_LENS = 0.012  # of the distance: what is left between a board's pose and a lens that is not yet known well
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerances:
+    """How far things may be from where they are said to be: bounds for each axis.
+
+    Attributes:
+        mount_m, mount_rad: of the camera on the flange, against its drawing.
+        place_m: of the board's middle, horizontally, the scene centre's tape measure included.
+        height_m: the same vertically.
+        turn_rad: of the board about the vertical.
+        tilt_rad: of the board against the horizontal.
+        focal: of the focal length, relative.
+        centre: of the principal point, over the image's width.
+    """
+
+    mount_m: float = 0.002
+    mount_rad: float = float(np.radians(0.9))
+    place_m: float = 0.03
+    height_m: float = 0.015
+    turn_rad: float = float(np.radians(10.0))
+    tilt_rad: float = float(np.radians(4.5))
+    focal: float = 0.025
+    centre: float = 0.006
+
+
+@dataclass(frozen=True, slots=True)
+class BoardKnowledge:
+    """What board poses are planned from.
+
+    Attributes:
+        camera: nominal, or calibrated.
+        T_flange_camera, T_base_board: nominal, or from the images' own poses.
+        spread: (12, 12) increments (d, w) of the former and of the latter that are possible are spread @ u for
+            every u within ± 1.
+        focal: the focal length may be off by this share.
+        centre: the principal point by this share of the image's width.
+        measured: from how many images; 0: nominal.
+    """
+
+    camera: CameraModel
+    T_flange_camera: Transform
+    T_base_board: Transform
+    spread: Array
+    focal: float
+    centre: float
+    measured: int = 0
+
+    def record(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "camera": self.camera.record(),
+            "T_flange_camera": self.T_flange_camera.tolist(),
+            "T_base_board": self.T_base_board.tolist(),
+            "spread": self.spread.tolist(),
+            "focal": self.focal,
+            "centre": self.centre,
+            "measured": self.measured,
+        }
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> BoardKnowledge:
+        """Of `record`."""
+        return cls(
+            CameraModel.from_record(record["camera"]),
+            np.array(record["T_flange_camera"]),
+            np.array(record["T_base_board"]),
+            np.array(record["spread"]),
+            float(record["focal"]),
+            float(record["centre"]),
+            int(record["measured"]),
+        )
+
+    def draws(self, count: int, seed: int = 0) -> tuple[Array, Array, Array, Array]:
+        """What may be true: `count` draws within what is possible.
+
+        Returns:
+            T_flange_camera (count, 4, 4), T_base_board (count, 4, 4), focal length over the estimate's (count,) and
+            shift of the principal point (count, 2), px.
+        """
+        rng = np.random.default_rng([seed, 0xD4A3])
+        steps = rng.uniform(-1, 1, (count, 12)) @ self.spread.T
+        hands = np.array([increment(self.T_flange_camera, s[:3], s[3:6]) for s in steps])
+        boards = np.array([increment(self.T_base_board, s[6:9], s[9:]) for s in steps])
+        zoom = 1 + self.focal * rng.uniform(-1, 1, count)
+        return hands, boards, zoom, self.centre * self.camera.width * rng.uniform(-1, 1, (count, 2))
+
+
+def nominal_knowledge(
+    camera: CameraModel,
+    T_flange_camera: Transform,
+    middle_m: Array,
+    approach: Array,
+    board: Board,
+    *,
+    long_side_across: bool = True,
+    tolerances: Tolerances = Tolerances(),
+) -> BoardKnowledge:
+    """What is known before any image.
+
+    Args:
+        camera: nominal, of the images' shape.
+        T_flange_camera: the mount's drawing.
+        middle_m: (3,) where the board's middle should lie, base frame.
+        approach: (3,) horizontal unit vector from the scene towards the base.
+        board: lies face up and level.
+        long_side_across: its long side runs across the approach, not along it.
+        tolerances: bounds.
+    """
+    middle = board.points().mean(axis=0)
+    down = np.array([0.0, 0.0, -1.0])
+    rows_are_long = board.rows >= board.columns
+    x = approach if rows_are_long == long_side_across else np.cross(down, approach)
+    R = np.column_stack([x, np.cross(down, x), down])
+    T_base_board = transform(R, middle_m - R @ middle)
+    t = tolerances
+    spread = np.zeros((12, 12))
+    spread[:3, :3], spread[3:6, 3:6] = t.mount_m * np.eye(3), t.mount_rad * np.eye(3)
+    turns = np.diag([t.tilt_rad, t.tilt_rad, t.turn_rad])
+    spread[6:9, 6:9] = np.diag([t.place_m, t.place_m, t.height_m])
+    spread[6:9, 9:] = cross((R @ middle)[None])[0] @ turns  # turned about its middle, not about its first corner
+    spread[9:, 9:] = turns
+    return BoardKnowledge(camera, T_flange_camera, T_base_board, spread, t.focal, t.centre)
+
+
+def refined_knowledge(
+    known: BoardKnowledge, views: Sequence[BoardView], T_base_flange: Array, board: Board, *, lens_known: bool = False
+) -> tuple[BoardKnowledge, Array]:
+    """What the first images tell: the lens (from five images on), the mount and the board, weighted with the nominal.
+
+    Bayes' rule on the linearised equations of the hand-eye problem (`linearise`): the nominal values with their
+    tolerances are the prior, an arm errs by about a millimetre.
+
+    Args:
+        known: nominal, or from calibrations so far.
+        views: (N) of the board, N > 0.
+        T_base_flange: (N, 4, 4).
+        board: what they show.
+        lens_known: the camera is calibrated and stays as it is.
+
+    Returns:
+        the knowledge, and T_camera_board (N, 4, 4) of the views.
+
+    Raises:
+        DataError: no view.
+        ComputeError: a view has no pose.
+    """
+    if not views:
+        raise DataError("no image of the board so far")
+    camera, focal, centre = known.camera, known.focal, known.centre
+    if not lens_known and len(views) >= _LENS_VIEWS:
+        camera, focal, centre = _lens(known, views, board)
+    boards = np.array([locate_view(view, board, camera)[0] for view in views])
+    start = T_base_flange[0] @ known.T_flange_camera @ boards[0]
+    prior_board = _nearer_end(known.T_base_board, start, board)
+    turned = board.half_turn()
+    if turned is not None:
+        boards = np.array([_same_way(T, T_base_flange[i] @ known.T_flange_camera, prior_board, turned)
+                           for i, T in enumerate(boards)])  # fmt: skip
+    away = float(np.median(np.linalg.norm(boards[:, :3, 3], axis=1)))
+    C = np.diag([(centre * away) ** 2] * 2 + [(max(focal, 1e-3) * away) ** 2] + [(_ON_LENS * focal / 0.025) ** 2] * 3)
+    X, B, covariance = _posterior(known, prior_board, T_base_flange, boards, C)
+    scale = np.sqrt(np.diag(covariance))
+    root = np.linalg.cholesky(covariance / np.outer(scale, scale)) * scale[:, None]
+    return BoardKnowledge(camera, X, B, _SAFETY * root, focal, centre, len(views)), boards
+
+
+def _posterior(
+    known: BoardKnowledge, prior_board: Transform, hands: Array, boards: Array, C: Array
+) -> tuple[Transform, Transform, Array]:
+    """T_flange_camera, T_base_board and their covariance (12, 12)."""
+    precision = np.linalg.inv(known.spread @ known.spread.T / 3 + 1e-16 * np.eye(12))
+    mount0, board0 = known.T_flange_camera, prior_board
+    mount, board = mount0, hands[0] @ mount0 @ boards[0]
+    noise = np.diag([_ARM_M**2] * 3 + [_ARM_RAD**2] * 3)
+    covariance = np.eye(12)
+    for _ in range(_ROUNDS):
+        e, J, JM = linearise(hands, boards, mount, board)
+        V = np.linalg.inv(noise + JM @ C @ np.swapaxes(JM, 1, 2))
+        H = np.einsum("nia,nij,njb->ab", J, V, J) + precision
+        off = np.concatenate([_from(mount0, mount), _from(board0, board)])
+        gradient = np.einsum("nia,nij,nj->a", J, V, e) + precision @ off
+        scale = 1 / np.sqrt(np.diag(H))
+        covariance = np.linalg.inv(H * np.outer(scale, scale)) * np.outer(scale, scale)
+        step = -covariance @ gradient
+        mount, board = increment(mount, step[:3], step[3:6]), increment(board, step[6:9], step[9:])
+    return mount, board, (covariance + covariance.T) / 2
+
+
+def _from(start: Transform, end: Transform) -> Array:
+    """(6,) increment (d, w) from one transform to the other."""
+    w = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
+    return np.concatenate([end[:3, 3] - start[:3, 3], w])
+
+
+def _lens(known: BoardKnowledge, views: Sequence[BoardView], board: Board) -> tuple[CameraModel, float, float]:
+    """A lens from the first images, where it is plausible: near the nominal one, and with a moderate distortion."""
+    size = (known.camera.width, known.camera.height)
+    try:
+        found = calibrate_intrinsics(views, board, size, model="radial2").camera
+    except ComputeError:
+        return known.camera, known.focal, known.centre
+    near = abs(found.fx / known.camera.fx - 1) < 2 * known.focal + 0.01
+    middle = np.abs(parameters_of(found, 4)[2:] - parameters_of(known.camera, 4)[2:]).max()
+    if not near or middle > 0.02 * size[0] or max(abs(found.k1), abs(found.k2)) > 1:
+        return known.camera, known.focal, known.centre
+    return found, _REFINED_FOCAL, _REFINED_CENTRE
+
+
+def _nearer_end(T_base_board: Transform, seen: Transform, board: Board) -> Transform:
+    """The nominal pose, or that of the board laid the other way round, whichever is nearer to how it is seen."""
+    middle = board.points().mean(axis=0)
+    other = T_base_board @ transform(Rotation.from_euler("z", np.pi), 2 * middle * [1, 1, 0])
+    return min((T_base_board, other), key=lambda T: float(np.linalg.norm(T[:3, :3] - seen[:3, :3])))
+
+
+def _same_way(
+    T_camera_board: Transform, T_base_camera: Transform, T_base_board: Transform, turned: Transform
+) -> Array:
+    """Of a board that looks the same after half a turn: the way that agrees with the others."""
+    expected = (inverse(T_base_camera) @ T_base_board)[:3, :3]
+    ways = (T_camera_board, T_camera_board @ turned)
+    return min(ways, key=lambda T: float(np.linalg.norm(T[:3, :3] - expected)))

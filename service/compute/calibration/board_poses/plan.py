@@ -1,0 +1,159 @@
+"""Which board poses to take next: those that shrink the covariance of T_flange_camera most."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from service.compute.calibration.hand_eye.estimate import HandEyeAnswer
+from service.compute.calibration.hand_eye.reprojection import projection_jacobian
+from service.compute.calibration.hand_eye.weighted import linearise
+from service.compute.camera_model import CameraModel
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform, inverse, look_at, transform
+
+_TILTS_DEG = (0.0, 12.0, 25.0, 38.0, 48.0)
+_AZIMUTHS = 12
+_ROLLS_DEG = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
+_DISTANCES = (0.8, 1.0)  # times the median distance so far
+_MARGIN = 0.02  # of the image's width, free of corners
+_MOST_TRIED = 60  # of the best candidates, for one that is reachable
+_FLOOR_M, _FLOOR_RAD = 1e-5, 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class SuggestedPose:
+    """A board pose worth taking.
+
+    Attributes:
+        T_base_flange: where to send the flange.
+        T_base_camera: where the camera then is.
+        sigma_mm: predicted standard deviation of T_flange_camera's translation once this and all before are taken.
+        sigma_deg: of its rotation.
+    """
+
+    T_base_flange: Transform
+    T_base_camera: Transform
+    sigma_mm: float
+    sigma_deg: float
+
+
+def suggest_board_poses(
+    answer: HandEyeAnswer,
+    T_base_flange: Array,
+    points_m: Array,
+    camera: CameraModel,
+    *,
+    corner_sigma_px: float,
+    count: int = 6,
+    reachable: Callable[[Transform], bool] | None = None,
+) -> tuple[SuggestedPose, ...]:
+    """Greedy A-optimal choice among arcs and rolls around the board, on the linearised weighted problem.
+
+    The criterion is the mean square displacement, by T_flange_camera's error, of points as far away as the board.
+    Poses that hide a corner of the board are no candidates.
+
+    Args:
+        answer: the calibration so far; its robot noise weighs the poses.
+        T_base_flange: (N, 4, 4) taken so far.
+        points_m: (P, 3) of the board.
+        camera: calibrated.
+        corner_sigma_px: noise of a corner.
+        count: of poses wanted.
+        reachable: whether the arm can get its flange there; asked for the best candidates only.
+
+    Returns:
+        up to `count` poses in the order of their gain; fewer when no others are reachable.
+
+    Raises:
+        DataError: no pose was taken so far.
+    """
+    if len(T_base_flange) == 0:
+        raise DataError("no board pose so far")
+    X, B = answer.T_flange_camera, answer.T_base_board
+    candidates = _candidates(B, T_base_flange @ X, points_m, camera)
+    noise = np.diag(
+        [max((answer.robot_noise_mm or 0.0) * 1e-3, _FLOOR_M) ** 2] * 3
+        + [max(np.radians(answer.robot_noise_deg or 0.0), _FLOOR_RAD) ** 2] * 3
+    )
+    flanges = candidates @ inverse(X)
+    so_far = _information(T_base_flange, X, B, points_m, camera, corner_sigma_px, noise).sum(axis=0)
+    gains = _information(flanges, X, B, points_m, camera, corner_sigma_px, noise)
+    middle = points_m.mean(axis=0)
+    lever = float(np.median(np.linalg.norm((T_base_flange @ X)[:, :3, 3] - (B[:3, :3] @ middle + B[:3, 3]), axis=1)))
+    open_ = list(range(len(flanges)))
+    chosen: list[SuggestedPose] = []
+    known: dict[int, bool] = {}
+    while open_ and len(chosen) < count:
+        covariance = _covariance_of(so_far + gains[open_])
+        cost = np.trace(covariance[:, :3, :3], axis1=1, axis2=2)
+        cost = cost + lever**2 * np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2)
+        best = -1
+        for k in np.argsort(cost)[:_MOST_TRIED].tolist():
+            if open_[k] not in known:
+                known[open_[k]] = reachable is None or reachable(flanges[open_[k]])
+            if known[open_[k]]:
+                best = k
+                break
+        if best < 0:
+            break
+        pick = open_.pop(best)
+        so_far = so_far + gains[pick]
+        sigma_m, sigma_rad = (
+            float(np.sqrt(np.trace(part))) for part in (covariance[best, :3, :3], covariance[best, 3:, 3:])
+        )
+        chosen.append(SuggestedPose(flanges[pick], candidates[pick], 1e3 * sigma_m, float(np.degrees(sigma_rad))))
+    return tuple(chosen)
+
+
+def _candidates(T_base_board: Transform, T_base_camera: Array, points_m: Array, camera: CameraModel) -> Array:
+    """(C, 4, 4) camera poses around the board that see all of it."""
+    centre_board = points_m.mean(axis=0)
+    eyes = (T_base_camera @ np.array([0.0, 0.0, 0.0, 1.0]))[:, :3]
+    centre = T_base_board[:3, :3] @ centre_board + T_base_board[:3, 3]
+    away = float(np.median(np.linalg.norm(eyes - centre, axis=1)))
+    poses: list[Transform] = []
+    for tilt in np.radians(_TILTS_DEG):
+        azimuths = np.arange(_AZIMUTHS if tilt > 0 else 1) * 2 * np.pi / _AZIMUTHS
+        for azimuth in azimuths:
+            # The board's z points away from the camera.
+            out = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])
+            for share in _DISTANCES:
+                upright = look_at(centre_board + share * away * out, centre_board, np.array([0.0, -1.0, 0.0]))
+                turns = [transform(Rotation.from_euler("z", roll, degrees=True), np.zeros(3)) for roll in _ROLLS_DEG]
+                poses += [T_base_board @ upright @ turn for turn in turns]
+    all_poses = np.array(poses)
+    boards = np.array([inverse(T) @ T_base_board for T in all_poses])
+    seen = np.einsum("nij,pj->npi", boards[:, :3, :3], points_m) + boards[:, None, :3, 3]
+    pixels = camera.project(seen.reshape(-1, 3)).reshape(len(boards), -1, 2)
+    margin = _MARGIN * camera.width
+    inside = (pixels > margin) & (pixels < np.array([camera.width, camera.height]) - margin)
+    return all_poses[inside.all(axis=(1, 2))]
+
+
+def _information(
+    flanges: Array, X: Transform, B: Transform, points_m: Array, camera: CameraModel, sigma_px: float, noise: Array
+) -> Array:
+    """(N, 12, 12) what each pose would tell of T_flange_camera and T_base_board."""
+    if len(flanges) == 0:
+        return np.zeros((0, 12, 12))
+    boards = np.array([inverse(flange @ X) @ B for flange in flanges])
+    _, J_px = projection_jacobian(points_m, boards, camera)
+    rows = J_px.reshape(len(boards), -1, 6)
+    normal = np.swapaxes(rows, 1, 2) @ rows
+    scale = 1 / np.sqrt(np.einsum("nii->ni", normal))
+    both = scale[:, :, None] * scale[:, None, :]
+    covariance = np.linalg.inv(normal * both) * both * sigma_px**2
+    _, J, from_board = linearise(flanges, boards, X, B)
+    V = noise + from_board @ covariance @ np.swapaxes(from_board, 1, 2)
+    return np.swapaxes(J, 1, 2) @ np.linalg.solve(V, J)
+
+
+def _covariance_of(information: Array) -> Array:
+    """(C, 6, 6) covariance of T_flange_camera from (C, 12, 12)."""
+    scale = 1 / np.sqrt(np.einsum("nii->ni", information))
+    both = scale[:, :, None] * scale[:, None, :]
+    return (np.linalg.inv(information * both) * both)[:, :6, :6]

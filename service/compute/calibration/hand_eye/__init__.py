@@ -1,0 +1,1 @@
+"""Hand-eye calibration: closed form, weighted fit, validation and records."""

@@ -1,0 +1,313 @@
+"""The fits behind a hand-eye calibration: outlying images, the weighted fit, and the arm's errors where that pays."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from service.compute.arm.correction import (
+    HARMONICS,
+    N_DH,
+    N_GEAR,
+    ArmCorrection,
+    check_arm,
+    corrected_T_base_flange,
+    correction_design,
+    correction_of,
+)
+from service.compute.arm.kinematics import ArmModel
+from service.compute.calibration.hand_eye.closed_form import (
+    MIN_VIEWS,
+    ClosedForm,
+    deviation,
+    mean_pose,
+    robust_start,
+    solve_closed_form,
+)
+from service.compute.calibration.hand_eye.reprojection import BoardCorners, solve_reprojection
+from service.compute.calibration.hand_eye.weighted import (
+    FLOOR_M,
+    Fit,
+    Noise,
+    Views,
+    estimate_noise,
+    linearise,
+    mahalanobis,
+    select_scales,
+    solve,
+)
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform
+
+Method = Literal["weighted", "reprojection", "park", "daniilidis", "tsai", "horaud", "andreff"]
+ArmTerms = Literal["none", "geometry", "geometry+gears"]
+
+# An arm's systematic error puts views three times the others' scatter off, and they must stay: it is their due. A
+# wrong pose, a moved board or a bad detection is farther away than this.
+_GROSS = 5.0
+_LIMIT = float(chdtri(6, 1e-4))  # where the arm's own error is part of the model
+_MEDIAN_NORM = 1.538  # median length of three standard normal numbers
+_CHI2_MEDIAN = float(chdtri(6, 0.5))
+_MAX_EXCLUDED = 1 / 3
+_ARM_FLOOR_M = 3e-6  # no arm repeats better
+_MIN_ARM_VIEWS = 9
+_ROUNDS = 6
+
+_GEAR_GROUPS = 1 + np.broadcast_to(
+    np.arange(6)[:, None, None] * len(HARMONICS) + np.arange(len(HARMONICS)), (6, 2, len(HARMONICS))
+)
+_KIND = {
+    "none": np.zeros(0, dtype=np.int64),
+    "geometry": np.zeros(N_DH, dtype=np.int64),
+    "geometry+gears": np.concatenate([np.zeros(N_DH, dtype=np.int64), np.ones(N_GEAR, dtype=np.int64)]),
+}
+_GROUPS = np.concatenate([np.zeros(N_DH, dtype=np.int64), _GEAR_GROUPS.ravel()])
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """T_flange_camera and T_base_board, and for a weighted fit what it rests on.
+
+    Attributes:
+        T_flange_camera: the calibration.
+        T_base_board: where the board lay.
+        views: weighted fit only: the views with the parameters in use.
+        noise: weighted fit only.
+        fit: weighted fit only.
+        correction: of the arm, if it takes part.
+    """
+
+    T_flange_camera: Transform
+    T_base_board: Transform
+    views: Views | None = None
+    noise: Noise | None = None
+    fit: Fit | None = None
+    correction: ArmCorrection | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """All that was measured: N views; `corners` and `joints_rad` (N, 6) where known."""
+
+    hands: Array
+    boards: Array
+    covariance: Array
+    corners: BoardCorners | None
+    joints_rad: Array | None
+    arm: ArmModel | None
+
+    def take(self, which: NDArray[np.bool_]) -> Measured:
+        """These views only."""
+        return Measured(
+            self.hands[which],
+            self.boards[which],
+            self.covariance[which],
+            None if self.corners is None else self.corners.take(which),
+            None if self.joints_rad is None else self.joints_rad[which],
+            self.arm,
+        )
+
+    def views(self, terms: ArmTerms) -> Views:
+        """For the weighted fit, with these parameters of the arm."""
+        kind = _KIND[terms]
+        if terms == "none":
+            design = np.zeros((len(self.hands), 6, 0))
+        else:
+            assert self.arm is not None
+            assert self.joints_rad is not None
+            check_arm(self.arm, self.joints_rad, self.hands)
+            design = correction_design(self.arm, self.joints_rad)[:, :, : len(kind)]
+        return Views(self.hands, self.boards, self.covariance, design, kind)
+
+    def placed(self, answer: Answer) -> Array:
+        """(N, 4, 4) T_base_board by each view alone."""
+        hands = self.hands
+        if answer.correction is not None:
+            assert self.joints_rad is not None
+            hands = corrected_T_base_flange(self.joints_rad, hands, answer.correction)
+        return hands @ answer.T_flange_camera @ self.boards
+
+
+def find_outliers(data: Measured, rng: np.random.Generator) -> dict[int, str]:
+    """Views whose robot pose and board pose disagree beyond what the others' noise explains, with reasons.
+
+    Raises:
+        ComputeError: more than a third of them.
+    """
+    views = data.views("none")
+    X, B = robust_start(data.hands, data.boards, rng)
+    e, _, _ = linearise(data.hands, data.boards, X, B)
+    noise = _median_noise(e)
+    fit = Fit(X, B, np.zeros(0), np.zeros((12, 12)))
+    keep = np.zeros(len(e), dtype=bool)
+    square = np.zeros(len(e))
+    for round_ in range(_ROUNDS):
+        square = mahalanobis(views, noise, fit, keep if round_ else None)
+        now = square < 6 * _GROSS**2
+        if now.sum() < max(MIN_VIEWS, (1 - _MAX_EXCLUDED) * len(e)):
+            raise ComputeError(
+                f"{np.count_nonzero(~now)} of {len(e)} board images disagree with the robot's poses",
+                remedy="check that images and poses belong together, the board's size, and that the board lay still",
+            )
+        if np.array_equal(now, keep):
+            break
+        keep = now
+        good = views.take(keep)
+        noise = estimate_noise(good, fit.T_flange_camera, fit.T_base_board, noise)
+        fit = solve(good, noise, fit.T_flange_camera, fit.T_base_board)
+    mm, deg = deviation(data.placed(Answer(fit.T_flange_camera, fit.T_base_board)), fit.T_base_board)
+    return {
+        int(
+            i
+        ): f"{mm[i]:.2f} mm and {deg[i]:.3f}° off the other images, {np.sqrt(square[i] / 6):.0f} times their noise"
+        for i in np.flatnonzero(~keep)
+    }
+
+
+def _median_noise(e: Array) -> Noise:
+    """A robust first guess from increments (N, 6)."""
+    lengths = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
+    robot_m, robot_rad = (max(float(v) / _MEDIAN_NORM, FLOOR_M) for v in np.median(lengths, axis=0))
+    return Noise(robot_m, robot_rad)
+
+
+def turned_back(data: Measured, answer: Answer, T_board_turned: Transform) -> NDArray[np.bool_]:
+    """(N,) views that agree better with the answer when their board is turned by half a turn."""
+    apart = [
+        Measured(data.hands, boards, data.covariance, None, data.joints_rad, data.arm).placed(answer)
+        for boards in (data.boards, data.boards @ T_board_turned)
+    ]
+    as_is, turned = (deviation(placed, answer.T_base_board)[0] for placed in apart)
+    return turned < as_is
+
+
+def fit_method(data: Measured, method: Method, start: Answer | None = None) -> Answer:
+    """One method's answer from these views, the arm taken as it reports itself.
+
+    Args:
+        data: without outliers.
+        method: which.
+        start: a nearby answer, which saves the search.
+
+    Raises:
+        ComputeError: no answer.
+    """
+    if method not in ("weighted", "reprojection"):
+        return fit_closed_form(data, method)
+    park = fit_closed_form(data, "park") if start is None else start
+    X, B = park.T_flange_camera, park.T_base_board
+    if method == "reprojection":
+        if data.corners is None:
+            raise ComputeError("the method reprojection needs the corners, not only the board's poses")
+        return Answer(*solve_reprojection(data.hands, data.corners, X, B))
+    views = data.views("none")
+    noise = start.noise if start is not None else None
+    if noise is None:
+        e, _, _ = linearise(data.hands, data.boards, X, B)
+        noise = _median_noise(e)
+    noise = estimate_noise(views, X, B, Noise(noise.robot_m, noise.robot_rad))
+    fit = solve(views, noise, X, B)
+    return Answer(fit.T_flange_camera, fit.T_base_board, views, noise, fit)
+
+
+def fit_closed_form(data: Measured, method: ClosedForm) -> Answer:
+    """A closed form's answer, the board at its mean place."""
+    X = solve_closed_form(data.hands, data.boards, method)
+    return Answer(X, mean_pose(data.hands @ X @ data.boards))
+
+
+def arm_noise(data: Measured, plain: Answer, terms: ArmTerms) -> Noise:
+    """Variances of the model with these parameters of the arm, before any selection among them.
+
+    Raises:
+        DataError: the joints are not this arm's.
+    """
+    assert plain.noise is not None
+    views = data.views(terms)
+    scales = (1.0,) * (int(views.kind.max()) + 1)
+    first = Noise(plain.noise.robot_m / 5, plain.noise.robot_rad / 5, scales)
+    return estimate_noise(views, plain.T_flange_camera, plain.T_base_board, first, floor_m=_ARM_FLOOR_M)
+
+
+def fit_with_arm(data: Measured, plain: Answer, terms: ArmTerms, start: Noise) -> Answer:
+    """The weighted answer together with the arm's systematic error.
+
+    Args:
+        data: without outliers, with joints and arm.
+        plain: the weighted answer without.
+        terms: which parameters.
+        start: from `arm_noise`, of these views or of nearly the same.
+
+    Raises:
+        ComputeError: no answer.
+        DataError: the joints are not this arm's.
+    """
+    assert data.arm is not None
+    views, noise = data.views(terms), start
+    X, B = plain.T_flange_camera, plain.T_base_board
+    if terms == "geometry+gears":
+        noise = select_scales(views, start, X, B, _GROUPS)
+        views = dataclasses.replace(views, kind=_GROUPS)
+    fit = solve(views, noise, X, B)
+    scaled = np.zeros(N_DH + N_GEAR)
+    scaled[: len(fit.arm)] = fit.arm
+    correction = correction_of(data.arm, scaled, _observed(fit, noise, views.kind))
+    return Answer(fit.T_flange_camera, fit.T_base_board, views, noise, fit, correction)
+
+
+def _observed(fit: Fit, noise: Noise, kind: NDArray[np.int64]) -> Array:
+    """(6,) share of the prior variance that the data removed, joint by joint."""
+    prior = np.array(noise.scales)[kind] ** 2
+    left = np.diag(fit.covariance)[12:]
+    joint = np.concatenate([np.repeat(np.arange(6), 4), np.repeat(np.arange(6), 2 * len(HARMONICS))])[: len(kind)]
+    return np.array([1 - left[joint == j].sum() / prior[joint == j].sum() for j in range(6)])
+
+
+def arm_outliers(answer: Answer) -> NDArray[np.bool_]:
+    """(N,) views that a fit with the arm's errors cannot explain, though one without could."""
+    assert answer.views is not None
+    assert answer.noise is not None
+    assert answer.fit is not None
+    square = mahalanobis(answer.views, answer.noise, answer.fit)
+    return square > _LIMIT * max(1.0, float(np.median(square)) / _CHI2_MEDIAN)
+
+
+def arm_is_possible(data: Measured) -> bool:
+    """Whether joints are known and views are enough to think of the arm's errors."""
+    return data.arm is not None and data.joints_rad is not None and len(data.hands) >= _MIN_ARM_VIEWS
+
+
+def held_out(
+    data: Measured,
+    keep: NDArray[np.bool_],
+    method: Method,
+    terms: ArmTerms,
+    start: tuple[Answer, Noise | None],
+    folds: NDArray[np.int64],
+    point_m: Array,
+) -> tuple[Array, Array]:
+    """(N,) mm and degrees by which each view puts the board off a fit that did not know it.
+
+    Args:
+        data: all views, outliers included (which no fit ever sees).
+        keep: (N,) the others.
+        method: of the fits.
+        terms: parameters of the arm in the fits.
+        start: answer to all views without the arm, and the arm's variances, to start from.
+        folds: (N,) fold of each view.
+        point_m: (3,) point of the board where the distance is measured.
+    """
+    mm, deg = np.zeros(len(folds)), np.zeros(len(folds))
+    for k in range(int(folds.max()) + 1):
+        test, train = folds == k, keep & (folds != k)
+        learnt = data.take(train)
+        answer = fit_method(learnt, method, start[0] if method in ("weighted", "reprojection") else None)
+        if start[1] is not None:
+            answer = fit_with_arm(learnt, answer, terms, start[1])
+        mm[test], deg[test] = deviation(data.take(test).placed(answer), answer.T_base_board, point_m)
+    return mm, deg

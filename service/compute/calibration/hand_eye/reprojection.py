@@ -1,0 +1,132 @@
+"""Board poses' covariance from their corners, and the hand-eye of the least reprojection error (12 parameters)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.arm.kinematics import increment
+from service.compute.calibration.hand_eye.weighted import cross, linearise
+from service.compute.camera_model import CameraModel
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array, Transform, inverse
+
+_STEP_M = 1e-6
+_ITERATIONS = 30
+
+
+@dataclass(frozen=True, slots=True)
+class BoardCorners:
+    """Detected corners of N board views.
+
+    Attributes:
+        points_m: (P, 3) in the board frame.
+        corners_px: (N, P, 2) detected; NaN where a corner was not seen.
+        camera: calibrated.
+    """
+
+    points_m: Array
+    corners_px: Array
+    camera: CameraModel
+
+    def __post_init__(self) -> None:
+        if self.corners_px.ndim != 3 or self.corners_px.shape[1:] != (len(self.points_m), 2):
+            raise DataError(f"{self.corners_px.shape} corners of boards with {len(self.points_m)}")
+
+    def take(self, which: NDArray[np.bool_]) -> BoardCorners:
+        """These views only."""
+        return BoardCorners(self.points_m, self.corners_px[which], self.camera)
+
+
+def projection_jacobian(points_m: Array, T_camera_board: Array, camera: CameraModel) -> tuple[Array, Array]:
+    """Pixels (N, P, 2) and their derivative (N, P, 2, 6) to the (d, w) increment of each T_camera_board (N, 4, 4)."""
+    points = np.einsum("nij,pj->npi", T_camera_board[:, :3, :3], points_m) + T_camera_board[:, None, :3, 3]
+    shape = points.shape[:2]
+
+    def project(p: Array) -> Array:
+        return camera.project(p.reshape(-1, 3)).reshape(*shape, 2)
+
+    # Central differences over a micrometre are good to nine digits, for whatever lens model the camera has.
+    to_point = np.stack(
+        [(project(points + shift) - project(points - shift)) / (2 * _STEP_M) for shift in np.eye(3) * _STEP_M],
+        axis=-1,
+    )
+    arms = (points - T_camera_board[:, None, :3, 3]).reshape(-1, 3)
+    turn = -to_point @ cross(arms).reshape(*shape, 3, 3)
+    return project(points), np.concatenate([to_point, turn], axis=-1)
+
+
+def board_covariance(corners: BoardCorners, T_camera_board: Array) -> tuple[Array, float]:
+    """(N, 6, 6) covariance of each located board's pose, and the corners' noise in px that it comes from.
+
+    The noise is the median over the views of their residuals' standard deviation for each axis.
+    """
+    pixels, J = projection_jacobian(corners.points_m, T_camera_board, corners.camera)
+    residual = (corners.corners_px - pixels).reshape(len(pixels), -1)
+    rows = J.reshape(len(J), -1, 6)
+    seen = np.isfinite(residual)
+    freedom = np.maximum(seen.sum(axis=1) - 6, 1)
+    sigma_px = float(np.median(np.sqrt(np.nansum(residual**2, axis=1) / freedom)))
+    rows = np.where(seen[:, :, None], rows, 0.0)
+    normal = np.swapaxes(rows, 1, 2) @ rows
+    scale = 1 / np.sqrt(np.einsum("nii->ni", normal))
+    both = scale[:, :, None] * scale[:, None, :]
+    return np.linalg.inv(normal * both) * both * sigma_px**2, sigma_px
+
+
+def _grams(hands: Array, corners: BoardCorners, X: Transform, B: Transform) -> Array:
+    """(N, 13, 13) products of the rows [J | residual] of each view's corners."""
+    boards = np.array([inverse(hand @ X) @ B for hand in hands])
+    pixels, J = projection_jacobian(corners.points_m, boards, corners.camera)
+    _, to_flange, from_board = linearise(hands, boards, X, B)
+    chained = J @ np.linalg.solve(from_board, -to_flange)[:, None]
+    rows = np.concatenate([chained, (pixels - corners.corners_px)[..., None]], axis=-1).reshape(len(hands), -1, 13)
+    rows = np.where(np.isfinite(rows[:, :, 12:]), rows, 0.0)
+    return np.swapaxes(rows, 1, 2) @ rows
+
+
+def _step(gram: Array) -> Array:
+    H = gram[:12, :12]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1 / np.sqrt(np.diag(H))
+        scaled = H * scale[:, None] * scale
+    if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > 1e12:
+        raise ComputeError(
+            "the views do not determine the hand-eye transform", remedy="take views with more rotation"
+        )
+    return -scale * np.linalg.solve(scaled, scale * gram[:12, 12])
+
+
+def solve_reprojection(
+    hands: Array, corners: BoardCorners, X: Transform, B: Transform
+) -> tuple[Transform, Transform]:
+    """T_flange_camera and T_base_board of the least reprojection error, the robot's poses held (Gauss-Newton).
+
+    The paper's method. It blames the images for the robot's errors, which are many times larger.
+
+    Args:
+        hands: (N, 4, 4) T_base_flange.
+        corners: of the N views.
+        X: start of T_flange_camera.
+        B: start of T_base_board.
+
+    Raises:
+        ComputeError: undetermined, or no convergence.
+    """
+    hand_eye, board, before = X, B, np.inf
+    for _ in range(_ITERATIONS):
+        gram = _grams(hands, corners, hand_eye, board).sum(axis=0)
+        step = _step(gram)
+        hand_eye, board = increment(hand_eye, step[:3], step[3:6]), increment(board, step[6:9], step[9:])
+        if np.abs(step).max() < 1e-9 or abs(before - gram[12, 12]) < 1e-12 * gram[12, 12]:
+            return hand_eye, board
+        before = float(gram[12, 12])
+    raise ComputeError("the reprojection error did not converge", remedy="check robot poses and board size")
+
+
+def resample_reprojection(hands: Array, corners: BoardCorners, X: Transform, B: Transform, counts: Array) -> Array:
+    """(R, 12) increments of the answer when view i counts `counts[r, i]` times."""
+    flat = counts @ _grams(hands, corners, X, B).reshape(len(hands), -1)
+    return np.array([_step(row.reshape(13, 13)) for row in flat])

@@ -1,0 +1,97 @@
+"""How far a hand-eye answer would scatter with other images: the bootstrap, and what held-out images say of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.compute.calibration.board.board import BoardView
+from service.compute.calibration.hand_eye.closed_form import CLOSED_FORMS, solve_closed_form
+from service.compute.calibration.hand_eye.fit import Answer, Measured, Method, fit_closed_form
+from service.compute.calibration.hand_eye.reprojection import BoardCorners, resample_reprojection
+from service.compute.calibration.hand_eye.weighted import resample
+from service.compute.calibration.intrinsics.adjustment import fit_pose, pose_matrix
+from service.compute.camera_covariance import CameraCovariance
+from service.compute.camera_model import CameraModel
+from service.core.geometry import Array, Transform
+
+_MIN_DISTINCT = 4  # views in a bootstrap replicate
+
+
+def bootstrap_covariance(
+    data: Measured, method: Method, answer: Answer, count: int, rng: np.random.Generator
+) -> Array:
+    """(6, 6) covariance of T_flange_camera over resamples of whole images.
+
+    It holds for systematic errors that differ from pose to pose too.
+    """
+    n = len(data.hands) if answer.views is None else len(answer.views.T_base_flange)
+    picks = [rng.integers(0, n, n) for _ in range(count)]
+    picks = [pick for pick in picks if len(np.unique(pick)) >= _MIN_DISTINCT]
+    counts = np.array([np.bincount(pick, minlength=n) for pick in picks], dtype=np.float64)
+    X = answer.T_flange_camera
+    if method in CLOSED_FORMS:
+        replicas = [fit_closed_form(_repeat(data, pick), method).T_flange_camera for pick in picks]
+        turns = [Rotation.from_matrix(T[:3, :3] @ X[:3, :3].T).as_rotvec() for T in replicas]
+        steps = np.array([[*(T[:3, 3] - X[:3, 3]), *w] for T, w in zip(replicas, turns, strict=True)])
+    elif method == "reprojection":
+        assert data.corners is not None
+        steps = resample_reprojection(data.hands, data.corners, X, answer.T_base_board, counts)
+    else:
+        assert answer.views is not None
+        assert answer.noise is not None
+        assert answer.fit is not None
+        steps = resample(answer.views, answer.noise, answer.fit, counts)
+    return np.cov(steps[:, :6].T)
+
+
+def camera_share(data: Measured, known: CameraCovariance) -> Array:
+    """(6, 6) covariance of T_flange_camera from what is not known of the camera, which is the same in every image.
+
+    The board's place in each image and then the mount are found again with cameras one standard deviation off; by
+    Park's closed form, whose answer the camera's error moves as it moves the others'.
+    """
+    corners = data.corners
+    assert corners is not None
+    total = np.zeros((6, 6))
+    before = solve_closed_form(data.hands, data.boards, "park")
+    for camera in known.deviations(corners.camera):
+        boards = np.array(
+            [_located(corners, k, T, camera) for k, T in enumerate(data.boards)],
+        )
+        X = solve_closed_form(data.hands, boards, "park")
+        turn = Rotation.from_matrix(X[:3, :3] @ before[:3, :3].T).as_rotvec()
+        step = np.concatenate([X[:3, 3] - before[:3, 3], turn])
+        total += np.outer(step, step)
+    return total
+
+
+def _located(corners: BoardCorners, index: int, T: Transform, camera: CameraModel) -> Transform:
+    """T_camera_board of one view through another camera, starting from where it was."""
+    seen = np.flatnonzero(np.isfinite(corners.corners_px[index]).all(axis=1))
+    view = BoardView(seen, corners.corners_px[index][seen])
+    start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
+    return pose_matrix(fit_pose(view, corners.points_m, camera, start)[0])
+
+
+def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Array) -> Array:
+    """The covariance (6, 6), translation and rotation each scaled up to what held-out images allow.
+
+    A closed form has no model of the noise, and views that err alike make its resamples alike: what N views place
+    with a scatter is not known better than that scatter over the root of N.
+
+    Args:
+        covariance: (d in metres, w in radians).
+        held_out_mm: (N,) of views that were judged by a calibration without them.
+        held_out_deg: (N,).
+    """
+    root = np.sqrt(len(held_out_mm))
+    least = np.array([1e-3 * np.median(held_out_mm), np.radians(np.median(held_out_deg))]) / root
+    stated = np.sqrt([np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])])
+    factor = np.repeat(np.maximum(1.0, least / np.maximum(stated, 1e-12)), 3)
+    return covariance * np.outer(factor, factor)
+
+
+def _repeat(data: Measured, pick: NDArray[np.int64]) -> Measured:
+    return Measured(data.hands[pick], data.boards[pick], data.covariance[pick], None, None, None)

@@ -1,0 +1,305 @@
+"""Hand-eye weighted by the noise of robot and images: variances from the data, arm errors as random effects.
+
+For view i the flange's pose by the images is  T_base_board · inverse(T_camera_board) · inverse(T_flange_camera).  Its
+increment e from the pose that the robot reported, in the axes of the flange, is the robot's error plus the images':
+
+    e_i(T_flange_camera, T_base_board) = G_i φ + a_i + J_i c_i,   a_i ~ N(0, diag(σ_t² 1, σ_r² 1)),  c_i ~ N(0, C_i)
+
+C_i is the covariance of the board's pose in the image; G_i φ the arm's systematic error (arm.correction), φ ~
+N(0, s²) in the scale of usual tolerances. The variances σ_t², σ_r² and s² are those of the largest restricted
+likelihood (REML; Patterson and Thompson 1971, by Henderson's mixed model equations).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from service.compute.arm.kinematics import increment
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform
+
+FLOOR_M = 2e-7
+_ITERATIONS = 8
+_SELECTION_ROUNDS = 80
+_UNDETERMINED = "the views do not determine the hand-eye transform"
+_SINGULAR = 3e-7  # least pivot of the scaled normal matrix
+
+
+@dataclass(frozen=True, slots=True)
+class Views:
+    """What was measured: N board views.
+
+    Attributes:
+        T_base_flange: (N, 4, 4) as reported.
+        T_camera_board: (N, 4, 4) from the images.
+        covariance: (N, 6, 6) of T_camera_board: (d, w) in the axes of the camera.
+        design: (N, 6, K) derivative of the flange's increment to the arm's parameters, K perhaps 0.
+        kind: (K,) index of the prior scale of each parameter in `Noise.scales`.
+    """
+
+    T_base_flange: Array
+    T_camera_board: Array
+    covariance: Array
+    design: Array
+    kind: NDArray[np.int64]
+
+    def take(self, which: NDArray[np.bool_]) -> Views:
+        """These views only."""
+        return Views(
+            self.T_base_flange[which],
+            self.T_camera_board[which],
+            self.covariance[which],
+            self.design[which],
+            self.kind,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Standard deviations: the robot's for each axis (m, rad), and the scales of the arm's parameters."""
+
+    robot_m: float
+    robot_rad: float
+    scales: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """An answer: the two transforms, the arm's parameters (K,) and their part of the joint covariance."""
+
+    T_flange_camera: Transform
+    T_base_board: Transform
+    arm: Array
+    covariance: Array  # (12 + K, 12 + K): T_flange_camera, T_base_board, each (d, w) in its outer axes; arm
+
+
+def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[Array, Array, Array]:
+    """Increments e (N, 6) of the flange, their derivative (N, 6, 12) to X and B, and (N, 6, 6) to the board's pose.
+
+    All increments are (d, w) of exp(w) R, t + d in the outer axes of the transform; those of e in the flange's axes.
+    """
+    n = len(hands)
+    Rh, Rx = np.swapaxes(hands[:, :3, :3], 1, 2), X[:3, :3]
+    R_camera = np.swapaxes(boards[:, :3, :3], 1, 2)  # R_board_camera
+    T_base_camera_R = B[:3, :3] @ R_camera
+    T_base_camera_t = B[:3, 3] - np.einsum("nij,nj->ni", T_base_camera_R, boards[:, :3, 3])
+    flange_R = T_base_camera_R @ Rx.T
+    flange_t = T_base_camera_t - np.einsum("nij,j->ni", flange_R, X[:3, 3])
+    gap_R = Rh @ flange_R
+    e = np.empty((n, 6))
+    e[:, :3] = np.einsum("nij,nj->ni", Rh, flange_t - hands[:, :3, 3])
+    e[:, 3:] = Rotation.from_matrix(gap_R).as_rotvec()
+    J = np.zeros((n, 6, 12))
+    J[:, :3, :3] = -gap_R
+    J[:, :3, 3:6] = -gap_R @ cross(X[None, :3, 3])
+    J[:, 3:, 3:6] = -gap_R
+    J[:, :3, 6:9] = Rh
+    J[:, :3, 9:] = -Rh @ cross(flange_t - B[:3, 3])
+    J[:, 3:, 9:] = Rh
+    JM = np.zeros((n, 6, 6))
+    turned = gap_R @ Rx
+    arm = -Rx.T @ X[:3, 3] - boards[:, :3, 3]  # from the board's origin to the flange, camera axes
+    JM[:, :3, :3] = -turned
+    JM[:, :3, 3:] = turned @ cross(arm)
+    JM[:, 3:, 3:] = -turned
+    return e, J, JM
+
+
+def cross(v: Array) -> Array:
+    """(N, 3, 3) matrices with cross(v) @ p = v × p."""
+    out = np.zeros((len(v), 3, 3))
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    return out - np.swapaxes(out, 1, 2)
+
+
+def _grams(views: Views, noise: Noise, X: Transform, B: Transform) -> tuple[Array, Array]:
+    """(N, P + 1, P + 1) products of the whitened rows [J | e] of each view, and (N,) ½ log|V|; P = 12 + K."""
+    e, J, JM = linearise(views.T_base_flange, views.T_camera_board, X, B)
+    L = np.linalg.cholesky(_robot(noise) + JM @ views.covariance @ np.swapaxes(JM, 1, 2))
+    white = np.linalg.solve(L, np.concatenate([J, -views.design, e[:, :, None]], axis=2))
+    return np.swapaxes(white, 1, 2) @ white, np.sum(np.log(np.diagonal(L, axis1=1, axis2=2)), axis=1)
+
+
+def _robot(noise: Noise) -> Array:
+    return np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
+
+
+def _prior(noise: Noise, kind: NDArray[np.int64]) -> Array:
+    return np.array(noise.scales)[kind] ** 2 if len(kind) else np.zeros(0)
+
+
+def _minimum(gram: Array, prior: Array) -> tuple[Array, Array, float]:
+    """Step (P,), covariance (P, P) and ½ log|H| of one summed Gram matrix (P + 1, P + 1) with the arm's prior.
+
+    Raises:
+        ComputeError: singular.
+    """
+    H = gram[:-1, :-1].copy()
+    H[np.arange(12, len(H)), np.arange(12, len(H))] += 1 / prior
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1 / np.sqrt(np.diag(H))  # metres, radians and tolerances: to the same size
+        scaled = H * scale[:, None] * scale
+    L = _factor(scaled)
+    half = np.asarray(solve_triangular(L, np.diag(scale), lower=True, check_finite=False), dtype=np.float64)
+    covariance = half.T @ half
+    log_determinant = float(np.sum(np.log(np.diag(L))) - np.sum(np.log(scale)))
+    return -covariance @ gram[:-1, -1], covariance, log_determinant
+
+
+def _factor(scaled: Array) -> Array:
+    """Cholesky factor of a normal matrix with unit diagonal. Raises ComputeError when it is singular."""
+    try:
+        L = np.asarray(np.linalg.cholesky(scaled), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        raise ComputeError(_UNDETERMINED, remedy="take views with more rotation") from error
+    if not np.diag(L).min() > _SINGULAR:
+        raise ComputeError(_UNDETERMINED, remedy="take views with more rotation")
+    return L
+
+
+def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations: int = _ITERATIONS) -> Fit:
+    """Least squares weighted by `noise`, in local increments scaled by their normal matrix (Gauss-Newton).
+
+    Args:
+        views: the measurements.
+        noise: standard deviations, as `estimate_noise` finds them.
+        X: start of T_flange_camera.
+        B: start of T_base_board.
+        iterations: at most.
+
+    Raises:
+        ComputeError: the views do not determine the answer.
+    """
+    prior = _prior(noise, views.kind)
+    fit = Fit(X, B, np.zeros(len(prior)), np.zeros((12 + len(prior),) * 2))
+    for _ in range(iterations):
+        grams, _ = _grams(views, noise, fit.T_flange_camera, fit.T_base_board)
+        step, covariance, _ = _minimum(grams.sum(axis=0), prior)
+        settled = np.abs(step[:12]).max() < 1e-10 and np.abs(step[12:] - fit.arm).max(initial=0.0) < 1e-5
+        fit = Fit(
+            increment(fit.T_flange_camera, step[:3], step[3:6]),
+            increment(fit.T_base_board, step[6:9], step[9:12]),
+            step[12:],
+            covariance,
+        )
+        if settled:
+            break
+    return fit
+
+
+def estimate_noise(views: Views, X: Transform, B: Transform, start: Noise, *, floor_m: float = FLOOR_M) -> Noise:
+    """Standard deviations of the largest restricted likelihood, at a linearisation near the answer.
+
+    Args:
+        views: without outliers.
+        X: T_flange_camera, approximately.
+        B: T_base_board.
+        start: first guess; with one scale for each kind of arm parameter.
+        floor_m: least robot noise; for the rotation the same number in radians.
+    """
+    e, J, JM = linearise(views.T_base_flange, views.T_camera_board, X, B)
+    rows = np.concatenate([J, -views.design, e[:, :, None]], axis=2)
+    images = JM @ views.covariance @ np.swapaxes(JM, 1, 2)
+    members = np.array([views.kind == g for g in range(len(start.scales))], dtype=np.float64)
+
+    def objective(logs: Array) -> tuple[float, Array]:
+        """Half the deviance and its gradient."""
+        noise = _noise(logs)
+        prior = _prior(noise, views.kind)
+        L = np.linalg.cholesky(_robot(noise) + images)
+        white = np.linalg.solve(L, rows)
+        flat = white.reshape(-1, rows.shape[2])
+        step, covariance, log_H = _minimum(flat.T @ flat, prior)
+        u = np.concatenate([step, [1.0]])
+        left = white @ u
+        value = np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))) + 0.5 * np.sum(np.log(prior)) + log_H
+        value += 0.5 * (np.sum(left**2) + np.sum(step[12:] ** 2 / prior))
+        # d/dV of each term, diagonal entries only: the robot's variances are diagonal.
+        inverse_L = np.linalg.inv(L)
+        trace = np.sum(inverse_L**2, axis=1)
+        solved = np.swapaxes(inverse_L, 1, 2) @ np.concatenate([white[:, :, :-1], left[:, :, None]], axis=2)
+        A = solved[:, :, :-1]
+        slope = trace - np.sum((A @ covariance) * A, axis=2) - solved[:, :, -1] ** 2
+        robot = [noise.robot_m**2 * slope[:, :3].sum(), noise.robot_rad**2 * slope[:, 3:].sum()]
+        scales = members @ (1 - (np.diag(covariance)[12:] + step[12:] ** 2) / prior) if len(prior) else []
+        return float(value), np.array([*robot, *scales])
+
+    first = np.log([max(start.robot_m, floor_m), max(start.robot_rad, floor_m), *start.scales])
+    bounds = [(np.log(floor_m), np.log(0.05)), (np.log(floor_m), np.log(0.2))]
+    bounds += [(np.log(1e-2), np.log(1e2))] * len(start.scales)
+    answer = minimize(objective, first, method="L-BFGS-B", jac=True, bounds=bounds, options={"maxiter": 60})
+    return _noise(np.asarray(answer.x, dtype=np.float64))
+
+
+def _noise(logs: Array) -> Noise:
+    values = np.exp(logs)
+    return Noise(float(values[0]), float(values[1]), tuple(float(v) for v in values[2:]))
+
+
+def select_scales(views: Views, noise: Noise, X: Transform, B: Transform, groups: NDArray[np.int64]) -> Noise:
+    """One prior scale for each group of arm parameters: those that the data do not need go to zero.
+
+    Automatic relevance determination (MacKay 1992, Tipping 2001): expectation maximisation first, which is safe,
+    then MacKay's fixed point, which is fast. A gear errs at one or two of its harmonics, not at all of them: found
+    out, they can be told from the other joints' errors, and hold beyond the angles that were visited.
+
+    Args:
+        views: as for `solve`.
+        noise: with the scales to start from, in the groups of `views.kind`.
+        X: T_flange_camera, near the answer.
+        B: T_base_board.
+        groups: (K,) group of each parameter.
+
+    Returns:
+        noise whose scales belong to `groups`.
+    """
+    gram = _grams(views, noise, X, B)[0].sum(axis=0)
+    members = (groups == np.arange(groups.max() + 1)[:, None]).astype(np.float64)
+    size = members.sum(axis=1)
+    square = np.array([float(np.mean(_prior(noise, views.kind)[groups == g])) for g in range(len(size))])
+    for round_ in range(_SELECTION_ROUNDS):
+        step, covariance, _ = _minimum(gram, square[groups])
+        energy, spread = members @ step[12:] ** 2, members @ np.diag(covariance)[12:]
+        if round_ < _SELECTION_ROUNDS // 2:
+            square = (energy + spread) / size
+        else:
+            square = energy / np.maximum(size - spread / square, 1e-3)
+        square = np.clip(square, 1e-6, 1e4)
+    return Noise(noise.robot_m, noise.robot_rad, tuple(float(v) for v in np.sqrt(square)))
+
+
+def resample(views: Views, noise: Noise, fit: Fit, counts: Array) -> Array:
+    """(R, 12 + K) increments of the answer when view i counts `counts[r, i]` times: a bootstrap's replicates.
+
+    One Gauss-Newton step from the answer, which is exact to second order in the replicates' spread.
+    """
+    grams, _ = _grams(views, noise, fit.T_flange_camera, fit.T_base_board)
+    prior = _prior(noise, views.kind)
+    flat = counts @ grams.reshape(len(grams), -1)
+    size = grams.shape[1]
+    return np.array([_minimum(row.reshape(size, size), prior)[0] for row in flat])
+
+
+def mahalanobis(views: Views, noise: Noise, fit: Fit, known: NDArray[np.bool_] | None = None) -> Array:
+    """(N,) squared distances of the views' increments from the model, 6 degrees of freedom each.
+
+    With `known`, the fit's own uncertainty counts too: it adds to the noise of views that the fit did not know, and
+    takes from that of those it did (studentised residuals).
+    """
+    grams, _ = _grams(views, noise, fit.T_flange_camera, fit.T_base_board)
+    v = np.concatenate([np.zeros(12), fit.arm, [1.0]])
+    if known is None:
+        return np.einsum("i,nij,j->n", v, grams, v)
+    e, J, JM = linearise(views.T_base_flange, views.T_camera_board, fit.T_flange_camera, fit.T_base_board)
+    A = np.concatenate([J, -views.design], axis=2)
+    V = _robot(noise) + JM @ views.covariance @ np.swapaxes(JM, 1, 2)
+    sign = np.where(known, -1.0, 1.0)[:, None, None]
+    spread = V + sign * (A @ fit.covariance @ np.swapaxes(A, 1, 2)) * (1 - 1e-6)
+    left = e - views.design @ fit.arm
+    return np.einsum("ni,ni->n", left, np.linalg.solve(spread, left[:, :, None])[:, :, 0])

@@ -1,0 +1,289 @@
+"""Least squares over one camera and the board's pose in every view, and the normal equations that remain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from service.compute.calibration.board.board import BoardView
+from service.compute.camera_model import CameraModel
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, transform
+
+LensModel = Literal["pinhole", "radial2", "opencv4", "opencv5", "rational"]
+#: Names of all parameters; a model estimates the first ones.
+PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+PARAMETER_COUNT: dict[LensModel, int] = {"pinhole": 4, "radial2": 6, "opencv4": 8, "opencv5": 9, "rational": 12}
+
+_HUBER = 3.0  # standard deviations of one coordinate beyond which a corner counts less
+_MAX_ITERATIONS = 40
+# px over the terms' own unit: k3 … k6 are drawn to 0 ± 3 by as much as one corner of 0.03 px. Where the images
+# determine them this is nothing; where they do not, numerator and denominator would cancel without limit.
+_PRIOR = 0.03 / 3
+_START_VIEWS = 20  # that OpenCV's solver starts from; the others join in the adjustment
+
+
+@dataclass(frozen=True, slots=True)
+class ViewEquations:
+    """One view at the solution, linearised; the view's own pose is eliminated from the equations.
+
+    Attributes:
+        residual: (2M,) projection minus corner, px; x and y of each corner in turn.
+        weighted: (2M,) the same times the root of its robust weight, freed of what a better pose would explain.
+        reduced: (2M, P) its derivative with respect to the parameters, freed of what the pose can compensate.
+        compensation: (6, P + 1) how the view's pose (rvec, tvec) follows a change of the parameters; the last column
+            is the pose's own correction.
+        pose_normal: (6, 6) normal matrix of the pose alone.
+    """
+
+    residual: Array
+    weighted: Array
+    reduced: Array
+    compensation: Array
+    pose_normal: Array
+
+    @property
+    def normal(self) -> Array:
+        """(P, P) this view's share of the reduced normal matrix."""
+        return self.reduced.T @ self.reduced
+
+    @property
+    def gradient(self) -> Array:
+        """(P,) this view's share of the reduced gradient; the shares of all views sum to nothing at the solution."""
+        return self.reduced.T @ self.weighted
+
+    @property
+    def rms_px(self) -> float:
+        """Two-dimensional root mean square of the residual."""
+        return rms(self.residual)
+
+
+@dataclass(frozen=True, slots=True)
+class Adjustment:
+    """A solution: parameters (P,), poses (N, 6) as rvec and tvec (m) of T_camera_board, and its equations."""
+
+    camera: CameraModel
+    parameters: Array
+    poses: Array
+    views: tuple[ViewEquations, ...]
+    sigma_px: float  # robust standard deviation of one coordinate
+
+    def T_camera_board(self) -> Array:
+        """(N, 4, 4)."""
+        return np.stack([pose_matrix(pose) for pose in self.poses])
+
+
+def rms(residual: Array) -> float:
+    """Two-dimensional root mean square of residuals (2M,)."""
+    return float(np.sqrt(np.sum(residual**2) / (len(residual) / 2)))
+
+
+def pose_matrix(pose: Array) -> Transform:
+    """Our transform of OpenCV's rvec and tvec (6,)."""
+    return transform(Rotation.from_rotvec(pose[:3]), pose[3:])
+
+
+def camera_of(parameters: Array, size: tuple[int, int]) -> CameraModel:
+    """The camera of the first P of PARAMETERS; the others are zero."""
+    return CameraModel(*size, *(float(v) for v in parameters))
+
+
+def parameters_of(camera: CameraModel, count: int) -> Array:
+    """(count,) the inverse of `camera_of`."""
+    return np.array([getattr(camera, name) for name in PARAMETERS[:count]])
+
+
+def project_with_jacobian(points: Array, pose: Array, camera: CameraModel) -> tuple[Array, Array, Array]:
+    """Pixels (M, 2) of board points (M, 3) and their derivatives by the pose (2M, 6) and all parameters (2M, 12)."""
+    terms = np.zeros(8)
+    terms[: len(camera.distortion)] = camera.distortion
+    pixels, jacobian = cv2.projectPoints(points, pose[:3], pose[3:], camera.matrix, terms)
+    J = np.asarray(jacobian, dtype=np.float64)
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2), J[:, :6], J[:, 6:18]
+
+
+def prior_precision(count: int) -> Array:
+    """(count,) diagonal of the normal matrix that the weak prior on k3 … k6 adds; nothing for the other terms."""
+    precision = np.zeros(count)
+    precision[8:] = _PRIOR**2
+    return precision
+
+
+def start(
+    views: Sequence[BoardView], points: Array, size: tuple[int, int], model: LensModel
+) -> tuple[CameraModel, Array]:
+    """A first camera from a part of the views by OpenCV's calibrateCamera, and the poses (N, 6) of all of them.
+
+    Raises:
+        ComputeError: no camera or no pose explains the views.
+    """
+    pick = np.unique(np.linspace(0, len(views) - 1, min(len(views), _START_VIEWS)).round().astype(int))
+    flags = cv2.CALIB_FIX_K3
+    if model == "pinhole":
+        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
+    if model in ("pinhole", "radial2"):
+        flags |= cv2.CALIB_ZERO_TANGENT_DIST
+    try:
+        _, K, distortion, _, _ = cv2.calibrateCamera(
+            [points[views[k].indices].astype(np.float32) for k in pick],
+            [views[k].corners.astype(np.float32).reshape(-1, 1, 2) for k in pick],
+            size,
+            np.eye(3),
+            np.zeros(5),
+            flags=flags,
+            criteria=(cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-6),
+        )
+    except cv2.error as error:
+        raise ComputeError(f"no camera explains the views ({error.err})", remedy="check the board's size") from error
+    terms = (float(v) for v in np.asarray(distortion).ravel()[:4])
+    camera = CameraModel(*size, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *terms)
+    return camera, np.stack([start_pose(view, points, camera) for view in views])
+
+
+def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
+    """(6,) rvec and tvec of one view of a known camera.
+
+    Raises:
+        ComputeError: no pose explains the corners.
+    """
+    done, rvec, tvec = cv2.solvePnP(
+        points[view.indices], view.corners, camera.matrix, camera.distortion, flags=cv2.SOLVEPNP_IPPE
+    )
+    if not done:
+        raise ComputeError("the board's pose could not be computed", remedy="check the corner counts")
+    return np.concatenate([np.asarray(rvec, np.float64).ravel(), np.asarray(tvec, np.float64).ravel()])
+
+
+def fit_pose(view: BoardView, points: Array, camera: CameraModel, pose: Array) -> tuple[Array, float]:
+    """The pose (6,) of one view of a known camera, from a near one, and its RMS error in px."""
+    object_points = points[view.indices]
+    residual = np.zeros(2 * len(view.indices))
+    for _ in range(10):
+        pixels, J, _ = project_with_jacobian(object_points, pose, camera)
+        residual = (pixels - view.corners).ravel()
+        step = np.linalg.lstsq(J, -residual)[0]
+        pose = pose + step
+        if np.abs(J @ step).max() < 1e-6:
+            break
+    return pose, rms(residual)
+
+
+def adjust(
+    views: Sequence[BoardView],
+    points: Array,
+    size: tuple[int, int],
+    camera: CameraModel,
+    poses: Array,
+    *,
+    parameters: int,
+    iterations: int = _MAX_ITERATIONS,
+) -> Adjustment:
+    """Levenberg-Marquardt over the camera's first `parameters` PARAMETERS and every pose, with Huber's weights.
+
+    Each view's pose is eliminated, so the cost of a step grows linearly with the number of views.
+    Source: Zhang, "A flexible new technique for camera calibration", PAMI 2000, for the model; Triggs et al.,
+    "Bundle adjustment — a modern synthesis", 1999, section 6.1, for the elimination.
+
+    Args:
+        views: (N) corners, px.
+        points: (K, 3) of the board, m.
+        size: width and height, px.
+        camera: start.
+        poses: (N, 6) start, rvec and tvec (m).
+        parameters: how many are estimated; the others stay as `camera` has them (zero).
+        iterations: at most.
+
+    Raises:
+        ComputeError: the equations are singular, or do not converge to finite numbers.
+    """
+    theta = parameters_of(camera, parameters)
+    damping = 1e-4
+    prior = prior_precision(parameters)
+    state, cost, scale = _linearise(views, points, theta, poses, size)
+    cost += float(prior @ theta**2)
+    for _ in range(iterations):
+        normal = np.sum([view.normal for view in state], axis=0) + np.diag(prior)
+        gradient = np.sum([view.gradient for view in state], axis=0) + prior * theta
+        shape = np.sqrt(np.diag(normal))
+        if not np.isfinite(shape).all() or shape.min() <= 0:
+            raise ComputeError("the views do not determine the camera", remedy="take views with more tilt")
+        scaled = normal / np.outer(shape, shape) + damping * np.eye(parameters)
+        step = -np.linalg.solve(scaled, gradient / shape) / shape
+        moved = np.stack([p + _pose_step(view, step) for p, view in zip(poses, state, strict=True)])
+        trial, trial_cost, trial_scale = _linearise(views, points, theta + step, moved, size, scale)
+        trial_cost += float(prior @ (theta + step) ** 2)
+        if not np.isfinite(trial_cost) or trial_cost > cost * (1 + 1e-12):
+            damping *= 10
+            if damping > 1e6:
+                break
+            continue
+        small = np.abs(step / np.maximum(np.abs(theta), 1e-3)).max() < 1e-9 or cost - trial_cost < 1e-13 * cost
+        theta, poses, state, damping = theta + step, moved, trial, damping / 10
+        cost = trial_cost
+        if small:
+            break
+        if trial_scale < 0.7 * scale:  # far from the solution the corners' own scale is not yet known
+            state, cost, scale = _linearise(views, points, theta, poses, size)
+            cost += float(prior @ theta**2)
+    state, _, scale = _linearise(views, points, theta, poses, size)
+    if not np.isfinite(theta).all() or theta[:2].min() <= 0:
+        raise ComputeError("the calibration did not converge", remedy="check the board's size and the views")
+    return Adjustment(camera_of(theta, size), theta, poses, state, scale)
+
+
+def linearised(boards: Array, points: Array, camera: CameraModel, parameters: int) -> Adjustment:
+    """The equations that boards T_camera_board (N, 4, 4) would have if their points (K, 3) were seen as expected.
+
+    Residuals are nothing, corners count 1 px: what images will tell can be judged before they are taken.
+    """
+    poses = np.array([np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]]) for T in boards])
+    theta = parameters_of(camera, parameters)
+    every = np.arange(len(points))
+    views = [
+        BoardView(every, project_with_jacobian(points, pose, camera_of(theta, (camera.width, camera.height)))[0])
+        for pose in poses
+    ]
+    equations, _, _ = _linearise(views, points, theta, poses, (camera.width, camera.height))
+    return Adjustment(camera, theta, poses, equations, 1.0)
+
+
+def _pose_step(view: ViewEquations, step: Array) -> Array:
+    return view.compensation[:, :-1] @ step + view.compensation[:, -1]
+
+
+def _linearise(
+    views: Sequence[BoardView],
+    points: Array,
+    theta: Array,
+    poses: Array,
+    size: tuple[int, int],
+    scale: float | None = None,
+) -> tuple[tuple[ViewEquations, ...], float, float]:
+    """Equations of every view, Huber's cost at `scale` (default: the present one), and the present robust scale."""
+    camera = camera_of(theta, size)
+    parts = [
+        (*project_with_jacobian(points[view.indices], pose, camera), view.corners)
+        for view, pose in zip(views, poses, strict=True)
+    ]
+    residuals = [(pixels - corners).ravel() for pixels, _, _, corners in parts]
+    present = max(float(1.4826 * np.median(np.abs(np.concatenate(residuals)))), 1e-9)
+    limit = _HUBER * (present if scale is None else scale)
+    equations: list[ViewEquations] = []
+    cost = 0.0
+    for residual, (_, by_pose, by_camera, _) in zip(residuals, parts, strict=True):
+        length = np.repeat(np.hypot(residual[::2], residual[1::2]), 2) / np.sqrt(2)
+        root = np.sqrt(np.minimum(1.0, limit / np.maximum(length, 1e-12)))
+        cost += float(np.sum(np.where(length <= limit, length**2, 2 * limit * length - limit**2)))
+        J_pose, J = by_pose * root[:, None], by_camera[:, : len(theta)] * root[:, None]
+        target = np.column_stack([J, residual * root])
+        Q, R = np.linalg.qr(J_pose)
+        inside = Q.T @ target
+        free = target - Q @ inside
+        follow = -np.linalg.solve(R, inside)
+        equations.append(ViewEquations(residual, free[:, -1], free[:, :-1], follow, R.T @ R))
+    return tuple(equations), cost, present

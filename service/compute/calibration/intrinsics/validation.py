@@ -1,0 +1,144 @@
+"""Cross-validation of a calibration over images, and what a careful person would object to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import floor
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.calibration.intrinsics.adjustment import adjust, fit_pose, rms
+from service.compute.calibration.intrinsics.estimate import IntrinsicsResult
+from service.compute.calibration.intrinsics.uncertainty import ProjectionUncertainty
+from service.core.errors import ComputeError
+from service.core.geometry import Array
+
+MIN_VIEWS_TO_VALIDATE = 4
+_FOLDS = 5
+# Gates of the procedure (the reasons are in the messages).
+_VIEWS = 60
+_RMS_PX = 0.5
+_COVERAGE = 0.9
+_TILT_DEG = 30.0
+_HELD_OUT_FACTOR = 1.3
+_INFLATION = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class CrossValidation:
+    """Errors of views that a calibration has not seen; only the view's own pose is fitted to it.
+
+    Attributes:
+        folds: how many parts the views were split in.
+        five_fold_rms_px: over all views, each held out once.
+        five_fold_view_px: (N,).
+        leave_one_out_rms_px: each view judged by the calibration without it (one Newton step).
+        leave_one_out_view_px: (N,); NaN where the other views do not determine the camera.
+    """
+
+    folds: int
+    five_fold_rms_px: float
+    five_fold_view_px: Array
+    leave_one_out_rms_px: float
+    leave_one_out_view_px: Array
+
+
+def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidation:
+    """Five-fold and leave-one-out over the views of a calibration.
+
+    Raises:
+        ComputeError: fewer than four views, of which none can be spared.
+    """
+    n = len(result.corners)
+    if n < MIN_VIEWS_TO_VALIDATE:
+        raise ComputeError(f"{n} views cannot be cross-validated", remedy="take more board images")
+    points = result.board.points()
+    size = (result.camera.width, result.camera.height)
+    folds = min(_FOLDS, n)
+    fold = np.random.default_rng(seed).permutation(n) % folds
+    solution = result.adjustment
+    held_out = np.zeros(n)
+    for k in range(folds):
+        train = np.flatnonzero(fold != k)
+        without = adjust(
+            [result.corners[i] for i in train],
+            points,
+            size,
+            solution.camera,
+            solution.poses[train],
+            parameters=len(result.parameters),
+            iterations=6,
+        )
+        for i in np.flatnonzero(fold == k):
+            held_out[i] = fit_pose(result.corners[i], points, without.camera, solution.poses[i])[1]
+    one_out = np.array(
+        [
+            rms(view.residual + view.reduced @ change)
+            for view, change in zip(solution.views, result.leave_one_out, strict=True)
+        ]
+    )
+    counts = np.array([len(view.indices) for view in result.corners])
+    return CrossValidation(folds, _pooled(held_out, counts), held_out, _pooled(one_out, counts), one_out)
+
+
+def _pooled(per_view_px: Array, counts: Array) -> float:
+    return float(np.sqrt(np.sum(per_view_px**2 * counts) / np.sum(counts)))
+
+
+def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) -> tuple[Array, NDArray[np.int64]]:
+    """Mean residual (rows, columns, 2) of the corners in each cell of the image, px, and how many (rows, columns).
+
+    Noise averages out; what remains is what the lens model does not hold.
+    """
+    corners = np.concatenate([view.corners for view in result.corners])
+    residual = np.concatenate([view.residual.reshape(-1, 2) for view in result.adjustment.views])
+    cells = np.array([columns, rows])
+    size = np.array([result.camera.width, result.camera.height])
+    cell = np.clip((corners + 0.5) / size * cells, 0, cells - 1).astype(int)
+    flat = cell[:, 1] * columns + cell[:, 0]
+    count = np.bincount(flat, minlength=columns * rows)
+    total = np.stack([np.bincount(flat, residual[:, k], columns * rows) for k in (0, 1)], axis=1)
+    mean = total / np.maximum(count, 1)[:, None]
+    return mean.reshape(rows, columns, 2), count.reshape(rows, columns).astype(np.int64)
+
+
+def calibration_warnings(
+    result: IntrinsicsResult, validation: CrossValidation | None, uncertainty: ProjectionUncertainty
+) -> tuple[str, ...]:
+    """Every reason to trust this calibration less, in words; none if there is none."""
+    found: list[str] = []
+    n = len(result.views)
+    if n < _VIEWS:
+        found.append(f"{n} views; {_VIEWS} or more average the errors that corners of one image share")
+    if result.rms_px > _RMS_PX:
+        found.append(f"{result.rms_px:.2f} px rms, more than {_RMS_PX} px: blur, motion, bent board, wrong model")
+    if result.coverage < _COVERAGE:
+        share = f"{floor(1000 * result.coverage) / 10:g} %"  # never rounded up to its limit
+        found.append(f"corners in {share} of the image, less than {_COVERAGE:.0%}: show the board there")
+    if result.tilt_deg.max() < _TILT_DEG:
+        found.append(f"largest tilt {result.tilt_deg.max():.0f}°, less than {_TILT_DEG:.0f}°: focal length is weak")
+    if result.inflation > _INFLATION:
+        found.append(
+            f"images disagree {np.sqrt(result.inflation):.1f} times as much as their corners' noise explains "
+            "(light, a bent board or a wrong model); the sigmas are enlarged by this"
+        )
+    for name, sigma in result.sigma.items():
+        if name in ("k2", "k3", "k4", "k5", "k6") and sigma > abs(getattr(result.camera, name)):
+            found.append(
+                f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): fewer terms do"
+            )
+    if result.board.pattern == "circles":
+        found.append("the middle of a tilted circle's image is not its centre: a checkerboard is more accurate")
+    if validation is None:
+        found.append("too few views for cross-validation")
+    elif validation.five_fold_rms_px > _HELD_OUT_FACTOR * result.rms_px:
+        found.append(
+            f"held-out views err by {validation.five_fold_rms_px:.2f} px, views in the fit by {result.rms_px:.2f} px"
+        )
+    if uncertainty.worst_px > _RMS_PX:
+        found.append(
+            f"projection is uncertain by {uncertainty.worst_px:.2f} px ({uncertainty.worst_mm:.3f} mm at "
+            f"{uncertainty.distance_m:.2f} m) where it is worst in the image"
+        )
+    return tuple(found)

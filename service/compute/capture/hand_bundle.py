@@ -1,0 +1,155 @@
+"""Spheres that nobody has measured, and where the camera was: adjusted together from the outlines of all images."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.layout.photo_adjustment import CALIBRATED, Photograph, adjust
+from service.compute.markers.cones import Cone
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, align_points, apply, inverse
+
+_WORST_CHI2 = 20.0  # per degree of freedom: beyond, some image was read wrongly
+_LEAST_SPHERES = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What one image contributes: an outline and a sphere's number, n times, and the camera as the image tells it."""
+
+    viewpoint: str
+    T_scene_camera: Transform
+    spheres: NDArray[np.int64]  # (n,)
+    axes: Array  # (n, 3)
+    half_angles_rad: Array  # (n,)
+    covariances: Array  # (n, 3, 3), as SphereOutline.cone_covariance
+
+    @classmethod
+    def of(cls, viewpoint: str, T_scene_camera: Transform, shown: Mapping[int, SphereOutline]) -> Reading:
+        """From the outlines of an image by the sphere that each of them shows."""
+        outlines = list(shown.values())
+        return cls(
+            viewpoint,
+            T_scene_camera,
+            np.array(list(shown), dtype=np.int64),
+            np.array([o.cone.axis for o in outlines]).reshape(-1, 3),
+            np.array([o.cone.half_angle_rad for o in outlines]),
+            np.array([o.cone_covariance for o in outlines]).reshape(-1, 3, 3),
+        )
+
+    def of_spheres(self, numbers: NDArray[np.int64]) -> Reading:
+        """The same without all other spheres."""
+        kept = np.isin(self.spheres, numbers)
+        return replace(
+            self,
+            spheres=self.spheres[kept],
+            axes=self.axes[kept],
+            half_angles_rad=self.half_angles_rad[kept],
+            covariances=self.covariances[kept],
+        )
+
+    def record(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "spheres": self.spheres.tolist(),
+            "axes": self.axes.tolist(),
+            "half_angles_rad": self.half_angles_rad.tolist(),
+            "covariances": self.covariances.tolist(),
+        }
+
+    @classmethod
+    def read(cls, viewpoint: str, T_scene_camera: Transform, data: Mapping[str, Any]) -> Reading:
+        """What `record` wrote."""
+        return cls(
+            viewpoint,
+            T_scene_camera,
+            np.array(data["spheres"], dtype=np.int64),
+            np.array(data["axes"]).reshape(-1, 3),
+            np.array(data["half_angles_rad"]),
+            np.array(data["covariances"]).reshape(-1, 3, 3),
+        )
+
+    def photograph(self, camera: CameraModel) -> Photograph:
+        """For the adjustment."""
+        cones = tuple(Cone(axis, float(half)) for axis, half in zip(self.axes, self.half_angles_rad, strict=True))
+        return Photograph(camera, cones, self.covariances)
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """What the images say together.
+
+    Attributes:
+        spheres_m: (N, 3), in the frame in which they were given; what two images do not show is where it was.
+        known: numbers of those that two images show.
+        sigma_m: of the sphere among these that is known worst against the others.
+        poses: T_scene_camera by viewpoint.
+    """
+
+    spheres_m: Array
+    known: NDArray[np.int64]
+    sigma_m: float
+    poses: Mapping[str, Transform]
+
+
+def adjust_together(
+    readings: Sequence[Reading], spheres_m: Array, camera: CameraModel, radius_m: float
+) -> Bundle | None:
+    """Refine spheres (N, 3) and cameras from the outlines of all images.
+
+    A sphere takes part that two images show: one alone tells its distance badly. None where fewer than two images
+    have four of these, or where they do not fit together.
+    """
+    counts = np.zeros(len(spheres_m), dtype=np.int64)
+    for reading in readings:
+        counts[reading.spheres] += 1
+    shared = np.nonzero(counts >= 2)[0]
+    number = np.full(len(spheres_m), -1, dtype=np.int64)
+    number[shared] = np.arange(len(shared))
+    joined = [r.of_spheres(shared) for r in readings]
+    joined = [r for r in joined if len(r.spheres) >= _LEAST_SPHERES]
+    if len(joined) < 2 or len(np.unique(np.concatenate([r.spheres for r in joined]))) < len(shared):
+        return None
+    first = joined[0].T_scene_camera
+    try:
+        found = adjust(
+            [r.photograph(camera) for r in joined],
+            [number[r.spheres] for r in joined],
+            apply(inverse(first), spheres_m[shared]),
+            [inverse(r.T_scene_camera) @ first for r in joined],
+            radius_m,
+            CALIBRATED,
+        )
+    except ComputeError:
+        return None
+    if found.chi2 > _WORST_CHI2:
+        return None
+    T_scene_first, _ = align_points(spheres_m[shared], found.centres_m)
+    refined = spheres_m.copy()
+    refined[shared] = apply(T_scene_first, found.centres_m)
+    poses = {r.viewpoint: T_scene_first @ inverse(T) for r, T in zip(joined, found.T_photo_first, strict=True)}
+    halves = np.concatenate([r.half_angles_rad for r in joined])
+    scale_sigma = EXPECTED_COMMON_ERRORS.growth_px / (camera.fx * float(np.tan(np.median(halves))))
+    return Bundle(refined, shared, _worst_sigma_m(found.centres_m, found.covariance, scale_sigma), poses)
+
+
+def _worst_sigma_m(centres_m: Array, covariance: Array, scale_sigma: float) -> float:
+    """Of the shape alone: where the whole is, and how it is turned, is of no interest.
+
+    The spheres' radius is the only length in the images: outlines that are all too wide make the whole too small.
+    """
+    away = centres_m - centres_m.mean(axis=0)
+    turns = np.stack([np.cross(axis, away).ravel() for axis in np.eye(3)], axis=1)
+    free, _ = np.linalg.qr(np.hstack([np.tile(np.eye(3), (len(away), 1)), turns]))
+    shape = np.eye(len(free)) - free @ free.T
+    own = (shape @ covariance @ shape.T).reshape(len(away), 3, len(away), 3)
+    of_scale = scale_sigma**2 * np.sum(away**2, axis=1)
+    return float(np.sqrt((np.einsum("ijij->i", own) + of_scale).max()))

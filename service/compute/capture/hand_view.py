@@ -1,0 +1,160 @@
+"""What one hand-held image says: where the camera was, by the spheres alone, and whether the image can be used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.capture.live import clipped_fraction, expected_spheres, paired, sharpness
+from service.compute.layout.photographs import places_by_size
+from service.compute.markers.detect import detect_spheres
+from service.compute.markers.records import DetectionOptions, SphereOutline
+from service.compute.markers.search.predicted import fit_pose
+from service.compute.planning.information import ViewInformation, view_information
+from service.compute.registration.identity import identify
+from service.compute.surfaces.constellations import match_constellations
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, inverse
+
+_LEAST_SPHERES = 4  # with four, a wrong reading of them contradicts itself
+_LEAST_SHARE = 0.7  # of the spheres that the image should show whole: with fewer, something stands before the lens
+_MOST_EDGE_PX = 3.5  # width of the step across an outline; a sharp image has about 1.5
+_MOST_CLIPPED = 0.05  # of the pixels
+_LEAST_BRIGHT = 60.0  # of 255: what a hundredth of the pixels exceed
+_ROUGH_M, _ROUGH_SIGMA_M = 0.012, 0.01  # how far two layouts from photographs differ
+_POSE_SIGMA_M = 2e-3  # an outline that contradicts the image's own pose by more is no sphere of the list
+
+
+@dataclass(frozen=True, slots=True)
+class HandView:
+    """One image.
+
+    Attributes:
+        T_scene_camera: (4, 4) in the frame of the spheres; None where they do not tell.
+        information: of the scan's pose in the camera's, None without a pose.
+        why: what makes the image unusable; empty for a good one.
+        shown: outlines by the sphere that each of them shows.
+    """
+
+    T_scene_camera: Transform | None
+    information: ViewInformation | None = field(repr=False)
+    outlines: int
+    spheres_seen: int
+    spheres_expected: int
+    edge_px: float
+    rms_px: float
+    clipped: float
+    why: str
+    shown: Mapping[int, SphereOutline] = field(default_factory=dict[int, SphereOutline], repr=False)
+
+
+def look_at_image(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    spheres_m: Array,
+    radius_m: float,
+    options: DetectionOptions,
+    *,
+    rough: bool = False,
+) -> HandView:
+    """Search a whole image (H, W, 3) for the spheres (M, 3); nothing is known of where the camera was.
+
+    Args:
+        rough: the spheres are known from photographs alone, to some millimetres; so is the camera's pose then.
+    """
+    outlines = detect_spheres(image_bgr, camera, options)
+    quality = sharpness(image_bgr, outlines, camera)
+    clipped = clipped_fraction(image_bgr)
+    found = _rough_pose(outlines, spheres_m, radius_m) if rough else _read(outlines, camera, spheres_m, radius_m)
+    T_camera_scene, markers = _refined(found, outlines, camera, spheres_m, radius_m)
+    exposure = _exposure(image_bgr, clipped)
+    if T_camera_scene is None:
+        why = exposure or (
+            f"{len(outlines)} spheres found, which do not tell where the camera was: it may have moved, be out of "
+            "focus, too near, or something stands before the lens"
+        )
+        return HandView(None, None, len(outlines), 0, 0, quality.edge_px, quality.rms_px, clipped, why)
+    T_scene_camera = inverse(T_camera_scene)
+    expected = expected_spheres(T_camera_scene, spheres_m, radius_m, camera)
+    seen = len(markers)
+    information = view_information(
+        T_scene_camera,
+        np.eye(4),
+        outlines,
+        markers,
+        spheres_m,
+        radius_m,
+        spheres_m.mean(axis=0),
+        _ROUGH_SIGMA_M if rough else _POSE_SIGMA_M,
+    )
+    why = exposure
+    if not why and quality.edge_px > _MOST_EDGE_PX:
+        why = f"blurred: outlines are {quality.edge_px:.1f} px wide; hold the camera still"
+    if not why and len(expected) >= _LEAST_SPHERES and seen < _LEAST_SHARE * len(expected):
+        why = f"{seen} of {len(expected)} spheres are seen: something stands before the lens"
+    return HandView(
+        T_scene_camera,
+        information,
+        len(outlines),
+        seen,
+        len(expected),
+        quality.edge_px,
+        quality.rms_px,
+        clipped,
+        why,
+        {sphere: outlines[o] for o, sphere in markers.items()},
+    )
+
+
+def _read(
+    outlines: Sequence[SphereOutline], camera: CameraModel, spheres_m: Array, radius_m: float
+) -> Transform | None:
+    """T_camera_scene by the one reading on which the spheres agree; None where there is none."""
+    if len(outlines) < _LEAST_SPHERES:
+        return None
+    try:
+        (reading,) = identify([outlines], spheres_m, camera, radius_m=radius_m)
+    except ComputeError:
+        return None
+    return reading.T_camera_scan
+
+
+def _rough_pose(outlines: Sequence[SphereOutline], spheres_m: Array, radius_m: float) -> Transform | None:
+    """The same from the spheres' places as this image alone shows them, laid over those of other photographs."""
+    places = places_by_size([outline.cone for outline in outlines], radius_m)
+    if len(places) < _LEAST_SPHERES:
+        return None
+    try:
+        return match_constellations(places, spheres_m, _ROUGH_M).T_a_b
+    except ComputeError:
+        return None
+
+
+def _refined(
+    start: Transform | None,
+    outlines: Sequence[SphereOutline],
+    camera: CameraModel,
+    spheres_m: Array,
+    radius_m: float,
+) -> tuple[Transform | None, dict[int, int]]:
+    """T_camera_scene and outline → sphere; None and nothing where fewer than four spheres agree."""
+    if start is None:
+        return None, {}
+    markers = paired(outlines, start, spheres_m, radius_m, camera)
+    if len(markers) < _LEAST_SPHERES:
+        return None, {}
+    axes = np.array([outlines[o].cone.axis for o in markers])
+    half = np.array([outlines[o].cone.half_angle_rad for o in markers])
+    pose = fit_pose(axes, half, spheres_m[list(markers.values())], radius_m, start)
+    return pose, paired(outlines, pose, spheres_m, radius_m, camera)
+
+
+def _exposure(image_bgr: NDArray[np.uint8], clipped: float) -> str:
+    if clipped > _MOST_CLIPPED:
+        return f"overexposed: {100 * clipped:.0f} % of the pixels are white"
+    bright = float(np.percentile(image_bgr[::4, ::4].max(axis=2), 99))
+    return f"underexposed: hardly a pixel is brighter than {bright:.0f} of 255" if bright < _LEAST_BRIGHT else ""

@@ -1,0 +1,197 @@
+"""What one more image brings while the capture runs: its spheres, and the registration of all images so far.
+
+The first images of a station are searched whole; from then on the registration says where the spheres are, and only
+their regions are looked at. Stations are independent problems, for the robot's poses of each are in a base frame of
+their own: only the station of the new image is solved again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.cones import cone_of_sphere
+from service.compute.markers.detect import detect_spheres
+from service.compute.markers.outlines.edges import profiles, sample
+from service.compute.markers.outlines.refine import refine_outline
+from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.registration.hypotheses import match, sightings
+from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.solve import RegistrationResult, register
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, apply, inverse
+
+_POINTS = 25  # of an outline in the provisional solution: its three numbers need no more
+_GATE = 0.5  # of a radius, what a robot that is off by millimetres still meets
+_SIZE_GATE = 0.12
+_FULL_SCALE = 254  # of 255: JPEG moves a clipped 255 by one
+_MARGIN = 1.1  # of the outline's radius: a sphere nearer to the image's border is not expected to be found
+
+
+@dataclass(frozen=True, slots=True)
+class LiveView:
+    """One image as the provisional registration sees it."""
+
+    name: str
+    T_base_camera: Transform  # (4, 4) robot pose and hand-eye, in the base frame of its station
+    outlines: tuple[SphereOutline, ...] = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Sharpness:
+    """How an image renders the outlines of its spheres."""
+
+    edge_px: float  # width of the luma step across the outlines, median; NaN without outlines
+    coverage: float  # part of the outlines with accepted edge points, median
+    rms_px: float  # of edge points against their own outline, median
+
+
+@dataclass(frozen=True, slots=True)
+class Provisional:
+    """The registration of one station's images so far.
+
+    `registration.residuals` refer to `used` images. `T_base_scan` maps the scan (or CT) frame to the station's base.
+    """
+
+    T_base_scan: Transform
+    registration: RegistrationResult = field(repr=False)
+    used: tuple[str, ...]  # images with spheres assigned, in the order of the registration
+
+    def predicted_error_m(self, point_scan_m: Array) -> float:
+        """Standard deviation (3D) of a point (3,) of the scan in this station's images."""
+        return self.registration.sigma_at_m(point_scan_m)
+
+
+def expected_spheres(T_camera_scan: Transform, spheres_m: Array, radius_m: float, camera: CameraModel) -> list[int]:
+    """Indices of the spheres (M, 3) whose whole outline falls into the image, other things out of the way."""
+    centres = apply(T_camera_scan, spheres_m)
+    distance = np.linalg.norm(centres, axis=1)
+    front = (centres[:, 2] > 0.3 * distance) & (distance > 2 * radius_m)
+    out: list[int] = []
+    for m in np.nonzero(front)[0]:
+        x, y = camera.project(centres[m][None])[0]
+        reach = _MARGIN * camera.fx * radius_m / distance[m] / (centres[m, 2] / distance[m])
+        if reach <= x <= camera.width - 1 - reach and reach <= y <= camera.height - 1 - reach:
+            out.append(int(m))
+    return out
+
+
+def find_spheres(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    spheres_m: Array,
+    radius_m: float,
+    T_camera_scan: Transform | None,
+    options: DetectionOptions = DEFAULTS,
+) -> tuple[SphereOutline, ...]:
+    """Outlines in an image (H, W, 3): near the predicted places, or by a search of the whole image.
+
+    Args:
+        T_camera_scan: the prediction, right to about a tenth of a radius; None, or a prediction near which fewer
+            than three spheres are found: the whole image is searched.
+    """
+    if T_camera_scan is not None:
+        found: list[SphereOutline] = []
+        for m in expected_spheres(T_camera_scan, spheres_m, radius_m, camera):
+            cone = cone_of_sphere(apply(T_camera_scan, spheres_m[m]), radius_m)
+            outline = refine_outline(image_bgr, camera, cone, options)
+            if outline is not None:
+                found.append(outline)
+        if len(paired(found, T_camera_scan, spheres_m, radius_m, camera)) >= 3:
+            return tuple(found)
+    return detect_spheres(image_bgr, camera, options)
+
+
+def register_station(
+    views: Sequence[LiveView],
+    spheres_m: Array,
+    radius_m: float,
+    camera: CameraModel,
+    T_base_scan: Transform | None = None,
+) -> Provisional:
+    """The registration of the images of one station.
+
+    Args:
+        views: images with their outlines, any number.
+        spheres_m: (M, 3) in the frame of the scan or the CT.
+        T_base_scan: a registration of earlier images, by which the spheres of all are told apart; None: they are
+            identified from scratch.
+
+    Raises:
+        ComputeError: the outlines do not determine an answer yet.
+    """
+    outlines = [tuple(_fewer_points(o) for o in view.outlines) for view in views]
+    poses = np.array([view.T_base_camera for view in views]).reshape(-1, 4, 4)
+    if T_base_scan is None:
+        assignments = identify(outlines, spheres_m, camera, poses, radius_m=radius_m, names=[v.name for v in views])
+    else:
+        assignments = tuple(
+            Assignment(paired(found, T, spheres_m, radius_m, camera), T)
+            for found, T in ((o, inverse(p) @ T_base_scan) for o, p in zip(outlines, poses, strict=True))
+        )
+    keep = [i for i, assignment in enumerate(assignments) if assignment.markers]
+    if not keep:
+        raise ComputeError("no image shows a sphere where the registration expects one")
+    answer = register(
+        [outlines[i] for i in keep],
+        [assignments[i] for i in keep],
+        poses[keep],
+        np.zeros(len(keep), dtype=np.int64),
+        spheres_m,
+        radius_m,
+        camera,
+    )
+    return Provisional(answer.T_world_scan, answer, tuple(views[i].name for i in keep))
+
+
+def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], camera: CameraModel) -> Sharpness:
+    """Width of the luma step across the outlines, and the outlines' own quality.
+
+    The width of an edge is its height over its steepest slope, in pixels: about 1.5 for a sharp image of this kind.
+    """
+    if not outlines:
+        return Sharpness(float("nan"), 0.0, float("nan"))
+    widths: list[float] = []
+    for outline in outlines:
+        where = profiles(outline.cone, camera, 64, np.arange(-8.0, 8.25, 0.5))
+        values = np.asarray(sample(image_bgr, where.pixels), dtype=np.float64) @ [0.114, 0.587, 0.299]
+        values = cv2.blur(values, (3, 1))
+        step = np.abs(np.median(values[:, :6], axis=1) - np.median(values[:, -6:], axis=1))
+        slope = np.abs(np.diff(values, axis=1)[:, 10:-10]).max(axis=1) / 0.5
+        clear = (step > 12) & (slope > 0) & where.inside.all(axis=1)
+        if clear.sum() >= 8:
+            widths.append(float(np.median(step[clear] / slope[clear])))
+    return Sharpness(
+        float(np.median(widths)) if widths else float("nan"),
+        float(np.median([o.coverage for o in outlines])),
+        float(np.median([o.rms_px for o in outlines])),
+    )
+
+
+def clipped_fraction(image_bgr: NDArray[np.uint8]) -> float:
+    """Share of the pixels of an image (H, W, 3) with a channel at the end of its scale, by a sixteenth of them."""
+    return float(np.mean(image_bgr[::4, ::4].max(axis=2) >= _FULL_SCALE))
+
+
+def paired(
+    outlines: Sequence[SphereOutline],
+    T_camera_scan: Transform,
+    spheres_m: Array,
+    radius_m: float,
+    camera: CameraModel,
+) -> dict[int, int]:
+    """Outline → sphere, by the predicted directions and sizes."""
+    seen = sightings(outlines, radius_m, camera)
+    pairs = match(seen, apply(T_camera_scan, spheres_m), radius_m, _GATE, _SIZE_GATE)
+    return {d: m for d, m, _ in pairs}
+
+
+def _fewer_points(outline: SphereOutline) -> SphereOutline:
+    step = max(1, len(outline.points) // _POINTS)
+    return dataclasses.replace(outline, points=outline.points[::step], points_px=outline.points_px[::step])

@@ -1,0 +1,219 @@
+"""How good a registration is: the paper's two errors on control spheres, and the true error where truth is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.records import SphereOutline
+from service.compute.registration.cost import residuals
+from service.compute.registration.identity import Assignment
+from service.compute.registration.normal_equations import (
+    compress,
+    inverse_symmetric,
+    marginalise,
+    pose_errors,
+    solve_symmetric,
+)
+from service.compute.registration.prediction import Foreign, Prediction, foreign_rows, predict
+from service.compute.registration.result import RegistrationResult, Solution
+from service.core.errors import ComputeError
+from service.core.geometry import Array, align_points, apply, inverse
+
+
+@dataclass(frozen=True, slots=True)
+class ControlError:
+    """One control sphere in one image."""
+
+    image: int
+    outline: int
+    sphere: int
+    radial_error_mm: float
+    reprojection_error_px: float
+    sigma_mm: float | None = (
+        None  # predicted rms of the radial error; None where nothing was stated to predict it from
+    )
+    normalised: float | None = (
+        None  # the outline's three numbers against their prediction, in standard deviations, rms
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Means over all outline points of all control spheres in all images."""
+
+    mean_radial_error_mm: float
+    mean_reprojection_error_px: float
+    errors: tuple[ControlError, ...]
+
+    @property
+    def normalised_rms(self) -> float | None:
+        """Rms of the normalised errors: near 1 if the stated covariances are right; None where there are none."""
+        values = [e.normalised for e in self.errors if e.normalised is not None]
+        return float(np.sqrt(np.mean(np.square(values)))) if values else None
+
+    def per_sphere(self) -> dict[int, tuple[float, float, int]]:
+        """Sphere → mean radial error (mm), mean reprojection error (px), number of images."""
+        out: dict[int, tuple[float, float, int]] = {}
+        for s in sorted({e.sphere for e in self.errors}):
+            mine = [e for e in self.errors if e.sphere == s]
+            radial = float(np.mean([e.radial_error_mm for e in mine]))
+            out[s] = (radial, float(np.mean([e.reprojection_error_px for e in mine])), len(mine))
+        return out
+
+
+def radial_errors_m(points: Array, centre_camera_m: Array, radius_m: float) -> Array:
+    """Distances (L,) between the rays through normalised points (L, 2) and the hull of the sphere."""
+    rays = np.column_stack([points, np.ones(len(points))])
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    along = rays @ centre_camera_m
+    return np.abs(np.linalg.norm(centre_camera_m - along[:, None] * rays, axis=1) - radius_m)
+
+
+def evaluate(
+    outlines: Sequence[Sequence[SphereOutline]],
+    assignments: Sequence[Assignment],
+    T_scan_camera: Array,
+    centres_scan_m: Array,
+    radius_m: float,
+    camera: CameraModel,
+    *,
+    registration: RegistrationResult | None = None,
+    centre_covariance_m2: Array | None = None,
+) -> Evaluation:
+    """Errors of spheres that took no part in the registration.
+
+    Args:
+        outlines: per image.
+        assignments: per image, outline → index into `centres_scan_m`.
+        T_scan_camera: (N, 4, 4) the registered cameras, metric.
+        centres_scan_m: (C, 3) control spheres.
+        radius_m: of the control spheres.
+        camera: intrinsics.
+        registration: what predicts the errors; its covariance gives `sigma_mm` and `normalised`. The cameras must be
+            its `T_scan_camera` or its `T_scan_camera_refined`.
+        centre_covariance_m2: (C, 3, 3) of the control spheres' centres; None takes them as exact.
+
+    Both errors are the paper's: radial, the mean distance between the rays of the outline's points and the hull of
+    the sphere; reprojection, the mean distance of the points from the projected outline (geometric, to first order).
+
+    Raises:
+        ComputeError: no control sphere was seen.
+    """
+    members = [(i, j, s) for i, a in enumerate(assignments) for j, s in sorted(a.markers.items())]
+    if not members:
+        raise ComputeError(
+            "no control sphere was found in any image", remedy="Capture control images before the spheres are removed"
+        )
+    stated = None
+    if registration is not None:
+        refined = bool(np.allclose(T_scan_camera, registration.T_scan_camera_refined, atol=1e-12, equal_nan=True))
+        rows = foreign_rows(registration.solution, outlines, members, centres_scan_m)
+        spread = None if centre_covariance_m2 is None else centre_covariance_m2[[s for _, _, s in members]]
+        stated = predict(registration.solution, rows, refined=refined, centre_covariance_m2=spread)
+    errors: list[ControlError] = []
+    for k, (i, j, s) in enumerate(members):
+        centre = apply(inverse(T_scan_camera[i]), centres_scan_m[s])
+        errors.append(
+            _error(i, j, s, outlines[i][j].points, centre, radius_m, camera, None if stated is None else stated[k])
+        )
+    return _summary(errors)
+
+
+def leave_one_out(registration: RegistrationResult, *, refined: bool = False) -> Evaluation:
+    """Errors of every registration sphere as predicted by the others: evaluation where there are no control spheres.
+
+    Args:
+        registration: with its solution, from which each sphere's outlines are taken out (one linear step; the
+            weights of the outlines and the sizes of all errors stay).
+        refined: predict with the errors found of the camera poses (from the other spheres) taken off.
+
+    A sphere without which a station would see fewer than three is left out of the result.
+
+    Raises:
+        ComputeError: no sphere can be spared.
+    """
+    full = registration.solution
+    problem = full.problem
+    errors: list[ControlError] = []
+    for m in sorted(set(problem.marker.tolist())):
+        out = problem.marker == m
+        weights = np.where(out, 0.0, full.weights)
+        if any(len(set(problem.marker[(weights > 0) & (problem.group == k)].tolist())) < 3
+               for k in range(len(problem.groups))):  # fmt: skip
+            continue
+        rest = _without(full, weights)
+        mine = np.nonzero(out & (full.weights > 0))[0]
+        lines = full.linearised
+        r = lines.r[mine] + lines.J[mine] @ rest.step
+        rows = Foreign(problem.image[mine], lines.J[mine], lines.A[mine], r, problem.whiten[mine])
+        stated = predict(rest.solution, rows, refined=refined)
+        T = rest.solution.state.cameras(problem, refined=refined)
+        for o, prediction in zip(mine, stated, strict=True):
+            i, j, _ = problem.members[o]
+            base = rest.solution.state.bases[problem.group[o]]
+            centre = apply(inverse(T[i]) @ base, problem.centres[m])
+            errors.append(_error(i, j, m, problem.points[o], centre, problem.radius_m, problem.camera, prediction))
+    if not errors:
+        raise ComputeError("no sphere can be left out: each is needed", remedy="Use more registration spheres")
+    return _summary(errors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    solution: Solution
+    step: Array  # (n,) of the common unknowns
+
+
+def _without(full: Solution, weights: Array) -> _Rest:
+    problem, lines, prior = full.problem, full.linearised, full.problem.prior()
+    blocks = compress(lines.J, lines.A, lines.r, problem.image, problem.n_images, weights)
+    marginal = marginalise(blocks, full.pose_root, full.outline_factor)
+    H = marginal.H + prior
+    dx = -solve_symmetric(H, marginal.g + prior @ full.state.prior_values(problem))
+    state = full.state.moved(problem, dx, pose_errors(blocks, marginal, dx, full.outline_factor))
+    solution = replace(
+        full, state=state, weights=weights, blocks=blocks, marginal=marginal, covariance=inverse_symmetric(H)
+    )
+    return _Rest(solution, dx)
+
+
+def _error(
+    image: int, outline: int, sphere: int, points: Array, centre: Array, radius_m: float, camera: CameraModel,
+    stated: Prediction | None,
+) -> ControlError:  # fmt: skip
+    radial = radial_errors_m(points, centre, radius_m)
+    lifted = np.column_stack([points, np.ones(len(points))])
+    distance = np.abs(residuals(lifted, np.broadcast_to(centre, lifted.shape), radius_m, "sampson"))
+    return ControlError(
+        image, outline, sphere, float(radial.mean()) * 1e3, float(distance.mean()) * 0.5 * (camera.fx + camera.fy),
+        None if stated is None else 1e3 * stated.sigma_rad * float(np.linalg.norm(centre)),
+        None if stated is None else stated.normalised,
+    )  # fmt: skip
+
+
+def _summary(errors: list[ControlError]) -> Evaluation:
+    return Evaluation(
+        float(np.mean([e.radial_error_mm for e in errors])),
+        float(np.mean([e.reprojection_error_px for e in errors])),
+        tuple(errors),
+    )
+
+
+def true_error_m(T_scan_camera: Array, T_scan_camera_true: Array, centre_scan_m: Array) -> float:
+    """Distance by which the scene's centre is misplaced, the cameras being laid over the true ones.
+
+    Args:
+        T_scan_camera: (N, 4, 4) registered cameras in the scan frame, metric.
+        T_scan_camera_true: (N, 4, 4) truth.
+        centre_scan_m: (3,) a point of the scene, in the scan frame.
+
+    The estimated camera positions are aligned to the true ones by a rigid fit (the world frame of structure from
+    motion is arbitrary); with T that fit, the error is |T c - c|.
+    """
+    good = np.all(np.isfinite(T_scan_camera.reshape(len(T_scan_camera), -1)), axis=1)
+    T_true_estimated, _ = align_points(T_scan_camera_true[good, :3, 3], T_scan_camera[good, :3, 3])
+    return float(np.linalg.norm(apply(T_true_estimated, centre_scan_m) - centre_scan_m))

@@ -1,0 +1,122 @@
+"""A folder of images, by one rule for all commands: odd files are left out by name, damaged ones are errors.
+
+Odd is what is whole and does not belong: the notes that macOS lays beside files (`._…`), a second copy of an image,
+one of another size. `strict` refuses odd files too.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from service.compute.images.files import image_size
+from service.core.errors import DataError
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm"})
+READ = "JPEG, PNG, TIFF, BMP, PGM and PNM files are read"
+_NAMED = 5  # damaged files that a refusal names
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFolder:
+    """Images of a folder, by name, and what was left out of it, with reasons."""
+
+    files: tuple[Path, ...]
+    left_out: dict[str, str] = field(default_factory=dict[str, str])
+
+    def without(self, reasons: dict[str, str]) -> ImageFolder:
+        """The same without these images."""
+        kept = tuple(file for file in self.files if file.name not in reasons)
+        return ImageFolder(kept, self.left_out | reasons)
+
+
+def image_folder(folder: Path, *, size: tuple[int, int] | None = None, strict: bool = False) -> ImageFolder:
+    """The images of a folder, each looked at: whole, once, of the size wanted.
+
+    Args:
+        folder: not looked into deeper.
+        size: width and height that the images must have; None takes the size that most have.
+        strict: odd files are errors too.
+
+    Raises:
+        DataError: no such folder, no image, damaged ones (all are named), none of the size; odd ones where `strict`.
+    """
+    if not folder.is_dir():
+        raise DataError("the image folder does not exist", where=str(folder), remedy="Check --images")
+    present = sorted(file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in IMAGE_SUFFIXES)
+    reasons = {file.name: "a hidden file, not an image" for file in present if file.name.startswith(".")}
+    shown = [file for file in present if file.name not in reasons]
+    if not shown:
+        raise DataError("no image in this folder", where=str(folder), remedy=READ)
+    sizes = _sizes(shown, folder)
+    reasons |= _copies(shown)
+    wanted = size or Counter(sizes[file.name] for file in shown if file.name not in reasons).most_common(1)[0][0]
+    for file in shown:
+        if file.name not in reasons and sizes[file.name] != wanted:
+            reasons[file.name] = (
+                f"{_words(sizes[file.name])}, {'the camera' if size else 'most images'} {_words(wanted)}"
+            )
+    if all(file.name in reasons for file in shown):
+        most = Counter(sizes.values()).most_common(1)[0][0]
+        raise DataError(
+            f"the images are {_words(most)}, the camera model is for {_words(wanted)}",
+            where=str(folder),
+            remedy="Use the calibration made at this image size, and images that no program has rotated or resized",
+        )
+    if reasons and strict:
+        raise strict_refusal(reasons, folder)
+    return ImageFolder(tuple(file for file in shown if file.name not in reasons), reasons)
+
+
+def strict_refusal(reasons: dict[str, str], folder: Path) -> DataError:
+    """What `--strict` says of odd files."""
+    return DataError(
+        f"{len(reasons)} files are odd: " + "; ".join(f"{name}: {reason}" for name, reason in reasons.items()),
+        where=str(folder),
+        remedy="Take them out of the folder, or leave out --strict: they are left out then",
+    )
+
+
+def _sizes(files: Sequence[Path], folder: Path) -> dict[str, tuple[int, int]]:
+    sizes: dict[str, tuple[int, int]] = {}
+    damaged: list[str] = []
+    for file in files:
+        try:
+            sizes[file.name] = image_size(file)
+        except DataError as error:
+            damaged.append(f"{file.name}: {error.what}")
+    if damaged:
+        rest = f"; and {len(damaged) - _NAMED} more" if len(damaged) > _NAMED else ""
+        raise DataError(
+            f"{len(damaged)} of {len(files)} images are damaged: {'; '.join(damaged[:_NAMED])}{rest}",
+            where=str(folder),
+            remedy="Copy them from the camera again, or take them out of the folder",
+        )
+    return sizes
+
+
+def _copies(files: Sequence[Path]) -> dict[str, str]:
+    """Images that are byte for byte the same as an earlier one."""
+    alike: defaultdict[int, list[Path]] = defaultdict(list)
+    for file in files:
+        alike[file.stat().st_size].append(file)
+    reasons: dict[str, str] = {}
+    for group in alike.values():
+        if len(group) < 2:
+            continue
+        first: dict[str, str] = {}
+        for file in group:
+            with file.open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            if digest in first:
+                reasons[file.name] = f"the same file as {first[digest]}"
+            else:
+                first[digest] = file.name
+    return reasons
+
+
+def _words(size: tuple[int, int]) -> str:
+    return f"{size[0]} × {size[1]} px"

@@ -1,0 +1,1 @@
+"""Whether placed spheres can be told apart, and which one to move."""

@@ -1,0 +1,386 @@
+"""Whether placed spheres can be told from one another: the least misfit of any wrong assignment, and what to move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.layout.misfits import bounded_misfits, misfits, rigid_motions
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array
+
+IntArray = NDArray[np.int64]
+
+SUBSET = 4  # spheres that an image shows at least
+# Ten centres at random leave 0.5 to 4 mm to the best wrong assignment of four; measured centres err by 0.01 mm, and
+# one image of exactly those four may be told by the others. Five that can be mistaken leave nothing to tell them by.
+REQUIRED_MARGIN_M = 0.4e-3
+REQUIRED_MARGIN_OF_FIVE_M = 2.0e-3
+REQUIRED_DEPTH_M = 5.0e-3  # rms height over the best plane: a flat layout has no handedness and weak poses
+LARGEST_GAP_RAD = np.deg2rad(150.0)  # between neighbouring azimuths: wider, and the spheres stand on one side only
+_FIRST_TOLERANCE_M = 1.0e-3
+_ROWS = 2_000_000  # combinations worked on at a time
+_MOST_MATCHES = 200_000  # a layout with so many near-symmetries needs no longer list
+_REACH_M = 3.0e-3  # misfits up to which assignments of four are judged, and carried on to more spheres
+_MOST_JUDGED = 600  # assignments whose bounds are computed, the best first
+_QUANTILE = 2.326  # of a normal distribution at the bounds' 99 %
+
+
+@dataclass(frozen=True, slots=True)
+class Confusion:
+    """A wrong assignment that nearly fits.
+
+    Attributes:
+        spheres: indices that are seen.
+        taken_for: the spheres that they would be taken for, in the same order.
+        misfit_m: rms distance after the best rigid motion.
+    """
+
+    spheres: tuple[int, ...]
+    taken_for: tuple[int, ...]
+    misfit_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Bounded:
+    """A length in metres with bounds that hold with 99 % each; all three alike where no uncertainty is known."""
+
+    value_m: float
+    lower_m: float
+    upper_m: float
+
+    @property
+    def sigma_m(self) -> float:
+        """The standard deviation of a normal distribution with bounds as far apart."""
+        return (self.upper_m - self.lower_m) / (2 * _QUANTILE)
+
+    def record_mm(self) -> dict[str, float]:
+        """Plain data in millimetres, as gates take it."""
+        return {"sigma": 1e3 * self.sigma_m, "lower": 1e3 * self.lower_m, "upper": 1e3 * self.upper_m}
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutReport:
+    """How well the spheres of a layout can be told apart.
+
+    Attributes:
+        margin: least misfit of any wrong assignment of any four spheres: what noise must stay well below.
+        margin_of_five: the same of five spheres; infinite where none was found.
+        worst: the assignments that fit best, best first.
+        margin_by_count_m: least misfit found when so many spheres are seen (4, 5, … all).
+        sphere_margins_m: (N,) least misfit among the assignments that take this sphere for another.
+        depth: rms distance of the centres from their best plane.
+        extent_m: rms distance of the centres from their mean.
+        largest_gap_rad: between neighbouring azimuths around the mean, in the best plane.
+        problems: what must be changed, in words; none: the layout passes.
+    """
+
+    margin: Bounded
+    margin_of_five: Bounded
+    worst: tuple[Confusion, ...]
+    margin_by_count_m: dict[int, float]
+    sphere_margins_m: Array
+    depth: Bounded
+    extent_m: float
+    largest_gap_rad: float
+    problems: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing must be changed."""
+        return not self.problems
+
+    @property
+    def margin_m(self) -> float:
+        """The margin without its bounds."""
+        return self.margin.value_m
+
+
+def check_layout(
+    centres_m: Array,
+    covariance: Array | None = None,
+    *,
+    radius_m: float = 0.015,
+    required_margin_m: float = REQUIRED_MARGIN_M,
+) -> LayoutReport:
+    """Judge a layout of spheres, before anything is measured with it.
+
+    Every assignment of four spheres to four others (or to themselves in another order) is a way to mistake them;
+    its misfit is that of the best rigid motion. Mirror-symmetric layouts fail too: two mirrored pairs make a
+    trapezoid, which half a turn maps onto itself. The search is exhaustive, by pairwise distances: distances that
+    differ by more than 2√2 times a misfit rule that misfit out.
+
+    Args:
+        centres_m: (N, 3), N ≥ 4.
+        covariance: (3N, 3N) m² of all centres together, or (N, 3, 3) of centres that were measured one by one.
+        radius_m: of the spheres.
+        required_margin_m: misfit below which a wrong assignment of four counts as possible; give more when the
+            centres are only roughly known.
+
+    Raises:
+        DataError: not centres (N, 3), or not finite.
+        ComputeError: fewer than four spheres, or two at the same place.
+    """
+    centres = np.asarray(centres_m, dtype=np.float64)
+    if centres.ndim != 2 or centres.shape[1] != 3 or not np.isfinite(centres).all():
+        raise DataError(f"sphere centres of shape {centres.shape} are not points (N, 3)")
+    if len(centres) < SUBSET:
+        raise ComputeError(
+            f"{len(centres)} spheres have no layout to judge, {SUBSET} are needed", remedy="place more spheres"
+        )
+    between = distances(centres)
+    if between[~np.eye(len(centres), dtype=bool)].min() < radius_m:
+        raise ComputeError("two spheres are at the same place", remedy="check the list of centres for repeats")
+    joint = _joint(covariance, len(centres))
+    matches = confusions(centres, beyond_m=max(2 * required_margin_m, _REACH_M))
+    order = np.argsort(matches.misfit, kind="stable")
+    worst = tuple(
+        Confusion(_ints(matches.seen[k]), _ints(matches.taken[k]), float(matches.misfit[k]))
+        for k in _distinct(matches, order)
+    )
+    sphere_margins = np.full(len(centres), np.inf)
+    moved = matches.seen != matches.taken
+    for column in range(SUBSET):
+        chosen = moved[:, column]
+        np.minimum.at(sphere_margins, matches.seen[chosen, column], matches.misfit[chosen])
+    by_count = _by_count(centres, matches, order)
+    best = order[:_MOST_JUDGED]
+    margin = _least(centres, joint, Matches(matches.seen[best], matches.taken[best], matches.misfit[best]))
+    of_five = _least(centres, joint, by_count[SUBSET + 1]) if SUBSET + 1 in by_count else _NO_BOUND
+    _, singular, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
+    report = LayoutReport(
+        margin=margin,
+        margin_of_five=of_five,
+        worst=worst,
+        margin_by_count_m={n: float(m.misfit[0]) for n, m in by_count.items()},
+        sphere_margins_m=sphere_margins,
+        depth=_depth(centres, singular, axes, joint),
+        extent_m=float(np.sqrt(np.mean(np.sum((centres - centres.mean(axis=0)) ** 2, axis=1)))),
+        largest_gap_rad=_largest_gap(centres, axes),
+        problems=(),
+    )
+    return replace(report, problems=_problems(report, required_margin_m))
+
+
+def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]:
+    """What must be changed, by the values themselves: gates judge the bounds."""
+    problems: list[str] = []
+    if report.margin_m < required_margin_m:
+        first = report.worst[0]
+        problems.append(
+            f"spheres {_names(first.spheres)} can be taken for {_names(first.taken_for)}: "
+            f"{report.margin_m * 1e3:.2f} mm apart, {required_margin_m * 1e3:.1f} mm are needed"
+        )
+    if report.margin_of_five.value_m < REQUIRED_MARGIN_OF_FIVE_M:
+        problems.append(
+            f"five spheres can be taken for others that are {report.margin_of_five.value_m * 1e3:.2f} mm different, "
+            f"{REQUIRED_MARGIN_OF_FIVE_M * 1e3:.0f} mm are needed"
+        )
+    if report.depth.value_m < REQUIRED_DEPTH_M:
+        problems.append(
+            f"the spheres lie within {report.depth.value_m * 1e3:.1f} mm of a plane, "
+            f"{REQUIRED_DEPTH_M * 1e3:.0f} mm are needed: set some of them higher"
+        )
+    if report.largest_gap_rad > LARGEST_GAP_RAD:
+        problems.append(f"no sphere over {np.rad2deg(report.largest_gap_rad):.0f}° of the way around: spread them")
+    return tuple(problems)
+
+
+def layout_record(report: LayoutReport) -> dict[str, Any]:
+    """The report as plain data, lengths in mm."""
+    return {
+        "passed": report.passed,
+        "problems": list(report.problems),
+        "margin_mm": 1e3 * report.margin_m,
+        "margin_sigma_mm": 1e3 * report.margin.sigma_m,
+        "bounds": {name: bounded.record_mm() for name, (bounded, _) in layout_bounds(report).items()},
+        "margin_by_count_mm": {str(k): 1e3 * v for k, v in report.margin_by_count_m.items() if np.isfinite(v)},
+        "worst": [
+            {"spheres": list(c.spheres), "taken_for": list(c.taken_for), "misfit_mm": 1e3 * c.misfit_m}
+            for c in report.worst
+        ],
+        "depth_mm": 1e3 * report.depth.value_m,
+        "extent_mm": 1e3 * report.extent_m,
+        "largest_gap_deg": float(np.rad2deg(report.largest_gap_rad)),
+    }
+
+
+def layout_bounds(report: LayoutReport) -> dict[str, tuple[Bounded, float]]:
+    """The numbers of a layout that gates judge, by the name of their measure, each with what it must reach (m)."""
+    found = {
+        "layout_margin_mm": (report.margin, REQUIRED_MARGIN_M),
+        "layout_margin_of_five_mm": (report.margin_of_five, REQUIRED_MARGIN_OF_FIVE_M),
+        "layout_depth_mm": (report.depth, REQUIRED_DEPTH_M),
+    }
+    return {name: value for name, value in found.items() if np.isfinite(value[0].value_m)}
+
+
+def layout_measures(report: LayoutReport) -> dict[str, float]:
+    """The numbers of a layout, lengths in mm, by the names of their measures: alike in every step."""
+    return {
+        **{name: 1e3 * bounded.value_m for name, (bounded, _) in layout_bounds(report).items()},
+        "layout_margin_sigma_mm": 1e3 * report.margin.sigma_m,
+        "layout_gap_deg": float(np.rad2deg(report.largest_gap_rad)),
+        "layout_problems": float(len(report.problems)),
+    }
+
+
+# --- search ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """Wrong assignments: `seen` (M, n) are taken for `taken` (M, n), with these misfits (M,) in metres."""
+
+    seen: IntArray
+    taken: IntArray
+    misfit: Array
+
+
+def confusions(centres: Array, beyond_m: float = 0.0) -> Matches:
+    """All wrong assignments of four up to a misfit of `beyond_m`, or more until there is one."""
+    between = distances(centres)
+    tolerance = max(_FIRST_TOLERANCE_M, beyond_m)
+    while True:
+        seen, taken = similar(between, 2 * np.sqrt(2.0) * tolerance)
+        misfit = misfits(centres, seen, taken)
+        sure = misfit <= tolerance
+        if np.any(sure):
+            return Matches(seen[sure], taken[sure], misfit[sure])
+        tolerance *= 2
+
+
+def similar(between: Array, tolerance: float) -> tuple[IntArray, IntArray]:
+    """Quadruples (M, 4) and others (M, 4) whose six distances agree; the quadruple itself is left out."""
+    n = len(between)
+    seen = np.stack(np.triu_indices(n, 1), axis=1)
+    taken = np.array([(p, q) for p in range(n) for q in range(n) if p != q])
+    a, b = np.nonzero(
+        np.abs(between[seen[:, 0], seen[:, 1]][:, None] - between[taken[:, 0], taken[:, 1]][None]) < tolerance
+    )
+    seen, taken = seen[a], taken[b]
+    for _ in range(SUBSET - 2):
+        step = max(1, _ROWS // (n * n))
+        parts = [
+            _extended(between, seen[k : k + step], taken[k : k + step], tolerance) for k in range(0, len(seen), step)
+        ]
+        seen = np.concatenate([s for s, _ in parts]) if parts else np.empty((0, seen.shape[1] + 1), dtype=np.int64)
+        taken = np.concatenate([t for _, t in parts]) if parts else seen
+        if len(seen) > _MOST_MATCHES:
+            seen, taken = seen[:_MOST_MATCHES], taken[:_MOST_MATCHES]
+    wrong = np.any(seen != taken, axis=1)
+    return seen[wrong], taken[wrong]
+
+
+def _extended(between: Array, seen: IntArray, taken: IntArray, tolerance: float) -> tuple[IntArray, IntArray]:
+    n = len(between)
+    agree = np.ones((len(seen), n, n), dtype=np.bool_)
+    for column in range(seen.shape[1]):
+        agree &= np.abs(between[seen[:, column]][:, :, None] - between[taken[:, column]][:, None, :]) < tolerance
+    later = np.arange(n)[None] > seen[:, -1:]
+    agree &= later[:, :, None]
+    for column in range(taken.shape[1]):
+        agree[np.arange(len(taken)), :, taken[:, column]] = False
+    row, new, image = np.nonzero(agree)
+    return (
+        np.concatenate([seen[row], new[:, None]], axis=1),
+        np.concatenate([taken[row], image[:, None]], axis=1),
+    )
+
+
+def distances(centres: Array) -> Array:
+    """(N, N) between all centres (N, 3)."""
+    return np.linalg.norm(centres[:, None] - centres[None], axis=2)
+
+
+# --- what follows from it -------------------------------------------------------------------------------
+
+
+def _distinct(matches: Matches, order: IntArray, most: int = 8) -> list[int]:
+    """The best assignments, each pair of sets once: an assignment and its inverse fit alike."""
+    chosen: list[int] = []
+    known: set[frozenset[tuple[int, int]]] = set()
+    for k in order[: 50 * most]:
+        pairs = frozenset((int(i), int(j)) for i, j in zip(matches.seen[k], matches.taken[k], strict=True))
+        if pairs in known or frozenset((j, i) for i, j in pairs) in known:
+            continue
+        known.add(pairs)
+        chosen.append(int(k))
+        if len(chosen) == most:
+            break
+    return chosen
+
+
+def _by_count(centres: Array, matches: Matches, order: IntArray) -> dict[int, Matches]:
+    """The best assignments by the number of spheres seen, best first: those of four, carried on to the others."""
+    n = len(centres)
+    seen, taken = matches.seen[order[:2000]], matches.taken[order[:2000]]
+    found = {SUBSET: Matches(seen, taken, matches.misfit[order[:2000]])}
+    R, t = rigid_motions(centres, seen, taken)
+    carried = np.einsum("mij,nj->mni", R, centres) + t[:, None]
+    distance = np.linalg.norm(carried[:, :, None] - centres[None, None], axis=3)
+    rows = np.arange(len(seen))
+    for column in range(SUBSET):
+        distance[rows, seen[:, column]] = np.inf
+        distance[rows, :, taken[:, column]] = np.inf
+    for count in range(SUBSET + 1, n + 1):
+        i, j = np.divmod(distance.reshape(len(seen), -1).argmin(axis=1), n)
+        distance[rows, i] = np.inf
+        distance[rows, :, j] = np.inf
+        seen, taken = np.concatenate([seen, i[:, None]], axis=1), np.concatenate([taken, j[:, None]], axis=1)
+        misfit = misfits(centres, seen, taken)
+        best = np.argsort(misfit, kind="stable")[:_MOST_JUDGED]
+        found[count] = Matches(seen[best], taken[best], misfit[best])
+    return found
+
+
+_NO_BOUND = Bounded(np.inf, np.inf, np.inf)
+
+
+def _least(centres: Array, joint: Array | None, matches: Matches) -> Bounded:
+    """The least misfit: at least the least of all lower bounds, at most the least of all upper ones."""
+    if joint is None:
+        least = float(matches.misfit.min())
+        return Bounded(least, least, least)
+    found = bounded_misfits(centres, joint, matches.seen, matches.taken)
+    lower, upper = float(found.lower_m.min()), float(found.upper_m.min())
+    return Bounded(float(np.clip(found.misfit_m.min(), lower, upper)), lower, upper)
+
+
+def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) -> Bounded:
+    """rms height over the best plane, with the first-order variance of a singular value."""
+    n = len(centres)
+    depth = float(singular[2] / np.sqrt(n))
+    if joint is None:
+        return Bounded(depth, depth, depth)
+    height = (centres - centres.mean(axis=0)) @ axes[2]
+    slope = np.outer(height / max(float(singular[2]), 1e-9) / np.sqrt(n), axes[2]).ravel()
+    sigma = float(np.sqrt(slope @ joint @ slope))
+    return Bounded(depth, max(depth - _QUANTILE * sigma, 0.0), depth + _QUANTILE * sigma)
+
+
+def _joint(covariance: Array | None, n: int) -> Array | None:
+    """(3N, 3N) of all centres; None where nothing is known."""
+    if covariance is None or covariance.ndim == 2:
+        return covariance
+    joint = np.zeros((n, 3, n, 3))
+    joint[np.arange(n), :, np.arange(n)] = covariance
+    return joint.reshape(3 * n, 3 * n)
+
+
+def _largest_gap(centres: Array, axes: Array) -> float:
+    flat = (centres - centres.mean(axis=0)) @ axes[:2].T
+    turn = np.sort(np.arctan2(flat[:, 1], flat[:, 0]))
+    return float(np.max(np.diff(np.append(turn, turn[0] + 2 * np.pi))))
+
+
+def _ints(row: IntArray) -> tuple[int, ...]:
+    return tuple(int(i) for i in row)
+
+
+def _names(spheres: Sequence[int]) -> str:
+    return ", ".join(str(i) for i in spheres)

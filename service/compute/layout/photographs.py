@@ -1,0 +1,246 @@
+"""Places of spheres from photographs by a camera that nobody has calibrated: one, or several from different sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from service.compute.layout.ambiguity import distances
+from service.compute.layout.photo_adjustment import Adjusted, LensPrior, Photograph, adjust
+from service.compute.markers.cones import Cone
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, align_points, apply, inverse
+
+IntArray = NDArray[np.int64]
+
+LEAST_SPHERES = 4
+_TOLERANCE_M = 0.015  # between two photographs that are read each by itself: depths err by some millimetres
+_TRIANGLES = 10  # of the leading photograph, the largest ones, with which poses of another one are proposed
+_PROPOSALS = 4000
+_READINGS = 3  # of one photograph, tried in the adjustment of all
+_APART = 1.5  # radii, at least, between two centres: 2 for spheres that touch, less what is uncertain
+_WORST_CHI2 = 20.0  # per degree of freedom: beyond, the photograph shows something else
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoLayout:
+    """The spheres of all photographs in one frame.
+
+    Attributes:
+        centres_m: (N, 3) in the frame of the leading photograph.
+        covariance: (3N, 3N) m², of all centres together.
+        spheres: for every photograph given, the sphere that each of its outlines shows (-1: none); an empty array
+            where the photograph could not be used.
+        T_photo_first: of every photograph, from the frame of the centres; None where it could not be used.
+        chi2: of the adjustment, per degree of freedom.
+    """
+
+    centres_m: Array
+    covariance: Array
+    spheres: tuple[IntArray, ...]
+    T_photo_first: tuple[Transform | None, ...]
+    chi2: float
+
+    @property
+    def used(self) -> int:
+        """How many photographs went into it."""
+        return sum(T is not None for T in self.T_photo_first)
+
+
+def layout_from_photographs(
+    photographs: Sequence[Photograph], radius_m: float, prior: LensPrior, expected: int | None = None
+) -> PhotoLayout:
+    """One layout from photographs of spheres that did not move in between.
+
+    The photograph with most spheres leads. Of one photograph, depths follow from the outlines' sizes, to some
+    tenths of a millimetre at best; from a second side they follow from the directions, ten times better, and the
+    camera is calibrated on the way.
+
+    Args:
+        photographs: of one camera.
+        radius_m: of the spheres.
+        prior: what is known of the camera.
+        expected: how many spheres there are; of more, those that fewest photographs show are left out.
+
+    Raises:
+        ComputeError: no photograph shows four spheres.
+    """
+    order = sorted(range(len(photographs)), key=lambda k: -len(photographs[k].cones))
+    if not order or len(photographs[order[0]].cones) < LEAST_SPHERES:
+        most = max((len(p.cones) for p in photographs), default=0)
+        raise ComputeError(
+            f"no photograph shows more than {most} spheres, {LEAST_SPHERES} are needed",
+            remedy="photograph all spheres from above, sharp and from less than a metre",
+        )
+    first = photographs[order[0]]
+    group = _Group([order[0]], [np.arange(len(first.cones))], [np.eye(4)])
+    found = _adjusted(photographs, group, places_by_size(first.cones, radius_m), radius_m, prior)
+    for k in order[1:]:
+        group, found = _joined(photographs, group, found, k, radius_m, prior)
+    if expected is not None and len(found.centres_m) > expected:
+        group, found = _reduced(photographs, group, found, expected, radius_m, prior)
+    spheres: list[IntArray] = [np.empty(0, dtype=np.int64)] * len(photographs)
+    poses: list[Transform | None] = [None] * len(photographs)
+    for k, ids, T in zip(group.photographs, group.spheres, found.T_photo_first, strict=True):
+        spheres[k], poses[k] = ids, T
+    return PhotoLayout(found.centres_m, found.covariance, tuple(spheres), tuple(poses), found.chi2)
+
+
+@dataclass(frozen=True, slots=True)
+class _Group:
+    """The photographs that are in register: their numbers, the spheres of their outlines (-1: none), their poses."""
+
+    photographs: list[int]
+    spheres: list[IntArray]
+    poses: list[Transform]
+
+
+def _adjusted(
+    photographs: Sequence[Photograph], group: _Group, centres: Array, radius_m: float, prior: LensPrior
+) -> Adjusted:
+    chosen: list[Photograph] = []
+    spheres: list[IntArray] = []
+    for k, ids in zip(group.photographs, group.spheres, strict=True):
+        shown = np.nonzero(ids >= 0)[0]
+        photo = photographs[k]
+        chosen.append(Photograph(photo.camera, tuple(photo.cones[i] for i in shown), photo.covariances[shown]))
+        spheres.append(ids[shown])
+    return adjust(chosen, spheres, centres, group.poses, radius_m, prior)
+
+
+def _joined(
+    photographs: Sequence[Photograph], group: _Group, found: Adjusted, k: int, radius_m: float, prior: LensPrior
+) -> tuple[_Group, Adjusted]:
+    """With photograph k, in the reading that fits best; without it where none does."""
+    places = places_by_size(photographs[k].cones, radius_m)
+    best: tuple[_Group, Adjusted] | None = None
+    best_rank = (True, np.inf)
+    for T_first_photo, pairs in _readings(found.centres_m, places):
+        ids = np.full(len(places), -1, dtype=np.int64)
+        for sphere, outline in pairs:
+            ids[outline] = sphere
+        new = np.nonzero(ids < 0)[0]
+        ids[new] = len(found.centres_m) + np.arange(len(new))
+        centres = np.concatenate([found.centres_m, apply(T_first_photo, places[new])])
+        joined = _Group(
+            [*group.photographs, k], [*group.spheres, ids], [*found.T_photo_first, inverse(T_first_photo)]
+        )
+        try:
+            adjusted = _adjusted(photographs, joined, centres, radius_m, prior)
+        except ComputeError:
+            continue  # not this reading
+        # Spheres are solid: where two share a place, an outline of a known one was read as one more, or one sphere
+        # was outlined twice. Such a reading counts only where there is no other.
+        rank = (_nearest_m(adjusted.centres_m) < _APART * radius_m, adjusted.chi2)
+        if adjusted.chi2 < _WORST_CHI2 and (best is None or rank < best_rank):
+            best, best_rank = (joined, adjusted), rank
+    return (group, found) if best is None else best
+
+
+def _nearest_m(centres: Array) -> float:
+    """Between the two nearest of the centres (N, 3)."""
+    return float(distances(centres)[~np.eye(len(centres), dtype=bool)].min())
+
+
+def _reduced(
+    photographs: Sequence[Photograph],
+    group: _Group,
+    found: Adjusted,
+    expected: int,
+    radius_m: float,
+    prior: LensPrior,
+) -> tuple[_Group, Adjusted]:
+    """Without the spheres that fewest photographs show: something else that is round was taken for one."""
+    count = np.bincount(np.concatenate([i[i >= 0] for i in group.spheres]), minlength=len(found.centres_m))
+    kept = np.sort(np.argsort(-count, kind="stable")[:expected])
+    if count[kept].min() == count[np.setdiff1d(np.arange(len(count)), kept)].max():
+        return group, found  # nothing tells which: the count itself says that something is wrong
+    number = np.full(len(count) + 1, -1, dtype=np.int64)
+    number[kept] = np.arange(expected)
+    smaller = _Group(group.photographs, [number[ids] for ids in group.spheres], list(found.T_photo_first))
+    return smaller, _adjusted(photographs, smaller, found.centres_m[kept], radius_m, prior)
+
+
+def places_by_size(cones: Sequence[Cone], radius_m: float) -> Array:
+    """(n, 3) centres in the photograph's own frame, by the sizes of the outlines."""
+    return np.array(
+        [cone.axis * (radius_m / np.sin(cone.half_angle_rad)) for cone in cones], dtype=np.float64
+    ).reshape(-1, 3)
+
+
+def _readings(a: Array, b: Array) -> list[tuple[Transform, list[tuple[int, int]]]]:
+    """T_a_b and pairs (index in a, index in b) of the ways in which places b (N, 3) agree with a (M, 3), best first.
+
+    Layouts that are nearly symmetric agree in more than one way: the adjustment tells which is true, and where it
+    cannot, the layout is the same either way.
+    """
+    if min(len(a), len(b)) < LEAST_SPHERES:
+        return []
+    rows, columns = _alike_triangles(a, b)
+    T = _rigid(a[rows], b[columns])
+    gap = np.linalg.norm(
+        a[None, :, None] - (np.einsum("mij,nj->mni", T[:, :3, :3], b) + T[:, None, :3, 3])[:, None], axis=3
+    )
+    nearest = gap.min(axis=1)
+    score = np.sum(np.minimum(nearest / _TOLERANCE_M, 1.0) ** 2, axis=1)
+    found: dict[tuple[tuple[int, int], ...], tuple[float, Transform]] = {}
+    for m in np.argsort(score, kind="stable")[:40]:
+        pairs, refined, cost = _refined(a, b, T[m])
+        if len(pairs) >= LEAST_SPHERES:
+            found.setdefault(tuple(pairs), (cost + 2.0 * (len(b) - len(pairs)), refined))
+    ranked = sorted(found.items(), key=lambda item: item[1][0])[:_READINGS]
+    return [(value[1], list(pairs)) for pairs, value in ranked]
+
+
+def _refined(a: Array, b: Array, start: Transform) -> tuple[list[tuple[int, int]], Transform, float]:
+    """Pairs within the tolerance, the pose that fits them all, and the sum of their squares over the tolerance's."""
+    pairs: list[tuple[int, int]] = []
+    cost, T_a_b = float("inf"), start
+    for _ in range(2):
+        gap = np.linalg.norm(a[:, None] - apply(T_a_b, b)[None], axis=2)
+        rows, columns = linear_sum_assignment(np.minimum(gap, 2 * _TOLERANCE_M))
+        near = gap[rows, columns] < _TOLERANCE_M
+        pairs = [(int(i), int(j)) for i, j in zip(rows[near], columns[near], strict=True)]
+        if len(pairs) < LEAST_SPHERES:
+            break
+        cost = float(np.sum((gap[rows[near], columns[near]] / _TOLERANCE_M) ** 2))
+        T_a_b, _ = align_points(a[rows[near]], b[columns[near]])
+    return pairs, T_a_b, cost
+
+
+def _alike_triangles(a: Array, b: Array) -> tuple[IntArray, IntArray]:
+    """Index triples (M, 3) of a, the largest triangles only, and of b, whose sides agree."""
+    da, db = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (a, b))
+    i, j, k = np.array([(p, q, r) for p in range(len(a)) for q in range(p) for r in range(q)]).T
+    area = np.linalg.norm(np.cross(a[j] - a[i], a[k] - a[i]), axis=1)
+    rows: list[IntArray] = []
+    columns: list[IntArray] = []
+    for t in np.argsort(-area, kind="stable")[:_TRIANGLES]:
+        p, q, r = i[t], j[t], k[t]
+        agree = (
+            (np.abs(db - da[p, q]) < _TOLERANCE_M)[:, :, None]
+            & (np.abs(db - da[p, r]) < _TOLERANCE_M)[:, None, :]
+            & (np.abs(db - da[q, r]) < _TOLERANCE_M)[None]
+        )
+        found = np.argwhere(agree)
+        found = found[(found[:, 0] != found[:, 1]) & (found[:, 0] != found[:, 2]) & (found[:, 1] != found[:, 2])]
+        columns.append(found)
+        rows.append(np.tile(np.array([p, q, r]), (len(found), 1)))
+    return np.concatenate(rows)[:_PROPOSALS], np.concatenate(columns)[:_PROPOSALS]
+
+
+def _rigid(a: Array, b: Array) -> Array:
+    """T_a_b (M, 4, 4) of point triples a, b (M, 3, 3). Source: as `align_points`."""
+    mean_a, mean_b = a.mean(axis=1), b.mean(axis=1)
+    H = np.einsum("mki,mkj->mij", b - mean_b[:, None], a - mean_a[:, None])
+    U, _, Vt = np.linalg.svd(H)
+    flip = np.ones((len(a), 3))
+    flip[:, 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    T = np.tile(np.eye(4), (len(a), 1, 1))
+    T[:, :3, :3] = np.einsum("mji,mj,mkj->mik", Vt, flip, U)
+    T[:, :3, 3] = mean_a - np.einsum("mij,mj->mi", T[:, :3, :3], mean_b)
+    return T

@@ -1,0 +1,1 @@
+"""From edge pixels to a sub-pixel outline of one sphere, with its covariance."""

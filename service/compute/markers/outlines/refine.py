@@ -1,0 +1,350 @@
+"""Outlines at full resolution: edges of an envelope, RANSAC, the forward model of the limb; their covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.cones import Cone, distance_gradient, ransac_cone
+from service.compute.markers.outlines.edges import (
+    envelope_edges,
+    profiles,
+    profiles_of,
+    sample,
+    sample_averaged,
+    sample_sharp,
+)
+from service.compute.markers.outlines.limb import fit_limb, masked_median
+from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
+from service.core.geometry import Array
+
+# Measured on rendered scenes with exact truth: what stays of an outline's error when its noise has averaged out.
+# It comes from what the limb's fall and the blur can be taken for each other, so it grows with the blur.
+SYSTEMATIC_PER_BLUR = 0.05
+MOST_SIGMA_PX = 0.5  # of an edge point; where there is no outline, places within the search's reach scatter more
+TEXTURE_FACTOR = 3.0  # sigma of an edge point over the one its own profile tells
+REACH = 0.04  # of the radius: as far as `approach_outlines` sees
+_BLOCKS = 16  # of an outline, for the noise that neighbouring edge points share
+_TRIALS = 150  # of RANSAC: the rough outline is near
+_FIRST_PROFILES, _FIRST_OF_LARGE = 48, 32
+_MOST_PROFILES, _FEWEST_PROFILES = 128, 48
+_FINE_RADIUS_PX = 75.0  # up to here every profile counts; beyond, fewer tell the sphere's place in space as well
+_UNIT_RADIUS_PX = 60.0  # radius in samples of the first approach, which averages the pixels of larger outlines
+_LEAST_PART = 0.19  # of the profiles that must agree
+_START_BLUR_PX, _START_CHROMA_BLUR_PX = 0.7, 1.2
+_ALIKE = 1.5  # radius over the smallest of outlines whose profiles are of one length
+_LEAST_RADIUS = 3.0  # samples; smaller ones have no inside to compare the outside with
+_MOST_CHANGE = 2.0  # of the radius in one fit of sub-pixel edges: such a one extrapolates, to less than nothing even
+_FOCUS = 1.3  # blur over the expected one from which on profiles were too short for it
+
+
+@dataclass(frozen=True, slots=True)
+class Approached:
+    """A cone as good as averaged pixels tell it, and the blurs to expect (px)."""
+
+    cone: Cone
+    blur_px: float = _START_BLUR_PX
+    chroma_blur_px: float = _START_CHROMA_BLUR_PX
+
+
+def refine_outline(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    rough: Cone,
+    options: DetectionOptions = DEFAULTS,
+    *,
+    score: float = 1.0,
+) -> SphereOutline | None:
+    """The outline near `rough` at full resolution, touching only its region; None when there is none to be trusted.
+
+    `rough` may come from the coarse search or from a prediction; it must be right to about a tenth of the radius.
+    """
+    return refine_outlines(image_bgr, camera, [rough], options, scores=[score])[0]
+
+
+def refine_outlines(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    roughs: Sequence[Cone],
+    options: DetectionOptions = DEFAULTS,
+    *,
+    scores: Sequence[float],
+) -> list[SphereOutline | None]:
+    """`refine_outline` of several, those of like size side by side."""
+    out: list[SphereOutline | None] = [None] * len(roughs)
+    found = {i: _by_envelope(image_bgr, camera, rough, options) for i, rough in enumerate(roughs)}
+    cones = {i: cone for i, cone in found.items() if cone is not None}
+    todo = sorted(cones, key=lambda i: cones[i].half_angle_rad)
+    while todo:
+        least = cones[todo[0]].half_angle_rad
+        alike = [i for i in todo if cones[i].half_angle_rad < _ALIKE * least]
+        todo = todo[len(alike) :]
+        near = approach_outlines(image_bgr, camera, [cones[i] for i in alike], options)
+        starts = {i: a for i, a in zip(alike, near, strict=True) if a is not None}
+        given = [scores[i] for i in starts]
+        for i, outline in zip(
+            starts, measure_outlines(image_bgr, camera, list(starts.values()), options, scores=given), strict=True
+        ):
+            out[i] = outline
+    return out
+
+
+def approach_outlines(
+    image_bgr: NDArray[np.uint8], camera: CameraModel, roughs: Sequence[Cone], options: DetectionOptions = DEFAULTS
+) -> list[Approached | None]:
+    """The cones near `roughs`, which must be right to REACH of their radii, on pixels averaged across the outline."""
+    if not roughs:
+        return []
+    radius_px = float(np.median([c.half_angle_rad for c in roughs])) * camera.fx
+    unit = max(1, round(radius_px / _UNIT_RADIUS_PX))
+    count = _FIRST_PROFILES if unit == 1 else _FIRST_OF_LARGE
+    out: list[Approached | None] = [None] * len(roughs)
+    todo = [(i, Approached(rough)) for i, rough in enumerate(roughs)]
+    for _ in range(3):
+        if not todo:
+            break
+        measured = _measure(image_bgr, camera, [a for _, a in todo], count, 1.0, 2.5, 4, unit, options)
+        again: list[tuple[int, Approached]] = []
+        for (i, before), found in zip(todo, measured, strict=True):
+            if found is None:
+                continue
+            if unit > 1:
+                out[i] = Approached(found.cone)  # finer than these samples, the blur is still to be found
+                continue
+            out[i] = Approached(found.cone, found.blur_px, found.chroma_blur_px)
+            if found.blur_px >= _FOCUS * max(1.0, before.blur_px):
+                again.append((i, out[i] or before))  # out of focus
+        todo = again
+    return out
+
+
+def measure_outlines(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    starts: Sequence[Approached],
+    options: DetectionOptions = DEFAULTS,
+    *,
+    scores: Sequence[float] = (),
+) -> list[SphereOutline | None]:
+    """The outlines at full resolution, starting from cones that are right to about a pixel; None as `refine_outline`.
+
+    An outline has more edge the larger it is, and the sphere's place in space is known the better: the number of
+    profiles falls as that allows.
+    """
+    if not starts:
+        return []
+    radius_px = float(np.median([s.cone.half_angle_rad for s in starts])) * camera.fx
+    wanted = _MOST_PROFILES * min(1.0, _FINE_RADIUS_PX / radius_px)
+    count = max(_FEWEST_PROFILES, _BLOCKS * round(wanted / _BLOCKS))
+    fine = radius_px < _FINE_RADIUS_PX
+    step, iterations = (0.5, 3) if fine else (0.7, 4)
+    found = _measure(image_bgr, camera, starts, count, step, 1.6 if fine else 2.5, iterations, 1, options)
+    for i, best in enumerate(found):
+        if best is not None and not fine and best.blur_px > _FOCUS * max(1.0, starts[i].blur_px):
+            longer = Approached(best.cone, best.blur_px, best.chroma_blur_px)
+            found[i] = _measure(image_bgr, camera, [longer], count, step, 2.5, iterations, 1, options)[0]
+    return [
+        None if best is None else _outline(image_bgr, camera, best, options, score)
+        for best, score in zip(found, scores or [1.0] * len(found), strict=True)
+    ]
+
+
+def _outline(
+    image: NDArray[np.uint8], camera: CameraModel, best: _Measured, options: DetectionOptions, score: float
+) -> SphereOutline | None:
+    if (
+        best.coverage < options.min_coverage
+        or best.rms_px > options.max_rms_px
+        or best.contrast < options.min_contrast
+        or best.cone.axis[2] < 0.3
+    ):
+        return None
+    middle = camera.project(best.cone.axis[None])[0]
+    colour = _median_colour(image, middle, 0.5 * best.cone.half_angle_rad * camera.fx)
+    evidence = Evidence(
+        best.coverage, best.rms_px, best.sigma_px, best.n_edges, best.systematic_px, best.contrast, colour, score,
+        best.covariance,
+    )  # fmt: skip
+    return outline_from_cone(best.cone, camera, options.n_points, evidence)
+
+
+def _by_envelope(
+    image: NDArray[np.uint8], camera: CameraModel, rough: Cone, options: DetectionOptions
+) -> Cone | None:
+    """The cone that most edges in an envelope of a tenth of the radius around `rough` agree with."""
+    rng = np.random.default_rng(options.seed)
+    radius_px = rough.half_angle_rad * camera.fx
+    reach = max(4.0, 0.1 * radius_px)
+    where = profiles(rough, camera, 96, np.arange(-reach, reach + 0.1, max(0.5, reach / 20)))
+    points = envelope_edges(sample(image, where.pixels), where)
+    if len(points.slot) < 16:
+        return None
+    per_pixel = where.per_pixel_rad[points.slot]
+    rays = rough.rays(where.azimuth_rad[points.slot], rough.half_angle_rad + points.offset_px * per_pixel)
+    tolerance = max(1.0, 0.012 * radius_px) * float(np.median(per_pixel))
+    bounds = (0.8 * rough.half_angle_rad, 1.25 * rough.half_angle_rad)
+    fit = ransac_cone(rays, points.strength, points.slot, bounds, tolerance, rng, _TRIALS)
+    return None if fit is None else fit[0]
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """A cone by sub-pixel edges."""
+
+    cone: Cone
+    blur_px: float
+    chroma_blur_px: float
+    coverage: float
+    sigma_px: float
+    rms_px: float
+    n_edges: int
+    contrast: float
+    systematic_px: float
+    covariance: Array
+
+
+def _measure(
+    image: NDArray[np.uint8],
+    camera: CameraModel,
+    starts: Sequence[Approached],
+    n_profiles: int,
+    step: float,
+    reach: float,
+    iterations: int,
+    unit: int,
+    options: DetectionOptions,
+) -> list[_Measured | None]:
+    """Cones near those given, from `n_profiles` each; lengths are in `unit` pixels, whose values are averaged."""
+    cones = [s.cone for s in starts]
+    radius = np.array([c.half_angle_rad for c in cones]) * camera.fx / unit
+    if not np.all(radius >= _LEAST_RADIUS):
+        large = {i: s for i, s in enumerate(starts) if radius[i] >= _LEAST_RADIUS}
+        found = iter(
+            _measure(image, camera, list(large.values()), n_profiles, step, reach, iterations, unit, options)
+            if large
+            else ()
+        )
+        return [next(found) if i in large else None for i in range(len(starts))]
+    typical = float(np.median(radius))
+    # Inside, as far as tells the limb's fall from the edge; outside, only what the blurred edge needs.
+    blur = max(1.0, float(np.median([s.blur_px for s in starts])))
+    inner = min(float(np.clip(0.13 * typical, 4.0, 12.0)) + 2 * (blur - 1), 0.6 * typical)
+    outer = 4.0 + 2.5 * (blur - 1)
+    offsets = np.asarray(np.arange(-round(inner / step), round(outer / step) + 1) * step, dtype=np.float64)
+    finer = (offsets[:, None] * unit + np.arange(unit) - 0.5 * (unit - 1)).reshape(-1)
+    where = profiles_of(cones, camera, n_profiles, finer)
+    values = sample_sharp(image, where.pixels) if unit == 1 else sample_averaged(image, where.pixels, unit)
+    limb = fit_limb(
+        values, offsets, np.all(where.inside, axis=2), radius, srgb=options.srgb,
+        blur=np.array([s.blur_px for s in starts]), chroma_blur=np.array([s.chroma_blur_px for s in starts]),
+        iterations=iterations, reach=reach,
+    )  # fmt: skip
+    azimuth, per_pixel = where.azimuth_rad, where.per_pixel_rad * unit
+    angle = np.median(per_pixel, axis=1)
+    fit = _robust_cones(azimuth, limb.offset * per_pixel / angle[:, None], limb.sigma, limb.ok)
+    covariance = _covariances(azimuth, fit)
+    contrast = masked_median(limb.contrast, fit.used)
+    out: list[_Measured | None] = []
+    for i, cone in enumerate(cones):
+        blur_px = float(limb.blur[i]) * unit
+        if not fit.good[i] or fit.scale[i] > max(MOST_SIGMA_PX, 0.3 * float(limb.blur[i])):
+            out.append(None)
+            continue
+        half = cone.half_angle_rad + float(fit.step[i, 2] * angle[i])
+        if not 1 / _MOST_CHANGE < half / cone.half_angle_rad < _MOST_CHANGE:  # a short arc tells no radius
+            out.append(None)
+            continue
+        axis = cone.axis + cone.frame()[:, :2] @ fit.step[i, :2] * angle[i]
+        systematic = SYSTEMATIC_PER_BLUR * blur_px
+        out.append(
+            _Measured(
+                cone=Cone(axis / float(np.linalg.norm(axis)), half),
+                blur_px=blur_px,
+                chroma_blur_px=float(limb.chroma_blur[i]) * unit,
+                coverage=float(fit.coverage[i]),
+                sigma_px=float(fit.scale[i]) * unit,
+                rms_px=float(np.sqrt(np.mean(fit.residual[i, fit.used[i]] ** 2))) * unit,
+                n_edges=int(fit.used[i].sum()),
+                contrast=float(contrast[i]),
+                systematic_px=systematic,
+                covariance=(covariance[i] + np.eye(3) * (systematic / unit) ** 2) * angle[i] ** 2,
+            )
+        )
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class _ConeFits:
+    """Of G cones: steps (G, 3), points used, residuals and weights (G, K), scale, coverage, whether there is one."""
+
+    step: Array
+    used: NDArray[np.bool_]
+    residual: Array
+    weights: Array
+    scale: Array
+    coverage: Array
+    good: NDArray[np.bool_]
+
+
+def _robust_cones(azimuth: Array, offset: Array, sigma: Array, ok: NDArray[np.bool_]) -> _ConeFits:
+    """Cones by Tukey's weights on the geometric distances (G, K), linear in the small steps from the given cones."""
+    J = -distance_gradient(azimuth)
+    least = max(12, round(_LEAST_PART * len(azimuth)))
+    good = ok.sum(axis=1) >= least
+    # Texture beside the outline is no white noise, and no edge is known better than a few hundredths of a pixel.
+    base = np.where(ok, 1.0 / ((TEXTURE_FACTOR * sigma) ** 2 + 0.05**2), 0.0)
+    weights, residual, scale = base, offset, np.ones(len(offset))
+    step = np.zeros((len(offset), 3))
+    for _ in range(6):
+        weighted = J.T * weights[:, None, :]  # (G, 3, K)
+        normal = weighted @ J
+        trace = np.trace(normal, axis1=1, axis2=2)
+        good = good & (np.linalg.det(normal) >= 1e-9 * trace**3) & (trace > 0)  # else an arc too short to tell
+        normal = np.where(good[:, None, None], normal, np.eye(3))
+        step = np.asarray(np.linalg.solve(normal, weighted @ offset[..., None])[..., 0], dtype=np.float64)
+        residual = offset - step @ J.T
+        size = np.abs(residual)
+        scale = np.maximum(0.03, 1.4826 * np.nan_to_num(masked_median(size, ok), posinf=1e3))
+        u = residual / (4.0 * scale[:, None])
+        weights = np.where(np.abs(u) < 1, base * (1 - u**2) ** 2, 0.0)
+        good = good & ((weights > 0).sum(axis=1) >= least)
+    size = np.abs(residual)
+    used = ok & (size < 3.5 * scale[:, None])
+    good = good & (used.sum(axis=1) >= least)
+    coverage = (ok & (size < np.maximum(0.5, 3.5 * scale)[:, None])).mean(axis=1)
+    return _ConeFits(step, used, residual, weights, scale, coverage, good)
+
+
+def _covariances(azimuth: Array, fit: _ConeFits) -> Array:
+    """(G, 3, 3) of the cone's two directions and half angle, in squared units, from the scatter of the edge points.
+
+    Neighbouring edge points share pixels, texture and shading, so they err alike. Means over blocks of the outline
+    show by how much more than independent points would: that factor multiplies the plain covariance.
+    """
+    J = -distance_gradient(azimuth)
+    w = np.where(fit.used & fit.good[:, None], fit.weights, 0.0)
+    w = np.where(fit.good[:, None], w / np.maximum(w.max(axis=1, keepdims=True), 1e-12), 1.0)
+    inverse = np.linalg.inv((J.T * w[:, None]) @ J)
+    noise = inverse @ ((J.T * w[:, None] ** 2) @ J) @ inverse * fit.scale[:, None, None] ** 2
+    blocks = (len(w), _BLOCKS, -1)
+    total = w.reshape(blocks).sum(axis=2)
+    square = (w * w).reshape(blocks).sum(axis=2)
+    sums = (w * np.where(fit.used, fit.residual, 0.0)).reshape(blocks).sum(axis=2)
+    filled = total > 0.25 * np.median(total, axis=1, keepdims=True)
+    # Three parameters were fitted to these means.
+    chi2 = np.where(filled, sums**2 / np.maximum(square, 1e-12), 0.0).sum(axis=1)
+    factor = chi2 / np.maximum(filled.sum(axis=1) - 3, 3) / fit.scale**2
+    return noise * np.maximum(1.0, factor)[:, None, None]
+
+
+def _median_colour(image: NDArray[np.uint8], middle: Array, reach: float) -> tuple[float, float, float]:
+    h, w = image.shape[:2]
+    x0, x1 = (int(np.clip(middle[0] + s * reach, 0, w - 1)) for s in (-1, 1))
+    y0, y1 = (int(np.clip(middle[1] + s * reach, 0, h - 1)) for s in (-1, 1))
+    step = max(1, (x1 - x0) // 32)
+    b, g, r = np.median(image[y0 : y1 + 1 : step, x0 : x1 + 1 : step].reshape(-1, 3), axis=0)
+    return float(b), float(g), float(r)

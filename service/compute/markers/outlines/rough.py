@@ -1,0 +1,235 @@
+"""One disc on the coarse copy: its rough outline, the outermost of several, and whether it can be a sphere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.colours import ColourModel, given_colour
+from service.compute.markers.cones import Cone, ransac_cone
+from service.compute.markers.outlines.candidates import Candidate
+from service.compute.markers.outlines.edges import envelope_edges, profiles, sample
+from service.compute.markers.records import DetectionOptions
+from service.core.geometry import Array
+
+# A disc with wires, stains or highlights on it, or on ground of its own colour, counts if it has the spheres' colour.
+_DOUBTFUL_INTERIOR, _DOUBTFUL_LEAK = 0.3, 0.36
+_DOUBTFUL_COVERAGE = 0.58
+_DARK = 0.3  # L* over that of the disc's middle, below which its colour does not go on
+_OUTWARD = (1.07, 1.65)  # of the radius: where a larger outline around a disc is looked for
+_LEAST_AROUND = 0.7  # part of it that must be seen
+_LEAST_RINGED_PX = 30.0  # radius of the disc; around smaller ones edges of any texture agree by chance
+_TRIALS = 200  # of RANSAC, on a coarse outline
+LEAST_UNAIDED = 0.5  # coverage below which only a prediction can tell what is outline
+_LEAST_RING = 0.55  # of the ring between two outlines that must have the inner disc's colour
+CLEAN_INTERIOR = 0.03
+CLEAR = 0.6  # score of discs that are certainly some
+
+
+@dataclass(frozen=True, slots=True)
+class RoughSphere:
+    """An outline found on the coarse copy."""
+
+    cone: Cone
+    coverage: float  # of the outline by edges, weighted by their strength
+    interior_edges: float  # edge pixels inside over area
+    mask_loss: float  # false positives and negatives of the ellipse against the mask, over the ellipse's area
+    leak: float  # part of the outline across which the disc's colour goes on without an edge
+    colour_bgr: tuple[float, float, float]
+    plain: bool  # passes every test by itself
+
+    @property
+    def score(self) -> float:
+        """0..1: a whole, clean disc has about 0.9."""
+        clean = max(0.0, 1.0 - 6.0 * self.interior_edges) if self.plain else 0.3
+        return float(self.coverage * clean * (1.0 - 0.5 * min(1.0, self.mask_loss)))
+
+
+def examine(
+    coarse: NDArray[np.uint8],
+    edge_map: NDArray[np.bool_],
+    camera: CameraModel,
+    candidate: Candidate,
+    options: DetectionOptions,
+    rng: np.random.Generator,
+) -> RoughSphere | None:
+    """The disc at a candidate, if its outline is seen and it can be a sphere."""
+    axis = np.append(camera.normalise(np.array([[candidate.x, candidate.y]]))[0], 1.0)
+    length = float(np.linalg.norm(axis))
+    cone = Cone(axis / length, float(np.arctan(candidate.radius / camera.fx / length)))
+    coverage = 0.0
+    votes = np.zeros(96)
+    for envelope in (0.3, 0.14):
+        reach = max(4.0, envelope * candidate.radius)
+        fit = _fitted(coarse, camera, cone, (-reach, reach), candidate.radius, rng)
+        if fit is None:
+            return None
+        cone, votes = fit
+        coverage = float(votes.mean())
+        if coverage < 0.8 * options.min_coverage * 0.8:
+            return None
+    return _judged(coarse, edge_map, camera, cone, votes, options)
+
+
+def _fitted(
+    coarse: NDArray[np.uint8],
+    camera: CameraModel,
+    near: Cone,
+    reach_px: tuple[float, float],
+    radius_px: float,
+    rng: np.random.Generator,
+) -> tuple[Cone, Array] | None:
+    """The cone that most edges within reach of one agree with, and how strongly at each of 96 azimuths."""
+    step = max(0.5, (reach_px[1] - reach_px[0]) / 48)
+    where = profiles(near, camera, 96, np.arange(reach_px[0], reach_px[1] + 0.1, step))
+    points = envelope_edges(sample(coarse, where.pixels), where)
+    if len(points.slot) < 16:
+        return None
+    per_pixel = where.per_pixel_rad[points.slot]
+    rays = near.rays(where.azimuth_rad[points.slot], near.half_angle_rad + points.offset_px * per_pixel)
+    bounds = (0.6 * near.half_angle_rad, 1.5 * near.half_angle_rad)
+    tolerance = max(0.9, 0.02 * radius_px) * float(np.median(per_pixel))
+    fit = ransac_cone(rays, points.strength, points.slot, bounds, tolerance, rng, _TRIALS)
+    if fit is None:
+        return None
+    votes = np.zeros(96)
+    np.maximum.at(votes, points.slot[fit[1]], points.strength[fit[1]])
+    return fit[0], votes
+
+
+def outermost(
+    coarse: NDArray[np.uint8],
+    edge_map: NDArray[np.bool_],
+    camera: CameraModel,
+    rough: RoughSphere,
+    options: DetectionOptions,
+    rng: np.random.Generator,
+) -> RoughSphere:
+    """The disc, or the larger one of its colour whose outline runs around it.
+
+    A glossy ball mirrors the horizon as a ring on itself, often sharper than its limb.
+    """
+    inner, radius_px = rough.cone, rough.cone.half_angle_rad * camera.fx
+    if rough.score < CLEAR or radius_px < _LEAST_RINGED_PX:
+        return rough
+    low, high = _OUTWARD
+    middle = 0.5 * (low + high)
+    cone = Cone(inner.axis, middle * inner.half_angle_rad)
+    reach = (high - middle) * radius_px
+    votes = np.zeros(96)
+    for envelope in (reach, 0.14 * radius_px):
+        fit = _fitted(coarse, camera, cone, (-envelope, envelope), radius_px, rng)
+        if fit is None or float((fit[1] > 0).mean()) < _LEAST_AROUND:
+            return rough
+        cone, votes = fit
+    around = apart_rad(inner, cone) + inner.half_angle_rad < cone.half_angle_rad
+    if not around or cone.half_angle_rad < low * inner.half_angle_rad:
+        return rough
+    colour = given_colour(rough.colour_bgr, options.colour_tolerance, srgb=options.srgb)
+    part = inner.half_angle_rad / cone.half_angle_rad
+    if share(coarse, camera, cone, colour, (part, 0.95)) < _LEAST_RING:
+        return rough
+    outer = _judged(coarse, edge_map, camera, cone, votes, options)
+    return outer if outer is not None and outer.plain else rough
+
+
+def _judged(
+    coarse: NDArray[np.uint8],
+    edge_map: NDArray[np.bool_],
+    camera: CameraModel,
+    cone: Cone,
+    votes: Array,
+    options: DetectionOptions,
+) -> RoughSphere | None:
+    """The disc of an outline with these votes, if it can be a sphere."""
+    coverage = float(votes.mean())
+    if cone.axis[2] < 0.3:
+        return None
+    interior, loss, leak, colour = _interior(coarse, edge_map, cone, camera, votes < 0.3)
+    bad = loss > 0.6 or coverage < 0.8 * options.min_coverage
+    if bad or leak > _DOUBTFUL_LEAK or interior > _DOUBTFUL_INTERIOR:
+        return None
+    plain = leak <= options.max_leak and interior <= options.max_interior_edges
+    rough = RoughSphere(cone, coverage, interior, loss, leak, colour, plain)
+    if plain and rough.score < options.min_score:
+        rough = replace(rough, plain=False)
+    least = LEAST_UNAIDED if interior < CLEAN_INTERIOR else _DOUBTFUL_COVERAGE
+    return rough if rough.plain or coverage > least else None
+
+
+def _interior(
+    coarse: NDArray[np.uint8],
+    edge_map: NDArray[np.bool_],
+    cone: Cone,
+    camera: CameraModel,
+    edgeless: NDArray[np.bool_],
+) -> tuple[float, float, float, tuple[float, float, float]]:
+    """Edge density inside, loss of the ellipse against the colour mask, leak, and median colour.
+
+    The mask holds what has the chromaticity of the disc's own middle; the loss is the paper's FP + FN, over the
+    area. The leak is the part of the outline without an edge (`edgeless`, one for each of K azimuths) across which
+    the mask goes on: the circle is then only a part of something of another shape.
+    """
+    outline = camera.project(cone.rays(np.linspace(0, 2 * np.pi, 64), np.full(64, cone.half_angle_rad)))
+    centre = outline.mean(axis=0)
+    h, w = edge_map.shape
+    reach = 1.25 * (outline - centre)
+    low = np.clip(np.floor((centre + reach).min(axis=0)).astype(int), 0, [w - 1, h - 1])
+    high = np.clip(np.ceil((centre + reach).max(axis=0)).astype(int) + 1, low + 1, [w, h])
+    box = coarse[low[1] : high[1], low[0] : high[0]]
+    masks: list[NDArray[np.bool_]] = []
+    for part in (1.0, 0.8):
+        canvas = np.zeros(box.shape[:2], np.uint8)
+        polygon = np.rint((centre + part * (outline - centre) - low) * 16).astype(np.int32)
+        cv2.fillPoly(canvas, [polygon], 1, shift=4)
+        masks.append(canvas > 0)
+    whole, core = masks
+    if core.sum() < 20:
+        return 1.0, 1.0, 1.0, (0.0, 0.0, 0.0)
+    interior = float(edge_map[low[1] : high[1], low[0] : high[0]][core].mean())
+    lab = cv2.cvtColor(box, cv2.COLOR_BGR2LAB).astype(np.float32)
+    inside = lab[core]
+    middle = np.median(inside, axis=0)
+    spread = np.maximum(1.4826 * np.median(np.abs(inside - middle), axis=0), [12.0, 2.5, 2.5])
+    # Shading moves lightness within a sphere much more than its colour.
+    mask = np.all(np.abs(lab - middle) < spread * [4.0, 3.5, 3.5], axis=2)
+    colour = np.median(box[core], axis=0)
+    loss = float((whole & ~mask).sum()) / float(whole.sum())
+    azimuth = np.linspace(0.0, 2 * np.pi, len(edgeless), endpoint=False)
+    leaks = edgeless.copy()
+    for part in (0.86, 1.13):
+        at = camera.project(cone.rays(azimuth, np.full(len(azimuth), part * cone.half_angle_rad))) - low
+        x, y = np.rint(at).astype(int).T
+        here = (x >= 0) & (y >= 0) & (x < mask.shape[1]) & (y < mask.shape[0])
+        leaks &= here
+        # In the shadow of sphere and ground nothing tells where the one ends and the other begins.
+        leaks[here] &= mask[y[here], x[here]] & (lab[y[here], x[here], 0] > _DARK * middle[0])
+    return interior, loss, float(leaks.mean()), (float(colour[0]), float(colour[1]), float(colour[2]))
+
+
+def share(
+    coarse: NDArray[np.uint8],
+    camera: CameraModel,
+    cone: Cone,
+    model: ColourModel,
+    reach: tuple[float, float] = (0.0, 0.92),
+) -> float:
+    """The part of a disc, or of the ring between two shares of its radius, that has the spheres' colour."""
+    low, high = reach
+    rings = np.sqrt(low**2 + (high**2 - low**2) * (np.arange(8) + 0.5) / 8)
+    azimuth = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+    at = camera.project(cone.rays(azimuth[:, None], rings * cone.half_angle_rad).reshape(-1, 3))
+    x, y = np.rint(at).astype(int).T
+    here = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
+    if not here.any():
+        return 0.0
+    return float(np.mean(model.distance(coarse[y[here], x[here]].astype(np.float64)) < 1.0))
+
+
+def apart_rad(a: Cone, b: Cone) -> float:
+    """The angle between the axes of two cones."""
+    return float(np.arccos(np.clip(a.axis @ b.axis, -1, 1)))

@@ -1,0 +1,343 @@
+"""Spheres in one image whose places are predicted: only their regions are touched, and nothing is forced."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.cones import Cone, cone_of_sphere, ransac_cone
+from service.compute.markers.outlines.edges import envelope_edges, profiles, sample
+from service.compute.markers.outlines.refine import Approached, approach_outlines, measure_outlines, refine_outline
+from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.registration.cost import skew
+from service.core.geometry import Array, Transform, apply, transform
+
+# Distances below are parts of a sphere's radius as the image shows it, unless the name has a unit.
+NEAR = 0.08  # a prediction as good as this is approached at once, and searched only when that fails
+WIDE = 0.42  # the worst that is looked for: a robot that is off by millimetres
+_PLACE_GATE, _SIZE_GATE = 0.05, 0.04  # of a whole outline against the image's other spheres; of a part, in proportion
+_ROUGH_GATE = 0.12
+_APPROACH_GATE = 0.02  # of outlines approached, on whose agreement the others are predicted
+_LEAST_PART = 0.45  # of an outline that must be inside the image and not behind another sphere
+_REGION_RADIUS_PX = 24.0  # of a sphere in the reduced region on which a search runs
+_REGION_RAYS = 64
+_APPROACHED = 5  # spheres on which an image's pose is first found; all, where these do not agree
+_POSE_SPHERES = 3  # three numbers each: with three, a pose is determined and contradicted by something
+
+
+@dataclass(frozen=True, slots=True)
+class Tone:
+    """Colour of the markers: chromaticity (a, b of CIELAB of 8-bit colours), and how far an outline's may be off."""
+
+    a: float
+    b: float
+    reach: float
+
+    def admits(self, outline: SphereOutline) -> bool:
+        """Whether the outline's colour may be a marker's."""
+        a, b = _chromaticity([outline])[0]
+        return bool(np.hypot(a - self.a, b - self.b) <= self.reach)
+
+
+def tone_of(outlines: Sequence[SphereOutline]) -> Tone:
+    """The colour that the outlines (one or more) share."""
+    tones = _chromaticity(outlines)
+    middle = np.median(tones, axis=0)
+    spread = float(np.median(np.linalg.norm(tones - middle, axis=1)))
+    return Tone(float(middle[0]), float(middle[1]), max(21.0, 7 * spread))
+
+
+def _chromaticity(outlines: Sequence[SphereOutline]) -> Array:
+    pixels = np.array([o.colour_bgr for o in outlines], dtype=np.float32).reshape(1, -1, 3) / 255
+    return cv2.cvtColor(pixels, cv2.COLOR_BGR2LAB)[0, :, 1:].astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Where the spheres `centres_m` (M, 3), scan frame, are expected, and how far off (in radii) they may be."""
+
+    T_camera_scan: Transform = field(repr=False)
+    centres_m: Array = field(repr=False)
+    radius_m: float
+    margin: float
+    tone: Tone
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """Outlines by sphere; spheres expected and not found, each with the reason; the image's own pose."""
+
+    outlines: dict[int, SphereOutline]
+    missing: dict[int, str]
+    T_camera_scan: Transform = field(repr=False)
+
+    @property
+    def expected(self) -> int:
+        """Spheres that the image should show."""
+        return len(self.outlines) + len(self.missing)
+
+    @property
+    def convincing(self) -> bool:
+        """Whether so much was found where it was predicted that the prediction must be right."""
+        return len(self.outlines) >= max(min(4, self.expected), 0.5 * self.expected)
+
+
+def locate_predicted(
+    image_bgr: NDArray[np.uint8], camera: CameraModel, expected: Prediction, options: DetectionOptions = DEFAULTS
+) -> Located:
+    """The outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
+
+    Each region is searched as far as the prediction may be off; what is found must agree with one pose of the camera
+    (its own, so that a robot may err), in place, size and colour. A sphere that does not is reported as missing.
+    """
+    found = _attempt(image_bgr, camera, expected, options)
+    if not found.convincing and expected.margin < WIDE:
+        wider = _attempt(image_bgr, camera, dataclasses.replace(expected, margin=WIDE), options)
+        if len(wider.outlines) > len(found.outlines):
+            return wider
+    return found
+
+
+def _attempt(
+    image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, options: DetectionOptions
+) -> Located:
+    centres, radius_m = expected.centres_m, expected.radius_m
+    pose = expected.T_camera_scan
+    starts = None
+    if expected.margin <= NEAR:
+        starts = _starts(image, camera, expected, pose, options)
+    if starts is None:
+        pose = _approached_pose(image, camera, expected, visible_cones(pose, centres, radius_m, camera))
+        starts = _starts(image, camera, expected, pose, options)
+    if starts is None:  # too few spheres to tell of one another
+        shown = visible_cones(pose, centres, radius_m, camera)
+        found = [refine_outline(image, camera, cone, options) for cone in shown.values()]
+    else:
+        shown = starts
+        found = measure_outlines(image, camera, list(starts.values()), options)
+    outlines: dict[int, SphereOutline] = {}
+    missing: dict[int, str] = {}
+    for m, outline in zip(shown, found, strict=True):
+        if outline is None:
+            missing[m] = "no outline where it is predicted"
+        elif not expected.tone.admits(outline):
+            missing[m] = "another colour than the markers'"
+        else:
+            outlines[m] = outline
+    cones = {m: o.cone for m, o in outlines.items()}
+    agreed = _agreed_pose(cones, expected, pose, _PLACE_GATE, 0.5 * len(cones))
+    pose = pose if agreed is None else agreed
+    for m, outline in list(outlines.items()):
+        place, size = deviation(outline.cone, cone_of_sphere(apply(pose, centres[m]), radius_m))
+        part = max(outline.coverage, 0.2)
+        if place > _PLACE_GATE / part or size > _SIZE_GATE / part:
+            del outlines[m]
+            missing[m] = "not where the image's other spheres put it"
+    return Located(outlines, missing, pose)
+
+
+def _starts(
+    image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, pose: Transform, options: DetectionOptions
+) -> dict[int, Approached] | None:
+    """Cones to measure, right to about a pixel: as approached, or where the spheres approached put the others.
+
+    None when the spheres approached do not agree on a pose.
+    """
+    centres, radius_m = expected.centres_m, expected.radius_m
+    shown = visible_cones(pose, centres, radius_m, camera)
+    near = approach_outlines(image, camera, list(shown.values()), options)
+    approached = {m: a for m, a in zip(shown, near, strict=True) if a is not None}
+    cones = {m: a.cone for m, a in approached.items()}
+    agreed = _agreed_pose(cones, expected, pose, _APPROACH_GATE, max(0.5 * len(shown), _POSE_SPHERES))
+    if agreed is None:
+        return None
+    out: dict[int, Approached] = {}
+    for m, cone in visible_cones(agreed, centres, radius_m, camera).items():
+        own = approached.get(m)
+        place, size = (np.inf, np.inf) if own is None else deviation(own.cone, cone)
+        out[m] = own if own is not None and place < _PLACE_GATE and size < _SIZE_GATE else Approached(cone)
+    return out
+
+
+def deviation(cone: Cone, predicted: Cone) -> tuple[float, float]:
+    """Distance of the centres in radii, and difference of the sizes as a part of the size."""
+    apart = float(np.linalg.norm(cone.axis - predicted.axis))  # of unit vectors: the angle, where it is small
+    half = predicted.half_angle_rad
+    return apart / half, abs(cone.half_angle_rad / half - 1.0)
+
+
+def visible_cones(
+    T_camera_scan: Transform, centres_scan_m: Array, radius_m: float, camera: CameraModel
+) -> dict[int, Cone]:
+    """Cones of the spheres whose outline is for the most part in the image and not behind another sphere."""
+    centres = apply(T_camera_scan, centres_scan_m)
+    distance = np.linalg.norm(centres, axis=1)
+    cones = {
+        m: cone_of_sphere(c, radius_m)
+        for m, c in enumerate(centres)
+        if c[2] > max(2 * radius_m, 0.35 * distance[m])  # what lies further aside no lens here shows
+    }
+    corners = camera.normalise(np.array([[0.0, 0.0], [camera.width - 1.0, camera.height - 1.0]]))
+    low, high = 1.2 * corners.min(axis=0), 1.2 * corners.max(axis=0)
+    out: dict[int, Cone] = {}
+    azimuth = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    for m, cone in cones.items():
+        rays = cone.rays(azimuth, np.full(48, cone.half_angle_rad))
+        if np.any(rays[:, 2] <= 0.1):
+            continue
+        plane = rays[:, :2] / rays[:, 2:]
+        seen = np.all((plane > low) & (plane < high), axis=1)  # beyond, a distortion polynomial may fold back
+        pixels = camera.project(rays)
+        seen &= np.all((pixels > 2) & (pixels < [camera.width - 3, camera.height - 3]), axis=1)
+        for k, other in cones.items():
+            if distance[k] < distance[m] - 0.5 * radius_m:
+                seen &= rays @ other.axis < np.cos(other.half_angle_rad)
+        if seen.mean() >= _LEAST_PART:
+            out[m] = cone
+    return out
+
+
+def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin: float) -> Cone | None:
+    """The circle near a predicted one, searched on the region at a reduced size."""
+    shrink = max(1.0, cone.half_angle_rad * camera.fx / _REGION_RADIUS_PX)
+    angle = cone.half_angle_rad * (1.15 + margin)
+    rim = camera.project(cone.rays(np.linspace(0, 2 * np.pi, 24), np.full(24, angle)))
+    x0, y0 = (int(v) for v in np.clip(np.floor(rim.min(axis=0)), 0, [camera.width - 8, camera.height - 8]))
+    x1, y1 = (int(v) for v in np.clip(np.ceil(rim.max(axis=0)), [x0 + 8, y0 + 8], [camera.width, camera.height]))
+    width, height = max(8, round((x1 - x0) / shrink)), max(8, round((y1 - y0) / shrink))
+    region = np.asarray(
+        cv2.resize(image[y0:y1, x0:x1], (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
+    )
+    sx, sy = width / (x1 - x0), height / (y1 - y0)
+    there = dataclasses.replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * sx,
+        fy=camera.fy * sy,
+        cx=(camera.cx - x0 + 0.5) * sx - 0.5,
+        cy=(camera.cy - y0 + 0.5) * sy - 0.5,
+    )
+    rng = np.random.default_rng(0)
+    radius_px = cone.half_angle_rad * there.fx
+    for envelope in (margin, 0.1):
+        reach = max(3.0, envelope * radius_px)
+        where = profiles(cone, there, _REGION_RAYS, np.arange(-reach, reach + 0.1, 0.5))
+        points = envelope_edges(sample(region, where.pixels), where)
+        if len(points.slot) < 16:
+            return None
+        per_pixel = where.per_pixel_rad[points.slot]
+        rays = cone.rays(where.azimuth_rad[points.slot], cone.half_angle_rad + points.offset_px * per_pixel)
+        bounds = (0.9 * cone.half_angle_rad, 1.1 * cone.half_angle_rad)
+        fit = ransac_cone(
+            rays, points.strength, points.slot, bounds, 0.8 * float(np.median(per_pixel)), rng, trials=120
+        )
+        if fit is None:
+            return None
+        cone = fit[0]
+    return cone
+
+
+def _approached_pose(
+    image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, shown: dict[int, Cone]
+) -> Transform:
+    """The image's pose from circles near the predicted ones: of a few spheres, of all where those do not agree."""
+    order = _spread(shown)
+    roughs: dict[int, Cone] = {}
+    for part, agreeing in ((order[:_APPROACHED], 4), (order[_APPROACHED:], 3)):
+        for m in part:
+            rough = _approach(image, camera, shown[m], expected.margin)
+            if rough is not None:
+                roughs[m] = rough
+        least = max(agreeing, 0.5 * len(roughs))
+        pose = _agreed_pose(roughs, expected, expected.T_camera_scan, _ROUGH_GATE, least)
+        if pose is not None:
+            return pose
+    return expected.T_camera_scan
+
+
+def _spread(cones: dict[int, Cone]) -> list[int]:
+    """The spheres, each as far as can be from those before it."""
+    if not cones:
+        return []
+    names = list(cones)
+    axes = np.array([cone.axis for cone in cones.values()])
+    order = [int(np.argmax(np.linalg.norm(axes - axes.mean(axis=0), axis=1)))]
+    gap = np.full(len(names), np.inf)
+    while len(order) < len(names):
+        gap = np.minimum(gap, np.linalg.norm(axes - axes[order[-1]], axis=1))
+        gap[order] = -1.0
+        order.append(int(np.argmax(gap)))
+    return [names[k] for k in order]
+
+
+def _agreed_pose(
+    cones: dict[int, Cone], expected: Prediction, start: Transform, gate: float, least: float
+) -> Transform | None:
+    """T_camera_scan on which `least` cones, and three, agree; None where they do not."""
+    if len(cones) < _POSE_SPHERES:
+        return None
+    index = list(cones)
+    axes = np.array([c.axis for c in cones.values()])
+    half = np.array([c.half_angle_rad for c in cones.values()])
+    pose = fit_pose(axes, half, expected.centres_m[index], expected.radius_m, start)
+    agreeing = sum(
+        deviation(c, cone_of_sphere(apply(pose, expected.centres_m[m]), expected.radius_m))[0] < gate
+        for m, c in cones.items()
+    )
+    return pose if agreeing >= max(_POSE_SPHERES, least) else None
+
+
+def fit_pose(
+    axes: Array, half_angles: Array, centres_m: Array, radius_m: float, start: Transform, iterations: int = 12
+) -> Transform:
+    """T_camera_scan from cones, by robust Gauss–Newton on their directions and sizes.
+
+    Args:
+        axes: (N, 3) unit directions to the centres, camera frame; N ≥ 3.
+        half_angles: (N,) of the cones.
+        centres_m: (N, 3) of the spheres, scan frame.
+        radius_m: of the spheres.
+        start: T_camera_scan.
+        iterations: at most.
+    """
+    pose = start
+    for _ in range(iterations):
+        step = _pose_step(pose, axes, half_angles, centres_m, radius_m)
+        if step is None:
+            return start
+        pose = transform(Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[:3])
+        if float(np.abs(step).max()) < 1e-9:
+            break
+    return pose
+
+
+def _pose_step(pose: Transform, axes: Array, half_angles: Array, centres_m: Array, radius_m: float) -> Array | None:
+    """One Gauss–Newton step (6,) of translation and rotation; None where the camera would be within a sphere."""
+    rotated = centres_m @ pose[:3, :3].T
+    c = rotated + pose[:3, 3]
+    distance = np.linalg.norm(c, axis=1)
+    if np.any(distance < 1.5 * radius_m):
+        return None
+    u = c / distance[:, None]
+    place = (u - axes) / half_angles[:, None]
+    size = np.arcsin(radius_m / distance) / half_angles - 1
+    residual = np.column_stack([place, size])  # (N, 4) in radii
+    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / (distance * half_angles)[:, None, None]
+    shrink = -radius_m / (distance**2 * np.sqrt(1 - (radius_m / distance) ** 2) * half_angles)
+    by_centre = np.concatenate([across, (shrink[:, None] * u)[:, None, :]], axis=1)  # (N, 4, 3)
+    J = np.concatenate([by_centre, -by_centre @ skew(rotated)], axis=2)
+    error = np.linalg.norm(residual, axis=1)
+    scale = max(0.01, 1.5 * float(np.median(error)))
+    weight = 1 / (1 + (error / scale) ** 2)
+    H = np.einsum("n,nki,nkj->ij", weight, J, J)
+    g = np.einsum("n,nki,nk->i", weight, J, residual)
+    d = 1 / np.sqrt(np.maximum(np.diag(H), 1e-12))
+    return -d * np.linalg.lstsq(H * np.outer(d, d), d * g, rcond=1e-12)[0]

@@ -1,0 +1,1 @@
+"""Files of camera poses and of what goes with them."""

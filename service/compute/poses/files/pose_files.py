@@ -1,0 +1,393 @@
+"""Reads and writes camera poses (CSV, transforms.json, COLMAP folders), camera.json and spheres.json."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from service.compute.camera_model import CameraModel
+from service.compute.images.folder import ImageFolder, strict_refusal
+from service.compute.poses.colmap import model_files as colmap_files
+from service.core.errors import DataError
+from service.core.geometry import Array, Transform, from_quaternion, transform
+from service.core.text.file_text import csv_rows, file_text
+from service.core.text.json_text import parse_json
+
+_HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
+_UNIT = 1e-3  # how far a quaternion's length may be from 1: files with four decimals pass
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y up, z backward
+_CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
+_DISTORTION = (
+    "k1",
+    "k2",
+    "p1",
+    "p2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+)  # what is not there is zero: a pinhole camera without any
+#: What `calibrate intrinsics` writes beside the camera into the same file.
+_CALIBRATION_KEYS = (
+    "model", "board", "n_views", "images", "rms_px", "per_view_rms_px", "excluded", "sigma", "sigma_independent",
+    "sigma_by_image", "sigma_corner_px", "inflation", "covariance", "coverage", "tilt", "cross_validation",
+    "residuals", "uncertainty", "warnings", "optics",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class SphereFile:
+    """Sphere positions that were measured elsewhere, in the scan's frame.
+
+    Attributes:
+        radius_m: of all spheres.
+        registration_m: (M, 3).
+        control_m: (K, 3), possibly none.
+    """
+
+    radius_m: float
+    registration_m: Array
+    control_m: Array
+
+
+def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Transform]:
+    """T_world_camera by image name from a CSV, a transforms.json or a COLMAP model folder.
+
+    Args:
+        path: file or folder; the format follows from what it is.
+        images: names that must have a pose, matched by file name if need be; only these are returned. None
+            returns all.
+
+    Raises:
+        DataError: unknown format, malformed content (with file:line), or an image without a pose.
+    """
+    if path.is_dir():
+        transforms = path / "transforms.json"
+        poses = read_transforms_json(transforms) if transforms.is_file() else read_colmap_model(path)
+    elif not path.is_file():
+        raise DataError("the pose file does not exist", where=str(path), remedy="check the path")
+    elif path.suffix.lower() == ".json":
+        poses = read_transforms_json(path)
+    elif path.suffix.lower() in {".csv", ".txt"}:
+        poses = read_poses_csv(path)
+    else:
+        raise DataError(
+            "unknown kind of pose file",
+            where=str(path),
+            remedy="give a .csv, a transforms.json or a COLMAP model folder",
+        )
+    return poses if images is None else _select(poses, images, path)
+
+
+def posed_images(
+    path: Path, images: ImageFolder, folder: Path, *, strict: bool = False
+) -> tuple[dict[str, Transform], ImageFolder]:
+    """T_world_camera of the images that have one, by name, and these images; the others are left out.
+
+    Raises:
+        DataError: as `read_poses`; no image has a pose; or one has none where `strict`.
+    """
+    names = [file.name for file in images.files]
+    chosen, missing = _matched(read_poses(path), names)
+    if not chosen:
+        raise _without_pose(missing, names, path)
+    reasons = dict.fromkeys(missing, f"no pose in {path.name}")
+    if reasons and strict:
+        raise strict_refusal(reasons, folder)
+    return chosen, images.without(reasons)
+
+
+def _select(poses: Mapping[str, Transform], images: Sequence[str], path: Path) -> dict[str, Transform]:
+    chosen, missing = _matched(poses, images)
+    if missing:
+        raise _without_pose(missing, images, path)
+    return chosen
+
+
+def _matched(poses: Mapping[str, Transform], images: Sequence[str]) -> tuple[dict[str, Transform], list[str]]:
+    """Poses by image, and the images without one."""
+    by_file_name: dict[str, list[str]] = {}
+    for name in poses:
+        by_file_name.setdefault(Path(name).name, []).append(name)
+    chosen: dict[str, Transform] = {}
+    missing: list[str] = []
+    for image in images:
+        alike = by_file_name.get(Path(image).name, [])
+        if image in poses:
+            chosen[image] = poses[image]
+        elif len(alike) == 1:
+            chosen[image] = poses[alike[0]]
+        else:
+            missing.append(image)
+    return chosen, missing
+
+
+def _without_pose(missing: Sequence[str], images: Sequence[str], path: Path) -> DataError:
+    return DataError(
+        f"{len(missing)} of {len(images)} images have no pose: {', '.join(missing[:5])}",
+        where=str(path),
+        remedy="add their poses, or leave the images out",
+    )
+
+
+# --- CSV ------------------------------------------------------------------------------------------------
+
+
+def read_poses_csv(path: Path) -> dict[str, Transform]:
+    """T_world_camera from a CSV with the header image,x,y,z,qx,qy,qz,qw (metres, scalar last).
+
+    Raises:
+        DataError: anything else, with file:line.
+    """
+    poses: dict[str, Transform] = {}
+    rows = csv_rows(path)
+    header = tuple(cell.strip() for cell in next(rows, (1, []))[1])
+    if header != _HEADER:
+        raise DataError(
+            f"the first line is {','.join(header)!r}", where=f"{path}:1", remedy=f"it must be {','.join(_HEADER)}"
+        )
+    for line, row in rows:
+        where = f"{path}:{line}"
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(_HEADER):
+            raise DataError(f"{len(row)} fields instead of {len(_HEADER)}", where=where, remedy="correct the line")
+        name = row[0].strip()
+        try:
+            values = np.array([float(cell) for cell in row[1:]])
+        except ValueError:
+            raise DataError("a field is not a number", where=where, remedy="correct the line") from None
+        if not name or not np.isfinite(values).all():
+            raise DataError("the name is empty or a number is not finite", where=where, remedy="correct the line")
+        length = float(np.linalg.norm(values[3:]))
+        if abs(length - 1) > _UNIT:
+            raise DataError(
+                f"the quaternion's length is {length:.4f}, not 1", where=where, remedy="check the order qx,qy,qz,qw"
+            )
+        if name in poses:
+            raise DataError(f"image {name} has two poses", where=where, remedy="remove one of them")
+        poses[name] = from_quaternion(values[:3], values[3:])
+    if not poses:
+        raise DataError("the file holds no pose", where=str(path), remedy="give one line an image")
+    return poses
+
+
+def write_poses_csv(path: Path, T_world_camera: Mapping[str, Transform]) -> None:
+    """Write poses as `read_poses_csv` reads them."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(_HEADER)
+        for name, T in T_world_camera.items():
+            quaternion = Rotation.from_matrix(T[:3, :3]).as_quat()
+            writer.writerow([name, *(repr(float(v)) for v in (*T[:3, 3], *quaternion))])
+
+
+# --- transforms.json ------------------------------------------------------------------------------------
+
+
+def read_transforms_json(path: Path) -> dict[str, Transform]:
+    """T_world_camera from a nerfstudio or Instant-NGP transforms.json, whose cameras look along -z.
+
+    Names are the frames' file_path without a leading "./".
+
+    Raises:
+        DataError: not such a file, a matrix that is not rigid, or a duplicate.
+    """
+    frames = _object(path).get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise DataError("no list of frames in the file", where=str(path), remedy="give a nerfstudio transforms.json")
+    poses: dict[str, Transform] = {}
+    for index, frame in enumerate(cast("list[Any]", frames)):
+        where = f"{path}: frames[{index}]"
+        entry = cast("dict[str, Any]", frame) if isinstance(frame, dict) else {}
+        name = entry.get("file_path")
+        if not isinstance(name, str) or "transform_matrix" not in entry:
+            raise DataError("a frame needs file_path and transform_matrix", where=where, remedy="correct the frame")
+        name = name.removeprefix("./")
+        matrix = _numbers(entry["transform_matrix"], where)
+        if matrix.shape not in {(4, 4), (3, 4)}:
+            raise DataError(f"transform_matrix is {matrix.shape}, not 4 × 4", where=where, remedy="correct the frame")
+        if name in poses:
+            raise DataError(f"image {name} has two poses", where=where, remedy="remove one of them")
+        poses[name] = transform(_rotation(matrix[:3, :3], where), matrix[:3, 3]) @ _OPENGL
+    return poses
+
+
+def _rotation(matrix: Array, where: str) -> Array:
+    """The rotation matrix nearest to one that was written with few digits."""
+    if np.abs(matrix @ matrix.T - np.eye(3)).max() > 5 * _UNIT or np.linalg.det(matrix) < 0:
+        raise DataError(
+            "the matrix is not a rotation (scaled, sheared or mirrored)",
+            where=where,
+            remedy="export rigid poses, without a scale",
+        )
+    U, _, Vt = np.linalg.svd(matrix)
+    return U @ Vt
+
+
+def write_transforms_json(path: Path, camera: CameraModel, T_world_camera: Mapping[str, Transform]) -> None:
+    """Write poses and camera as nerfstudio's transforms.json (OPENCV model, OpenGL camera axes).
+
+    Raises:
+        DataError: the camera has rational distortion, which that format cannot hold.
+    """
+    if camera.k4 or camera.k5 or camera.k6:
+        raise DataError(
+            "transforms.json cannot hold the rational distortion k4, k5, k6",
+            where=str(path),
+            remedy="calibrate with the model opencv4 or opencv5",
+        )
+    document = {
+        "camera_model": "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        # nerfstudio counts from the corner of the first pixel, as COLMAP does
+        "cx": camera.cx + 0.5,
+        "cy": camera.cy + 0.5,
+        "k1": camera.k1,
+        "k2": camera.k2,
+        "p1": camera.p1,
+        "p2": camera.p2,
+        **({"k3": camera.k3} if camera.k3 else {}),
+        "frames": [
+            {"file_path": name, "transform_matrix": (T @ _OPENGL).tolist()} for name, T in T_world_camera.items()
+        ],
+    }
+    path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+
+
+# --- COLMAP ---------------------------------------------------------------------------------------------
+
+
+def read_colmap_model(folder: Path) -> dict[str, Transform]:
+    """T_world_camera from a COLMAP model (cameras, images, points3D as .bin or .txt), or a folder above it.
+
+    Raises:
+        DataError: no model in the folder, or an unreadable one.
+    """
+    for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "0"):
+        if any((place / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return colmap_files.read_model(place)
+    raise DataError(
+        "no COLMAP model in the folder",
+        where=str(folder),
+        remedy="it must hold cameras, images and points3D (.bin or .txt)",
+    )
+
+
+def write_colmap_text(folder: Path, camera: CameraModel, T_world_camera: Mapping[str, Transform]) -> None:
+    """Write poses and camera as a COLMAP text model without points.
+
+    Raises:
+        DataError: an image name with spaces, which that format cannot hold, or the folder cannot be written.
+    """
+    spaced = [name for name in T_world_camera if name.split() != [name]]
+    if spaced:
+        raise DataError(
+            "COLMAP's text format cannot hold image names with spaces", where=spaced[0], remedy="rename the image"
+        )
+    folder.mkdir(parents=True, exist_ok=True)
+    colmap_files.write_model(folder, camera, dict(T_world_camera))
+
+
+# --- camera.json, spheres.json --------------------------------------------------------------------------
+
+
+def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> CameraModel:
+    """Camera from {"width","height","fx","fy","cx","cy"} and, where not zero, "k1" … "k6", "p1", "p2" (as in OpenCV).
+
+    A file that `calibrate intrinsics` wrote holds what it knows of the calibration beside these; any other key is
+    refused, since it may change what the numbers mean.
+
+    Raises:
+        DataError: a key is missing, unknown or not a number, or the size is not the images' (width, height).
+    """
+    document = _object(path)
+    _check_keys(document, set(_CAMERA_KEYS), {*_DISTORTION, *_CALIBRATION_KEYS}, path)
+    values: dict[str, float] = {}
+    for key in (*_CAMERA_KEYS, *_DISTORTION):
+        value = document.get(key, 0.0)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise DataError(f"{key} is {value!r}, not a number", where=str(path), remedy=f"correct {key}")
+        values[key] = value
+    if min(values["fx"], values["fy"]) <= 0 or any(values[k] < 1 or values[k] % 1 for k in ("width", "height")):
+        raise DataError(
+            "width, height, fx and fy must be positive, the size whole", where=str(path), remedy="correct them"
+        )
+    size = (int(values["width"]), int(values["height"]))
+    if image_size is not None and size != image_size:
+        raise DataError(
+            f"the camera is calibrated at {size[0]}×{size[1]}, the images are {image_size[0]}×{image_size[1]}",
+            where=str(path),
+            remedy="use images of the calibrated size, or calibrate at theirs",
+        )
+    return CameraModel(*size, *(float(values[k]) for k in (*_CAMERA_KEYS, *_DISTORTION)[2:]))
+
+
+def write_camera_json(path: Path, camera: CameraModel) -> None:
+    """Write a camera as `read_camera_json` reads it."""
+    path.write_text(json.dumps(camera.record(), indent=2) + "\n", encoding="utf-8")
+
+
+def read_spheres_json(path: Path) -> SphereFile:
+    """Spheres from {"radius_mm": 15, "registration_mm": [[x,y,z],…], "control_mm": [[x,y,z],…]}.
+
+    `details`, what the `spheres` command knows of each besides, is passed over.
+
+    Raises:
+        DataError: a key is missing or unknown, no registration sphere, or malformed numbers.
+    """
+    document = _object(path)
+    _check_keys(document, {"radius_mm", "registration_mm"}, {"control_mm", "details"}, path)
+    radius = document["radius_mm"]
+    if isinstance(radius, bool) or not isinstance(radius, int | float) or not 0 < radius < math.inf:
+        raise DataError(
+            f"radius_mm is {radius!r}, not a positive number", where=str(path), remedy="correct radius_mm"
+        )
+    centres: list[Array] = []
+    for key in ("registration_mm", "control_mm"):
+        rows = _numbers(document.get(key, []), f"{path}: {key}")
+        if rows.size == 0:
+            rows = np.empty((0, 3))
+        if rows.ndim != 2 or rows.shape[1] != 3:
+            raise DataError(f"{key} is not a list of [x, y, z]", where=str(path), remedy=f"correct {key}")
+        centres.append(rows * 1e-3)
+    if len(centres[0]) == 0:
+        raise DataError("registration_mm is empty", where=str(path), remedy="give at least three spheres")
+    return SphereFile(float(radius) * 1e-3, centres[0], centres[1])
+
+
+def _check_keys(document: Mapping[str, Any], needed: set[str], optional: set[str], path: Path) -> None:
+    missing = sorted(needed - set(document))
+    unknown = sorted(set(document) - needed - optional)
+    if missing or unknown:
+        parts = [f"missing {', '.join(missing)}"] * bool(missing) + [f"unknown {', '.join(unknown)}"] * bool(unknown)
+        allowed = ", ".join(sorted(needed | optional))
+        raise DataError(f"wrong keys: {'; '.join(parts)}", where=str(path), remedy=f"the keys are {allowed}")
+
+
+def _object(path: Path) -> dict[str, Any]:
+    document = parse_json(file_text(path), name=str(path))
+    if not isinstance(document, dict):
+        raise DataError("the file does not hold a JSON object", where=str(path), remedy="Begin it with {")
+    return cast("dict[str, Any]", document)
+
+
+def _numbers(value: object, where: str) -> Array:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise DataError("not an array of numbers", where=where, remedy="correct the numbers") from None
+    if not np.isfinite(array).all():
+        raise DataError("a number is not finite", where=where, remedy="correct the numbers")
+    return array

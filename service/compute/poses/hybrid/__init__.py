@@ -1,0 +1,1 @@
+"""Hybrid poses: images, robot and spheres in one bundle adjustment."""

@@ -1,0 +1,319 @@
+"""Hybrid camera poses: tracks, robot poses and spheres of known place in one bundle adjustment.
+
+Structure from motion gives the cameras' relative poses to hundredths of a millimetre but no scale; the spheres give
+scale and the scan's frame; the robot gives each station's base. One adjustment weighs all three by the variances
+that the data themselves show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from service.compute.camera_covariance import CameraCovariance
+from service.compute.camera_model import CameraModel
+from service.compute.markers.records import SphereOutline
+from service.compute.poses.hybrid.adjustment import Solution, solve
+from service.compute.poses.hybrid.bundle import Data, Sigmas, SphereSightings, State, whitening_of
+from service.compute.poses.hybrid.camera_error import camera_share
+from service.compute.poses.sfm.tracks import Tracks
+from service.compute.registration.identity import identify
+from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors
+from service.compute.registration.solve import RegistrationResult, register
+from service.core.errors import ComputeError, DataError
+from service.core.geometry import Array, Transform, apply, inverse, transform
+
+
+@dataclass(frozen=True, slots=True)
+class HybridOptions:
+    """Settings of the adjustment.
+
+    Attributes:
+        sphere_sigma_m: standard deviation of a sphere's position in the scan, for each coordinate, where no
+            covariance of it is given.
+        common_errors: sizes of what all outlines have in common, solved for; None: `EXPECTED_COMMON_ERRORS`.
+        most_observations: of tracks that take part; more gain next to nothing and cost time and memory.
+        robot_sigma_m: of the robot's positions, to begin with; estimated from the data.
+        robot_sigma_rad: of its orientations, likewise.
+        track_sigma_px: of the tracks, likewise.
+    """
+
+    sphere_sigma_m: float = 5e-6
+    common_errors: CommonErrors | None = None
+    most_observations: int = 200_000
+    robot_sigma_m: float = 1e-3
+    robot_sigma_rad: float = 2e-3
+    track_sigma_px: float = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class HybridPoses:
+    """Metric camera poses and everything that came out with them.
+
+    World is the base frame of the first group, or the scan frame where no robot pose was given. Increments (d, w) of
+    covariances are exp(w) R, t + d in the axes of the outer frame, metres and radians.
+
+    Attributes:
+        T_scan_camera: (N, 4, 4).
+        T_world_camera: (N, 4, 4).
+        T_world_scan: the registration.
+        T_world_group: base of each group.
+        points_scan: (P, 3) scene points that took part.
+        covariance: (6 (N + G), 6 (N + G)) joint, of T_scan_camera of every image, then T_scan_base of every group.
+        camera_share: what of it is the camera's own uncertainty; zero where that was not given.
+        camera: as given, or refined.
+        sigma_track_px: of one observation of a track.
+        sphere_factor: of the outlines' residuals over their own sigmas.
+        sigma_robot_m, sigma_robot_rad: of the robot's poses for each axis, systematic errors included; None without.
+        chi2: reduced chi square of each component: tracks, spheres, centres, robot_position, robot_rotation, lens.
+        registration: of the scan to the poses of structure from motion, where the adjustment began.
+        centre_scan_m: (3,) the middle of the spheres.
+    """
+
+    T_scan_camera: Array
+    T_world_camera: Array
+    T_world_scan: Transform
+    T_world_group: dict[int, Transform]
+    points_scan: Array = field(repr=False)
+    covariance: Array = field(repr=False)
+    camera_share: Array = field(repr=False)
+    camera: CameraModel
+    sigma_track_px: float
+    sphere_factor: float
+    sigma_robot_m: float | None
+    sigma_robot_rad: float | None
+    chi2: dict[str, float]
+    registration: RegistrationResult = field(repr=False)
+    centre_scan_m: Array
+
+    @property
+    def scan_pose_covariance(self) -> Array:
+        """(N, 6, 6) of T_scan_camera, axes of the scan: how well each image is placed against the scan."""
+        n = len(self.T_scan_camera)
+        return np.array([self.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(n)])
+
+    @property
+    def pose_covariance(self) -> Array:
+        """(N, 6, 6) of T_world_camera, axes of the world: the robot's noise is in it, common to all images."""
+        joint = self.joint_world_covariance()
+        return np.array([joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(self.T_world_camera))])
+
+    def joint_world_covariance(self) -> Array:
+        """(6 N + 6, 6 N + 6) of T_world_camera of every image and, last, of T_world_scan."""
+        n = len(self.T_scan_camera)
+        J = np.zeros((6 * n + 6, len(self.covariance)))
+        R = self.T_world_scan[:3, :3]
+        if not self.T_world_group:
+            J[: 6 * n, : 6 * n] = np.eye(6 * n)
+            return J @ self.covariance @ J.T
+        base = slice(6 * n, 6 * n + 6)
+        t_base = inverse(self.T_world_scan)[:3, 3]
+        for i in range(n):
+            rows = slice(6 * i, 6 * i + 6)
+            J[rows, rows] = _block(R, R)
+            J[rows, base] = _relative(R, self.T_scan_camera[i, :3, 3] - t_base)
+        J[6 * n :, base] = _relative(R, -t_base)
+        return J @ self.covariance @ J.T
+
+    @property
+    def scan_covariance(self) -> Array:
+        """(6, 6) of T_world_scan; zero where the world is the scan frame."""
+        return self.joint_world_covariance()[-6:, -6:]
+
+    def sigma_at_m(self, point_scan_m: Array) -> float:
+        """Predicted target registration error at a point (3,) of the scan: 3D standard deviation, metres.
+
+        Of the set of images as a whole, laid over the true one by its camera positions: errors of single images
+        average out, what all of them have in common remains.
+        """
+        n = len(self.T_scan_camera)
+        v = point_scan_m - self.T_scan_camera[:, :3, 3]
+        centred = self.T_scan_camera[:, :3, 3] - self.T_scan_camera[:, :3, 3].mean(axis=0)
+        inertia = np.sum(centred**2) * np.eye(3) - centred.T @ centred
+        # The rigid fit of the displaced positions: mean displacement, and rotation I^-1 sum r x d.
+        arm = point_scan_m - self.T_scan_camera[:, :3, 3].mean(axis=0)
+        J = np.zeros((3, len(self.covariance)))
+        for i in range(len(v)):
+            turn = np.linalg.solve(inertia, _skew(centred[i]))
+            J[:, 6 * i : 6 * i + 3] = np.eye(3) / n - _skew(arm) @ turn
+        return float(np.sqrt(np.trace(J @ self.covariance @ J.T)))
+
+
+def hybrid_poses(
+    poses: Array,
+    tracks: Tracks,
+    outlines: Sequence[Sequence[SphereOutline]],
+    camera: CameraModel,
+    centres_scan_m: Array,
+    radius_m: float,
+    *,
+    T_base_camera: Array | None = None,
+    groups: Sequence[int] | NDArray[np.int64] | None = None,
+    lens_covariance: Array | None = None,
+    known_camera: CameraCovariance | None = None,
+    sphere_covariance_m2: Array | None = None,
+    names: Sequence[str] = (),
+    options: HybridOptions | None = None,
+) -> HybridPoses:
+    """Adjust tracks, spheres and robot poses together.
+
+    Args:
+        poses: (N, 4, 4) T_world_camera of structure from motion, in any frame and scale.
+        tracks: its tracks.
+        outlines: per image, what the detector found.
+        camera: intrinsics of all images, that the outlines were made with.
+        centres_scan_m: (M, 3) registration spheres in the scan frame, metres.
+        radius_m: of the spheres.
+        T_base_camera: (N, 4, 4) from the robot and the hand-eye calibration, each in the frame of its group; NaN for
+            an image without. None: the spheres alone give the metric frame.
+        groups: (N,) station of each image; None: all one.
+        lens_covariance: (4, 4) of fx, fy, cx, cy as calibrated, to refine them with the calibration as a prior; None
+            holds the camera.
+        known_camera: how well a camera that is held is known, which the poses' covariance then carries on. None: as
+            if exactly.
+        sphere_covariance_m2: (M, 3, 3) of the centres; None: options.sphere_sigma_m.
+        names: of the images, for messages.
+        options: settings.
+
+    Raises:
+        DataError: lengths do not agree.
+        ComputeError: the spheres cannot be identified, the registration fails, or the adjustment is not determined.
+    """
+    settings = options or HybridOptions()
+    n = len(poses)
+    stations = np.zeros(n, dtype=np.int64) if groups is None else np.asarray(groups, dtype=np.int64)
+    if len(outlines) != n or len(stations) != n or (T_base_camera is not None and T_base_camera.shape != (n, 4, 4)):
+        raise DataError(f"{n} camera poses, but {len(outlines)} images' outlines and {len(stations)} stations")
+    one = np.zeros(n, dtype=np.int64)
+    assignments = identify(
+        outlines, centres_scan_m, camera, poses, radius_m=radius_m, groups=one, metric=False, names=names
+    )
+    # Only to begin with and to find wrong outlines: the adjustment itself knows the errors of the poses.
+    start = register(
+        outlines,
+        assignments,
+        poses,
+        one,
+        centres_scan_m,
+        radius_m,
+        camera,
+        estimate_scale=True,
+        pose_covariance="exact",
+    )
+    used = tracks.thinned(settings.most_observations)
+    sightings = _sightings(outlines, start)
+    bases, order, group = _bases(start.T_scan_camera, T_base_camera, stations)
+    state = State(
+        cameras=start.T_scan_camera,
+        points=np.vstack([apply(inverse(start.T_world_scan), start.scale * used.points), centres_scan_m]),
+        bases=bases,
+        camera=camera,
+    )
+    f = 0.5 * (camera.fx + camera.fy)
+    common = settings.common_errors or EXPECTED_COMMON_ERRORS
+    spheres = sphere_covariance_m2
+    if spheres is None:
+        spheres = np.broadcast_to(settings.sphere_sigma_m**2 * np.eye(3), (len(centres_scan_m), 3, 3))
+    distance_m = float(np.mean(radius_m / np.sin(sightings.half_angles)))
+    data = Data(
+        tracks=used,
+        sightings=sightings,
+        centres=centres_scan_m,
+        centre_whitening=whitening_of(spheres),
+        common_sigma_px=np.repeat([common.shift_px, common.growth_px, common.light_px], [2, 1, 3]),
+        light_unit_m=distance_m / f,
+        radius_m=radius_m,
+        robot=T_base_camera if order else None,
+        group=group,
+        calibrated=camera,
+        lens_covariance=lens_covariance,
+    )
+    sigmas = Sigmas(settings.track_sigma_px, 1.0, settings.robot_sigma_m, settings.robot_sigma_rad)
+    solution = solve(state, data, sigmas)
+    share = np.zeros_like(solution.covariance)
+    if known_camera is not None and lens_covariance is None:
+        share = camera_share(solution, data, known_camera)
+    return _answer(solution, share, order, len(used.points), start)
+
+
+def _answer(
+    solution: Solution, share: Array, order: list[int], n_points: int, start: RegistrationResult
+) -> HybridPoses:
+    state, n = solution.state, len(solution.state.cameras)
+    T_world_scan = inverse(state.bases[0]) if order else np.eye(4)
+    size = 6 * (n + len(order))
+    return HybridPoses(
+        T_scan_camera=state.cameras,
+        T_world_camera=T_world_scan @ state.cameras,
+        T_world_scan=T_world_scan,
+        T_world_group={g: T_world_scan @ state.bases[k] for k, g in enumerate(order)},
+        points_scan=state.points[:n_points],
+        covariance=(solution.covariance + share)[:size, :size],
+        camera_share=share[:size, :size],
+        camera=state.camera,
+        sigma_track_px=solution.sigmas.track_px,
+        sphere_factor=solution.sigmas.sphere,
+        sigma_robot_m=solution.sigmas.robot_m if order else None,
+        sigma_robot_rad=solution.sigmas.robot_rad if order else None,
+        chi2=solution.chi2,
+        registration=start,
+        centre_scan_m=state.points[n_points:].mean(axis=0),
+    )
+
+
+def _sightings(outlines: Sequence[Sequence[SphereOutline]], start: RegistrationResult) -> SphereSightings:
+    """The outlines that the registration used; a marker that it never used keeps its place in the scan."""
+    used = [r for r in start.residuals if not r.excluded]
+    found = [outlines[r.image][r.outline] for r in used]
+    whitening = whitening_of(np.array([o.cone_covariance for o in found]))
+    return SphereSightings(
+        image=np.array([r.image for r in used]),
+        marker=np.array([r.marker for r in used]),
+        axes=np.array([o.cone.axis for o in found]),
+        frames=np.array([o.cone.frame() for o in found]),
+        half_angles=np.array([o.cone.half_angle_rad for o in found]),
+        whitening=whitening,
+    )
+
+
+def _bases(
+    T_scan_camera: Array, T_base_camera: Array | None, stations: NDArray[np.int64]
+) -> tuple[Array, list[int], NDArray[np.int64]]:
+    """(G, 4, 4) T_scan_base to begin with, the groups in order, and each image's position among them."""
+    if T_base_camera is None:
+        return np.empty((0, 4, 4)), [], np.zeros(len(stations), dtype=np.int64)
+    known = np.isfinite(T_base_camera).all(axis=(1, 2))
+    first = int(stations[0])
+    order = sorted({int(g) for g in stations[known]}, key=lambda g: (g != first, g))
+    bases: list[Transform] = []
+    for g in order:
+        mine = np.nonzero(known & (stations == g))[0]
+        if len(mine) < 2:
+            raise ComputeError(f"station {g} has {len(mine)} images with a robot pose; two are needed")
+        T = np.array([T_scan_camera[i] @ inverse(T_base_camera[i]) for i in mine])
+        R = Rotation.from_matrix(T[:, :3, :3]).mean()
+        lever = np.array([T_scan_camera[i, :3, 3] - R.apply(T_base_camera[i, :3, 3]) for i in mine])
+        bases.append(transform(R, np.median(lever, axis=0)))
+    group = np.array([order.index(int(g)) if int(g) in order else 0 for g in stations], dtype=np.int64)
+    return np.array(bases), order, group
+
+
+def _skew(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def _block(a: Array, b: Array) -> Array:
+    out = np.zeros((6, 6))
+    out[:3, :3], out[3:, 3:] = a, b
+    return out
+
+
+def _relative(R_world_scan: Array, lever_scan: Array) -> Array:
+    """(6, 6) derivative of T_world_x = T_scan_base^-1 T_scan_x by T_scan_base, lever = x's origin less the base's."""
+    out = _block(-R_world_scan, -R_world_scan)
+    out[:3, 3:] = R_world_scan @ _skew(lever_scan)
+    return out

@@ -1,0 +1,1 @@
+"""Structure from motion: features, pairs, tracks, mapping and adjustment."""

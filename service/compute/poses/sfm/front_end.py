@@ -1,0 +1,204 @@
+"""The front end of structure from motion, image by image: features, and verified matches with earlier images."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import SimpleQueue
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from service.compute.camera_model import CameraModel
+from service.compute.poses.colmap.process import ColmapProcess
+from service.compute.poses.sfm.features import ImageFeatures, PairMatches
+from service.compute.poses.sfm.options import Progress, SfmOptions
+from service.compute.poses.sfm.pairs import choose_pairs
+from service.core.errors import DataError
+from service.core.geometry import Transform
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+
+class FrontEnd:
+    """Extracts and matches in child processes that stay alive from one image to the next; close it, or use `with`.
+
+    What comes out depends on the images, the camera and the options alone: bit for bit the same whichever image
+    came first and however many processes work. As images arrive:
+
+        with FrontEnd(camera, options) as front:
+            features[name] = front.extract_features(file)
+            matches += front.match_pairs(features, pairs_with(name, features, planned))
+
+    where `planned = pairs_of(…)` of the poses at which the images are to be taken. When all are there, the pairs of
+    the images that are there count: those of them that were matched are taken, `missing_pairs` of them are matched,
+    and `reconstruct_from` maps.
+    """
+
+    def __init__(
+        self,
+        camera: CameraModel,
+        options: SfmOptions | None = None,
+        *,
+        processes: int = 1,
+        log: Path | None = None,
+        child: ColmapProcess | None = None,
+    ) -> None:
+        """No process is started before there is something to do.
+
+        Args:
+            camera: calibrated at the images' size.
+            options: settings.
+            processes: children that work side by side, each on one core.
+            log: file for COLMAP's output; None: a temporary one. Further processes write beside it.
+            child: works instead of children of its own, and is left alive for whoever comes next.
+        """
+        self._camera = camera
+        self._options = options or SfmOptions()
+        self._lent = child is not None
+        self._children = (
+            [child]
+            if child is not None
+            else [
+                ColmapProcess(
+                    seed=self._options.seed,
+                    log=log if log is None or k == 0 else log.with_suffix(f".{k}{log.suffix}"),
+                )
+                for k in range(max(1, processes))
+            ]
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, _kind: type[BaseException] | None, _error: BaseException | None, _trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the child processes, but for one that was lent."""
+        for child in [] if self._lent else self._children:
+            child.close()
+
+    def extract_features(self, file: Path) -> ImageFeatures:
+        """Features of one image.
+
+        Raises:
+            DataError: the image is missing, unreadable or of another size than the camera.
+            ComputeError: COLMAP failed.
+        """
+        return self._extracted(self._children[0], file)
+
+    def extract_all(self, files: Mapping[str, Path], progress: Progress | None = None) -> dict[str, ImageFeatures]:
+        """Features of several images by name, side by side; `progress` is told ("extract", done, total).
+
+        Raises:
+            DataError, ComputeError: as `extract_features`; the message names the image.
+        """
+
+        def work(child: ColmapProcess, name: str) -> ImageFeatures:
+            try:
+                return self._extracted(child, files[name])
+            except DataError as error:
+                raise DataError(f"image {name}: {error.what}", where=error.where, remedy=error.remedy) from error
+
+        names = sorted(files)
+        return dict(zip(names, self._spread(work, names, "extract", progress), strict=True))
+
+    def match_pairs(
+        self,
+        features: Mapping[str, ImageFeatures],
+        pairs: Iterable[tuple[str, str]],
+        progress: Progress | None = None,
+    ) -> list[PairMatches]:
+        """Verified matches of each pair of names, sorted by pair; `progress` is told ("match", done, total).
+
+        A pair is matched in the order of its names, so (a, b) and (b, a) give the same.
+
+        Raises:
+            ComputeError: COLMAP failed.
+        """
+        ordered = sorted({(min(pair), max(pair)) for pair in pairs})
+
+        def work(child: ColmapProcess, pair: tuple[str, str]) -> PairMatches:
+            a, b = (features[name] for name in pair)
+            job = self._job() | {
+                "pixels": (a.pixels, b.pixels),
+                "descriptors": (a.descriptors, b.descriptors),
+            }
+            found = child.run("match", job, timeout_s=self._options.timeout_s)
+            return PairMatches(*pair, found["features"], found["configuration"], found["matrices"])
+
+        return self._spread(work, ordered, "match", progress)
+
+    def _job(self) -> dict[str, Any]:
+        return {"camera": dataclasses.asdict(self._camera), "options": dataclasses.asdict(self._options)}
+
+    def _extracted(self, child: ColmapProcess, file: Path) -> ImageFeatures:
+        job = self._job() | {"file": str(file)}
+        return ImageFeatures(**child.run("extract", job, timeout_s=self._options.timeout_s))
+
+    def _spread(
+        self,
+        work: Callable[[ColmapProcess, Item], Answer],
+        items: Sequence[Item],
+        stage: str,
+        progress: Progress | None,
+    ) -> list[Answer]:
+        """Answers in the order of the items, the children side by side."""
+        free: SimpleQueue[ColmapProcess] = SimpleQueue()
+        for child in self._children:
+            free.put(child)
+
+        def one(item: Item) -> Answer:
+            child = free.get()
+            try:
+                return work(child, item)
+            finally:
+                free.put(child)
+
+        out: list[Answer] = []
+        if progress is not None:
+            progress(stage, 0, len(items))
+        with ThreadPoolExecutor(len(self._children)) as pool:
+            tasks = [pool.submit(one, item) for item in items]
+            try:
+                for task in tasks:
+                    out.append(task.result())
+                    if progress is not None:
+                        progress(stage, len(out), len(items))
+            finally:
+                pool.shutdown(cancel_futures=True)
+        return out
+
+
+def pairs_of(
+    names: Iterable[str],
+    T_world_camera_prior: Mapping[str, Transform] | None,
+    options: SfmOptions,
+    *,
+    stations: Mapping[str, str] | None = None,
+) -> list[tuple[str, str]]:
+    """Pairs of names worth matching (see `choose_pairs`): a function of the set of images and their poses alone.
+
+    Before the images are taken, the poses at which they are to be taken give the pairs with which matching can begin;
+    when all are there, the pairs of those that are there are the ones that count.
+    """
+    order = sorted(names)
+    chosen = choose_pairs(order, T_world_camera_prior, options.neighbours, options.max_angle_deg, stations=stations)
+    return [(order[i], order[j]) for i, j in chosen]
+
+
+def pairs_with(name: str, arrived: Iterable[str], pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Those of the pairs that join the image `name` with one that has arrived: what can be matched now."""
+    there = set(arrived)
+    return sorted((min(pair), max(pair)) for pair in pairs if name in pair and there >= set(pair) - {name})
+
+
+def missing_pairs(pairs: Iterable[tuple[str, str]], matches: Iterable[PairMatches]) -> list[tuple[str, str]]:
+    """Those of the pairs that have not been matched yet."""
+    done = {m.pair for m in matches}
+    return sorted({(min(pair), max(pair)) for pair in pairs} - done)

@@ -1,0 +1,98 @@
+"""Variance components: how noisy outlines and poses are, told from the residuals themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from service.compute.registration.normal_equations import Blocks, marginalise
+from service.core.geometry import Array
+
+_FACTOR = (0.02, 1e4)  # of the outlines' variance
+_POSE = (1e-3, 1e3)  # of the square roots below
+_GROWTH = 5.0  # of the square roots of the pose noise in one estimate
+
+
+@dataclass(frozen=True, slots=True)
+class PoseNoise:
+    """Square roots of the covariances of the pose errors as a sum of parts with a factor each.
+
+    `parts` (K, N, 6, 6) must act on different rows (translation, rotation), or be one; `least` is the smallest
+    factor allowed, `free` whether they are estimated.
+    """
+
+    parts: Array
+    least: float
+    free: bool
+
+    def root(self, factors: Array) -> Array:
+        """(N, 6, 6) with root @ root.T the covariance."""
+        return np.einsum("k,knij->nij", factors, self.parts)
+
+
+def no_pose_noise(n_images: int) -> PoseNoise:
+    """Poses taken as exact."""
+    return PoseNoise(np.zeros((1, n_images, 6, 6)), 1.0, free=False)
+
+
+def unknown_pose_noise(n_images: int) -> PoseNoise:
+    """Isotropic noise of position and of orientation, alike for all images, in units of 0.1 mm and 0.1 mrad."""
+    parts = np.zeros((2, n_images, 6, 6))
+    parts[0, :, :3, :3] = 1e-4 * np.eye(3)
+    parts[1, :, 3:, 3:] = 1e-4 * np.eye(3)
+    return PoseNoise(parts, _POSE[0], free=True)
+
+
+def given_pose_noise(covariance: Array) -> PoseNoise:
+    """The stated covariances (N, 6, 6); the residuals may show them to be too small, never too large."""
+    values, vectors = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    return PoseNoise(root[None], 1.0, free=True)
+
+
+def estimate(
+    blocks: Blocks, noise: PoseNoise, prior: Array, prior_gradient: Array, start: tuple[float, Array]
+) -> tuple[float, Array]:
+    """Factor of the outlines' variance and factors (K,) of the pose noise, by restricted maximum likelihood.
+
+    Args:
+        blocks: linearised at the present solution.
+        noise: the form of the pose noise.
+        prior: (n, n) information on the common unknowns from elsewhere.
+        prior_gradient: (n,) of that information at the present solution.
+        start: present values.
+
+    Source: Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal",
+    Biometrika 58(3), 1971. A wide prior on each logarithm keeps few residuals from saying much.
+
+    The pose noise grows at most fivefold at a time: residuals far larger than stated send the first step of the
+    minimiser to poses that are known by nothing, from where neither it nor the solution comes back.
+    """
+    n_free = len(start[1]) if noise.free else 0
+    most = np.log(np.clip(_GROWTH * start[1][:n_free], max(noise.least, _POSE[0]) * _GROWTH, _POSE[1]))
+    lower = [np.log(_FACTOR[0]) / 2, *([np.log(noise.least)] * n_free)]
+    upper = [np.log(_FACTOR[1]) / 2, *most.tolist()]
+
+    def cost(y: Array) -> float:
+        factor = float(np.exp(2 * y[0]))
+        scales = np.exp(y[1:]) if n_free else start[1]
+        m = marginalise(blocks, noise.root(scales), factor)
+        H, g = m.H + prior, m.g + prior_gradient
+        # A common unknown of which these poses tell nothing, but for rounding, takes no part.
+        told = np.diag(H) > 0
+        d = np.where(told, 1 / np.sqrt(np.where(told, np.diag(H), 1.0)), 0.0)
+        values, vectors = np.linalg.eigh(H * np.outer(d, d))
+        good = values > 1e-13
+        projected = vectors.T @ (d * g)
+        gain = float(np.sum(projected[good] ** 2 / values[good]))
+        log_H = float(np.sum(np.log(values[good])) - 2 * np.sum(np.log(d[told])))
+        return m.quadratic - gain + m.log_determinant + log_H + y[0] ** 2
+
+    at = np.clip(
+        np.concatenate([[0.5 * np.log(start[0])], np.log(np.maximum(start[1][:n_free], 1e-12))]), lower, upper
+    )
+    best = minimize(cost, at, method="L-BFGS-B", bounds=list(zip(lower, upper, strict=True)))
+    y = np.asarray(best.x, dtype=np.float64)
+    return float(np.exp(2 * y[0])), np.exp(y[1:]) if n_free else start[1]

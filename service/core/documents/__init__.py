@@ -1,0 +1,1 @@
+"""The texts of generated documents, made from the models themselves."""

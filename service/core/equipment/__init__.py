@@ -1,0 +1,1 @@
+"""Whether clocks, camera bodies and disk space suit a run, judged from the record."""

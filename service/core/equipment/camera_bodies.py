@@ -1,0 +1,74 @@
+"""One serial number for one camera: its connection states one, its photographs another, of the same body. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from service.core.records.events import DeviceOpened, Event, View
+
+
+@dataclass(frozen=True, slots=True)
+class Bodies:
+    """The serial numbers of a run's cameras.
+
+    Attributes:
+        wires: as cameras state them over their connections, by which device; over USB a camera may put digits of its
+            model before those of the body.
+        stated: as photographs state them, each once.
+    """
+
+    wires: Mapping[str, str]
+    stated: tuple[str, ...]
+
+    def shown(self, identity: Mapping[str, Any]) -> str:
+        """The one number to show for a device: a camera's is the body's own, as photographs state it."""
+        wire = str(identity.get("serial") or "")
+        return self._own(wire) if identity.get("kind") == "camera" else wire
+
+    def _own(self, wire: str) -> str:
+        return next((number for number in self.stated if wire and _same(wire, number)), wire)
+
+    @property
+    def explained(self) -> tuple[str, ...]:
+        """Why a number is not the one that a camera states over its connection, a sentence each."""
+        return tuple(
+            f"The serial number of {device} is {self._own(wire)}, as every photograph of it states. Over its "
+            f"connection it states {wire}, which ends with the same digits: it is one and the same body"
+            for wire, device in self.wires.items()
+            if self._own(wire) != wire
+        )
+
+    @property
+    def strange(self) -> str:
+        """Photographs that state another body than any camera that was opened; "" where there are none."""
+        known = [wire for wire in self.wires if wire]
+        others = [number for number in self.stated if not any(_same(wire, number) for wire in known)]
+        if not known or not others:
+            return ""
+        return (
+            f"Photographs state the serial number {' and '.join(others)}, and no camera that was opened does: "
+            f"{', '.join(f'{self.wires[wire]} states {wire}' for wire in known)}. They are of another body"
+        )
+
+
+def bodies(events: Sequence[Event]) -> Bodies:
+    """Of a run's events."""
+    opened = [event.payload for event in events if isinstance(event.payload, DeviceOpened)]
+    stated = (event.payload.camera.get("body_serial") for event in events if isinstance(event.payload, View))
+    identities = ((payload.device, payload.report.get("identity") or {}) for payload in opened)
+    return bodies_of(identities, (str(number or "") for number in stated))
+
+
+def bodies_of(identities: Iterable[tuple[str, Mapping[str, Any]]], stated: Iterable[str]) -> Bodies:
+    """Of the identities that devices gave, each with its name in rig.yaml, and the numbers of the photographs."""
+    wires = {
+        str(identity.get("serial") or ""): name for name, identity in identities if identity.get("kind") == "camera"
+    }
+    return Bodies(wires, tuple(dict.fromkeys(number for number in stated if number)))
+
+
+def _same(one: str, other: str) -> bool:
+    a, b = one.lstrip("0"), other.lstrip("0")
+    return bool(a and b) and (a.endswith(b) or b.endswith(a))

@@ -1,0 +1,118 @@
+"""Will the disk do for a run? A forecast from what is planned and what was written, and what follows from it: pure.
+
+What is left below the least is for the evidence alone: no log, no new photograph.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from service.core.protocol.models import Protocol
+from service.core.recovery.ways_on import planned_views
+from service.core.run.state import RunState
+
+LEAST_FREE_BYTES = 1 << 30
+_VIEWS_UNDER_WAY = 5  # for which there must be room above the least: in the camera, on its way, being computed
+_ENOUGH_VIEWS = 3  # from so many on a run's own figures count
+_MANUAL_VIEWS = 60  # a person takes as many as it needs; this is usual
+# Where no run has been recorded yet: JPEG and RAW of 60 MP with what is computed of them; of a simulated rig less.
+_GUESSED_VIEW_BYTES, _GUESSED_SIMULATED_BYTES = 100_000_000, 4_000_000
+_GUESSED_OTHER_BYTES = 1_000_000_000  # CT, scans, registered data
+
+Verdict = Literal["enough", "short", "stop"]
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What the files of a run take, as recorded."""
+
+    views: int = 0
+    view_bytes: int = 0  # photographs, with RAW and pose logs
+    computed_bytes: int = 0  # what jobs wrote
+    other_bytes: int = 0  # CT, scans, protocol …
+
+
+@dataclass(frozen=True, slots=True)
+class Forecast:
+    """What a run will still write, against what is free."""
+
+    views_left: int
+    view_bytes: int  # a view, with what is computed of it
+    needed_bytes: int  # to the end of the run
+    free_bytes: int
+    known_from: Literal["this run", "an earlier run", "a guess"]
+
+    @property
+    def stop_below_bytes(self) -> int:
+        """Free space below which no further photograph is begun."""
+        return LEAST_FREE_BYTES + _VIEWS_UNDER_WAY * self.view_bytes
+
+    @property
+    def verdict(self) -> Verdict:
+        """`stop`: nothing more is begun. `short`: it will come to that before the end of the run."""
+        if self.free_bytes < min(self.stop_below_bytes, LEAST_FREE_BYTES + self.needed_bytes):
+            return "stop"
+        return "short" if self.free_bytes - self.needed_bytes < LEAST_FREE_BYTES else "enough"
+
+    @property
+    def words(self) -> str:
+        """For people: the figures and what they mean."""
+        views = f"{self.views_left} views of {self.view_bytes / 1e6:.0f} MB each, by {self.known_from}"
+        figures = f"{size_words(self.free_bytes)} are free, and the run needs about {size_words(self.needed_bytes)}"
+        figures += f" more ({views})" if self.views_left else " more"
+        if self.verdict == "enough":
+            return f"Disk: {figures}"
+        if self.verdict == "short":
+            return f"The disk will not do: {figures}; the last {size_words(LEAST_FREE_BYTES)} are kept free"
+        return f"The disk of the data folder is nearly full: {figures}. Nothing is begun before there is more room"
+
+
+def forecast(
+    protocol: Protocol, state: RunState | None, here: Usage, before: Usage | None, free_bytes: int, *, simulated: bool
+) -> Forecast:
+    """What a run will still write.
+
+    Args:
+        protocol: of the run.
+        state: of the run; None before it begins.
+        here: what its files take by now.
+        before: what those of an earlier run of the same protocol took in all; None: there was none.
+        free_bytes: on the disk of the data folder.
+        simulated: whether the rig is.
+    """
+    known = before if before is not None and before.views >= _ENOUGH_VIEWS else None
+    own = here if here.views >= _ENOUGH_VIEWS else None
+    guess = _GUESSED_SIMULATED_BYTES if simulated else _GUESSED_VIEW_BYTES
+    source = own or known
+    photograph = guess if source is None else source.view_bytes / source.views
+    # Jobs come after their views: early in a run what they wrote says too little.
+    computed = max((u.computed_bytes / u.views for u in (own, known) if u is not None), default=0.0)
+    other = known.other_bytes if known is not None else (0 if simulated else _GUESSED_OTHER_BYTES)
+    left = views_left(protocol, state)
+    needed = left * photograph
+    needed += max(0.0, computed * (here.views + left) - here.computed_bytes)
+    needed += max(0, other - here.other_bytes)
+    if state is not None and state.terminal:
+        left, needed = 0, 0.0
+    known_from: Literal["this run", "an earlier run", "a guess"] = (
+        "this run" if own is not None else "an earlier run" if known is not None else "a guess"
+    )
+    return Forecast(left, round(photograph + computed), round(needed), free_bytes, known_from)
+
+
+def views_left(protocol: Protocol, state: RunState | None) -> int:
+    """How many photographs the protocol plans that are not taken yet."""
+    left = 0
+    for step in protocol.steps:
+        now = None if state is None else state.steps[step.id]
+        if now is not None and (now.phase == "passed" or now.skipped):
+            continue
+        planned = _MANUAL_VIEWS if step.kind == "manual_capture" else planned_views(step)
+        left += max(0, planned - (0 if now is None else len(now.captured)))
+    return left
+
+
+def size_words(size_bytes: float) -> str:
+    """`850 MB`, `12.3 GB`: for people."""
+    return f"{size_bytes / 1e9:.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.0f} MB"

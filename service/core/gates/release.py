@@ -1,0 +1,39 @@
+"""When a completed run may leave the system: its release by a second person."""
+
+from __future__ import annotations
+
+from service.core.errors import IllegalTransitionError
+from service.core.protocol.models import Protocol
+from service.core.run.state import RunState
+
+
+def refuse_release(state: RunState, actor: str, signed_sha256: str) -> IllegalTransitionError | None:
+    """Why this person cannot release the run by signing this hash, or None."""
+    if state.status != "completed":
+        return IllegalTransitionError(
+            f"the run is {state.status}", where="release", remedy="Only a completed run can be released"
+        )
+    if state.released_by:
+        return IllegalTransitionError(f"{state.released_by} has released the run already", where="release")
+    if actor in state.people:
+        return IllegalTransitionError(
+            f"{actor} took part in this run", where="release", remedy="A second person checks and releases it"
+        )
+    if signed_sha256 != state.completed_sha256:
+        return IllegalTransitionError(
+            "the signature is for another record than the end of this run",
+            where="release",
+            remedy="Read the run again and sign it as it is now",
+        )
+    return None
+
+
+def refuse_export(protocol: Protocol, state: RunState) -> IllegalTransitionError | None:
+    """Why nothing of the run may be exported yet as far as people are concerned, or None."""
+    if protocol.release == "second_person" and not state.released_by:
+        return IllegalTransitionError(
+            "the protocol asks for a second person's release before anything is exported",
+            where=state.run_id,
+            remedy="A supervisor who took no part in the run reads it and signs its release",
+        )
+    return None

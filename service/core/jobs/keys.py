@@ -1,0 +1,37 @@
+"""Names of jobs that are the same for the same work: after a restart or a retry its result is used again."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from service.core.run.state import JobState, RunState
+
+
+def arguments_name(arguments: Mapping[str, Any]) -> str:
+    """What tells these arguments from others."""
+    return hashlib.sha256(json.dumps(arguments, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _stem(state: RunState, step: str, kind: str, name: str) -> str:
+    generation = sum(past.step == step and past.viewpoint is None for past in state.superseded)
+    return f"{step}/{generation}/{kind}/{name}/"
+
+
+def job_key(state: RunState, step: str, kind: str, name: str) -> str:
+    """The key under which a job would be enqueued now.
+
+    A redo of the step begins a new generation; a job that has failed is tried anew under another key.
+    """
+    stem = _stem(state, step, kind, name)
+    jobs = state.steps[step].jobs.values()
+    return stem + str(sum(job.idempotency_key.startswith(stem) and job.status == "failed" for job in jobs))
+
+
+def newest_job(state: RunState, step: str, kind: str, name: str) -> JobState | None:
+    """The last job of this work that was enqueued since the step's last redo; None if it never was."""
+    stem = _stem(state, step, kind, name)
+    jobs = [job for job in state.steps[step].jobs.values() if job.idempotency_key.startswith(stem)]
+    return max(jobs, key=lambda job: job.enqueued_seq, default=None)

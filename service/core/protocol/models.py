@@ -1,0 +1,337 @@
+"""The lab procedure as typed data: the protocol file's models, its loader and its JSON Schema."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn, TypeVar, Union, cast
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    SerializeAsAny,
+    TypeAdapter,
+    WithJsonSchema,
+    create_model,
+)
+
+from service.core.errors import ProtocolError
+from service.core.protocol.rules import rule_violations
+from service.core.records.events import Record
+from service.core.recovery.reasons import Reasons
+from service.core.run.lifecycle import RESERVED_STEP_IDS
+from service.core.text.checked_yaml import checked, decoded, did_you_mean, refuse
+from service.core.text.yaml_tree import Plain, Problem, YamlTree, field_name, parse_yaml
+
+ParamsT = TypeVar("ParamsT", bound=BaseModel)
+
+
+def _fraction(value: Any) -> Any:
+    """Shutter speeds are written as photographers write them: `1/15`."""
+    if not isinstance(value, str):
+        return value
+    numerator, slash, denominator = value.partition("/")
+    try:
+        return float(numerator) / (float(denominator) if slash else 1.0)
+    except (ValueError, ZeroDivisionError):
+        raise ValueError(f"{value!r} is neither a number of seconds nor a fraction such as 1/15") from None
+
+
+def _not_reserved(value: str) -> str:
+    if value in RESERVED_STEP_IDS:
+        raise ValueError(f"{value!r} is the name of a state of the run; choose another")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Text = Annotated[str, Field(min_length=1)]
+StepId = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$"), AfterValidator(_not_reserved)]
+Exposure = Annotated[
+    float,
+    Field(gt=0, allow_inf_nan=False),
+    BeforeValidator(_fraction),
+    WithJsonSchema(
+        {
+            "anyOf": [
+                {"type": "number", "exclusiveMinimum": 0},
+                {"type": "string", "pattern": r"^[0-9.]+/[0-9.]+$", "examples": ["1/15"]},
+            ]
+        }
+    ),
+]
+
+
+class Spheres(Record):
+    """The reference spheres on and around the specimen."""
+
+    radius_mm: Positive
+    registration: Annotated[int, Field(ge=4)]  # how many
+    control: Annotated[int, Field(ge=0)] = 0
+    # Where it is not told, the detector learns it from the clearest spheres of each image.
+    colour: Annotated[str, Field(pattern=r"^(white|grey|green|orange|#[0-9a-fA-F]{6})$")] | None = None
+
+
+class Board(Record):
+    """The calibration checkerboard, counted in inner corners."""
+
+    columns: Annotated[int, Field(ge=3)]
+    rows: Annotated[int, Field(ge=3)]
+    square_mm: Positive
+
+
+class CameraSection(Record):
+    """The camera settings that stay fixed through the run."""
+
+    aperture_f: Positive
+    exposure_s: Exposure
+    iso: Annotated[int, Field(gt=0)]
+    focus_mode: Text = "Manual"
+    image_quality: Literal["JPEG", "RAW", "RAW+JPEG"] = "JPEG"
+
+
+class Motion(Record):
+    """How the arm moves between viewpoints."""
+
+    speed_rad_s: Positive = 0.5
+    acceleration_rad_s2: Positive = 0.5
+    dwell_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5  # after standing still, before the exposure
+
+
+class Settle(Record):
+    """When the arm counts as standing still, and how long to wait for it."""
+
+    window_s: Positive = 0.5
+    joint_speed_rad_s: Positive = 0.001
+    tcp_speed_m_s: Positive = 0.0002
+    position_peak_to_peak_m: Positive = 0.00002
+    rotation_peak_to_peak_rad: Positive = 0.0000873
+    timeout_s: Positive = 20.0
+
+
+# Who may accept a gate outside its limits; `another_supervisor`: who neither began the run nor confirmed the step.
+AcceptedBy = Literal["supervisor", "another_supervisor"]
+
+
+class Gate(Record):
+    """A measured number and its limits; a step passes only within all of them, or as somebody accepts it."""
+
+    measure: Text
+    min: Finite | None = None
+    max: Finite | None = None
+    unit: str = ""
+    why: str = ""
+    unless_skipped: str | None = None  # the earlier step without which there is no such number; skipped: no such gate
+    accept_by: AcceptedBy | None = None  # None: nobody may; see service.core.gates.acceptance
+
+
+class Recovery(Record):
+    """What happens when the work of a step fails: see service.core.recovery.policy."""
+
+    retries: Annotated[int, Field(ge=0, le=20)] = 2  # of passing troubles of a device, without progress in between
+    wait_s: Annotated[float, Field(ge=0, le=600)] = 1.0  # before a retry
+    on_failure: Literal["ask", "abort"] = "ask"
+
+
+class HandAction(Record):
+    """What the technician's hands do when confirming this step; a simulated rig does it by itself."""
+
+    action: Text
+    station: str | None = None
+
+
+class StepFields(Record):
+    """Everything of a step but its params."""
+
+    id: StepId
+    kind: Text
+    title: Text
+    why: str = ""
+    instructions: str = ""
+    drawing: str = ""  # of service/web/run/drawings, beside the instructions; "": as the kind of step suggests
+    checklist: tuple[Text, ...] = ()
+    gates: tuple[Gate, ...] = ()
+    sign: bool = False
+    confirm: bool = True
+    skippable: bool = False
+    irreversible: bool = False
+    requires: tuple[str, ...] = ()
+    recovery: Recovery = Recovery()
+    simulated_hands: tuple[HandAction, ...] = ()  # without effect on a real rig
+
+
+class MovingParams(Record):
+    """Base of the params of a step kind whose work moves the robot: such work never begins by itself."""
+
+    @property
+    def moves_robot(self) -> bool:
+        """Whether it does so with these params."""
+        return True
+
+
+class Step(StepFields):
+    """One step of the procedure; `params` is of the step kind's own model."""
+
+    params: SerializeAsAny[BaseModel]
+
+    @property
+    def moves_robot(self) -> bool:
+        """Whether the robot moves while this step works: its confirmation is held, or the pedal pressed twice."""
+        return isinstance(self.params, MovingParams) and self.params.moves_robot
+
+    @property
+    def begins_confirmed(self) -> bool:
+        """Whether a person lets it begin: what moves the robot always, whatever the protocol says."""
+        return self.confirm or self.moves_robot
+
+    def params_as(self, model: type[ParamsT]) -> ParamsT:
+        """The params, typed. Raises ProtocolError when the step is of another kind."""
+        if not isinstance(self.params, model):
+            raise ProtocolError(f"the params of this step are not {model.__qualname__}", where=f"step {self.id}")
+        return self.params
+
+
+class ProtocolFields(Record):
+    """Everything of a protocol but its steps."""
+
+    id: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+    version: Text
+    title: Text
+    source: str = ""
+    spheres: Spheres
+    board: Board | None = None
+    camera: CameraSection | None = None  # None: no settings are demanded, and no step of the protocol sets a camera
+    motion: Motion = Motion()
+    settle: Settle = Settle()
+    # Whether a person who took no part in the run must release it before anything of it is exported.
+    release: Literal["none", "second_person"] = "none"
+    reasons: Reasons = Reasons()  # offered where a redo, a skip or an acceptance asks for one
+
+
+class Protocol(ProtocolFields):
+    """A lab procedure."""
+
+    steps: tuple[Step, ...]
+
+    @property
+    def step_ids(self) -> tuple[str, ...]:
+        """Identifiers in order."""
+        return tuple(step.id for step in self.steps)
+
+    def step(self, step_id: str) -> Step:
+        """The step of this identifier. Raises ProtocolError if there is none."""
+        return self.steps[self.index(step_id)]
+
+    def index(self, step_id: str) -> int:
+        """The step's position. Raises ProtocolError if there is none."""
+        try:
+            return self.step_ids.index(step_id)
+        except ValueError:
+            raise ProtocolError(
+                f"no step {step_id!r}", where=self.id, remedy=f"Steps: {', '.join(self.step_ids)}"
+            ) from None
+
+
+@dataclass(frozen=True)
+class LoadedProtocol:
+    """A protocol, the hash of its file's bytes, and its text."""
+
+    protocol: Protocol
+    sha256: str
+    source: str
+
+
+class _FileStep(StepFields):
+    params: dict[str, Any] = Field(default_factory=dict)
+
+
+class _FileProtocol(ProtocolFields):
+    steps: Annotated[tuple[_FileStep, ...], Field(min_length=1)]
+
+
+def load_protocol(path: Path, params_models: Mapping[str, type[BaseModel]]) -> LoadedProtocol:
+    """Read a protocol file; `params_models` gives the Params of every known step kind.
+
+    Raises ProtocolError naming file:line and field of everything that is wrong, all of it at once.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ProtocolError(
+            f"cannot read the protocol: {error.strerror}", where=str(path), remedy="Check the path"
+        ) from error
+    return parse_protocol(content, params_models, name=str(path))
+
+
+def parse_protocol(content: bytes, params_models: Mapping[str, type[BaseModel]], *, name: str) -> LoadedProtocol:
+    """The same for a file's bytes (a recorded artefact, an editor's buffer); `name` stands for the file in errors."""
+    text = decoded(content, name=name, error=ProtocolError)
+    tree = parse_yaml(text, name=name)
+    problems = list(tree.problems)
+    data = tree.data if isinstance(tree.data, dict) else {}
+    if not isinstance(tree.data, dict):
+        problems.append(Problem(1, "", "not a protocol: the file must hold fields such as id, version and steps"))
+        _refuse(problems, name)
+    parsed, found = checked(data, _FileProtocol, tree)
+    problems += found
+    problems += [Problem(tree.line(at), field_name(at), message) for at, message in rule_violations(data)]
+    params = _validate_params(data, params_models, tree, problems)
+    if problems or parsed is None:
+        _refuse(problems, name)
+    steps = tuple(
+        Step(params=params[index], **{field: getattr(step, field) for field in StepFields.model_fields})
+        for index, step in enumerate(parsed.steps)
+    )
+    fields = {field: getattr(parsed, field) for field in ProtocolFields.model_fields}
+    return LoadedProtocol(Protocol(steps=steps, **fields), hashlib.sha256(content).hexdigest(), text)
+
+
+def _validate_params(
+    data: Mapping[str, Plain], models: Mapping[str, type[BaseModel]], tree: YamlTree, problems: list[Problem]
+) -> dict[int, BaseModel]:
+    """The params of every step by its index, judged by the model of its kind; appends to `problems`."""
+    params: dict[int, BaseModel] = {}
+    steps = data.get("steps")
+    for index, step in enumerate(steps if isinstance(steps, list) else []):
+        if not isinstance(step, dict) or not isinstance(step.get("kind"), str):
+            continue
+        kind, at = str(step["kind"]), ("steps", index)
+        if kind not in models:
+            message = f"unknown kind {kind!r}{did_you_mean(kind, models)}; kinds: {', '.join(sorted(models))}"
+            problems.append(Problem(tree.line((*at, "kind")), field_name((*at, "kind")), message))
+            continue
+        given = step.get("params", {})
+        if not isinstance(given, dict):
+            continue  # the structure's own check has said so
+        found, wrong = checked(given, models[kind], tree, (*at, "params"))
+        problems += wrong
+        if found is not None:
+            params[index] = found
+    return params
+
+
+def _refuse(problems: list[Problem], name: str) -> NoReturn:
+    remedy = "See docs/reference/protocol.schema.json for what a protocol may hold"
+    refuse(problems, what="protocol", name=name, remedy=remedy, error=ProtocolError)
+
+
+def protocol_json_schema(params_models: Mapping[str, type[BaseModel]]) -> dict[str, Any]:
+    """JSON Schema (draft 2020-12) of a protocol file, with the params of every step kind; for editors."""
+    kinds: list[type[BaseModel]] = []
+    for kind, model in sorted(params_models.items()):
+        needed = any(field.is_required() for field in model.model_fields.values())
+        default: Any = ... if needed else Field(default_factory=model)
+        fields: dict[str, Any] = {"kind": (Literal[kind], ...), "params": (model, default)}
+        kinds.append(create_model(f"Step_{kind}", __base__=StepFields, __doc__=f"A step of kind {kind}.", **fields))
+    # A union built at run time: the type checker cannot follow, pydantic can.
+    step = cast(Any, Union)[tuple(kinds)]
+    if len(kinds) > 1:
+        step = Annotated[step, Field(discriminator="kind")]
+    steps: Any = (Annotated[tuple[step, ...], Field(min_length=1)], ...)
+    whole = create_model("Protocol", __base__=ProtocolFields, __doc__="An orthocapture protocol.", steps=steps)
+    schema = TypeAdapter(whole).json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}

@@ -1,0 +1,88 @@
+"""The list of an import: every file that was brought, with its hash, and what was left out and why."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from service.core.errors import DataError
+from service.core.records.events import Record
+
+PhotographRole = Literal["calibration", "image", "control_image"]
+FileRole = Literal["scan", "control_scan", "ct"]
+
+
+class ImportedFile(Record):
+    """One file as it was when it was listed. `path` is within the import's folder, or absolute outside of it."""
+
+    path: str
+    sha256: str
+    size_bytes: int
+    modified_utc: str
+    media_type: str = "application/octet-stream"
+
+
+class ImportedView(Record):
+    """One photograph with the raw files of the same exposure, and what it says of itself."""
+
+    name: str
+    role: PhotographRole
+    photograph: ImportedFile
+    raws: tuple[ImportedFile, ...] = ()
+    camera: dict[str, Any]
+
+
+class LeftOutFile(Record):
+    """A file of the folder that is not imported."""
+
+    path: str
+    reason: str
+
+
+class ImportList(Record):
+    """What an import consists of. The same folder gives the same list: it names a run that was interrupted."""
+
+    folder: str
+    views: tuple[ImportedView, ...]
+    files: dict[FileRole, tuple[ImportedFile, ...]]
+    left_out: tuple[LeftOutFile, ...] = ()
+
+    def of(self, role: PhotographRole) -> tuple[ImportedView, ...]:
+        """The photographs of one kind, in order."""
+        return tuple(view for view in self.views if view.role == role)
+
+    def holds(self, role: PhotographRole | FileRole) -> bool:
+        """Whether anything of this kind was brought."""
+        return any(view.role == role for view in self.views) or any(name == role for name in self.files)
+
+    def all_files(self) -> tuple[ImportedFile, ...]:
+        """Every file to be imported."""
+        photographs = [file for view in self.views for file in (view.photograph, *view.raws)]
+        return (*photographs, *(file for files in self.files.values() for file in files))
+
+    def check(self, path: str, sha256: str) -> ImportedFile:
+        """The list's entry of a file that is being imported.
+
+        Raises DataError when the list does not hold it, or when its bytes are not those that were listed.
+        """
+        found = next((file for file in self.all_files() if self.absolute(file) == path), None)
+        if found is None:
+            raise DataError(
+                "the file is not in the list of the import", where=path, remedy="Begin a new import of this folder"
+            )
+        if found.sha256 != sha256:
+            raise DataError(
+                "the file has changed since it was listed",
+                where=path,
+                remedy="Restore it and resume the run, or begin a new import",
+            )
+        return found
+
+    def absolute(self, file: ImportedFile) -> str:
+        """Where a file lies."""
+        return file.path if file.path.startswith("/") else f"{self.folder}/{file.path}"
+
+
+def imported_sentence(at_utc: str, by: str) -> str:
+    """What every reader of an imported run is told first."""
+    when = f"{at_utc[:16].replace('T', ' ')} UTC"
+    return f"The photographs were imported on {when} by {by}; how the images were captured is not in evidence"

@@ -1,0 +1,39 @@
+"""Reasons that are offered where one is asked for: gloves write badly, and the same words can be counted later."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from service.core.records.events import Record
+
+_Text = Annotated[str, Field(min_length=3, max_length=200)]
+
+
+class Reasons(Record):
+    """Of a protocol, by what is done; free words beside them are always possible. What is recorded is the text."""
+
+    redo: tuple[_Text, ...] = (
+        "Images are blurred or badly lit",
+        "The specimen, the board or a sphere has moved",
+        "Something stood in the view",
+        "A device gave a wrong or incomplete result",
+        "Confirmed by mistake, or before everything was ready",
+    )
+    skip: tuple[_Text, ...] = (
+        "Not part of this acquisition",
+        "A device is out of order",
+        "Done already, outside of this run",
+        "No time is left for it",
+    )
+    accept: tuple[_Text, ...] = (
+        "Only just outside; enough for the purpose of this run",
+        "Another figure shows that the result can be used",
+        "It cannot be repeated: the specimen has changed",
+    )
+
+
+def full_reason(preset: str, own: str) -> str:
+    """What is recorded: the reason that was chosen, and what was written beside it."""
+    return ": ".join(part for part in (preset.strip(), own.strip()) if part)

@@ -1,0 +1,229 @@
+"""What can be done now about a step that fell short, failed or cannot begin: choices with their cost and loss."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+from statistics import median
+from typing import Any, Literal
+
+from service.core.gates.acceptance import acceptance_refusal, demanded_role
+from service.core.gates.dependence import dependent_steps, used_steps
+from service.core.protocol.models import Protocol, Step
+from service.core.records.events import OperatorVerb
+from service.core.recovery.words import AGAIN, OTHERWISE, REMEDIES, UNKNOWN_REMEDY, Again
+from service.core.run.actions import redo_refusal, skip_refusal, unmet_requirements
+from service.core.run.state import RunState, StepState
+from service.core.run.state_transitions import seconds_between
+
+_WITH_WHAT_IS_THERE = "Judge it again by the images that are there; single ones are taken again on the page Capture"
+Trouble = Literal["gates", "failure", "requirements"]
+
+
+@dataclass(frozen=True, slots=True)
+class WayOn:
+    """One choice. The first of a list that is available is the recommended one."""
+
+    verb: OperatorVerb
+    step: str  # that it is about
+    words: str
+    minutes: float | None  # what it takes; None: not known before it is done
+    loses: str
+    available: bool = True
+    why_not: str = ""
+
+
+def trouble_of(protocol: Protocol, state: RunState) -> Trouble | None:
+    """What the current step is stopped by; None while nothing stops it."""
+    if not state.started or state.terminal:
+        return None
+    if state.phase == "recovering" and not state.step.retry_granted:
+        return "gates" if state.step.failure is None else "failure"
+    if state.phase == "ready" and unmet_requirements(protocol.step(state.current), state):
+        return "requirements"
+    return None
+
+
+def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
+    """Every way on from where the run is stopped, those that can be taken first; empty while nothing stops it.
+
+    Ending the run is always among them and always last: what is recorded stays whole.
+    """
+    trouble = trouble_of(protocol, state)
+    if trouble is None:
+        return ()
+    step = protocol.step(state.current)
+    if trouble == "requirements":
+        found = [_redo(protocol, state, name) for name in unmet_requirements(step, state)]
+        found.append(_skip(protocol, state))
+    else:
+        again, redos = _again(protocol, state, trouble), _redos(protocol, state, step)
+        same = trouble == "gates" and (_again_of(step).same or _all_taken(step, state.step))
+        found = [*redos, again] if same else [again, *redos]
+        found += [_accept(protocol, state)] if trouble == "gates" else []
+        found.append(_skip(protocol, state))
+    found.sort(key=lambda way: not way.available)  # stable
+    done = [way for way in found if way.available]
+    return (*done, _end(protocol, state), *_together(way for way in found if not way.available))
+
+
+def planned_views(step: Step) -> int:
+    """How many images the protocol plans in a step."""
+    return sum(int(one.count) for one in planned_sets(step))
+
+
+def planned_sets(step: Step) -> tuple[Any, ...]:
+    """Sets of viewpoints, or the board poses that the software plans: each has a count and a station."""
+    planned = getattr(step.params, "board_poses", None)
+    listed: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
+    return listed if planned is None else (*listed, planned)
+
+
+def view_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
+    """Seconds that one view takes: as this run's took, else as the arm's plan says; None: neither is known."""
+    if state.view_gaps_s:
+        return median(state.view_gaps_s)
+    plans = [n.data for n in state.steps[step.id].notes if "estimated_s" in n.data and n.data.get("views")]
+    if plans:
+        return float(plans[-1]["estimated_s"]) / len(plans[-1]["views"])
+    return None
+
+
+def takes_words(minutes: float | None) -> str:
+    """`about 12 min`: for people."""
+    if minutes is None:
+        return "not known"
+    if minutes == 0:
+        return "no time"
+    return "under a minute" if minutes < 1 else f"about {minutes:.0f} min"
+
+
+# --- one function a verb -----------------------------------------------------------------------------------
+
+
+def _again(protocol: Protocol, state: RunState, trouble: Trouble) -> WayOn:
+    step, now = protocol.step(state.current), state.step
+    words = str(now.mend.get("advice") or (_WITH_WHAT_IS_THERE if _all_taken(step, now) else _again_of(step).words))
+    if not now.mend and trouble == "failure" and now.failure is not None:
+        words = f"{REMEDIES.get(now.failure.error, UNKNOWN_REMEDY)}; then try again"
+    mended = len(now.mend.get("viewpoints", ())) + int(now.mend.get("images", 0))
+    left = mended or max(planned_views(step) - len(now.captured), 0)
+    each_s = view_s(protocol, state, step)
+    minutes = _minutes(now.worked_s)
+    if left and each_s is not None:
+        minutes = left * each_s / 60
+    elif now.captured and step.kind in ("viewpoint_capture", "calibration"):
+        minutes = _computing(now.worked_s, len(now.captured), each_s)
+    kept = {0: "", 1: " The image is kept."}.get(len(now.captured), f" The {len(now.captured)} images are kept.")
+    return WayOn("confirm", step.id, words, minutes, f"Nothing.{kept}")
+
+
+def _computing(worked_s: float | None, views: int, each_s: float | None) -> float | None:
+    """Minutes of what is computed from the views once they are there."""
+    return None if worked_s is None or each_s is None else max(worked_s - views * each_s, each_s) / 60
+
+
+def _all_taken(step: Step, now: StepState) -> bool:
+    """Every view is there and the step knows no further one: trying again changes no figure."""
+    return not now.mend and 0 < planned_views(step) <= len(now.captured)
+
+
+def _again_of(step: Step) -> Again:
+    return AGAIN.get(step.kind, OTHERWISE)
+
+
+def _redos(protocol: Protocol, state: RunState, step: Step) -> list[WayOn]:
+    """This step afresh, and the earlier steps whose results it uses: what gives other figures first, the nearest."""
+    used = sorted(used_steps(protocol, step), key=protocol.index, reverse=True)
+    used.sort(key=lambda name: _again_of(protocol.step(name)).same and not protocol.step(name).irreversible)
+    begun = [name for name in used if state.steps[name].phase != "pending"]
+    afresh = [step.id] if state.step.captured or step.irreversible else []
+    return [_redo(protocol, state, name) for name in (*afresh, *begun)]
+
+
+def _together(ways: Iterable[WayOn]) -> Iterator[WayOn]:
+    """What is refused for one and the same reason, as one line."""
+    for _, group in groupby(ways, key=lambda way: way.why_not):
+        first, *others = group
+        yield replace(first, words=", ".join([first.words, *(way.words.split(": ", 1)[-1] for way in others)]))
+
+
+def _redo(protocol: Protocol, state: RunState, target: str) -> WayOn:
+    steps = protocol.steps[protocol.index(target) : protocol.index(state.current) + 1]
+    begun = [s for s in steps if state.steps[s.id].started_utc]
+    images = sum(len(state.steps[s.id].captured) for s in begun)
+    reset = [s.title for s in begun if s.id != target]
+    title = protocol.step(target).title
+    lost = [f"{images} images no longer count"] if images else []
+    lost += [f"These are done again as well: {', '.join(reset)}"] if reset else []
+    loses = ". ".join([*lost, "All of it stays in the record"]) + "." if lost else "Nothing."
+    afresh = (
+        "Do this step again from its beginning" if target == state.current else f"Do an earlier step again: {title}"
+    )
+    refusal = redo_refusal(protocol, state, target)
+    minutes = _sum(_minutes(_took_s(protocol, state, s)) for s in (begun or [protocol.step(target)]))
+    return WayOn("redo", target, afresh, minutes, loses, refusal is None, "" if refusal is None else refusal.what)
+
+
+def _accept(protocol: Protocol, state: RunState) -> WayOn:
+    step, refusal = protocol.step(state.current), acceptance_refusal(protocol, state)
+    rest = [protocol.step(name).title for name in dependent_steps(protocol, step.id)]
+    says = f" These say that they depend on it: {', '.join(rest)}." if rest else ""
+    role = demanded_role(protocol, state) or "supervisor"
+    return WayOn(
+        "accept",
+        step.id,
+        f"Accept the figures as they are: a {role} signs, with a reason",
+        1.0,
+        f"The figures stay outside their limits, a deviation that every reader is told of first.{says}",
+        refusal is None,
+        "" if refusal is None else refusal.what,
+    )
+
+
+def _skip(protocol: Protocol, state: RunState) -> WayOn:
+    step, refusal = protocol.step(state.current), skip_refusal(protocol, state)
+    later = protocol.steps[protocol.index(step.id) + 1 :]
+    blocked = [s.title for s in later if step.id in s.requires]
+    unjudged = [g.measure for s in later for g in s.gates if g.unless_skipped == step.id]
+    using = [s.title for s in later if step.id in used_steps(protocol, s)]
+    lost = ["Its result does not count"]
+    lost += [f"These cannot begin: {', '.join(blocked)}"] if blocked else []
+    lost += [f"Not judged later: {', '.join(dict.fromkeys(unjudged))}"] if unjudged else []
+    lost += [f"These do without it, as far as they can: {', '.join(using)}"] if using else []
+    why_not = "" if refusal is None else refusal.what
+    return WayOn("skip", step.id, "Go on without this step", 0.0, ". ".join(lost) + ".", refusal is None, why_not)
+
+
+def _end(protocol: Protocol, state: RunState) -> WayOn:
+    left = [s.title for s in protocol.steps if state.steps[s.id].phase != "passed"]
+    undone = f"{left[0]}, and {len(left) - 1} later steps" if len(left) > 2 else ", ".join(left)
+    loses = (
+        "Nothing that is recorded: it is sealed, and can be read, verified, reported and given away. "
+        f"Not done: {undone}. The run cannot go on."
+    )
+    return WayOn("abort", state.current, "End the run here and keep what there is", 0.0, loses)
+
+
+# --- what things take ------------------------------------------------------------------------------------------
+
+
+def _took_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
+    """What a step took in this run; for views that are still to be taken, as long as one takes."""
+    now = state.steps[step.id]
+    each_s, views = view_s(protocol, state, step), planned_views(step)
+    if views and each_s is not None:
+        return views * each_s
+    if now.started_utc and now.ended_utc:
+        return seconds_between(now.started_utc, now.ended_utc)
+    return now.worked_s
+
+
+def _minutes(seconds: float | None) -> float | None:
+    return None if seconds is None else seconds / 60
+
+
+def _sum(parts: Iterable[float | None]) -> float | None:
+    known = list(parts)
+    return None if any(part is None for part in known) else sum(part for part in known if part is not None)

@@ -1,0 +1,37 @@
+"""Which results came in time: a result may arrive after the specimen's release, and then says so."""
+
+from __future__ import annotations
+
+from datetime import datetime
+
+from service.core.protocol.models import Protocol
+from service.core.run.state import RunState
+
+_ANSWERS = ("registration", "evaluation")  # kinds of the steps whose results a release rests on
+
+
+def released_utc(protocol: Protocol, state: RunState) -> str:
+    """When what the registration shows could no longer be measured again; "" before that.
+
+    That is when the first irreversible step that requires a registration or an evaluation has passed, or else the
+    end of the run.
+    """
+    for step in protocol.steps:
+        rests = any(protocol.step(name).kind in _ANSWERS for name in step.requires)
+        if step.irreversible and rests and state.steps[step.id].phase == "passed":
+            return state.steps[step.id].ended_utc
+    return state.ended_utc if state.status == "completed" else ""
+
+
+def late_s(protocol: Protocol, state: RunState, now_utc: str) -> float | None:
+    """How long after the release a result arrives; None: in time."""
+    released = released_utc(protocol, state)
+    if not released:
+        return None
+    return max(0.0, (datetime.fromisoformat(now_utc) - datetime.fromisoformat(released)).total_seconds())
+
+
+def late_words(seconds: float) -> str:
+    """`arrived 12 min after the release`."""
+    minutes = round(seconds / 60)
+    return f"arrived {minutes} min after the release" if minutes else "arrived after the release"

@@ -1,0 +1,53 @@
+"""Results that came after the evaluation was made, and what they changed in its table: for every reader of a run.
+
+A registration that arrives later never takes the place of the run's own (registrations.py); that it came,
+when, and whether it is better is told all the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from service.core.protocol.models import Protocol
+from service.core.results.registrations import Row, arrived, later_evaluations, own_registration, signed_rows
+from service.core.run.state import RunState
+
+
+@dataclass(frozen=True, slots=True)
+class LateResult:
+    """One row of the evaluation's table that was not there when the evaluation was made."""
+
+    seq: int  # of the event with which it came
+    at_utc: str
+    step: str
+    name: str  # of the registration
+    text: str
+    after_release: bool
+
+
+def late_results(protocol: Protocol, state: RunState) -> list[LateResult]:
+    """All, in the order in which they came."""
+    own = own_registration(protocol, state)
+    before = signed_rows(protocol, state)
+    if own is None:
+        return []
+    mine = next(row for row in before if row["poses"] == own)
+    known = {str(row["poses"]) for row in before}
+    found: list[LateResult] = []
+    for step, job in later_evaluations(protocol, state):
+        for row in job.result["table"]:
+            name = str(row["poses"])
+            if name not in known:
+                known.add(name)
+                text = f"{name}: {arrived(job)}. {_changed(row, mine)}"
+                found.append(LateResult(job.ended_seq, job.ended_utc, step, name, text, job.late_s is not None))
+    return sorted(found, key=lambda result: result.seq)
+
+
+def _changed(row: Row, own: Row) -> str:
+    error_mm, own_mm = float(row["mean_radial_error_mm"]), float(own["mean_radial_error_mm"])
+    better = "better than" if error_mm < own_mm else "not better than"
+    return (
+        f"It adds a row to the table, with a mean radial error of {error_mm:.3f} mm: {better} the run's own, "
+        f"{own['poses']} with {own_mm:.3f} mm, which stays the one that was judged and signed"
+    )

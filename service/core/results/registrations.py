@@ -1,0 +1,138 @@
+"""The registrations of a run and their evaluations, whenever they arrived, and which of them is the run's own.
+
+The run's own registration is the one with the smallest error on the control spheres among those that the
+evaluation step judged: that is what was signed, and by what the specimen was released. One that arrives later may be
+better; it is reported beside it and does not take its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from service.core.jobs.priorities import lane_of
+from service.core.protocol.models import Protocol
+from service.core.results.arrival import late_words
+from service.core.run.state import JobState, RunState
+
+Row = Mapping[str, Any]
+
+
+def last_result(protocol: Protocol, state: RunState, kind: str) -> Mapping[str, Any]:
+    """The Result of the last step of a kind that has one; empty if there is none."""
+    results = (state.steps[step.id].result for step in reversed(protocol.steps) if step.kind == kind)
+    return next((result for result in results if result), {})
+
+
+def registration_name(record: Mapping[str, Any]) -> str:
+    """`colmap`, or `colmap_1920x1080` of images reduced to that size."""
+    if record.get("full_camera") is None:
+        return str(record["poses"])
+    camera = record["camera"]
+    return f"{record['poses']}_{int(camera['width'])}x{int(camera['height'])}"
+
+
+def registrations(protocol: Protocol, state: RunState) -> dict[str, Mapping[str, Any]]:
+    """Every registration by its name: those of the step's result, then those that came after it."""
+    found = dict(last_result(protocol, state, "registration").get("registrations", {}))
+    for _, job in _finished(protocol, state, "registration", "register") if found else ():
+        found.setdefault(registration_name(job.result), job.result)
+    return found
+
+
+def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
+    """The paper's table, whenever a row arrived; `late` of a row is "" where the evaluation itself had it."""
+    rows: list[Row] = [{**row, "late": ""} for row in signed_rows(protocol, state)]
+    known = {row["poses"] for row in rows}
+    for _, job in later_evaluations(protocol, state) if rows else ():
+        rows += [{**row, "late": arrived(job)} for row in job.result["table"] if row["poses"] not in known]
+    return rows
+
+
+def arrived(job: JobState) -> str:
+    """`arrived 12 min after the release`, or `arrived after the evaluation` where nothing was released by then."""
+    return "arrived after the evaluation" if job.late_s is None else late_words(job.late_s)
+
+
+def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:
+    """What the agreement of some rows of the table does not show; "" where no two of them have that in common.
+
+    Incremental and global mapping and the triangulation each see a share of the tracks and give poses to begin with;
+    the model that counts is one adjustment of all tracks from there (service/compute/poses/sfm/mapping.py).
+    """
+    if not any(
+        job.kind == "structure_from_motion"
+        and "features" in job.arguments  # of runs that were recorded before: not so
+        for step in state.steps.values()
+        for job in step.jobs.values()
+    ):
+        return ""
+    rows = evaluated(protocol, state)
+    alike = [row for row in rows if row["source"] in _ADJUSTED]
+    names = {size: [str(r["poses"]) for r in alike if r["resolution"] == size] for size in _sizes(alike)}
+    shared = [" and ".join([", ".join(group[:-1]), group[-1]]) for group in names.values() if len(group) > 1]
+    if not shared:
+        return ""
+    return (
+        f"{'; '.join(shared)} come from the same features and matches and end in the same adjustment of all of them; "
+        "they differ in the poses that it begins with. That they agree shows that the result does not depend on "
+        "where it begins. They are one measurement, and do not confirm each other"
+        + (
+            "; hybrid goes on from one of them, with the robot's poses and the spheres"
+            if any(row["source"] == "hybrid" for row in rows)
+            else ""
+        )
+        + "."
+    )
+
+
+_ADJUSTED = ("triangulated", "colmap", "glomap")
+
+
+def _sizes(rows: Iterable[Row]) -> list[str]:
+    return list(dict.fromkeys(str(row["resolution"]) for row in rows))
+
+
+def budgets(protocol: Protocol, state: RunState) -> dict[str, Mapping[str, Any]]:
+    """The error budget of each registration."""
+    found = dict(last_result(protocol, state, "evaluation").get("budgets", {}))
+    for _, job in later_evaluations(protocol, state):
+        found = {**job.result["budgets"], **found}
+    return found
+
+
+def own_registration(protocol: Protocol, state: RunState) -> str | None:
+    """The name of the run's own registration (see above); None before the evaluation."""
+    rows = signed_rows(protocol, state)
+    return str(min(rows, key=_error_mm)["poses"]) if rows else None
+
+
+def better_later(protocol: Protocol, state: RunState) -> Row | None:
+    """The best of those that came after the evaluation, where it is better than the run's own."""
+    own = own_registration(protocol, state)
+    rows = evaluated(protocol, state)
+    best = min(rows, key=_error_mm, default=None)
+    signed = {row["poses"] for row in signed_rows(protocol, state)}
+    return best if own is not None and best is not None and best["poses"] not in signed else None
+
+
+def signed_rows(protocol: Protocol, state: RunState) -> list[Row]:
+    """The table as the evaluation step made it: what was judged and signed."""
+    return list(last_result(protocol, state, "evaluation").get("table", ()))
+
+
+def _error_mm(row: Row) -> float:
+    return float(row["mean_radial_error_mm"])
+
+
+def later_evaluations(protocol: Protocol, state: RunState) -> list[tuple[str, JobState]]:
+    """The evaluations of registrations that came after the step's own evaluation, each with its step."""
+    jobs = _finished(protocol, state, "evaluation", "evaluate")
+    return [(step, job) for step, job in jobs if lane_of(job.priority) == "background"]
+
+
+def _finished(protocol: Protocol, state: RunState, step_kind: str, job_kind: str) -> Iterator[tuple[str, JobState]]:
+    for step in protocol.steps:
+        if step.kind == step_kind:
+            jobs = state.steps[step.id].jobs.values()
+            yield from ((step.id, job) for job in jobs if job.kind == job_kind and job.status == "finished")

@@ -1,0 +1,216 @@
+"""RunState → what happens next, as a value. The runner executes it and appends the outcome; it decides nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from service.core.errors import IntegrityError
+from service.core.gates.acceptance import describe_accepted
+from service.core.gates.verdict import describe, describe_judged, evaluate_gates
+from service.core.protocol.models import Protocol, Step
+from service.core.records.events import OperatorVerb, Uncertainty
+from service.core.recovery.ways_on import WayOn, ways_on
+from service.core.run.actions import (
+    allowed_actions,
+    check_action,
+    needs_leave,
+    needs_signature_now,
+    record_to_sign,
+    redoable_steps,
+    unmet_requirements,
+)
+from service.core.run.fold import advance, fold, initial_state
+from service.core.run.state import Deviation, JobState, Note, RunState, StepState, Superseded
+
+__all__ = [
+    "AbortRun",
+    "Accept",
+    "AskOperator",
+    "Decision",
+    "Deviation",
+    "EvaluateGates",
+    "FinishRun",
+    "Halt",
+    "JobState",
+    "Note",
+    "Retry",
+    "RunState",
+    "RunStep",
+    "StepState",
+    "Superseded",
+    "advance",
+    "allowed_actions",
+    "check_action",
+    "decide",
+    "evaluate_gates",
+    "fold",
+    "initial_state",
+    "record_to_sign",
+    "redoable_steps",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class AskOperator:
+    """Wait for a person; `options` are the verbs that can be accepted now."""
+
+    step: str
+    for_: Literal["confirm", "sign", "recovery"]
+    text: str
+    checklist: tuple[str, ...]  # to be ticked with a confirm
+    options: tuple[OperatorVerb, ...]
+    sign_sha256: str = ""  # what a signature binds (OperatorAction.signed_sha256)
+    ways: tuple[WayOn, ...] = ()  # where the step is stopped: the choices, the recommended one first
+
+
+@dataclass(frozen=True, slots=True)
+class RunStep:
+    """Do the work of a step, or go on with it. With `begin`, append StepStarted first."""
+
+    step: str
+    attempt: int
+    begin: bool
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateGates:
+    """Append evaluate_gates(step, attempt, measures, skipped steps, uncertainties)."""
+
+    step: str
+    attempt: int
+    measures: Mapping[str, float]
+    uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])
+
+
+@dataclass(frozen=True, slots=True)
+class Accept:
+    """Append StepPassed."""
+
+    step: str
+    attempt: int
+
+
+@dataclass(frozen=True, slots=True)
+class Retry:
+    """Wait, then append StepRetried with this attempt number; what was captured is kept."""
+
+    step: str
+    attempt: int
+    why: str
+    wait_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class FinishRun:
+    """Append RunCompleted."""
+
+    deviations: int
+
+
+@dataclass(frozen=True, slots=True)
+class AbortRun:
+    """Append RunAborted: the step's recovery policy ends the run."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Halt:
+    """Nothing to do: no motion, no work, until an operator resumes (paused) or for good."""
+
+    status: Literal["paused", "completed", "aborted"]
+
+
+Decision = AskOperator | RunStep | EvaluateGates | Accept | Retry | FinishRun | AbortRun | Halt
+
+
+def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - one return a phase
+    """What the runner does next. Raises IntegrityError for a run of which nothing is recorded."""
+    if not state.started:
+        raise IntegrityError("nothing is recorded of this run", remedy="Append run_started first")
+    if state.status != "active":
+        return Halt(state.status)
+    now = state.step
+    match state.phase:
+        case "ready":
+            return _decide_ready(protocol, state)
+        case "running" if needs_leave(protocol, state):
+            return _ask(protocol, state, "confirm", _what_goes_on(protocol.step(now.step), now))
+        case "running":
+            return RunStep(now.step, now.attempt, begin=False)
+        case "checking":
+            return EvaluateGates(now.step, now.attempt, now.measures, now.uncertainties)
+        case "awaiting_operator":
+            if needs_signature_now(protocol, state):
+                return _ask(protocol, state, "sign", _what_is_signed(now))
+            return Accept(now.step, now.attempt)
+        case "recovering":
+            return _decide_recovering(protocol, state)
+        case "passed":
+            return FinishRun(state.deviation_count)
+
+
+def _what_goes_on(step: Step, now: StepState) -> str:
+    kept = {0: "it had taken no image yet", 1: "its image is kept"}
+    images = kept.get(len(now.captured), f"its {len(now.captured)} images are kept")
+    return (
+        f"The program that drove the robot ended during this step ({step.title}); {images}. "
+        "Look whether anything has changed and nobody is in reach; the robot moves as soon as you confirm"
+    )
+
+
+def _what_is_signed(now: StepState) -> str:
+    figures = "; ".join(describe(verdict) for verdict in now.verdicts) or "this step has no gates"
+    head = "Passed its gates" if now.accepted is None else f"{describe_accepted(now.accepted)}. All its figures"
+    return f"{head}: {figures}. Check the figures and sign"
+
+
+def _decide_ready(protocol: Protocol, state: RunState) -> Decision:
+    step, now = protocol.step(state.current), state.step
+    unmet = unmet_requirements(step, state)
+    if unmet:
+        return _ask(protocol, state, "recovery", f"Required before it and not passed: {', '.join(unmet)}")
+    if needs_signature_now(protocol, state):
+        text = (
+            f"{step.title} cannot be undone. Its captures have passed: {', '.join(step.requires)}. Sign to release it"
+        )
+        return _ask(protocol, state, "sign", text)
+    if step.begins_confirmed and (not now.confirmed or needs_leave(protocol, state)):
+        return _ask(protocol, state, "confirm", step.instructions or step.title)
+    return RunStep(now.step, now.attempt, begin=True)
+
+
+def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
+    step, now = protocol.step(state.current), state.step
+    anew = needs_leave(protocol, state)
+    if now.retry_granted and not anew:
+        return Retry(now.step, now.attempt + 1, "the operator asked for it", 0.0)
+    if now.failure is None:
+        outside = any(not verdict.passed and not verdict.undecided for verdict in now.verdicts)
+        say = describe_judged if outside else describe  # all of them are said to be undecided then
+        failed = "; ".join(say(verdict) for verdict in now.verdicts if not verdict.passed)
+        found = "Outside its limits" if outside else "Not decided yet"
+        # What the step itself suggests, if it knows a way: further viewpoints that would bring the numbers within.
+        advice = str(now.mend.get("advice", ""))
+        return _ask(protocol, state, "recovery", f"{found}: {failed}" + (f". {advice}" if advice else ""))
+    why = f"{now.failure.error}: {now.failure.message}"
+    if anew and now.failure.recovery == "retry":
+        return _ask(protocol, state, "recovery", f"{why}. The robot moves again as soon as you confirm")
+    match now.failure.recovery:
+        case "retry":
+            return Retry(now.step, now.attempt + 1, why, step.recovery.wait_s)
+        case "abort":
+            return AbortRun(why)
+        case "ask":
+            return _ask(protocol, state, "recovery", why)
+
+
+def _ask(protocol: Protocol, state: RunState, for_: Literal["confirm", "sign", "recovery"], text: str) -> AskOperator:
+    items = protocol.step(state.current).checklist
+    unticked = state.phase == "recovering" and len(state.step.ticked) < len(items)
+    checklist = items if for_ == "confirm" or unticked else ()
+    options = allowed_actions(protocol, state)
+    signed = record_to_sign(protocol, state)
+    return AskOperator(state.current, for_, text, checklist, options, signed, ways_on(protocol, state))

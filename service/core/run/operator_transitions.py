@@ -1,0 +1,103 @@
+"""What an operator's action does to the state of a run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from service.core.gates.acceptance import describe_accepted, failed_gates
+from service.core.protocol.models import Protocol
+from service.core.records.events import Event, OperatorAction
+from service.core.run.actions import refuse
+from service.core.run.lifecycle import redo
+from service.core.run.state import Accepted, DeviationKind, Leave, RunState, StepState
+from service.core.run.state_transitions import UNMEASURED, change, deviate, go, pass_on, supersede
+
+
+def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return a verb
+    """The state after an action; one that is not allowed is listed as refused and has no other effect."""
+    refusal = refuse(protocol, state, p, event.actor)
+    if refusal is not None:
+        return deviate(state, event, "refused", p.step, f"{p.action} had no effect: {refusal}")
+    state = replace(state, people=state.people | {event.actor})
+    if p.automatic:
+        state = deviate(
+            state, event, "automatic", state.current, f"{p.action} given automatically on a simulated rig"
+        )
+    match p.action:
+        case "confirm":
+            return _confirm(_let_move(state, event), event, p)
+        case "sign":
+            return change(state, state.current, signed=True, signed_by=event.actor)
+        case "accept":
+            accepted = Accepted(event.seq, event.actor, p.role, p.identified, p.reason, failed_gates(state.step))
+            state = deviate(state, event, "gate_accepted", state.current, describe_accepted(accepted))
+            return go(protocol, state, "gates_accepted", accepted=accepted)
+        case "skip":
+            overridden = bool(state.step.verdicts) and not state.step.gates_passed
+            kind: DeviationKind = "gate_overridden" if overridden else "skip"
+            state = deviate(state, event, kind, state.current, p.reason)
+            return pass_on(protocol, go(protocol, state, "skip", skipped=True, ended_utc=event.at_utc))
+        case "abort":
+            return replace(go(protocol, state, "abort"), stop_reason=p.reason or f"aborted by {event.actor}")
+        case "pause":
+            return go(protocol, state, "pause")
+        case "resume":
+            return go(protocol, _let_move(state, event), "resume")
+        case "redo" if p.viewpoint is not None:
+            return replace(_redo_viewpoint(protocol, state, event, p.viewpoint, p.reason), last_redo_seq=event.seq)
+        case "redo":
+            target = p.step or state.current
+            return replace(_redo_step(protocol, state, event, target, p.reason), last_redo_seq=event.seq)
+
+
+def _let_move(state: RunState, event: Event) -> RunState:
+    return replace(state, restarted=False, leave=Leave(event.seq, event.actor))
+
+
+def _confirm(state: RunState, event: Event, p: OperatorAction) -> RunState:
+    ticked = p.checklist or state.step.ticked  # a list that was left open is ticked now
+    there = change(state, state.current, confirmed_by=event.actor, ticked=ticked)
+    match state.phase:
+        case "running":  # after a restart: the work goes on
+            return there
+        case "recovering":
+            return change(there, state.current, retry_granted=True)
+        case _:
+            return change(there, state.current, confirmed=True)
+
+
+def _redo_step(protocol: Protocol, state: RunState, event: Event, target: str, reason: str) -> RunState:
+    """Back to `target`: it and every later step start afresh."""
+    for step in protocol.step_ids[protocol.index(target) :]:
+        now = state.steps[step]
+        if now.phase == "pending":
+            continue
+        began = bool(now.started_utc)
+        if step == target:
+            state = deviate(state, event, "redo", step, reason)
+        elif began or now.skipped:
+            state = deviate(state, event, "reset_by_redo", step, f"reset because {target} is done again: {reason}")
+        if began or now.skipped:
+            state = supersede(state, event, step, reason, None, now.captured)
+        # The number rises even when nothing had begun, so that a record that is on its way is known to be void.
+        state = replace(state, steps={**state.steps, step: StepState(step, attempt=now.attempt + 1)})
+    return go(protocol, state, redo(target))
+
+
+def _redo_viewpoint(protocol: Protocol, state: RunState, event: Event, viewpoint: str, reason: str) -> RunState:
+    """Forget one viewpoint; a step that had finished its work becomes ready again with the others kept."""
+    now = state.step
+    state = deviate(state, event, "redo_viewpoint", state.current, f"{viewpoint}: {reason}")
+    if viewpoint in now.captured:
+        state = supersede(state, event, state.current, reason, viewpoint, {viewpoint: now.captured[viewpoint]})
+    changes: dict[str, Any] = {
+        "captured": {name: seq for name, seq in now.captured.items() if name != viewpoint},
+        "viewpoint_failures": {name: n for name, n in now.viewpoint_failures.items() if name != viewpoint},
+        "skipped_viewpoints": tuple(name for name in now.skipped_viewpoints if name != viewpoint),
+    }
+    if now.phase in ("running", "ready"):
+        return change(state, state.current, **changes)
+    changes |= {**UNMEASURED, "attempt": now.attempt + 1, "skipped": False, "retry_granted": False}
+    changes |= {"confirmed": False, "ticked": (), "passed_sha256": "", "passed_seq": 0, "ended_utc": ""}
+    return go(protocol, change(state, state.current, **changes), redo(state.current))

@@ -1,0 +1,275 @@
+"""What a run's events add up to, as frozen records: RunState and its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from service.core.jobs.priorities import WAITED
+from service.core.records.events import ArtefactRef, GateVerdict, Identified, Uncertainty
+from service.core.run.lifecycle import Phase
+from service.core.text.counts import counted
+
+# What a step shows as its progress while a person takes the images: the camera is idle, and shows its live view.
+WAITING_FOR_HAND = "waiting for the next image"
+StepPhase = Literal["pending", "ready", "running", "checking", "awaiting_operator", "recovering", "passed"]
+Status = Literal["active", "paused", "completed", "aborted"]
+DeviationKind = Literal[
+    "skip",
+    "gate_overridden",
+    "gate_accepted",
+    "redo",
+    "redo_viewpoint",
+    "reset_by_redo",
+    "viewpoint_skipped",
+    "refused",
+    "automatic",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class JobState:
+    """A job of the registration worker, as the events tell."""
+
+    job: str
+    kind: str
+    attempt: int
+    enqueued_seq: int
+    idempotency_key: str
+    arguments: Mapping[str, Any]
+    status: Literal["enqueued", "finished", "failed"] = "enqueued"
+    measures: Mapping[str, float] = field(default_factory=dict[str, float])
+    artefacts: tuple[ArtefactRef, ...] = ()
+    result: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    error: str = ""
+    message: str = ""
+    priority: int = WAITED
+    enqueued_utc: str = ""
+    ended_seq: int = 0  # of the event with which it finished or failed
+    ended_utc: str = ""
+    duration_s: float = 0.0
+    late_s: float | None = None  # after the specimen's release, or the run's end; None: in time
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A StepNote with its time."""
+
+    seq: int
+    at_utc: str
+    note: str
+    data: Mapping[str, Any]
+    attempt: int = 0  # of the step
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """The last StepFailed of a step that has not been recovered yet."""
+
+    seq: int
+    error: str
+    message: str
+    recovery: Literal["retry", "ask", "abort"]
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """Figures outside their limits with which a person let a step pass."""
+
+    seq: int  # of the action
+    by: str
+    role: str
+    identified: Identified
+    reason: str
+    verdicts: tuple[GateVerdict, ...]  # the failed ones
+
+
+@dataclass(frozen=True, slots=True)
+class StepState:
+    """Where a step stands. `attempt` counts from 1 and is the one under way or to come next."""
+
+    step: str
+    attempt: int = 1
+    phase: StepPhase = "pending"
+    confirmed: bool = False
+    confirmed_by: str = ""  # who let the present work begin: by the confirmation, or of a retry
+    ticked: tuple[str, ...] = ()  # checklist items of the confirmation
+    signed: bool = False
+    signed_by: str = ""
+    skipped: bool = False
+    retry_granted: bool = False  # an operator confirmed in recovering
+    measures: Mapping[str, float] = field(default_factory=dict[str, float])  # of this attempt
+    artefacts: tuple[ArtefactRef, ...] = ()  # of this attempt's step_measured
+    result: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])
+    verdicts: tuple[GateVerdict, ...] = ()
+    gates_passed: bool = False
+    gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds
+    accepted: Accepted | None = None  # outside the limits, and yet to count as passed
+    passed_sha256: str = ""  # of the step_passed event: what the release of an irreversible step binds
+    passed_seq: int = 0
+    failure: Failure | None = None
+    failures: int = 0  # failures in a row without a viewpoint captured or an operator's leave in between
+    # Viewpoints, notes and jobs survive a retry and end with a redo.
+    captured: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → seq of its event
+    viewpoint_failures: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → times
+    skipped_viewpoints: tuple[str, ...] = ()  # given up
+    notes: tuple[Note, ...] = ()
+    asked: tuple[Literal["release", "finish"], ...] = ()  # by a person at a screen, of a capture by hand
+    jobs: Mapping[str, JobState] = field(default_factory=dict[str, JobState])
+    started_utc: str = ""
+    ended_utc: str = ""
+    work_began_utc: str = ""  # of the present attempt
+    worked_s: float | None = None  # how long the last attempt worked until it had its figures or failed
+
+    @property
+    def passed_its_gates(self) -> bool:
+        """Passed, by its figures or as they were accepted, and not merely skipped."""
+        return self.phase == "passed" and (self.gates_passed or self.accepted is not None) and not self.skipped
+
+    @property
+    def mend(self) -> Mapping[str, Any]:
+        """What would mend this attempt, as it found out: data of its newest note with `advice`; empty without one.
+
+        The `hands` are those of that note: nobody acts on advice that a later note has replaced.
+        """
+        advised = (
+            note.data for note in reversed(self.notes) if note.attempt == self.attempt and "advice" in note.data
+        )
+        return next(advised, {})
+
+
+@dataclass(frozen=True, slots=True)
+class Superseded:
+    """An attempt, or one viewpoint of it, that a later one replaces. Its evidence stays."""
+
+    seq: int  # of the event that superseded it
+    step: str
+    attempt: int
+    reason: str
+    viewpoint: str | None = None
+    captured: Mapping[str, int] = field(default_factory=dict[str, int])
+    began: bool = True  # whether its work had begun
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """Something that departed from the protocol; a note (automatic confirmation) is listed but not counted."""
+
+    seq: int
+    kind: DeviationKind
+    step: str | None
+    text: str
+    actor: str = ""
+
+    @property
+    def is_note(self) -> bool:
+        """Whether this is for the record only."""
+        return self.kind == "automatic"
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """A DeviceTrouble."""
+
+    seq: int
+    device: str
+    error: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class Leave:
+    """Who has let the robot move, and in which event."""
+
+    seq: int
+    by: str
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """A RecordCorrected with who and when."""
+
+    seq: int
+    of_seq: int
+    field: str
+    old: Any
+    new: Any
+    reason: str
+    actor: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunState:
+    """The fold of a run's events."""
+
+    machine_state: str  # of service.core.run.lifecycle
+    current: str  # identifier of the step that the run is at (of the last one, once it has ended)
+    steps: Mapping[str, StepState]
+    status: Status = "active"
+    seq: int = 0  # of the last event; 0: nothing recorded yet
+    run_id: str = ""
+    operator: str = ""
+    simulated: bool = False
+    origin: Literal["captured", "imported"] = "captured"
+    auto_confirm: bool = False
+    sessions: int = 0
+    restarted: bool = False  # another process drives the run now, and nobody has let it go on since
+    leave: Leave | None = None  # the newest one in this session; each arm takes it once
+    stop_reason: str = ""
+    deviations: tuple[Deviation, ...] = ()
+    superseded: tuple[Superseded, ...] = ()
+    overtaken: tuple[int, ...] = ()  # seq of events that arrived after an operator's action had made them void
+    troubles: tuple[Trouble, ...] = ()
+    last_redo_seq: int = 0
+    people: frozenset[str] = frozenset()  # who took part: started it, controlled it, acted on it
+    controller: str = ""  # who has control of it on a screen
+    corrections: tuple[Correction, ...] = ()
+    ended_utc: str = ""  # of run_completed or run_aborted
+    completed_sha256: str = ""  # of the run_completed event: what a release binds
+    released_by: str = ""
+    view_gaps_s: tuple[float, ...] = ()  # of the last views: seconds from one to the next in the same work
+    last_view: tuple[str, str] = ("", "")  # step and time of the latest, while its work goes on
+
+    @property
+    def step(self) -> StepState:
+        """The current step."""
+        return self.steps[self.current]
+
+    @property
+    def phase(self) -> Phase:
+        """Phase of the current step."""
+        phase = self.step.phase
+        assert phase != "pending"  # the current step is never pending
+        return phase
+
+    @property
+    def started(self) -> bool:
+        """Whether run_started has been recorded."""
+        return self.seq > 0
+
+    @property
+    def paused(self) -> bool:
+        """Whether an operator has paused the run."""
+        return self.status == "paused"
+
+    @property
+    def skipped(self) -> frozenset[str]:
+        """Steps that an operator has left out; not those whose gates alone were overridden."""
+        return frozenset(name for name, step in self.steps.items() if step.skipped and not step.verdicts)
+
+    @property
+    def terminal(self) -> bool:
+        """Whether the run has ended, one way or the other."""
+        return self.status in ("completed", "aborted")
+
+    @property
+    def deviation_count(self) -> int:
+        """Deviations without the notes."""
+        return sum(not deviation.is_note for deviation in self.deviations)
+
+    @property
+    def deviations_told(self) -> str:
+        """The same in words: `1 deviation`."""
+        return counted(self.deviation_count, "deviation")

@@ -1,0 +1,71 @@
+"""The few ways in which a RunState changes; what the fold and the operator's actions are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import datetime
+from typing import Any
+
+from service.core.protocol.models import Protocol
+from service.core.records.events import Event
+from service.core.run.lifecycle import ABORTED, COMPLETED, lifecycle
+from service.core.run.state import Deviation, DeviationKind, RunState, Superseded
+
+# What a step forgets when its work is done again.
+UNMEASURED: Mapping[str, Any] = {
+    "measures": {},
+    "artefacts": (),
+    "result": {},
+    "uncertainties": {},
+    "verdicts": (),
+    "gates_passed": False,
+    "gates_sha256": "",
+    "accepted": None,
+    "signed": False,
+    "signed_by": "",
+    "failure": None,
+}
+
+
+def seconds_between(earlier_utc: str, later_utc: str) -> float:
+    """Seconds from one time of the record (ISO 8601) to another."""
+    return (datetime.fromisoformat(later_utc) - datetime.fromisoformat(earlier_utc)).total_seconds()
+
+
+def go(protocol: Protocol, state: RunState, trigger: str, **changes: Any) -> RunState:
+    """Fire a trigger and apply `changes` to the step that the run was at. Raises IllegalTransitionError."""
+    machine = lifecycle(protocol.step_ids)
+    target = machine.next(state.machine_state, trigger)
+    steps = {**state.steps, state.current: replace(state.step, **changes)}
+    place = machine.place(target)
+    if place is None:
+        status = COMPLETED if target == COMPLETED else ABORTED
+        return replace(state, machine_state=target, status=status, steps=steps)
+    steps[place.step] = replace(steps[place.step], phase=place.phase)
+    status = "paused" if place.paused else "active"
+    return replace(state, machine_state=target, status=status, current=place.step, steps=steps)
+
+
+def change(state: RunState, step: str, **changes: Any) -> RunState:
+    """Replace fields of one step."""
+    return replace(state, steps={**state.steps, step: replace(state.steps[step], **changes)})
+
+
+def pass_on(protocol: Protocol, state: RunState) -> RunState:
+    """From passed to the next step's ready; the last one waits for run_completed."""
+    return state if state.current == protocol.step_ids[-1] else go(protocol, state, "advance")
+
+
+def supersede(
+    state: RunState, event: Event, step: str, reason: str, viewpoint: str | None, captured: Mapping[str, int]
+) -> RunState:
+    """List an attempt, or one viewpoint of it, as replaced."""
+    now = state.steps[step]
+    past = Superseded(event.seq, step, now.attempt, reason, viewpoint, captured, began=bool(now.started_utc))
+    return replace(state, superseded=(*state.superseded, past))
+
+
+def deviate(state: RunState, event: Event, kind: DeviationKind, step: str | None, text: str) -> RunState:
+    """List a deviation."""
+    return replace(state, deviations=(*state.deviations, Deviation(event.seq, kind, step, text, event.actor)))

@@ -1,0 +1,102 @@
+"""A YAML file held against the pydantic model of its fields: everything that is wrong at once, each with its line."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NoReturn, TypeVar, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from service.core.errors import OrthocaptureError
+from service.core.text.yaml_tree import FieldPath, Plain, Problem, YamlTree, field_name
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+def decoded(content: bytes, *, name: str, error: type[OrthocaptureError]) -> str:
+    """The text of a UTF-8 file, with or without a byte order mark. Raises `error` with the line of what is none."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as why:
+        line = content.count(b"\n", 0, why.start) + 1
+        raise error("not UTF-8 text", where=f"{name}:{line}", remedy="Save the file as UTF-8") from why
+
+
+def checked(
+    data: Plain, model: type[ModelT], tree: YamlTree, at: FieldPath = ()
+) -> tuple[ModelT | None, list[Problem]]:
+    """Part of a file as a record of `model`, or what is wrong with it.
+
+    Types are as in JSON, without conversion: text in quotes is no number, and `yes` is no truth value.
+
+    Args:
+        data: what stands at `at` in the file.
+        tree: the file, for the lines.
+        at: where the part begins.
+    """
+    try:
+        return model.model_validate_json(json.dumps(data), strict=True), []
+    except ValidationError as error:
+        return None, [problem_of(details, tree, model, at) for details in error.errors()]
+
+
+def problem_of(details: ErrorDetails, tree: YamlTree, model: type[BaseModel], at: FieldPath = ()) -> Problem:
+    """What pydantic found in a record of `model` that begins at `at`, in a technician's words, with its line."""
+    start = len(at)
+    for part in details["loc"]:
+        if (*at, part) in tree.lines:  # parts that are not in the file are names of union members
+            at = (*at, part)
+    kind, last = details["type"], details["loc"][-1] if details["loc"] else ""
+    if kind == "missing":
+        return Problem(tree.line(at), field_name((*at, last)), "missing field")
+    if kind == "extra_forbidden":
+        near = did_you_mean(str(last), _known(model, at[start:-1]))
+        return Problem(tree.line(at), field_name(at), f"unknown field{near}")
+    message = details["msg"].removeprefix("Value error, ")
+    given = details["input"]
+    shown = "" if isinstance(given, (dict, list)) else f" (it is {json.dumps(given, default=str)})"
+    quote = '; put it in quotes: "…"' if kind == "string_type" and isinstance(given, (int, float)) else ""
+    return Problem(tree.line(at), field_name(at), f"{message}{shown}{quote}")
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """` (did you mean 'title'?)` where a known word is near; "" otherwise."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def refuse(
+    problems: Iterable[Problem], *, what: str, name: str, remedy: str, error: type[OrthocaptureError]
+) -> NoReturn:
+    """Raise `error` with every problem, in the order of the file's lines.
+
+    Args:
+        what: the kind of file, such as "protocol".
+        name: the file.
+    """
+    ordered = sorted(set(problems), key=lambda p: (p.line, p.field))
+    places = [(f"{name}:{p.line}" if p.line else name) + (f" {p.field}" if p.field else "") for p in ordered]
+    if len(ordered) == 1:
+        raise error(ordered[0].message, where=places[0], remedy=remedy)
+    listed = "\n".join(f"  {place}: {p.message}" for place, p in zip(places, ordered, strict=True))
+    raise error(f"{len(ordered)} things are wrong in this {what}:\n{listed}\n", where=name, remedy=remedy)
+
+
+def _known(model: type[BaseModel], path: FieldPath) -> Mapping[str, object]:
+    """The fields of the record that stands at `path` within a record of `model`."""
+    models = [model]
+    for part in path:
+        fields = [each.model_fields[part] for each in models if isinstance(part, str) and part in each.model_fields]
+        models = [inside for field in fields for inside in _records(field.annotation)] or models
+    return {name: field for each in models for name, field in each.model_fields.items()}
+
+
+def _records(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The models that a field's type names, within tuples, mappings and unions."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inside in get_args(annotation):
+        yield from _records(inside)

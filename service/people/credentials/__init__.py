@@ -1,0 +1,1 @@
+"""Passwords, PINs and badges, and failed tries."""

@@ -1,0 +1,61 @@
+"""Badges: what a reader types of them signs where the site allows it. Hashed and told by events, as PINs are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sqlalchemy import select, update
+
+from service.people.credentials.passwords import Passwords, plain_badge
+from service.people.errors import AccountError
+from service.people.person import Person
+from service.people.rows import get_account, record_change, require_reason
+from service.store.database.tables import accounts
+from service.store.store import Store
+
+
+class Badges:
+    """What supervisors and administrators do about the badges of people."""
+
+    def __init__(self, store: Store, passwords: Passwords, check_password: Callable[[str, str], None]) -> None:
+        self._store = store
+        self._passwords = passwords
+        self._check_password = check_password
+
+    def enrol(self, by: Person, account: str, password: str, badge: str) -> None:
+        """Give an account a badge, in the place of the one that it had.
+
+        Its owner agrees by the account's password: otherwise whoever enrols badges could sign as anybody.
+
+        Raises:
+            AccountError: it is no badge, or somebody else's.
+            SignInRefusedError: the password is not that of the account.
+        """
+        plain = plain_badge(badge)
+        self._check_password(account, password)
+        if any(self._passwords.matches(stored, plain) for stored in self._others(account)):
+            raise AccountError(
+                "this badge belongs to somebody else", where="badge", remedy="Revoke it there first, or take another"
+            )
+        self._set(by, account, self._passwords.hash(plain), "enrolled")
+
+    def revoke(self, by: Person, account: str, reason: str) -> None:
+        """Take a badge away; it signs nothing from then on. Raises AccountError."""
+        self._set(by, account, "", "revoked", require_reason(reason))
+
+    def _others(self, account: str) -> list[str]:
+        with self._store.database.reading() as connection:
+            rows = connection.execute(
+                select(accounts.c.badge_hash).where(accounts.c.account != account, accounts.c.badge_hash != "")
+            )
+            return [row.badge_hash for row in rows]
+
+    def _set(self, by: Person, account: str, stored: str, new: str, reason: str = "") -> None:
+        values = {"badge_hash": stored}
+        with self._store.database.writing() as connection:
+            row = get_account(connection, account)
+            if not stored and not row.badge_hash:
+                raise AccountError(f"{account} has no badge", where="badge", remedy="Nothing has to be done")
+            connection.execute(update(accounts).where(accounts.c.account == account).values(**values))
+            old = "enrolled" if row.badge_hash else ""
+            record_change(self._store, connection, by.account, account, "badge", old, new, reason, stored=values)

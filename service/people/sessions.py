@@ -1,0 +1,322 @@
+"""People at the screens: signing in and out, the lock of a screen, the password asked again for a signature."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping
+from threading import Lock
+from typing import Any, Literal
+
+from argon2 import PasswordHasher
+from sqlalchemy import Connection, Row, delete, insert, select, update
+
+from service.people.accounts import Accounts
+from service.people.credentials.badges import Badges
+from service.people.credentials.passwords import Passwords, new_token, token_sha256
+from service.people.errors import (
+    AccountError,
+    AccountJustChangedError,
+    NotSignedInError,
+    PinRefusedError,
+    SignInRefusedError,
+)
+from service.people.person import Person, Screen
+from service.people.rows import (
+    SERVICE,
+    SESSION_S,
+    find_account,
+    get_account,
+    plain_name,
+    record_change,
+    record_sign_in,
+    to_person,
+)
+from service.store.database.tables import accounts, sessions
+from service.store.store import Store
+
+FREE_FAILURES = 5  # wrong passwords in a row before an account waits; wrong PINs before a sign-in ends
+FIRST_WAIT_S = 30.0
+LONGEST_WAIT_S = 900.0
+_SCREEN_LETTERS = "23456789ABCDEFGHJKMNPQRSTVWXYZ"
+
+
+KnownBy = Literal["password", "pin", "badge"]  # of what somebody gives to sign
+NAMES: Mapping[KnownBy, str] = {"password": "password", "pin": "PIN", "badge": "badge"}
+
+
+def wait_after_s(failures: int) -> float:
+    """How long an account waits after so many wrong passwords in a row."""
+    over = failures - FREE_FAILURES
+    return 0.0 if over < 0 else min(FIRST_WAIT_S * 2.0 ** min(over, 10), LONGEST_WAIT_S)
+
+
+class People:
+    """Accounts and sign-ins of a data folder. Every change is one transaction with its event in the site's chain."""
+
+    def __init__(self, store: Store, hasher: PasswordHasher | None = None) -> None:
+        self._store = store
+        self._passwords = Passwords(hasher)
+        self._one_guess = (
+            Lock()
+        )  # at a time: no guess overtakes the count of failures, and argon2's memory is bounded
+        self.accounts = Accounts(store, self._passwords)
+        self.badges = Badges(store, self._passwords, self.check_password)
+
+    def _now_s(self) -> float:
+        return self._store.clock.utc_now().timestamp()
+
+    def first_link(self) -> str | None:
+        """A new one-time token (page /set-up/TOKEN) while there is no administrator; earlier ones are void."""
+        return self.accounts.first_link()
+
+    # --- passwords ---
+
+    def sign_in(self, account: str, password: str, *, address: str = "", replaces: str = "") -> str:
+        """The token of a new sign-in, for the cookie. `replaces`: the token that the browser had, which ends.
+
+        Raises SignInRefusedError, in the same words and after the same time whatever the cause.
+        """
+        with self._one_guess:
+            row = self._checked(account, password, address)
+            token = new_token()
+            now = self._now_s()
+            with self._store.database.writing() as connection:
+                self._require_unchanged(connection, row)
+                self._end(connection, replaces)
+                self._end_expired(connection, now)
+                screen = "".join(secrets.choice(_SCREEN_LETTERS) for _ in range(6))
+                session: dict[str, Any] = {
+                    "token_sha256": token_sha256(token),
+                    "account": row.account,
+                    "screen": screen,
+                    "csrf": new_token(),
+                    "created_utc_s": now,
+                }
+                connection.execute(insert(sessions).values(**session, seen_utc_s=now, locked=0, pin_failures=0))
+                self._reset_failures(connection, row, password)
+                record_sign_in(
+                    self._store,
+                    connection,
+                    "signed_in",
+                    account=row.account,
+                    screen=screen,
+                    address=address,
+                    actor=row.account,
+                    session=session,
+                )
+            return token
+
+    def check_password(self, account: str, password: str) -> None:
+        """The password asked again, for a signature. A wrong one counts; raises SignInRefusedError."""
+        with self._one_guess:
+            row = self._checked(account, password, "")
+            if row.failures or self._passwords.is_outdated(row.password_hash):
+                with self._store.database.writing() as connection:
+                    self._require_unchanged(connection, row)
+                    self._reset_failures(connection, row, password)
+
+    def check_secret(self, account: str, known_by: KnownBy, secret: str) -> None:
+        """Password, PIN or badge asked again, for a signature. A wrong one counts; raises SignInRefusedError.
+
+        Only the right password begins the count anew: who knows a PIN gains no further guesses at the password.
+        """
+        if known_by == "password":
+            self.check_password(account, secret)
+            return
+        with self._one_guess:
+            self._checked(account, secret.strip().upper(), "", known_by)
+
+    def refuse_address(self, address: str) -> None:
+        """Record that an address has failed too often and is not listened to for a while."""
+        with self._store.database.writing() as connection:
+            record_sign_in(self._store, connection, "locked_out", account="", address=address)
+
+    def _checked(self, typed: str, secret: str, address: str, known_by: KnownBy = "password") -> Row[Any]:
+        name = plain_name(typed)
+        with self._store.database.reading() as connection:
+            row = find_account(connection, name)
+        waits = row is not None and row.locked_until_utc_s > self._now_s()
+        usable = row is not None and row.state == "active" and not waits
+        hashes = {} if row is None else {"password": row.password_hash, "pin": row.pin_hash, "badge": row.badge_hash}
+        stored = str(hashes[known_by]) if usable else ""
+        matches = self._passwords.matches(stored, secret)
+        if row is not None and matches:
+            return row
+        with self._store.database.writing() as connection:
+            if row is not None and usable:
+                failures = get_account(connection, name).failures + 1  # another process may count too
+                wait_s = wait_after_s(failures)
+                connection.execute(
+                    update(accounts)
+                    .where(accounts.c.account == name)
+                    .values(failures=failures, locked_until_utc_s=self._now_s() + wait_s if wait_s else 0.0)
+                )
+                waits = wait_s > 0
+            # A name that is no account may be a password typed into the wrong field: it is not written down.
+            record_sign_in(
+                self._store,
+                connection,
+                "locked_out" if waits else "refused",
+                account=row.account if row is not None else "",
+                address=address,
+            )
+        raise SignInRefusedError(
+            f"name and {NAMES[known_by]} do not belong together, or the account has to wait",
+            where="password",
+            remedy=f"Check both. After {FREE_FAILURES} wrong {NAMES[known_by]}s in a row an account waits "
+            f"{FIRST_WAIT_S:.0f} s, then longer; an administrator can end the wait",
+        )
+
+    def _require_unchanged(self, connection: Connection, row: Row[Any]) -> None:
+        """The account is still what its password was checked against."""
+        present = find_account(connection, row.account)
+        if present is None or present.state != "active" or present.password_hash != row.password_hash:
+            raise AccountJustChangedError(
+                "the account has just been changed", where="password", remedy="Sign in again"
+            )
+
+    def _reset_failures(self, connection: Connection, row: Row[Any], password: str) -> None:
+        values: dict[str, object] = {"failures": 0, "locked_until_utc_s": 0.0}
+        if self._passwords.is_outdated(row.password_hash):
+            stored = {"password_hash": self._passwords.hash(password)}
+            values |= stored
+            name = row.account
+            record_change(self._store, connection, name, name, "password", "set", "hashed anew", stored=stored)
+        connection.execute(update(accounts).where(accounts.c.account == row.account).values(**values))
+
+    # --- sign-ins ---
+
+    def person(self, token: str, *, idle_lock_s: float, deliberate: bool) -> Person | None:
+        """Who has this token, if it is valid. Locks the screen when nobody has acted on it for `idle_lock_s`.
+
+        Args:
+            token: of the cookie.
+            idle_lock_s: site's limit.
+            deliberate: whether a person did this, rather than the page by itself; only that keeps a screen open.
+        """
+        now = self._now_s()
+        with self._store.database.reading() as connection:
+            row = self._session(connection, token)
+        if row is None:
+            return None
+        if row.state != "active" or now - row.created_utc_s >= SESSION_S:
+            with self._store.database.writing() as connection:
+                self._end(connection, token)
+            return None
+        if not row.locked and now - row.seen_utc_s >= idle_lock_s:
+            with self._store.database.writing() as connection:
+                self._lock(connection, row.account, row.screen, actor=SERVICE)
+            with self._store.database.reading() as connection:
+                row = self._session(connection, token)
+        elif deliberate and not row.locked and now - row.seen_utc_s >= 1.0:
+            with self._store.database.writing() as connection:
+                connection.execute(update(sessions).where(sessions.c.screen == row.screen).values(seen_utc_s=now))
+        return None if row is None else to_person(row)
+
+    def sign_out(self, person: Person) -> None:
+        """End this sign-in."""
+        with self._store.database.writing() as connection:
+            record_sign_in(
+                self._store,
+                connection,
+                "signed_out",
+                account=person.account,
+                screen=person.screen,
+                actor=person.account,
+            )
+            connection.execute(delete(sessions).where(sessions.c.screen == person.screen))
+
+    def lock(self, person: Person) -> None:
+        """Lock this screen until its PIN is given."""
+        with self._store.database.writing() as connection:
+            self._lock(connection, person.account, person.screen, actor=person.account)
+
+    def unlock(self, person: Person, pin: str) -> None:
+        """Open a locked screen. Raises PinRefusedError; NotSignedInError once too many were wrong, which ends it."""
+        with self._one_guess:
+            with self._store.database.reading() as connection:
+                row = connection.execute(
+                    select(accounts.c.pin_hash, sessions.c.pin_failures)
+                    .join(sessions, sessions.c.account == accounts.c.account)
+                    .where(sessions.c.screen == person.screen)
+                ).one_or_none()
+            if row is None:
+                raise NotSignedInError("this sign-in has ended", remedy="Sign in again")
+            matches = self._passwords.matches(row.pin_hash, pin)
+            failures = 0 if matches else row.pin_failures + 1
+            ended = failures >= FREE_FAILURES
+            with self._store.database.writing() as connection:
+                record_sign_in(
+                    self._store,
+                    connection,
+                    "screen_unlocked" if matches else "ended" if ended else "refused",
+                    account=person.account,
+                    screen=person.screen,
+                    actor=person.account if matches else SERVICE,
+                )
+                here = sessions.c.screen == person.screen
+                if ended:
+                    connection.execute(delete(sessions).where(here))
+                elif matches:
+                    opened = {"locked": 0, "pin_failures": 0, "seen_utc_s": self._now_s()}
+                    connection.execute(update(sessions).where(here).values(**opened))
+                else:
+                    connection.execute(update(sessions).where(here).values(pin_failures=failures))
+        if ended:
+            raise NotSignedInError(
+                f"{FREE_FAILURES} wrong PINs: this sign-in has ended", remedy="Sign in again with the password"
+            )
+        if not matches:
+            left = FREE_FAILURES - failures
+            raise PinRefusedError(
+                "this is not the PIN",
+                where="pin",
+                remedy=f"Try again; {left} {'try is' if left == 1 else 'tries are'} left, then sign in again",
+            )
+
+    def screens(self, account: str) -> list[Screen]:
+        """The valid sign-ins of an account, newest first."""
+        with self._store.database.reading() as connection:
+            rows = connection.execute(
+                select(sessions)
+                .where(sessions.c.account == account, sessions.c.created_utc_s > self._now_s() - SESSION_S)
+                .order_by(sessions.c.created_utc_s.desc())
+            ).all()
+        return [Screen(r.screen, r.account, r.created_utc_s, r.seen_utc_s, bool(r.locked)) for r in rows]
+
+    def end_screen(self, person: Person, screen: str) -> None:
+        """End one of a person's own sign-ins, on another screen perhaps."""
+        with self._store.database.writing() as connection:
+            chosen = (sessions.c.screen == screen) & (sessions.c.account == person.account)
+            if connection.execute(select(sessions.c.screen).where(chosen)).one_or_none() is None:
+                raise AccountError(f"you have no sign-in {screen!r}", where="screen", remedy="It may have ended")
+            record_sign_in(
+                self._store, connection, "ended", account=person.account, screen=screen, actor=person.account
+            )
+            connection.execute(delete(sessions).where(chosen))
+
+    def _session(self, connection: Connection, token: str) -> Row[Any] | None:
+        return connection.execute(
+            select(sessions, accounts.c.full_name, accounts.c.role, accounts.c.state)
+            .join(accounts, sessions.c.account == accounts.c.account)
+            .where(sessions.c.token_sha256 == token_sha256(token))
+        ).one_or_none()
+
+    def _lock(self, connection: Connection, account: str, screen: str, *, actor: str) -> None:
+        changed = connection.execute(
+            update(sessions).where(sessions.c.screen == screen, sessions.c.locked == 0).values(locked=1)
+        )
+        if changed.rowcount:
+            record_sign_in(self._store, connection, "screen_locked", account=account, screen=screen, actor=actor)
+
+    def _end_expired(self, connection: Connection, now: float) -> None:
+        expired = sessions.c.created_utc_s <= now - SESSION_S
+        for row in connection.execute(select(sessions.c.account, sessions.c.screen).where(expired)).all():
+            record_sign_in(self._store, connection, "ended", account=row.account, screen=row.screen)
+        connection.execute(delete(sessions).where(expired))
+
+    def _end(self, connection: Connection, token: str) -> None:
+        row = self._session(connection, token) if token else None
+        if row is not None:
+            record_sign_in(self._store, connection, "ended", account=row.account, screen=row.screen)
+            connection.execute(delete(sessions).where(sessions.c.screen == row.screen))

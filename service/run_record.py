@@ -1,0 +1,226 @@
+"""The runner's view of the evidence: the run's events as they are, folded; and the writing of new ones."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from threading import Lock
+from typing import Literal
+
+from service.core.errors import ComputeError, IntegrityError
+from service.core.jobs.keys import arguments_name, job_key
+from service.core.protocol.models import Protocol, parse_protocol
+from service.core.records.events import ArtefactRef, Event, Payload, RunStarted, View
+from service.core.run.decide import advance, fold
+from service.core.run.state import JobState, RunState
+from service.core.text.terms import term
+from service.steps import params_models
+from service.steps.context import JobRequest, JobResult
+from service.steps.time_left import Left, missing_results
+from service.store.database.engine import RESTORE
+from service.store.queue.leases import RunLease
+from service.store.records import NewArtefact, NewJob
+from service.store.store import Store
+
+
+def recorded_root(store: Store, run_id: str) -> RunStarted:
+    """The first event of a run. Raises IntegrityError where it is of another kind."""
+    root = store.first_event(run_id).payload
+    if not isinstance(root, RunStarted):
+        raise IntegrityError("the run's first event is not run_started", where=run_id, remedy=RESTORE)
+    return root
+
+
+def recorded_protocol(store: Store, root: RunStarted) -> Protocol:
+    """The protocol as it was when a run began, from the evidence. Raises IntegrityError, ProtocolError."""
+    content = store.artefact_path(root.protocol.sha256, verify=True).read_bytes()
+    return parse_protocol(content, params_models(), name=root.protocol.original_name).protocol
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """What is recorded of one run, as read at one moment: its events and their fold belong together."""
+
+    store: Store
+    run_id: str
+    protocol: Protocol
+    events: tuple[Event, ...]
+    state: RunState
+
+    def captures(self, step_id: str) -> tuple[View, ...]:
+        """The valid captures of a step's current attempt, in order."""
+        payloads = (self.events[seq - 1].payload for seq in sorted(self.state.steps[step_id].captured.values()))
+        return tuple(payload for payload in payloads if isinstance(payload, View))
+
+
+@dataclass
+class RunFollower:
+    """Reads the events of one run as they are recorded, and folds them; safe to use from several threads.
+
+    An event that cannot have happened is not taken: every later `refresh` and `now` raises IntegrityError again.
+    `leave_not_before_s` is the host's time.monotonic() when the newest leave to move was not in the record yet.
+    """
+
+    store: Store
+    run_id: str
+    protocol: Protocol
+    leave_not_before_s: float = field(init=False, default=-math.inf)
+    _events: list[Event] = field(init=False, default_factory=list[Event], repr=False)
+    _state: RunState = field(init=False, repr=False)
+    _log: RunRecord | None = field(init=False, default=None, repr=False)  # of the newest state, once it was asked for
+    _looked_s: float = field(init=False, default=-math.inf)
+    _reading: Lock = field(init=False, default_factory=Lock, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        self._state = fold(self.protocol, [])
+        self.refresh()
+
+    @property
+    def state(self) -> RunState:
+        """The fold of what was read last."""
+        return self._state
+
+    def refresh(self) -> RunState:
+        """Read what other processes (worker, command line, web) have appended meanwhile. Raises IntegrityError."""
+        with self._reading:
+            return self._read()
+
+    def now(self) -> RunRecord:
+        """Events and state as recorded up to now. Raises IntegrityError."""
+        with self._reading:
+            state = self._read()
+            if self._log is None or self._log.state is not state:
+                self._log = RunRecord(self.store, self.run_id, self.protocol, tuple(self._events), state)
+            return self._log
+
+    def _read(self) -> RunState:
+        leave, looked_s = self._state.leave, time.monotonic()
+        for event in self.store.events(self.run_id, after_seq=len(self._events)):
+            self._state = advance(
+                self.protocol, self._state, event
+            )  # it may refuse the event, which is not kept then
+            self._events.append(event)
+        if self._state.leave != leave:
+            self.leave_not_before_s = self._looked_s
+        self._looked_s = looked_s
+        return self._state
+
+
+def read_log(store: Store, run_id: str, protocol: Protocol) -> RunRecord:
+    """A run's record as of now, for who looks once. Raises IntegrityError for events that cannot have happened."""
+    return RunFollower(store, run_id, protocol).now()
+
+
+def results_to_come(log: RunRecord) -> list[Left]:
+    """What was planned for a registration and has not arrived, with the time left; empty when all has."""
+    started = log.store.jobs_started(log.run_id)
+    cores = os.cpu_count() or 1
+    left = missing_results(log.protocol, log.state, started, datetime.now(UTC).isoformat(), cores)
+    return [replace(one, waits=not started) for one in left]
+
+
+@dataclass
+class StepEvidence:
+    """service.steps.context.Evidence for one execution of one step."""
+
+    log: RunFollower
+    lease: RunLease
+    step: str
+    attempt: int
+    checkpoint: Callable[[], None]
+    progress: Callable[[str, int, int], None]
+    wait: Callable[[float], None]
+    space: Callable[[], None]
+
+    def record(self, *payloads: Payload, artefacts: tuple[NewArtefact, ...] = (), actor: str = "runner") -> None:
+        """Append events and artefact rows in one transaction."""
+        self.log.store.record(self.log.run_id, payloads, actor=actor, artefacts=artefacts, lease=self.lease)
+
+    def put_file(self, path: Path, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Copy a file into the store."""
+        return self.log.store.put_file(path, kind=kind, media_type=media_type, original_name=original_name)
+
+    def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
+        """Write bytes into the store."""
+        return self.log.store.put_bytes(data, kind=kind, media_type=media_type, original_name=original_name)
+
+    def path(self, ref: ArtefactRef) -> Path:
+        """Where an artefact's bytes lie."""
+        return self.log.store.artefact_path(ref.sha256)
+
+    def holds(self, sha256: str) -> bool:
+        """See service.steps.context.Evidence."""
+        return self.log.store.holds(self.log.run_id, sha256)
+
+    def captures(self, step_id: str) -> tuple[View, ...]:
+        """See service.steps.context.Evidence."""
+        return self.log.now().captures(step_id)
+
+    def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
+        """Enqueue jobs, once whatever restarts happen, and wait for their results in order.
+
+        Raises ComputeError with the worker's words when a job failed for good.
+        """
+        keys = [self._key(request) for request in requests]
+        jobs = [
+            NewJob(r.kind, self.step, self.attempt, key, r.arguments, priority=r.priority)
+            for r, key in zip(requests, keys, strict=True)
+        ]
+        self.log.store.record(self.log.run_id, [], actor="runner", jobs=jobs, lease=self.lease)
+        while True:
+            self.checkpoint()
+            self.space()  # a worker begins nothing on a disk that is nearly full
+            state = self.log.refresh()
+            mine = {job.idempotency_key: job for job in state.steps[self.step].jobs.values()}
+            if any(key not in mine for key in keys):
+                raise IntegrityError(
+                    "a job just enqueued is not in the record",
+                    where=f"step {self.step}",
+                    remedy="Run `orthocapture audit verify` on the data folder",
+                )
+            for key in keys:
+                if mine[key].status == "failed":
+                    raise ComputeError(
+                        f"the worker could not do {term(mine[key].kind)}: {mine[key].message}",
+                        where=f"step {self.step}",
+                        remedy="Put right what its words name, or take what is missing; then try again",
+                    )
+            done = sum(mine[key].status == "finished" for key in keys)
+            open_kinds = [mine[key].kind for key in keys if mine[key].status != "finished"]
+            self.progress(", ".join(map(term, dict.fromkeys(open_kinds))) or "computed", done, len(keys))
+            if done == len(keys):
+                return tuple(JobResult(mine[key].measures, mine[key].artefacts, mine[key].result) for key in keys)
+            self.wait(0.2)
+
+    def enqueue(self, request: JobRequest, name: str) -> None:
+        """See service.steps.context.Evidence."""
+        key = job_key(self.log.refresh(), self.step, request.kind, name)
+        if all(job.idempotency_key != key for job in self.jobs(self.step)):
+            job = NewJob(request.kind, self.step, self.attempt, key, request.arguments, priority=request.priority)
+            self.log.store.record(self.log.run_id, [], actor="runner", jobs=[job], lease=self.lease)
+
+    def asked(self) -> tuple[Literal["release", "finish"], ...]:
+        """See service.steps.context.Evidence."""
+        return self.log.refresh().steps[self.step].asked
+
+    def jobs(self, step_id: str) -> tuple[JobState, ...]:
+        """See service.steps.context.Evidence."""
+        jobs = self.log.refresh().steps[step_id].jobs.values()
+        return tuple(sorted(jobs, key=lambda job: job.enqueued_seq))
+
+    def state(self) -> RunState:
+        """See service.steps.context.Evidence."""
+        return self.log.refresh()
+
+    def require_space(self) -> None:
+        """See service.steps.context.Evidence."""
+        self.space()
+
+    def _key(self, request: JobRequest) -> str:
+        """The same for the same work: after a restart or a retry its result is used, not computed again."""
+        return job_key(self.log.refresh(), self.step, request.kind, arguments_name(request.arguments))

@@ -1,0 +1,158 @@
+"""Beginning and continuing a run: what is recorded first, and what must hold before anything moves."""
+
+from __future__ import annotations
+
+from ipaddress import ip_address
+from pathlib import Path
+
+from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.protocol.models import LoadedProtocol, Protocol
+from service.core.records.entered import RunAbout
+from service.core.records.events import ActionAfterEnd, ActionRefused, OperatorAction, RunStarted
+from service.core.run.state import RunState
+from service.rig import Rig, parse_recorded_rig, read_rig
+from service.run_record import recorded_protocol, recorded_root
+from service.runner import software_versions
+from service.store.files.space_used import forecast_of, require_space
+from service.store.records import NewArtefact
+from service.store.signatures.timestamps import Authority
+from service.store.store import Store
+
+_SCHEMES = ("ptpip:", "socket://")
+
+
+def start_run(
+    store: Store,
+    loaded: LoadedProtocol,
+    rig: Rig,
+    *,
+    operator: str,
+    auto_confirm: bool,
+    about: RunAbout | None = None,
+) -> str:
+    """Record the root of a new run's chain, with what was entered of it; its name.
+
+    Raises ConfigurationError when automatic confirmation is asked for on anything but a simulated rig, and
+    SpaceShortError on a disk on which nothing could be captured.
+    """
+    if auto_confirm:
+        require_simulated(rig)
+    require_space(store, forecast_of(store, loaded.protocol, simulated=rig.section.simulated))
+    source = loaded.source.encode()
+    protocol = store.put_bytes(
+        source, kind="protocol", media_type="application/yaml", original_name=f"{loaded.protocol.id}.yaml"
+    )
+    imported = rig.section.imported is not None
+    rig_ref = store.put_bytes(
+        rig.source,
+        kind="import_list" if imported else "rig",
+        media_type="application/json" if imported else "application/yaml",
+        original_name=str(rig.path),
+    )
+    payload = RunStarted(
+        protocol_id=loaded.protocol.id,
+        protocol_version=loaded.protocol.version,
+        protocol_sha256=loaded.sha256,
+        protocol=protocol,
+        rig=rig_ref,
+        simulated=rig.section.simulated,
+        auto_confirm=auto_confirm,
+        operator=operator,
+        software=software_versions(),
+        origin="imported" if imported else "captured",
+        about=about if about != RunAbout() else None,
+    )
+    return store.create_run(payload, operator, [NewArtefact(protocol, "runner"), NewArtefact(rig_ref, "runner")])
+
+
+def record_refusal(
+    store: Store, run_id: str, state: RunState, action: OperatorAction, refusal: OrthocaptureError, actor: str
+) -> None:
+    """Write down that an action was refused: in the run, or, where that has ended, in the site's record."""
+    why = str(refusal)
+    if state.terminal:
+        after = ActionAfterEnd(run=run_id, action=action.action, step=action.step, why=why)
+        store.record_site([after], actor=actor, software=software_versions())
+    else:
+        store.record(run_id, [ActionRefused(action=action.action, step=action.step, why=why)], actor=actor)
+
+
+def recorded_run(store: Store, run_id: str) -> tuple[Protocol, RunStarted]:
+    """The protocol as it was when the run began, from the evidence; and the run's root."""
+    root = recorded_root(store, run_id)
+    return recorded_protocol(store, root), root
+
+
+def recorded_rig(store: Store, root: RunStarted) -> Rig:
+    """The rig of a run: its file must still be what it was. Of an import the list in the evidence is all there is.
+
+    Raises ConfigurationError when the file has changed since the run began.
+    """
+    if root.origin == "imported":
+        source = store.artefact_path(root.rig.sha256, verify=True).read_bytes()
+        return parse_recorded_rig(source, Path(root.rig.original_name))
+    path = Path(root.rig.original_name)
+    source = read_rig(path)
+    if source != store.artefact_path(root.rig.sha256, verify=True).read_bytes():
+        raise ConfigurationError(
+            "the rig file has changed since the run began",
+            where=str(path),
+            remedy="Restore it, or start a new run: calibration and poses belong to one rig",
+        )
+    return parse_recorded_rig(source, path)
+
+
+def time_stamp_authority(rig: Rig) -> Authority | None:
+    """Who is asked for a time stamp at the end of a run of this rig; None: nobody."""
+    section = rig.section.timestamp
+    return None if section is None else Authority(section.url, rig.folder / section.certificates, section.timeout_s)
+
+
+def signature_copy(rig: Rig) -> Path | None:
+    """The second place of the log of signatures; None: there is none."""
+    named = rig.section.signature_copy
+    return None if named is None else rig.folder / named
+
+
+def require_rig_free(store: Store, rig: Path, *, run_id: str = "") -> None:
+    """Refuse to drive a run (`run_id`, or a new one) while a living process drives another with the same rig file.
+
+    Raises ConfigurationError, naming the other run.
+    """
+    for other in store.runs():
+        if other.run_id == run_id or not store.driven(other.run_id):
+            continue
+        theirs = store.events(other.run_id)[0].payload
+        if isinstance(theirs, RunStarted) and theirs.rig.original_name == str(rig):
+            raise ConfigurationError(
+                f"the rig is in use: run {other.run_id} is driven with it",
+                where=str(rig),
+                remedy="End that run, or let it come to its end; both are recorded",
+            )
+
+
+def require_simulated(rig: Rig) -> None:
+    """Refuse automatic confirmation unless the rig says that it is simulated and every address is this machine's."""
+    remedy = "Leave --auto-confirm out: on a real rig a person confirms every motion"
+    if not rig.section.simulated:
+        raise ConfigurationError(
+            "automatic confirmation is for simulated rigs only", where=str(rig.path), remedy=remedy
+        )
+    for name, settings in rig.section.devices.items():
+        address = str(settings.get("host") or settings.get("port") or "")
+        if (":" in address or "host" in settings) and not _is_this_machine(address):
+            raise ConfigurationError(
+                f"device {name!r} at {address} is not on this machine, so the rig cannot be simulated",
+                where=str(rig.path),
+                remedy=remedy,
+            )
+
+
+def _is_this_machine(address: str) -> bool:
+    for scheme in _SCHEMES:
+        address = address.removeprefix(scheme)
+    host = address.split(":")[0]
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,306 @@
+"""A copy of a data folder, made while it is written to: database, log of signatures, and what is new of the files.
+
+The database is copied first, in one consistent state, by SQLite's own means; every file that a row of that state
+names is on disk by then. What a run adds meanwhile belongs to the next backup.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import Connection, select
+
+from service.core.errors import IntegrityError, StoreError
+from service.store.backup.folder import PART, STATE_FILE, BackupFolder, BackupState, folder_errors
+from service.store.database.engine import DATABASE_NAME, LOOK, open_read_only
+from service.store.database.tables import artefacts, event_index, heads, runs
+from service.store.durable_effects import Clock, DurableFiles, Files, RandomIds, SystemClock, utc_text
+from service.store.files.artefacts import chunks_of, hash_file, relative_path
+from service.store.signatures.checkpoints import read_every_checkpoint
+from service.store.signatures.keys import FOLDER as KEYS
+from service.store.signatures.keys import KeyFolder
+from service.store.signatures.log import NAME as LOG_NAME
+from service.store.signatures.log import read_log
+from service.store.verification import verify as audit
+
+Progress = Callable[[str, int, int], None]  # what is being done, done, total (bytes)
+_SPARE_BYTES = 64 << 20  # beside what is to be copied
+
+
+@dataclass(frozen=True, slots=True)
+class BackupReport:
+    """What a backup did."""
+
+    folder: Path
+    name: str  # of the state: `orthocapture store restore --state NAME`
+    state: BackupState
+    copied: int  # files, this time
+    copied_bytes: int
+    present: int  # files that were there from earlier backups
+
+
+def back_up(
+    data_dir: Path,
+    destination: Path,
+    *,
+    with_keys: bool = False,
+    read_all: bool = False,
+    keep: int | None = None,
+    progress: Progress | None = None,
+    files: Files | None = None,
+    clock: Clock | None = None,
+) -> BackupReport:
+    """Copy a data folder into a folder of backups; begun again after an interruption it goes on where it was.
+
+    Args:
+        data_dir: the data folder; a run may be going on in it.
+        destination: the folder of backups: empty, not there yet, or holding earlier ones of this data folder.
+        with_keys: copy the private signing key too.
+        read_all: read every file that earlier backups have copied again, and copy anew those that were altered.
+        keep: how many states to keep, the newest; None: all. Those before one with faults are always kept.
+        progress: told how many bytes were copied.
+        files: the seam for durable effects.
+        clock: names the state.
+
+    Raises:
+        StoreError: there is no data, or the destination cannot be used or is too small; no backup was made.
+        IntegrityError: what was written does not read back as it was; no backup was made.
+    """
+    folder = BackupFolder(destination, files or DurableFiles(), RandomIds())
+    here, there = data_dir.resolve(), destination.resolve()
+    if here == there or here in there.parents or there in here.parents:
+        raise StoreError(
+            "a backup within its own data folder would be lost with it",
+            where=str(destination),
+            remedy="Name a folder on another disk",
+        )
+    source = open_read_only(data_dir, DurableFiles())  # before anything is made: there may be no data
+    source.close()
+    folder.prepare()
+    with folder.locked(), folder_errors("the backup could not be written"):
+        folder.discard_unfinished()
+        at_utc = utc_text((clock or SystemClock()).utc_now())
+        name = at_utc.replace(":", "").replace("-", "")
+        return _Backup(data_dir, folder, name, at_utc, with_keys, read_all, progress or _silent).make(keep)
+
+
+def _silent(_what: str, _done: int, _total: int) -> None:
+    return
+
+
+@dataclass(frozen=True, slots=True)
+class _Holds:
+    """What the copied database names."""
+
+    sizes: dict[str, int]  # of files, by hash
+    heads: dict[str, tuple[int, str]]
+    root_sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class _Backup:
+    data_dir: Path
+    folder: BackupFolder
+    name: str
+    at_utc: str
+    with_keys: bool
+    read_all: bool
+    progress: Progress
+
+    def make(self, keep: int | None) -> BackupReport:
+        files, part = self.folder.files, self.folder.path(self.name + PART)
+        files.make_directory(part)
+        database_sha256 = self._copy_database(part)
+        copy = open_read_only(part, files)
+        try:
+            with copy.reading() as connection:
+                holds, signed = _holds(connection), _signed(connection)
+        finally:
+            copy.close()
+        signatures_sha256 = self._copy_signatures(part, signed)
+        self._require_same_site(holds)
+        missing = self._missing(holds.sizes)
+        self._require_space({sha256: holds.sizes[sha256] for sha256 in missing})
+        lost = self._copy_files(missing, holds.sizes)
+        if self.with_keys:
+            self._copy_keys(part)
+        checked = audit.verify(part, files=False)
+        state = BackupState(
+            at_utc=self.at_utc,
+            host=socket.gethostname(),
+            data_folder=str(self.data_dir.resolve()),
+            database_sha256=database_sha256,
+            signatures_sha256=signatures_sha256,
+            artefacts=len(holds.sizes),
+            artefact_bytes=sum(holds.sizes.values()),
+            heads=holds.heads,
+            root_sha256=holds.root_sha256,
+            with_keys=self.with_keys,
+            faults=(*lost, *(str(fault) for fault in checked.faults)),
+        )
+        self._write(part / STATE_FILE, state.model_dump_json(indent=1).encode())
+        files.sync_directory(part)
+        files.rename(part, self.folder.path(self.name))
+        files.sync_directory(part.parent)
+        if keep is not None and not state.faults:
+            for old in self.folder.states()[: -max(keep, 1)]:
+                self.folder.discard(self.folder.path(old))
+        copied = [sha256 for sha256 in missing if (self.folder.artefacts.folder / relative_path(sha256)).exists()]
+        size = sum(holds.sizes[sha256] for sha256 in copied)
+        return BackupReport(self.folder.folder, self.name, state, len(copied), size, len(holds.sizes) - len(missing))
+
+    def _copy_database(self, part: Path) -> str:
+        """In one step of SQLite's backup: one state, whoever writes meanwhile. Its SHA-256."""
+        self.progress("copying the database", 0, 0)
+        target = part / DATABASE_NAME
+        source = open_read_only(self.data_dir, DurableFiles())
+        try:
+            with source.reading() as connection:
+                raw = connection.connection.driver_connection
+                assert isinstance(raw, sqlite3.Connection)  # the engine's own driver
+                with closing(sqlite3.connect(target, isolation_level=None)) as copy:
+                    raw.backup(copy)
+                    copy.execute("PRAGMA journal_mode = DELETE")  # one file, which reading does not change
+        except sqlite3.Error as error:
+            raise StoreError(f"the database could not be copied: {error}", where=str(target), remedy=LOOK) from error
+        finally:
+            source.close()
+        self.folder.files.sync_file(target)
+        return hash_file(target)[0]
+
+    def _copy_signatures(self, part: Path, copied: set[tuple[str, int]]) -> str:
+        """The lines up to the first whose signature came after the database was copied. SHA-256, "" for no log."""
+        log = self.data_dir / LOG_NAME
+        lines = read_log(log)
+        if lines is None:
+            return ""
+        # Only what the data folder holds by now is newer. A line without a signature in either was there before it
+        # was cut back, and stays, for the audit to find.
+        newer = self._signed_now() - copied
+        count = len(lines)
+        for line in lines:
+            if line.checkpoint is not None and (line.checkpoint.run_id, line.checkpoint.seq) in newer:
+                count = line.number - 1
+                break
+        self._write(part / LOG_NAME, b"".join(log.read_bytes().splitlines(keepends=True)[:count]))
+        return hash_file(part / LOG_NAME)[0]
+
+    def _signed_now(self) -> set[tuple[str, int]]:
+        source = open_read_only(self.data_dir, DurableFiles())
+        try:
+            with source.reading() as connection:
+                return _signed(connection)
+        finally:
+            source.close()
+
+    def _require_same_site(self, holds: _Holds) -> None:
+        names = self.folder.states()
+        if names and self.folder.read(names[-1]).root_sha256 not in ("", holds.root_sha256):
+            raise StoreError(
+                "this folder holds the backups of another data folder",
+                where=str(self.folder.folder),
+                remedy="Give each data folder a folder of its own for its backups",
+            )
+
+    def _missing(self, sizes: dict[str, int]) -> list[str]:
+        """Hashes of the files that are to be copied. Altered ones are taken away first."""
+        found: list[str] = []
+        total, done = sum(sizes.values()), 0
+        for sha256, size in sizes.items():
+            path = self.folder.artefacts.folder / relative_path(sha256)
+            whole = path.is_file() and path.stat().st_size == size
+            if whole and self.read_all:
+                whole = hash_file(path)[0] == sha256
+                self.progress("reading earlier copies again", done, total)
+            done += size
+            if not whole:
+                self.folder.files.remove(path)
+                found.append(sha256)
+        return found
+
+    def _require_space(self, missing: dict[str, int]) -> None:
+        needed, free = sum(missing.values()) + _SPARE_BYTES, shutil.disk_usage(self.folder.folder).free
+        if needed > free:
+            raise StoreError(
+                f"the backup needs {needed / 1e9:.1f} GB more, and {free / 1e9:.1f} GB are free",
+                where=str(self.folder.folder),
+                remedy="Make room there, or name a folder on a larger disk; what was copied by then is used again",
+            )
+
+    def _copy_files(self, missing: list[str], sizes: dict[str, int]) -> list[str]:
+        """Copy and read again. What the data folder itself has lost or altered is told, and stops nothing."""
+        lost: list[str] = []
+        total, done = sum(sizes[sha256] for sha256 in missing), 0
+        for sha256 in missing:
+            source = self.data_dir / "artefacts" / relative_path(sha256)
+            fault = self._copy_file(sha256, source)
+            if fault:
+                lost.append(fault)
+            done += sizes[sha256]
+            self.progress("copying files", done, total)
+        # Those of earlier backups too: whoever renamed them may have died before this call.
+        for shard in {relative_path(sha256).parent for sha256 in sizes}:
+            if (self.folder.artefacts.folder / shard).is_dir():
+                self.folder.files.sync_directory(self.folder.artefacts.folder / shard)
+        return lost
+
+    def _copy_file(self, sha256: str, source: Path) -> str:
+        try:
+            self.folder.artefacts.put(chunks_of(source), expected_sha256=sha256)
+        except StoreError:
+            fault = _fault_of(source, sha256)
+            if not fault:
+                raise
+            return fault
+        self.folder.artefacts.verified_path(sha256)
+        return ""
+
+    def _copy_keys(self, part: Path) -> None:
+        keys = part / KEYS
+        keys.mkdir(mode=0o700)
+        for key_id in KeyFolder(self.data_dir, self.folder.files).present():
+            copy = keys / f"{key_id}.pem"
+            self.folder.files.write(copy, [(self.data_dir / KEYS / copy.name).read_bytes()], private=True)
+            self.folder.files.sync_file(copy)
+        self.folder.files.sync_directory(keys)
+
+    def _write(self, path: Path, content: bytes) -> None:
+        self.folder.files.write(path, [content])
+        self.folder.files.sync_file(path)
+        if path.read_bytes() != content:
+            raise IntegrityError(
+                "what was written does not read back as it was",
+                where=str(path),
+                remedy="The medium is not to be trusted: use another one",
+            )
+
+
+def _fault_of(source: Path, sha256: str) -> str:
+    """What is wrong with a file of the data folder; "" for nothing."""
+    shown = f"artefacts/{relative_path(sha256)}"
+    try:
+        return "" if hash_file(source)[0] == sha256 else f"{shown}: the file was altered; it is not in the backup"
+    except FileNotFoundError:
+        return f"{shown}: the file is missing"
+    except OSError as error:
+        return f"{shown}: the file cannot be read ({error.strerror}); it is not in the backup"
+
+
+def _holds(connection: Connection) -> _Holds:
+    named = select(artefacts.c.sha256, artefacts.c.size_bytes).distinct().order_by(artefacts.c.sha256)
+    first = select(event_index.c.run_id).order_by(event_index.c.position).limit(1).scalar_subquery()
+    return _Holds(
+        sizes={row.sha256: row.size_bytes for row in connection.execute(named)},
+        heads={row.run_id: (row.seq, row.sha256) for row in connection.execute(select(heads))},
+        root_sha256=connection.execute(select(runs.c.root_sha256).where(runs.c.run_id == first)).scalar() or "",
+    )
+
+
+def _signed(connection: Connection) -> set[tuple[str, int]]:
+    return {(item.run_id, item.seq) for item in read_every_checkpoint(connection)}

@@ -1,0 +1,157 @@
+"""A data folder from a backup: into an empty folder only, verified before it becomes one."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import delete, select
+
+from service.core.errors import IntegrityError, StoreError
+from service.core.records.events import DataRestored
+from service.store.backup.folder import BackupFolder, BackupState, folder_errors
+from service.store.database.engine import DATABASE_NAME, open_read_only
+from service.store.database.tables import artefacts, control, leases, sessions
+from service.store.durable_effects import DurableFiles, Files, RandomIds
+from service.store.files.artefacts import ArtefactFiles, chunks_of, hash_file, relative_path
+from service.store.signatures.keys import FOLDER as KEYS
+from service.store.signatures.log import NAME as LOG_NAME
+from service.store.store import Store
+from service.store.verification import verify as audit
+from service.store.verification.verify import AuditReport
+
+Progress = Callable[[str, int, int], None]  # what is being done, done, total (bytes)
+_UNDER_WAY = "restoring"  # within the destination: no data folder until it was verified
+
+
+@dataclass(frozen=True, slots=True)
+class RestoreReport:
+    """What was restored, and what its verification says."""
+
+    folder: Path
+    name: str
+    state: BackupState
+    lost: tuple[str, ...]  # files that the backup itself does not hold whole
+    audit: AuditReport
+
+    @property
+    def ok(self) -> bool:
+        """Whether everything is there and verifies."""
+        return self.audit.ok and not self.lost
+
+
+def restore(
+    backup: Path,
+    destination: Path,
+    *,
+    name: str = "",
+    actor: str,
+    progress: Progress | None = None,
+    files: Files | None = None,
+) -> RestoreReport:
+    """Make a data folder as it was when a backup was made. The backup is only read.
+
+    What a damaged backup has lost is told in the report, and the rest is restored all the same. Leases, sign-ins and
+    control of screens belonged to the processes of then and are left out. The site's chain says that it was restored.
+
+    Args:
+        backup: the folder of backups.
+        destination: a folder that is empty, or not there yet.
+        name: which state; "" for the newest.
+        actor: who restores, for the record.
+        progress: told how many bytes were copied, then verified.
+        files: the seam for durable effects.
+
+    Raises:
+        StoreError: the destination holds something, or cannot be written.
+        IntegrityError: the copied database is not the one that was written.
+    """
+    files = files or DurableFiles()
+    source = BackupFolder(backup, files, RandomIds())
+    source.require()
+    name = name or next(reversed(source.states()), "")
+    state = source.read(name)
+    with folder_errors("the data folder could not be restored"):
+        _require_empty(destination)
+        for directory in (*reversed(destination.absolute().parents), destination.absolute()):
+            files.make_directory(directory) if not directory.exists() else None
+        work = destination / _UNDER_WAY
+        files.make_directory(work)
+        _copy_state(source.path(name), work, state, files)
+        lost = _copy_files(source, work, files, progress)
+        report = audit.verify(work, progress=progress)
+        _let_go(work, DataRestored(state=name, at_utc=state.at_utc, folder=state.data_folder, host=state.host), actor)
+        for part in (LOG_NAME, KEYS, "artefacts", DATABASE_NAME):  # the database last: it makes the data folder
+            if (work / part).exists():
+                files.rename(work / part, destination / part)
+        files.sync_directory(destination)
+        work.rmdir()
+    return RestoreReport(destination, name, state, tuple(lost), report)
+
+
+def _require_empty(destination: Path) -> None:
+    if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
+        if (destination / _UNDER_WAY).is_dir():
+            what, remedy = "an earlier restoration into this folder was interrupted", "Delete it, then repeat this"
+        else:
+            what, remedy = "this folder is not empty", "Name an empty folder; nothing is ever overwritten"
+        raise StoreError(what, where=str(destination), remedy=remedy)
+
+
+def _copy_state(state_dir: Path, work: Path, state: BackupState, files: Files) -> None:
+    expected = {DATABASE_NAME: state.database_sha256, LOG_NAME: state.signatures_sha256}
+    for part, sha256 in expected.items():
+        if not sha256:
+            continue
+        files.write(work / part, chunks_of(state_dir / part))
+        files.sync_file(work / part)
+        if hash_file(work / part)[0] != sha256:
+            raise IntegrityError(
+                f"{part} of this backup was altered, or the copy of it",
+                where=str(state_dir / part),
+                remedy="Restore an older state with --state; nothing was restored",
+            )
+    if state.with_keys:
+        (work / KEYS).mkdir(mode=0o700)
+        for key in sorted((state_dir / KEYS).glob("*.pem")):
+            shutil.copy2(key, work / KEYS / key.name)
+            files.sync_file(work / KEYS / key.name)
+        files.sync_directory(work / KEYS)
+
+
+def _copy_files(source: BackupFolder, work: Path, files: Files, progress: Progress | None) -> list[str]:
+    folder = ArtefactFiles(work / "artefacts", files, RandomIds())
+    folder.prepare()
+    copy = open_read_only(work, files)
+    try:
+        with copy.reading() as connection:
+            named = select(artefacts.c.sha256, artefacts.c.size_bytes).distinct().order_by(artefacts.c.sha256)
+            sizes = {row.sha256: row.size_bytes for row in connection.execute(named)}
+    finally:
+        copy.close()
+    lost: list[str] = []
+    done = 0
+    for sha256, size in sizes.items():
+        path = source.artefacts.folder / relative_path(sha256)
+        if not path.is_file():
+            lost.append(f"{path}: missing in the backup")
+        else:
+            try:
+                folder.put(chunks_of(path), expected_sha256=sha256)
+            except StoreError:
+                if hash_file(path)[0] == sha256:
+                    raise
+                lost.append(f"{path}: altered in the backup")
+        done += size
+        if progress is not None:
+            progress("copying files", done, sum(sizes.values()))
+    return lost
+
+
+def _let_go(work: Path, restored: DataRestored, actor: str) -> None:
+    with Store.open(work, create=False) as store, store.database.writing() as connection:
+        for table in (leases, control, sessions):
+            connection.execute(delete(table))
+        store.append_site(connection, [restored], actor=actor)

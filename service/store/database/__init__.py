@@ -1,0 +1,1 @@
+"""The SQLite database: tables, migrations, transactions and the write-ahead log."""

@@ -1,0 +1,258 @@
+"""The SQLite database of a data folder: opening, migrating, and the two kinds of transaction."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from sqlalchemy import Connection, Engine, create_engine, event, inspect, text
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
+from sqlalchemy.pool import ConnectionPoolEntry
+
+from service.core.errors import StoreError
+from service.store.durable_effects import Files
+from service.store.errors import StoreVersionError
+
+DATABASE_NAME = "orthocapture.sqlite"
+BUSY_TIMEOUT_S = 30.0
+REVISIONS = ("0001", "0002", "0003", "0004", "0005")  # of migrations/versions, in order
+RESTORE = "Restore the data folder from a copy; run `orthocapture audit verify` on the copy"
+LOOK = "Look at the disk of the data folder: room, cable, permissions; then resume the run. What was recorded is safe"
+_MIGRATIONS = "service.store.database:migrations"  # package:folder, which Alembic reads with importlib.resources
+
+
+def database_path(data_dir: Path) -> Path:
+    """Where the database of a data folder lies."""
+    return data_dir / DATABASE_NAME
+
+
+def read_schema(connection: Connection) -> dict[tuple[str, str], tuple[str, str | None]]:
+    """What this database is made of, as `fresh_schema` gives it."""
+    made = connection.execute(text("SELECT type, name, tbl_name, sql FROM sqlite_master"))
+    return {(str(row.type), str(row.name)): (str(row.tbl_name), row.sql) for row in made}
+
+
+@cache
+def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
+    """What a database is made of, as this software makes it: table and SQL by kind (table, index …) and name."""
+    engine = create_engine("sqlite://")
+    try:
+        with engine.begin() as connection:
+            _upgrade(connection, Path(":memory:"))
+            return read_schema(connection)
+    finally:
+        engine.dispose()
+
+
+class Database:
+    """Connections to one database. Writers begin IMMEDIATE, so a transaction never has to be upgraded and retried."""
+
+    def __init__(self, engine: Engine, path: Path, files: Files) -> None:
+        self._engine = engine
+        self._path = path
+        self._files = files
+        self._opened: dict[Path, tuple[int, int]] = {}  # the files written to: device and inode
+
+    @contextmanager
+    def reading(self) -> Generator[Connection]:
+        """One consistent snapshot. Raises StoreError."""
+        with _store_errors(self._path), self._engine.connect() as connection, connection.begin():
+            yield connection
+
+    @contextmanager
+    def writing(self) -> Generator[Connection]:
+        """One transaction: commits through the seam at the end, rolls back on any exception. Raises StoreError."""
+        with _store_errors(self._path), self._engine.connect() as plain:
+            connection = plain.execution_options(writes=True)
+            with connection.begin() as transaction:
+                yield connection
+                self.require_in_place()
+                self._files.commit(transaction.commit)
+
+    def require_in_place(self) -> None:
+        """Raises StoreError unless the database and its log are the files that were written to before.
+
+        SQLite goes on writing to files that were moved away or deleted: what it wrote would be nowhere. The log
+        beside the database is not removed by SQLite itself as long as this process has a connection.
+        """
+        for path in (self._path, self._path.with_name(self._path.name + "-wal")):
+            try:
+                found = path.stat()
+            except FileNotFoundError:
+                found = None
+            place = None if found is None else (found.st_dev, found.st_ino)
+            opened = self._opened.setdefault(path, place) if place is not None else self._opened.get(path)
+            if place is None or place != opened:
+                raise StoreError(
+                    f"{path.name} was {'removed' if place is None else 'replaced'} while it was in use; nothing is "
+                    "written any more",
+                    where=str(path),
+                    remedy="Put the file back as it was, with those of the same name beside it, then resume the run; "
+                    "files that were captured lie in the data folder",
+                )
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._engine.dispose()
+
+
+def open_database(data_dir: Path, files: Files) -> Database:
+    """Open for writing; creates and upgrades. Raises StoreVersionError when a newer software has written it."""
+    path = database_path(data_dir)
+    engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
+    database = Database(engine, path, files)
+    try:
+        with database.reading() as connection:
+            is_current = _revision(connection) == REVISIONS[-1]
+        if not is_current:
+            with database.writing() as connection:
+                _upgrade(connection, path)
+        database.require_in_place()
+        files.sync_directory(data_dir)
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def open_read_only(data_dir: Path, files: Files) -> Database:
+    """Open an existing database without the means to change it. Raises StoreError, StoreVersionError."""
+    path = database_path(data_dir)
+    if not path.is_file():
+        raise StoreError(
+            "there is no run data here",
+            where=str(path),
+            remedy="Name the data folder with --data DIR, or with the environment variable ORTHOCAPTURE_DATA",
+        )
+    address = f"file:{quote(str(path.absolute()))}?uri=true&mode=ro"
+    try:
+        return _checked_read_only(_engine(address, writable=False), path, files)
+    except StoreVersionError:
+        raise
+    except StoreError:
+        # On read-only media SQLite cannot make its shared-memory file; nobody can be writing there either.
+        if path.with_name(path.name + "-wal").exists():
+            raise
+        return _checked_read_only(_engine(f"{address}&immutable=1", writable=False), path, files)
+
+
+def _checked_read_only(engine: Engine, path: Path, files: Files) -> Database:
+    database = Database(engine, path, files)
+    try:
+        with database.reading() as connection:
+            present = _revision(connection)
+            _refuse_unknown(present, path)
+            _refuse_old(present, path)
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def _engine(address: str, *, writable: bool) -> Engine:
+    engine = create_engine(f"sqlite:///{address}", connect_args={"timeout": BUSY_TIMEOUT_S})
+
+    def on_connect(connection: sqlite3.Connection, _record: ConnectionPoolEntry) -> None:
+        # The driver's own BEGIN comes too late and is never IMMEDIATE; on_begin below sends it.
+        connection.isolation_level = None
+        pragmas = ["foreign_keys = ON", "recursive_triggers = ON"]
+        pragmas += ["journal_mode = WAL", "synchronous = FULL"] if writable else ["query_only = ON"]
+        try:
+            for pragma in pragmas:
+                connection.execute(f"PRAGMA {pragma}")
+        except sqlite3.Error:  # no database, or a damaged one: the pool does not know of this connection yet
+            connection.close()
+            raise
+
+    def on_begin(connection: Connection) -> None:
+        writes = connection.get_execution_options().get("writes", False)
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+    event.listen(engine, "connect", on_connect)
+    event.listen(engine, "begin", on_begin)
+    return engine
+
+
+def _revision(connection: Connection) -> str | None:
+    if not inspect(connection).has_table("alembic_version"):
+        return None
+    revision: str | None = connection.execute(text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
+    return revision
+
+
+def _refuse_unknown(present: str | None, path: Path) -> None:
+    if present is not None and present not in REVISIONS:
+        raise StoreVersionError(
+            f"this database was written by a newer version of orthocapture (its revision {present} is unknown here)",
+            where=str(path),
+            remedy="Install the version that wrote it, or a newer one; nothing was changed",
+        )
+
+
+def _refuse_old(present: str | None, path: Path) -> None:
+    if present != REVISIONS[-1]:
+        raise StoreVersionError(
+            "this database was written by an older version of orthocapture and has not been upgraded"
+            if present
+            else "this is not a database of orthocapture",
+            where=str(path),
+            remedy="Open it once with `orthocapture status`, or use the version that wrote it",
+        )
+
+
+def _upgrade(connection: Connection, path: Path) -> None:
+    present = _revision(connection)
+    _refuse_unknown(present, path)
+    if present is None and inspect(connection).get_table_names():
+        raise StoreVersionError(
+            "this is not a database of orthocapture", where=str(path), remedy="Choose another data folder"
+        )
+    if present != REVISIONS[-1]:
+        # Half a second to import, for what happens once in the life of a database.
+        from alembic import command  # noqa: PLC0415
+        from alembic.config import Config  # noqa: PLC0415
+
+        config = Config()
+        config.set_main_option("script_location", _MIGRATIONS)
+        config.set_main_option("path_separator", "os")
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
+
+
+@contextmanager
+def _store_errors(path: Path) -> Generator[None]:
+    try:
+        yield
+    except DBAPIError as error:
+        raise StoreError(_explain(error), where=str(path), remedy=_advise(error)) from error
+    except UnicodeDecodeError as error:  # of the driver, where damaged bytes are to be text
+        raise StoreError(
+            "the database is damaged: it holds text that is no UTF-8", where=str(path), remedy=RESTORE
+        ) from error
+    except SQLAlchemyError as error:
+        raise StoreError(f"the database refused: {error}", where=str(path), remedy=LOOK) from error
+    except OSError as error:
+        raise StoreError(
+            f"the data folder refused: {error.strerror or error}", where=str(error.filename or path), remedy=LOOK
+        ) from error
+
+
+def _explain(error: DBAPIError) -> str:
+    return f"the database refused: {error.orig}"
+
+
+def _advise(error: DBAPIError) -> str:
+    code: Any = getattr(error.orig, "sqlite_errorname", "")
+    return {
+        "SQLITE_BUSY": "Another process holds the database for too long; look for one that hangs",
+        "SQLITE_FULL": "Free space on this disk; what was recorded before is safe",
+        "SQLITE_CORRUPT": RESTORE,
+        "SQLITE_NOTADB": RESTORE,
+        "SQLITE_READONLY": "Check the permissions of the data folder",
+        "SQLITE_CANTOPEN": "Check that the data folder exists and its permissions",
+    }.get(str(code), LOOK)

@@ -1,0 +1,78 @@
+"""The write-ahead log of a database as it lies there: commits that SQLite would pass over without a word.
+
+SQLite reads the log up to the first frame whose checksum does not fit, and takes what follows for the rest of a write
+that a power cut ended. Of a damaged frame that is not true: whole commits follow it. The format is that of
+https://sqlite.org/fileformat2.html#walformat.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+from service.core.errors import StoreError
+from service.store.database.engine import DATABASE_NAME, LOOK
+from service.store.verification.chain_checks import Fault
+
+_HEADER = struct.Struct(">8I")
+_FRAME = struct.Struct(">6I")
+_MAGIC = 0x377F0682  # the last bit says how words are laid out for the checksum
+_WORD = 0xFFFFFFFF
+_HEAD_DAMAGED = -1
+
+
+def wal_findings(data_dir: Path) -> tuple[list[Fault], list[str]]:
+    """Faults and notes on commits that are not read any more. Raises StoreError where the log cannot be read.
+
+    One commit may be the rest of a write that a power cut ended: its frames need not have reached the disk in order.
+    From two on something was altered, because a commit is only begun once the one before it is on the disk.
+    """
+    log = data_dir / f"{DATABASE_NAME}-wal"
+    # Looked at again where something is found: a process may be writing to it just now.
+    commits = _passed_over(log) and _passed_over(log)
+    if commits == _HEAD_DAMAGED:
+        return [Fault(None, None, log.name, "its head is damaged: what was committed last is lost")], []
+    if commits == 1:
+        return [], [f"{log.name}: a commit behind a damaged frame is not read, as after a power cut"]
+    return (
+        [Fault(None, None, log.name, f"{commits} commits behind a damaged frame are lost")] if commits else []
+    ), []
+
+
+def _passed_over(log: Path) -> int:
+    """How many commits lie in a write-ahead log behind a frame that is damaged; 0 without a log."""
+    try:
+        content = log.read_bytes()
+    except FileNotFoundError:
+        return 0
+    except OSError as error:
+        raise StoreError(
+            f"the write-ahead log cannot be read: {error.strerror}", where=str(log), remedy=LOOK
+        ) from error
+    if len(content) <= _HEADER.size:
+        return 0
+    magic, _format, page, _checkpoint, *salts, one, two = _HEADER.unpack_from(content)
+    order = ">" if magic & 1 else "<"
+    sums = _checksum(content[:24], (0, 0), order)
+    if magic & ~1 != _MAGIC or sums != (one, two):
+        return _HEAD_DAMAGED
+    size = _FRAME.size + page
+    commits, sound = 0, True
+    for start in range(_HEADER.size, len(content) - size + 1, size):
+        _number, pages, *of_frame, one, two = _FRAME.unpack_from(content, start)
+        if sound:
+            sums = _checksum(content[start : start + 8], sums, order)
+            sums = _checksum(content[start + _FRAME.size : start + size], sums, order)
+            sound = of_frame == salts and sums == (one, two)
+        if not sound and of_frame == salts and pages:  # other salts are of an earlier use of the file
+            commits += 1
+    return commits
+
+
+def _checksum(data: bytes, sums: tuple[int, int], order: str) -> tuple[int, int]:
+    one, two = sums
+    words = struct.unpack(f"{order}{len(data) // 4}I", data)
+    for first, second in zip(words[::2], words[1::2], strict=True):
+        one = (one + first + two) & _WORD
+        two = (two + second + one) & _WORD
+    return one, two

@@ -1,0 +1,303 @@
+"""Content-addressed files, and the rows that say where each came from."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import re
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Row, insert, select
+
+from service.core.errors import IntegrityError, StoreError
+from service.core.records.events import ArtefactRef, Event
+from service.store.database.engine import RESTORE
+from service.store.database.tables import artefacts
+from service.store.durable_effects import Files, Ids
+from service.store.events import canonical_parsed, references, sha256_text
+from service.store.records import Artefact, NewArtefact
+
+CHUNK_BYTES = 1 << 20
+TEMPORARY = "tmp"  # beside the shards, on the same file system, so that the rename is atomic
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+
+
+def relative_path(sha256: str) -> Path:
+    """ab/abcdef…, below the artefact folder. Raises StoreError for what is not a SHA-256."""
+    if not _SHA256.fullmatch(sha256):
+        raise StoreError(
+            f"{sha256!r} is not a SHA-256", remedy="Use the reference that put_file or put_bytes returned"
+        )
+    return Path(sha256[:2], sha256)
+
+
+def chunks_of(path: Path) -> Iterator[bytes]:
+    """The bytes of a file, one megabyte at a time."""
+    with path.open("rb") as handle:
+        while chunk := handle.read(CHUNK_BYTES):
+            yield chunk
+
+
+def hash_file(path: Path) -> tuple[str, int]:
+    """SHA-256 and size of a file. Raises OSError."""
+    meter = _Meter(chunks_of(path))
+    for _ in meter:
+        pass
+    return meter.sha256, meter.size
+
+
+class _Meter:
+    """Hashes and counts what passes through."""
+
+    def __init__(self, chunks: Iterable[bytes]) -> None:
+        self._chunks = chunks
+        self._hash = hashlib.sha256()
+        self.size = 0
+
+    def __iter__(self) -> Iterator[bytes]:
+        for chunk in self._chunks:
+            self._hash.update(chunk)
+            self.size += len(chunk)
+            yield chunk
+
+    @property
+    def sha256(self) -> str:
+        return self._hash.hexdigest()
+
+
+class ArtefactFiles:
+    """The folder of content-addressed files: written once, read-only, never changed."""
+
+    def __init__(self, folder: Path, files: Files, ids: Ids) -> None:
+        self._folder = folder
+        self._files = files
+        self._ids = ids
+        self._durable_shards: set[Path] = set()
+
+    @property
+    def folder(self) -> Path:
+        """Where the shards lie."""
+        return self._folder
+
+    def prepare(self) -> None:
+        """Make the folders of a new store. Raises OSError."""
+        for directory in (self._folder, self._folder / TEMPORARY):
+            self._files.make_directory(directory)
+            self._files.sync_directory(directory.parent)
+
+    def put(self, chunks: Iterable[bytes], *, expected_sha256: str | None = None) -> tuple[str, int]:
+        """Store bytes durably under their SHA-256; putting the same again changes nothing. Returns hash and size.
+
+        The order makes a crash harmless: data, mode, fsync, rename, fsync of the directory; the row comes later.
+
+        Raises:
+            StoreError: the bytes are not those expected, or the disk is full.
+            IntegrityError: a file of this name is there with other content.
+        """
+        temporary = self._folder / TEMPORARY / f"{self._ids.new_token()}.part"
+        meter = _Meter(chunks)
+        with _put_errors():
+            try:
+                self._files.write(temporary, meter)
+                _check_arrival(meter.sha256, expected_sha256)
+                target = self._folder / relative_path(meter.sha256)
+                self._make_shard(target.parent)
+                if self._made_young(target):
+                    self._check_same(target, meter.sha256)
+                    self._files.remove(temporary)
+                else:
+                    self._files.make_read_only(temporary)
+                    self._files.sync_file(temporary)
+                    self._files.rename(temporary, target)
+            except (OSError, StoreError):
+                self._files.remove(temporary)
+                raise
+            # Also for a file that was there: whoever renamed it may have died before this call.
+            self._files.sync_directory(target.parent)
+        return meter.sha256, meter.size
+
+    def _make_shard(self, shard: Path) -> None:
+        if shard not in self._durable_shards:
+            self._files.make_directory(shard)
+            self._files.sync_directory(shard.parent)
+            self._durable_shards.add(shard)
+
+    def _made_young(self, target: Path) -> bool:
+        """Whether the file is there already; it counts as new then, lest it be removed as a leftover of old."""
+        with _locked(self._folder, fcntl.LOCK_SH):
+            try:
+                os.utime(target)
+            except (FileNotFoundError, PermissionError):  # of another user: the same bytes take its place
+                return False
+        return True
+
+    def _check_same(self, target: Path, sha256: str) -> None:
+        present, _size = hash_file(target)
+        if present != sha256:
+            raise IntegrityError(
+                f"a stored file was altered: its content is {present}",
+                where=str(target),
+                remedy="Run `orthocapture audit verify`; restore the file from a copy",
+            )
+
+    def path(self, sha256: str) -> Path:
+        """The file of a recorded artefact. Raises IntegrityError when it is missing."""
+        path = self._folder / relative_path(sha256)
+        if not path.is_file():
+            raise IntegrityError(
+                "a stored file is missing", where=str(path), remedy="Restore it from a copy of the data"
+            )
+        return path
+
+    def verified_path(self, sha256: str) -> Path:
+        """The file, after hashing it again. Raises IntegrityError when it is missing or altered."""
+        path = self.path(sha256)
+        self._check_same(path, sha256)
+        return path
+
+
+def alone_with(folder: Path) -> AbstractContextManager[None]:
+    """Nobody takes a file of this artefact folder for stored meanwhile. Raises OSError."""
+    return _locked(folder, fcntl.LOCK_EX)
+
+
+@contextmanager
+def _locked(folder: Path, how: int) -> Generator[None]:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, how)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _check_arrival(sha256: str, expected_sha256: str | None) -> None:
+    if expected_sha256 is not None and sha256 != expected_sha256:
+        raise StoreError(
+            f"the file changed on its way: SHA-256 {sha256} instead of {expected_sha256}",
+            where="artefacts",
+            remedy="Fetch it from the device again",
+        )
+
+
+@contextmanager
+def _put_errors() -> Generator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise StoreError(
+            f"a file could not be stored: {error.strerror or error}",
+            where=str(error.filename or ""),
+            remedy="Check free space and permissions; nothing of it was recorded, and what was before is safe",
+        ) from error
+
+
+def record_sha256(event_sha256: str, fields: dict[str, Any]) -> str:
+    """Hash that binds an artefact's row to the event that brought it; `record_sha256` itself is left out."""
+    named = {name: value for name, value in fields.items() if name != "record_sha256"}
+    return sha256_text(canonical_parsed(named | {"event_sha256": event_sha256}))
+
+
+def insert_artefacts(
+    connection: Connection, folder: ArtefactFiles, events: Sequence[Event], new: Sequence[NewArtefact]
+) -> None:
+    """Write the rows of new artefacts beside the events that refer to them, in the caller's transaction.
+
+    Raises:
+        StoreError: an artefact that no event refers to, or an event that refers to an artefact without a row.
+        IntegrityError: the file is missing or has another size.
+    """
+    waiting = list(new)
+    for event in events:
+        named = references(event.payload.model_dump(mode="python"))
+        mine = [artefact for artefact in waiting if artefact.ref in named]
+        waiting = [artefact for artefact in waiting if artefact.ref not in named]
+        for position, artefact in enumerate(mine):
+            _insert(connection, folder, event, position, artefact)
+        for ref in named:
+            _require_row(connection, event, ref)
+    if waiting:
+        raise StoreError(
+            f"no event of this record refers to artefact {waiting[0].ref.sha256} ({waiting[0].ref.original_name})",
+            remedy="Name its ArtefactRef in the payload, so that the chain covers it",
+        )
+
+
+def _insert(
+    connection: Connection, folder: ArtefactFiles, event: Event, position: int, artefact: NewArtefact
+) -> None:
+    path = folder.path(artefact.ref.sha256)
+    size = path.stat().st_size
+    if size != artefact.ref.size_bytes:
+        raise IntegrityError(
+            f"the file has {size} bytes instead of {artefact.ref.size_bytes}", where=str(path), remedy=RESTORE
+        )
+    fields: dict[str, Any] = {
+        "run_id": event.run_id,
+        "seq": event.seq,
+        "position": position,
+        **artefact.ref.model_dump(),
+        "device": artefact.device,
+        "step": artefact.step,
+        "attempt": artefact.attempt,
+        "viewpoint": artefact.viewpoint,
+        "who": event.actor if artefact.who is None else artefact.who,
+        "at_utc": event.at_utc if artefact.at_utc is None else artefact.at_utc,
+        "monotonic_s": float(event.monotonic_s if artefact.monotonic_s is None else artefact.monotonic_s),
+    }
+    digest = record_sha256(event.sha256, fields)
+    connection.execute(insert(artefacts).values(**fields, record_sha256=digest))
+
+
+def _require_row(connection: Connection, event: Event, ref: ArtefactRef) -> None:
+    statement = (
+        select(artefacts.c.seq)
+        .where(
+            artefacts.c.sha256 == ref.sha256,
+            artefacts.c.run_id == event.run_id,
+            artefacts.c.size_bytes == ref.size_bytes,
+        )
+        .limit(1)
+    )
+    if connection.execute(statement).first() is None:
+        raise StoreError(
+            f"{event.payload.kind} refers to an artefact that this run has not recorded: {ref.original_name}",
+            where=ref.sha256,
+            remedy="Hand it to the same call as NewArtefact",
+        )
+
+
+def read_artefacts(connection: Connection, run_id: str) -> list[Artefact]:
+    """All rows of a run, in the order of the events."""
+    rows = connection.execute(
+        select(artefacts).where(artefacts.c.run_id == run_id).order_by(artefacts.c.seq, artefacts.c.position)
+    )
+    return [to_artefact(row) for row in rows]
+
+
+def to_artefact(row: Row[Any]) -> Artefact:
+    """A row as a record."""
+    return Artefact(
+        run_id=row.run_id,
+        seq=row.seq,
+        position=row.position,
+        ref=ArtefactRef(
+            sha256=row.sha256,
+            kind=row.kind,
+            media_type=row.media_type,
+            size_bytes=row.size_bytes,
+            original_name=row.original_name,
+        ),
+        device=row.device,
+        step=row.step,
+        attempt=row.attempt,
+        viewpoint=row.viewpoint,
+        who=row.who,
+        at_utc=row.at_utc,
+        monotonic_s=row.monotonic_s,
+        record_sha256=row.record_sha256,
+    )

@@ -1,0 +1,290 @@
+"""The job queue: enqueue once, claim with a lease, renew, finish, fail or try again. Rows change; events do not."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, Row, func, insert, select, true, update
+
+from service.core.jobs.priorities import EARLY, Lane
+from service.core.records.events import Event, JobEnqueued, JobFailed, JobFinished, StepNote
+from service.store.database.tables import jobs
+from service.store.durable_effects import Clock, Ids, utc_text
+from service.store.errors import LeaseLostError
+from service.store.events import append, canonical, parse_canonical
+from service.store.queue.leases import ProcessIdentity, identity_of, identity_values
+from service.store.records import Job, NewJob
+
+ACTOR = "store"  # of events that no worker can write any more
+
+
+def enqueue(
+    connection: Connection, clock: Clock, ids: Ids, run_id: str, new: Sequence[NewJob], *, actor: str
+) -> list[Event]:
+    """Append JobEnqueued and insert the row of every job whose key the run does not have yet."""
+    appended: list[Event] = []
+    for job in new:
+        if find_by_key(connection, run_id, job.idempotency_key) is not None:
+            continue
+        payload = JobEnqueued(
+            job=ids.new_job(),
+            job_kind=job.kind,
+            step=job.step,
+            attempt=job.attempt,
+            idempotency_key=job.idempotency_key,
+            arguments=dict(job.arguments),
+            priority=job.priority,
+        )
+        (event,) = append(connection, clock, run_id, [payload], actor)
+        connection.execute(
+            insert(jobs).values(
+                job_id=payload.job,
+                run_id=run_id,
+                kind=job.kind,
+                step=job.step,
+                attempt=job.attempt,
+                idempotency_key=job.idempotency_key,
+                arguments=canonical(payload.model_dump(mode="json")["arguments"]),
+                state="queued",
+                tries=0,
+                try_limit=job.try_limit,
+                enqueued_seq=event.seq,
+                enqueued_utc=event.at_utc,
+                priority=job.priority,
+            )
+        )
+        appended.append(event)
+    return appended
+
+
+def find_by_key(connection: Connection, run_id: str, idempotency_key: str) -> Job | None:
+    """The job of a run with this key."""
+    row = connection.execute(
+        select(jobs).where(jobs.c.run_id == run_id, jobs.c.idempotency_key == idempotency_key)
+    ).one_or_none()
+    return None if row is None else to_job(row)
+
+
+def read_jobs(connection: Connection, run_id: str) -> list[Job]:
+    """All jobs of a run, oldest first."""
+    return [
+        to_job(row)
+        for row in connection.execute(select(jobs).where(jobs.c.run_id == run_id).order_by(jobs.c.position))
+    ]
+
+
+def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> int:
+    """How many jobs are queued or being computed."""
+    statement = select(func.count()).select_from(jobs).where(jobs.c.state.in_(("queued", "running")), _of_lane(lane))
+    if run_id is not None:
+        statement = statement.where(jobs.c.run_id == run_id)
+    return connection.execute(statement).scalar_one()
+
+
+def started(connection: Connection, run_id: str) -> dict[str, str]:
+    """When each job that is being computed was begun, by its name."""
+    running = select(jobs.c.job_id, jobs.c.started_utc).where(jobs.c.run_id == run_id, jobs.c.state == "running")
+    return {row.job_id: row.started_utc for row in connection.execute(running)}
+
+
+def claim(
+    connection: Connection,
+    clock: Clock,
+    ids: Ids,
+    *,
+    worker: str,
+    lease_s: float,
+    kinds: Collection[str] | None,
+    run_id: str | None,
+    lane: Lane | None = None,
+) -> Job | None:
+    """Take the job of the highest priority, the oldest of these, that is queued or that its worker has lost.
+
+    A worker loses a job when it dies or lets its lease run out. `lane`: only what is waited for, or only the rest.
+
+    A job that has killed its worker `try_limit` times is failed here, so that it cannot go round for ever.
+    """
+    now = clock.utc_now()
+    statement = select(jobs).where(jobs.c.state.in_(("queued", "running"))).order_by(jobs.c.priority, jobs.c.position)
+    statement = statement.where(_of_lane(lane))
+    if kinds is not None:
+        statement = statement.where(jobs.c.kind.in_(tuple(kinds)))
+    if run_id is not None:
+        statement = statement.where(jobs.c.run_id == run_id)
+    for row in connection.execute(statement).all():
+        if row.state == "running":
+            if now.timestamp() < row.until_utc_s and identity_of(row).life() != "dead":
+                continue
+            _note(connection, clock, row, actor=ACTOR, note="job_lease_lost", data={"worker": row.worker})
+            if row.tries >= row.try_limit:
+                message = f"the worker died or stopped answering {row.tries} times"
+                _end_failed(
+                    connection, clock, row, worker=row.worker, error="WorkerLost", message=message, actor=ACTOR
+                )
+                continue
+        connection.execute(
+            update(jobs)
+            .where(jobs.c.job_id == row.job_id)
+            .values(
+                state="running",
+                tries=row.tries + 1,
+                worker=worker,
+                token=ids.new_token(),
+                until_utc_s=now.timestamp() + lease_s,
+                started_utc=utc_text(now),
+                **identity_values(ProcessIdentity.of_this_process()),
+            )
+        )
+        return to_job(connection.execute(select(jobs).where(jobs.c.job_id == row.job_id)).one())
+    return None
+
+
+def _of_lane(lane: Lane | None) -> ColumnElement[bool]:
+    if lane is None:
+        return true()
+    return jobs.c.priority < EARLY if lane == "waited" else jobs.c.priority >= EARLY
+
+
+def renew(connection: Connection, clock: Clock, job: Job, lease_s: float) -> Job:
+    """Push the time limit out again. Raises LeaseLostError."""
+    held_row(connection, job)
+    until = clock.utc_now().timestamp() + lease_s
+    connection.execute(update(jobs).where(jobs.c.job_id == job.job_id).values(until_utc_s=until))
+    return to_job(connection.execute(select(jobs).where(jobs.c.job_id == job.job_id)).one())
+
+
+def finish(connection: Connection, clock: Clock, job: Job, payload: JobFinished) -> Event:
+    """Append the result and close the job. Raises LeaseLostError when the job has gone to another worker."""
+    row = held_row(connection, job)
+    (event,) = append(connection, clock, job.run_id, [payload], row.worker)
+    _end(connection, row, event, state="finished", error=None)
+    return event
+
+
+def release(connection: Connection, pids: Collection[int]) -> None:
+    """Queue the jobs of these processes of this host again, untried: they were told to stop, and have."""
+    here = ProcessIdentity.of_this_process()
+    mine = (jobs.c.state == "running", jobs.c.host == here.host, jobs.c.boot == here.boot, jobs.c.pid.in_(pids))
+    values = {"state": "queued", "tries": jobs.c.tries - 1, "token": None, "until_utc_s": None}
+    connection.execute(update(jobs).where(*mine).values(**values))
+
+
+def fail(
+    connection: Connection, clock: Clock, job: Job, error: str, message: str, *, retry: bool, traceback: str = ""
+) -> list[Event]:
+    """Put the job back in the queue, or fail it for good when not `retry` or its tries are used up.
+
+    Raises LeaseLostError when the job has gone to another worker.
+    """
+    row = held_row(connection, job)
+    if not retry or row.tries >= row.try_limit:
+        end = _end_failed(
+            connection,
+            clock,
+            row,
+            worker=row.worker,
+            error=error,
+            message=message,
+            actor=row.worker,
+            traceback=traceback,
+        )
+        return [end]
+    event = _note(
+        connection,
+        clock,
+        row,
+        actor=row.worker,
+        note="job_failed_will_retry",
+        data={"error": error, "message": message} | ({"traceback": traceback} if traceback else {}),
+    )
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.job_id == job.job_id)
+        .values(state="queued", token=None, until_utc_s=None, error=f"{error}: {message}")
+    )
+    return [event]
+
+
+def held_row(connection: Connection, job: Job) -> Row[Any]:
+    """The row of a job whose lease is still `job.token`. Raises LeaseLostError."""
+    row = connection.execute(select(jobs).where(jobs.c.job_id == job.job_id)).one_or_none()
+    if row is None or row.state != "running" or job.token is None or row.token != job.token:
+        state = "gone" if row is None else f"{row.state}, worker {row.worker}"
+        raise LeaseLostError(
+            f"job {job.job_id} is no longer this worker's ({state})",
+            where=f"run {job.run_id}, {job.kind} of step {job.step}",
+            remedy="Drop the result; the job is done by whoever has it now",
+        )
+    return row
+
+
+def _note(
+    connection: Connection, clock: Clock, row: Row[Any], *, actor: str, note: str, data: Mapping[str, Any]
+) -> Event:
+    payload = StepNote(
+        step=row.step,
+        attempt=row.attempt,
+        note=note,
+        data={"job": row.job_id, "job_kind": row.kind, "tries": row.tries, **data},
+    )
+    (event,) = append(connection, clock, row.run_id, [payload], actor)
+    return event
+
+
+def _end_failed(
+    connection: Connection,
+    clock: Clock,
+    row: Row[Any],
+    *,
+    worker: str,
+    error: str,
+    message: str,
+    actor: str,
+    traceback: str = "",
+) -> Event:
+    payload = JobFailed(
+        job=row.job_id,
+        job_kind=row.kind,
+        step=row.step,
+        attempt=row.attempt,
+        worker=worker,
+        error=error,
+        message=message,
+        traceback=traceback,
+    )
+    (event,) = append(connection, clock, row.run_id, [payload], actor)
+    _end(connection, row, event, state="failed", error=f"{error}: {message}")
+    return event
+
+
+def _end(connection: Connection, row: Row[Any], event: Event, *, state: str, error: str | None) -> None:
+    connection.execute(
+        update(jobs)
+        .where(jobs.c.job_id == row.job_id)
+        .values(state=state, ended_seq=event.seq, ended_utc=event.at_utc, error=error, token=None, until_utc_s=None)
+    )
+
+
+def to_job(row: Row[Any]) -> Job:
+    """A row as a record."""
+    return Job(
+        job_id=row.job_id,
+        run_id=row.run_id,
+        kind=row.kind,
+        step=row.step,
+        attempt=row.attempt,
+        idempotency_key=row.idempotency_key,
+        arguments=parse_canonical(row.arguments),
+        state=row.state,
+        tries=row.tries,
+        try_limit=row.try_limit,
+        worker=row.worker,
+        token=row.token,
+        until_utc_s=row.until_utc_s,
+        started_utc=row.started_utc,
+        ended_utc=row.ended_utc,
+        ended_seq=row.ended_seq,
+        error=row.error,
+        priority=row.priority,
+    )

@@ -1,0 +1,186 @@
+"""Leases: one runner a run. A process of this host has one for as long as it lives, others for a time.
+
+No clock takes a run away from a runner that lives on this host: its clock may be set, its waits may be long, and a
+process that was stopped (SIGSTOP) would go on moving the arm when it is continued.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import psutil
+from sqlalchemy import Connection, Row, delete, insert, select, update
+
+from service.core.errors import StoreError
+from service.store.database.engine import Database
+from service.store.database.tables import leases
+from service.store.durable_effects import Clock, Ids
+from service.store.errors import LeaseHeldError, LeaseLostError
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+_SAME_START_S = 1.5  # boot time is known to a second
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessIdentity:
+    """Who holds a lease, so that another process of the same host can tell whether it still lives.
+
+    `process_started_s` counts from boot, not from an epoch: a step of the system clock does not change it.
+    """
+
+    host: str
+    boot: str  # boot id where the system has one: a process of an earlier boot is dead
+    pid: int
+    process_started_s: float
+
+    @classmethod
+    def of_this_process(cls) -> ProcessIdentity:
+        """This process."""
+        process = psutil.Process()
+        return cls(socket.gethostname(), _boot(), process.pid, _started_s(process))
+
+    def life(self) -> Literal["lives", "dead", "unknown"]:
+        """What is known of it; of a process of another host nothing is. A stopped process lives."""
+        if self.host != socket.gethostname():
+            return "unknown"
+        if self.boot != _boot():
+            return "dead"
+        try:
+            process = psutil.Process(self.pid)
+            if process.status() == psutil.STATUS_ZOMBIE:
+                return "dead"
+            same = abs(_started_s(process) - self.process_started_s) <= _SAME_START_S
+        except psutil.NoSuchProcess:
+            return "dead"
+        except psutil.AccessDenied:
+            return "unknown"
+        return "lives" if same else "dead"
+
+
+def _boot() -> str:
+    return _BOOT_ID.read_text().strip() if _BOOT_ID.exists() else ""
+
+
+def _started_s(process: psutil.Process) -> float:
+    return process.create_time() - psutil.boot_time()
+
+
+def identity_of(row: Row[Any]) -> ProcessIdentity:
+    """The holder that a row of `leases` or `jobs` names."""
+    return ProcessIdentity(row.host, row.boot, row.pid, row.process_started_s)
+
+
+def identity_values(identity: ProcessIdentity) -> dict[str, Any]:
+    """The same as column values."""
+    return {
+        "host": identity.host,
+        "boot": identity.boot,
+        "pid": identity.pid,
+        "process_started_s": identity.process_started_s,
+    }
+
+
+class RunLease:
+    """The right to drive one run, until it is released or this process dies; renewed by itself within a `with`."""
+
+    def __init__(self, run_id: str, token: str, seconds: float, database: Database, clock: Clock) -> None:
+        self.run_id = run_id
+        self.token = token
+        self._seconds = seconds
+        self._database = database
+        self._clock = clock
+        self._over = threading.Event()
+        self._keeper = threading.Thread(target=self._keep, name=f"lease of {run_id}", daemon=True)
+
+    def renew(self) -> None:
+        """Push the time limit out again. Raises LeaseLostError when another process has taken over."""
+        with self._database.writing() as connection:
+            check_lease(connection, self)
+            until = self._clock.utc_now().timestamp() + self._seconds
+            connection.execute(update(leases).where(leases.c.token == self.token).values(until_utc_s=until))
+
+    def release(self) -> None:
+        """Let the next runner in; releasing twice, or after a take-over, does nothing."""
+        with self._database.writing() as connection:
+            connection.execute(delete(leases).where(leases.c.token == self.token))
+
+    def _keep(self) -> None:
+        while not self._over.wait(self._seconds / 3):
+            try:
+                self.renew()
+            except LeaseLostError:
+                return  # the next write is refused, and says so
+            except StoreError as error:  # the disk was full or busy for a moment; the lease may outlive it
+                _log.warning("the lease of %s was not renewed: %s", self.run_id, error)
+
+    def __enter__(self) -> Self:
+        self._keeper.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._keeper.join()
+        self.release()
+
+
+def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
+    """Whether somebody has the lease of a run who may still live."""
+    row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
+    return row is not None and is_live(row, clock.utc_now().timestamp())
+
+
+def held_runs(connection: Connection, clock: Clock) -> list[str]:
+    """Runs whose lease somebody has who may still live, by name."""
+    now_utc_s = clock.utc_now().timestamp()
+    rows = connection.execute(select(leases).order_by(leases.c.run_id)).all()
+    return [row.run_id for row in rows if is_live(row, now_utc_s)]
+
+
+def is_live(row: Row[Any], now_utc_s: float) -> bool:
+    """Whether the holder of a row of `leases` or `jobs` may still live; of another host: as long as its time runs."""
+    life = identity_of(row).life()
+    return life == "lives" or (life == "unknown" and now_utc_s < row.until_utc_s)
+
+
+def acquire(database: Database, clock: Clock, ids: Ids, *, run_id: str, holder: str, seconds: float) -> RunLease:
+    """Take the lease of a run. Raises LeaseHeldError naming who has it and how long."""
+    token = ids.new_token()
+    with database.writing() as connection:
+        now = clock.utc_now().timestamp()
+        row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
+        if row is not None:
+            if is_live(row, now):
+                here = row.host == socket.gethostname()
+                left_s = max(0.0, row.until_utc_s - now)
+                raise LeaseHeldError(
+                    f"another process drives this run: {row.holder}",
+                    where=f"process {row.pid} on {row.host}",
+                    remedy="End it" if here else f"End it, or wait {left_s:.0f} s after it has stopped answering",
+                )
+            connection.execute(delete(leases).where(leases.c.run_id == run_id))
+        identity = ProcessIdentity.of_this_process()
+        connection.execute(
+            insert(leases).values(
+                run_id=run_id, holder=holder, token=token, until_utc_s=now + seconds, **identity_values(identity)
+            )
+        )
+    return RunLease(run_id, token, seconds, database, clock)
+
+
+def check_lease(connection: Connection, lease: RunLease) -> None:
+    """Raises LeaseLostError unless the lease is still the one in the database."""
+    if connection.execute(select(leases.c.run_id).where(leases.c.token == lease.token)).first() is None:
+        raise LeaseLostError(
+            "another process has taken over this run",
+            where=lease.run_id,
+            remedy="This one stops; nothing was written",
+        )

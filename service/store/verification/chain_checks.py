@@ -1,0 +1,302 @@
+"""The pure part of the audit: rows and hashes in, faults out. No database, no files. Signatures: audit_signatures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any
+
+from pydantic_core import ValidationError
+
+from service.core.errors import StoreError
+from service.core.records.events import PAYLOAD, ArtefactRef
+from service.store.events import ROOT, canonical_parsed, event_sha256_of_text, parse_canonical, references
+from service.store.files.artefacts import record_sha256
+from service.store.records import SITE
+
+Rows = Sequence[Mapping[str, Any]]
+_REF_COLUMNS = tuple(ArtefactRef.model_fields)
+_CLOCK_READ_TWICE_S = 5.0
+_OF_JOBS = frozenset({"job_enqueued", "job_finished", "job_failed"})
+_JOB_COLUMNS = {"job": "job_id", "job_kind": "kind", "step": "step", "attempt": "attempt"}
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing that does not verify."""
+
+    run_id: str | None
+    seq: int | None  # of the event that it concerns
+    file: str
+    what: str  # what differs
+
+    def __str__(self) -> str:
+        place = ", ".join(
+            part
+            for part in (
+                f"run {self.run_id}" if self.run_id else "",
+                f"event {self.seq}" if self.seq is not None else "",
+                self.file,
+            )
+            if part
+        )
+        return f"{place}: {self.what}" if place else self.what
+
+
+@dataclass(frozen=True, slots=True)
+class FileState:
+    """What hashing a listed file again gave."""
+
+    shown: str
+    sha256: str
+    size: int
+    problem: str
+
+
+@dataclass
+class ChainFacts:
+    """What other checks need to know of a chain, gathered while its events pass by once."""
+
+    sha256_at: dict[int, str] = field(default_factory=dict[int, str])
+    jobs: dict[int, Any] = field(default_factory=dict[int, Any])  # payloads that concern jobs
+    jobs_utc: dict[int, str] = field(default_factory=dict[int, str])  # when
+    key_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
+    people: list[tuple[Any, str]] = field(default_factory=list[tuple[Any, str]])  # changes and sign-ins, when
+    stamps: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of authorities, as the site tells
+    heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of ServiceStarted
+    runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of the site's chain
+    to_sign: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # what is signed when it happens
+    last_own: int = 0  # number of the last event that does not come from a job
+    first: Mapping[str, Any] | None = None
+
+    def add(self, seq: int, payload: Any, at_utc: str) -> None:
+        """An event whose content is as it was recorded."""
+        kind = payload["kind"]
+        if kind in _OF_JOBS:
+            self.jobs[seq] = payload
+            self.jobs_utc[seq] = at_utc
+            return
+        self.last_own = seq
+        if kind == "key_changed":
+            self.key_changes.append((seq, payload))
+        elif kind == "account_changed" or (kind == "sign_in_recorded" and payload["screen"]):
+            self.people.append((payload, at_utc))
+        elif kind == "time_stamp_kept":
+            self.stamps.append((seq, payload))
+        elif kind == "run_signed":
+            self.runs_signed.append((seq, payload))
+        elif kind in ("step_passed", "run_completed", "run_aborted"):
+            self.to_sign.append((seq, kind))
+        elif kind == "service_started":
+            self.heads_at_start.append((seq, payload["heads"]))
+
+
+def run_faults(
+    run_id: str,
+    *,
+    run_rows: Rows,
+    head_rows: Rows,
+    event_rows: Iterable[Mapping[Any, Any]],
+    artefact_rows: Rows,
+    job_rows: Rows,
+    files: Mapping[str, FileState] | None,  # None: not read
+    facts: ChainFacts,
+) -> Iterator[Fault]:
+    """Every fault of one run, in the order of its events, then those of the run as a whole. Fills `facts`."""
+    by_seq: dict[int, list[Mapping[str, Any]]] = {}
+    for row in artefact_rows:
+        by_seq.setdefault(int(row["seq"]), []).append(row)
+    recorded: set[tuple[str, int]] = set()
+    seq, previous = 0, ROOT
+    for row in event_rows:
+        yield from _link_faults(run_id, row, seq, previous)
+        seq, previous = int(row["seq"]), str(row["sha256"])
+        facts.sha256_at[seq] = previous
+        facts.first = facts.first or row
+        mine = by_seq.pop(seq, [])
+        payload, named, problem = _payload_of(row)
+        if problem:
+            yield Fault(run_id, seq, "", problem)
+            continue
+        facts.add(seq, payload, str(row["at_utc"]))
+        recorded |= {(str(item["sha256"]), int(item["size_bytes"])) for item in mine}
+        yield from _artefact_faults(run_id, row, payload, named, mine, recorded=recorded, files=files)
+    for left in by_seq.values():
+        for item in left:
+            what = f"artefact {item['original_name']} ({item['sha256']}) belongs to an event that is not there"
+            yield Fault(run_id, int(item["seq"]), "", what)
+    yield from _end_faults(run_id, run_rows, head_rows, facts.first, (seq, previous))
+    yield from _job_faults(run_id, job_rows, facts.jobs, facts.jobs_utc)
+
+
+def chain_fault(
+    run_id: str, event_rows: Iterable[Mapping[Any, Any]], end: tuple[int, str]
+) -> Fault | tuple[int, str]:
+    """The first fault of the events that follow `end` (number and hash), or where the chain ends now."""
+    seq, previous = end
+    for row in event_rows:
+        for fault in _link_faults(run_id, row, seq, previous):
+            return fault
+        seq, previous = int(row["seq"]), str(row["sha256"])
+        _, _, problem = _payload_of(row)
+        if problem:
+            return Fault(run_id, seq, "", problem)
+    return seq, previous
+
+
+def _link_faults(run_id: str, row: Mapping[str, Any], before: int, previous: str) -> Iterator[Fault]:
+    seq = int(row["seq"])
+    if seq != before + 1:
+        missing = f"event {before + 1} is" if seq == before + 2 else f"events {before + 1} to {seq - 1} are"
+        yield Fault(run_id, before + 1, "", f"{missing} missing from the chain")
+    elif row["previous_sha256"] != previous:
+        yield Fault(run_id, seq, "", f"previous_sha256 is {row['previous_sha256']}, the event before has {previous}")
+
+
+def _payload_of(row: Mapping[str, Any]) -> tuple[Any, tuple[ArtefactRef, ...], str]:
+    """The payload as plain data, what it refers to and an empty text; or None, and what is wrong with the event."""
+    try:
+        payload = parse_canonical(row["payload"])
+        PAYLOAD.validate_python(payload)
+        text = canonical_parsed(payload)
+        fields = {name: row[name] for name in ("seq", "run_id", "at_utc", "monotonic_s", "actor", "previous_sha256")}
+        digest = event_sha256_of_text(fields, text)
+        if digest != row["sha256"]:
+            return None, (), f"the content was altered: its SHA-256 is {digest}, recorded is {row['sha256']}"
+        if text != row["payload"]:
+            return None, (), "the payload is not in canonical form: its text was altered"
+        if payload["kind"] != row["kind"]:
+            return None, (), f"the column kind says {row['kind']}, the payload {payload['kind']}"
+        # In canonical form a reference's name of a field stands as it is; looking through every payload takes long.
+        named = references(payload) if '"original_name":' in text else ()
+    except (ValidationError, ValueError, StoreError) as error:
+        return None, (), f"the content was altered: it cannot be read ({str(error).splitlines()[0]})"
+    return payload, named, ""
+
+
+def _artefact_faults(
+    run_id: str,
+    event: Mapping[str, Any],
+    payload: Any,
+    named: tuple[ArtefactRef, ...],
+    rows: Rows,
+    *,
+    recorded: set[tuple[str, int]],
+    files: Mapping[str, FileState] | None,
+) -> Iterator[Fault]:
+    seq = int(event["seq"])
+    for row in rows:
+        state = None if files is None else files[row["sha256"]]
+        shown = "" if state is None else state.shown
+        if ArtefactRef(**{column: row[column] for column in _REF_COLUMNS}) not in named:
+            yield Fault(run_id, seq, shown, "the artefact's row is not what the event refers to")
+        elif record_sha256(event["sha256"], dict(row)) != row["record_sha256"]:
+            yield Fault(run_id, seq, shown, "the artefact's row was altered (device, step, time, who …)")
+        if state is None:
+            continue
+        if state.problem:
+            yield Fault(run_id, seq, state.shown, f"{state.problem} ({row['original_name']})")
+        elif state.size != row["size_bytes"]:
+            what = f"the file has {state.size} bytes, recorded are {row['size_bytes']} ({row['original_name']})"
+            yield Fault(run_id, seq, state.shown, what)
+        elif state.sha256 != row["sha256"]:
+            yield Fault(run_id, seq, state.shown, f"the content was altered: its SHA-256 is {state.sha256}")
+    for ref in named:
+        if (ref.sha256, ref.size_bytes) not in recorded:
+            what = f"{payload['kind']} refers to {ref.original_name} ({ref.sha256}), which has no artefact row"
+            yield Fault(run_id, seq, "", what)
+
+
+def _end_faults(
+    run_id: str, run_rows: Rows, head_rows: Rows, first: Mapping[str, Any] | None, end: tuple[int, str]
+) -> Iterator[Fault]:
+    for head in head_rows:
+        if (head["seq"], head["sha256"]) != end:
+            what = (
+                f"the chain ends at event {end[0]} ({end[1]}), it was left at event {head['seq']} ({head['sha256']})"
+            )
+            yield Fault(run_id, end[0] + 1, "", what)
+    if not head_rows:
+        yield Fault(run_id, None, "", "the record of where the chain ends is missing")
+    if not run_rows:
+        yield Fault(run_id, None, "", "the run's own row is missing")
+    for row in run_rows:
+        kind = "site_opened" if run_id == SITE else "run_started"
+        if first is None or first["sha256"] != row["root_sha256"] or first["kind"] != kind:
+            yield Fault(run_id, 1, "", f"the chain does not begin with the {kind} that the run's row names")
+        elif _payload_of(first)[0] is not None and parse_canonical(first["payload"]).get("simulated", False) != bool(
+            row["simulated"]
+        ):
+            yield Fault(run_id, 1, "", "the run's row and its first event disagree on whether it was simulated")
+        if first is not None and not _same_moment(str(row["created_utc"]), str(first["at_utc"])):
+            what = f"the run's row says that it was made at {row['created_utc']}, its first event {first['at_utc']}"
+            yield Fault(run_id, 1, "", what)
+
+
+def _same_moment(one_utc: str, other_utc: str) -> bool:
+    """To a few seconds: older versions read the clock twice."""
+    try:
+        apart = datetime.fromisoformat(one_utc) - datetime.fromisoformat(other_utc)
+    except (ValueError, TypeError):
+        return False
+    return abs(apart.total_seconds()) < _CLOCK_READ_TWICE_S
+
+
+def _job_faults(run_id: str, rows: Rows, payloads: Mapping[int, Any], at_utc: Mapping[int, str]) -> Iterator[Fault]:
+    enqueued = {seq: payload for seq, payload in payloads.items() if payload["kind"] == "job_enqueued"}
+    ended = {seq: payload for seq, payload in payloads.items() if payload["kind"] in ("job_finished", "job_failed")}
+    ends_of: dict[str, dict[int, Any]] = {}
+    for seq, end in ended.items():
+        ends_of.setdefault(end["job"], {})[seq] = end
+    for row in rows:
+        shown = f"job {row['job_id']}"
+        payload = enqueued.pop(int(row["enqueued_seq"]), None)
+        if payload is None:
+            yield Fault(run_id, int(row["enqueued_seq"]), "", f"{shown} has no event job_enqueued")
+        elif (
+            any(payload[name] != row[column] for name, column in _JOB_COLUMNS.items())
+            or payload["idempotency_key"] != row["idempotency_key"]
+            or canonical_parsed(payload["arguments"]) != row["arguments"]
+            or payload.get("priority", row["priority"]) != row["priority"]
+            or at_utc.get(int(row["enqueued_seq"])) != row["enqueued_utc"]
+        ):
+            yield Fault(run_id, int(row["enqueued_seq"]), "", f"{shown} differs from its event job_enqueued")
+        ends = ends_of.pop(row["job_id"], {})
+        expected = {"finished": "job_finished", "failed": "job_failed"}.get(str(row["state"]))
+        found = {seq: end["kind"] for seq, end in ends.items()}
+        if found != ({} if expected is None else {row["ended_seq"]: expected}):
+            what = f"{shown} is {row['state']}, but its ending events are {found or 'none'}"
+            yield Fault(run_id, row["ended_seq"], "", what)
+        elif expected is not None:
+            yield from _end_of_job_faults(run_id, row, ends[row["ended_seq"]], at_utc)
+        elif row["ended_seq"] is not None or row["ended_utc"] is not None:
+            yield Fault(run_id, int(row["enqueued_seq"]), "", f"{shown} is {row['state']} and has an end")
+    for seq, payload in enqueued.items():
+        yield Fault(run_id, seq, "", f"job {payload['job']} was enqueued and has no row")
+    for seq, payload in ((seq, end) for ends in ends_of.values() for seq, end in ends.items()):
+        yield Fault(run_id, seq, "", f"job {payload['job']} ended and has no row")
+
+
+def _end_of_job_faults(
+    run_id: str, row: Mapping[str, Any], end: Mapping[str, Any], at_utc: Mapping[int, str]
+) -> Iterator[Fault]:
+    error = f"{end['error']}: {end['message']}" if end["kind"] == "job_failed" else None
+    lease = row["token"], row["until_utc_s"]
+    told = error, at_utc.get(row["ended_seq"]), end["worker"], (None, None)
+    if (row["error"], row["ended_utc"], row["worker"] or "", lease) != told:
+        yield Fault(run_id, row["ended_seq"], "", f"job {row['job_id']} differs from its event {end['kind']}")
+
+
+def summary(payload: Mapping[str, Any]) -> str:
+    """One line on an event's payload: its short fields, in order."""
+    parts = [
+        f"{name}={value}"
+        for name, value in payload.items()
+        if name != "kind"
+        and isinstance(value, str | int | float | bool)
+        and value not in ("", False)
+        and name != "why"
+    ]
+    text = " ".join(part if len(part) <= 60 else part[:59] + "…" for part in parts)
+    return text if len(text) <= 160 else text[:159] + "…"

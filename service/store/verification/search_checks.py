@@ -1,0 +1,92 @@
+"""Whether a search finds what the events say: their words are indexed once more, and the two are compared."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+
+from sqlalchemy import Connection, text
+
+from service.store.database.engine import DATABASE_NAME
+from service.store.verification.chain_checks import Fault
+
+_MADE = "USING fts5(words, content = '', columnsize = 0)"
+_PARTS = {"data": "id, block", "idx": "segid, term, pgno", "config": "k, v"}  # of the index, as tables
+# As the trigger events_indexed writes them, in the order in which it did.
+_WORDS = """
+SELECT i.position, e.actor || ' ' ||
+       coalesce((SELECT group_concat(atom, ' ') FROM json_tree(e.payload) WHERE type = 'text'), '')
+FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq
+WHERE json_valid(e.payload) ORDER BY i.position
+"""
+_OTHER = """
+SELECT DISTINCT doc FROM (SELECT * FROM (SELECT * FROM {0}_places EXCEPT SELECT * FROM {1}_places)
+UNION ALL SELECT * FROM (SELECT * FROM {1}_places EXCEPT SELECT * FROM {0}_places)) ORDER BY doc
+"""
+_BOTH = ("present", "again")
+_DAMAGED = "the index by which auditors search is damaged"
+
+
+def word_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
+    """Events whose words a search would not find as they stand there, or would find in another event.
+
+    Everything is done on copies in a private database: the evidence is not even opened for writing.
+    """
+    try:
+        with closing(sqlite3.connect("")) as private:  # "": in a file of its own once it is large
+            wrong, damage = _compared(connection, private)
+    except sqlite3.Error as error:
+        wrong, damage = [], f"{_DAMAGED}: {error}"
+    wanted, placed = frozenset(run_ids), False
+    for position in wrong:
+        found = text("SELECT run_id, seq FROM event_index WHERE position = :position")
+        row = connection.execute(found, {"position": position}).one_or_none()
+        placed = True
+        if row is None:
+            what = f"the index by which auditors search has words of an event that is not there (place {position})"
+            yield Fault(None, None, DATABASE_NAME, what)
+        elif row.run_id in wanted:
+            yield Fault(str(row.run_id), int(row.seq), "", "the words by which auditors search are not the event's")
+    if damage and not placed:
+        yield Fault(None, None, DATABASE_NAME, damage)
+
+
+def _compared(connection: Connection, private: sqlite3.Connection) -> tuple[list[int], str]:
+    """Places of events whose words differ; and what is wrong with the way to them, "" for nothing."""
+    for name in _BOTH:
+        private.execute(f"CREATE VIRTUAL TABLE {name} {_MADE}")
+    for part, columns in _PARTS.items():
+        private.execute(f"DELETE FROM present_{part}")
+        rows = connection.execute(text(f"SELECT {columns} FROM event_words_{part}"))
+        marks = ", ".join("?" for _ in columns.split(","))
+        private.executemany(f"INSERT INTO present_{part} ({columns}) VALUES ({marks})", (tuple(row) for row in rows))
+    words = connection.execute(text(_WORDS))
+    private.executemany("INSERT INTO again (rowid, words) VALUES (?, ?)", (tuple(row) for row in words))
+    private.commit()
+    versions = [private.execute(f"SELECT k, v FROM {name}_config ORDER BY k").fetchall() for name in _BOTH]
+    if versions[0] != versions[1]:
+        return [], f"{_DAMAGED}: it is of format {versions[0]}, not {versions[1]}"
+    for name in _BOTH:
+        private.execute(f"CREATE VIRTUAL TABLE {name}_places USING fts5vocab({name}, 'instance')")
+    private.execute("CREATE VIRTUAL TABLE words USING fts5vocab(again, 'row')")
+    if not _same(*(private.execute(f"SELECT term, doc, col, offset FROM {name}_places") for name in _BOTH)):
+        wrong = [int(row[0]) for row in private.execute(_OTHER.format(*_BOTH))]
+        return wrong, f"{_DAMAGED}: it does not hold the words of the events"
+    # What is there in order need not be found: a search goes another way, by the first words of the index's pages.
+    for (term,) in private.execute("SELECT term FROM words"):
+        asked = (f"SELECT count(*) FROM {name} WHERE {name} MATCH ?" for name in _BOTH)
+        found, awaited = (private.execute(ask, (f'"{term}"',)).fetchone()[0] for ask in asked)
+        if found != awaited:
+            return [], f"{_DAMAGED}: a search for {term!r} finds {found} events, {awaited} have the word"
+    private.execute("INSERT INTO present (present) VALUES ('integrity-check')")
+    return [], ""
+
+
+def _same(one: sqlite3.Cursor, other: sqlite3.Cursor) -> bool:
+    while True:
+        here, there = one.fetchmany(1000), other.fetchmany(1000)
+        if here != there:
+            return False
+        if not here:
+            return True
