@@ -53,7 +53,7 @@ def read_journal(journal: Path) -> list[dict[str, Any]]:
 
 
 class MortalFiles:
-    """service.store.durable_effects.Files that records every effect in a journal and dies at one point of one of them."""
+    """DurableFiles that records every effect in a journal and dies at one point of one of them."""
 
     def __init__(self, data: Path, journal: Path, die_at: Point | None) -> None:
         self._data = data
