@@ -1,4 +1,4 @@
-"""A gate outside its limits, accepted by a person: who may, what it binds, and that every reader is told."""
+"""Accepting a gate that is outside its limits: who may do it, what it binds, and that every reader is told."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ ACCEPTING = PROTOCOL.replace("viewpoints_captured, min: 3", "viewpoints_captured
 
 
 class LeftError(Exception):
-    """Nobody is there any more."""
+    """The person has gone."""
 
 
 def leave(_question: AskOperator, _state: RunState) -> OperatorAction:
@@ -63,7 +63,7 @@ def leave(_question: AskOperator, _state: RunState) -> OperatorAction:
 
 
 def at_failed_capture(text: str = TOY_ACCEPTING, **measures: float) -> Log:
-    """The toy protocol after a capture whose figures are outside their limits; Bob confirmed it."""
+    """The toy protocol after a capture whose figures are outside their limits, confirmed by Bob."""
     log = Log(toy_protocol(text))
     log.do()
     log.act("confirm", actor="Bob")
@@ -104,7 +104,7 @@ def test_an_accepted_step_passes_and_counts_for_what_requires_it() -> None:
     log = at_failed_capture()
     assert "accept" in log.question.options
     accept(log)
-    assert log.state.phase == "awaiting_operator"  # its signature is due all the same
+    assert log.state.phase == "awaiting_operator"  # its signature is still due
     assert "accepted by Emmy (supervisor): enough for a pilot" in log.question.text
     log.sign()
     log.accept()
@@ -148,14 +148,14 @@ def test_it_needs_a_person_a_role_a_reason_and_the_figures(fields: dict[str, obj
     assert log.state.steps == before.steps
 
 
-@pytest.mark.parametrize("actor", ["Ada", "Bob"])  # who began the run, who confirmed the step
+@pytest.mark.parametrize("actor", ["Ada", "Bob"])  # Ada began the run, Bob confirmed the step
 def test_another_supervisor_is_another_one(actor: str) -> None:
     log = at_failed_capture(sharp=3.0)
     accept(log, actor)
     assert "somebody else" in last_refusal(log)
     accept(log, "Emmy")
     assert log.state.step.accepted is not None
-    at_ease = at_failed_capture()  # `supervisor` alone: the operator may, if that is the role
+    at_ease = at_failed_capture()  # `supervisor` alone: the operator may, if that is the required role
     accept(at_ease, actor)
     assert at_ease.state.step.accepted is not None
 
@@ -195,7 +195,7 @@ def test_later_steps_that_use_it_depend_on_it() -> None:
     assert rest[:2] == ("hand_eye", "viewpoint_capture_1")
     assert {"registration", "evaluation"} <= set(rest)
     assert "scanning" not in rest
-    assert dependent_steps(toy_protocol(), "capture") == ()  # `requires` is no use of a result
+    assert dependent_steps(toy_protocol(), "capture") == ()  # `requires` is not the use of a result
     log = at_failed_capture()
     accept(log)
     assert [gate.step for gate in depends_on(log.protocol, log.state, "capture")] == ["capture"]
@@ -212,7 +212,7 @@ def web(tmp_path: Path) -> Generator[WebSite]:
 
 
 def failed_capture(web: WebSite) -> Bench:
-    """A run whose capture waits for a decision on its screen; 4 of 5 views are there."""
+    """A run whose capture waits for a decision on its screen; it has 4 of 5 views."""
     bench = web.begin_run(ACCEPTING)
     bench.script("capture", "recovery", leave)
     with pytest.raises(LeftError):
@@ -250,7 +250,7 @@ def test_a_supervisor_accepts_on_the_technicians_screen(web: WebSite) -> None:
     page = web.browser("auditor").get(f"/runs/{bench.run_id}", params={"step": "capture"}).text
     assert "This depends on an accepted gate" in page
     bench.operator.script = {}
-    assert bench.run().status == "completed"  # the irreversible step that requires it goes ahead
+    assert bench.run().status == "completed"  # the irreversible step that requires it continues
     bench.must_verify()
 
 
@@ -366,7 +366,7 @@ def test_report_data_set_and_bundle_say_it(accepted_run: tuple[Path, str]) -> No
     text = "0.9 mm, allowed ≤ 0.35; accepted by Emmy (supervisor): the pilot does not need it"
     shown = render_html(report_content(run, verify(data, run_id), with_scene=False, with_pictures=False))
     plain = re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", shown))
-    assert plain.index("gate accepted") < plain.index("redo")  # first of the deviations
+    assert plain.index("gate accepted") < plain.index("redo")  # listed first among the deviations
     assert plain.count("Depends on an accepted gate: Evaluate: best_mean_radial_error_mm " + text) >= 2
     export_dataset(run.summary(), folder / "dataset")
     described = json.loads((folder / "dataset" / "dataset.json").read_text())

@@ -1,4 +1,4 @@
-"""What people want of a run that has ended is refused and told to the site's record: the run stays sealed."""
+"""Requests about a run that has ended are refused and recorded in the site's chain: the run stays sealed."""
 
 from __future__ import annotations
 

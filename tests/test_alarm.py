@@ -1,4 +1,4 @@
-"""Alerts for people who are elsewhere: a web server and a mail server of this test, and what arrives there."""
+"""Alerts for people who are elsewhere: what arrives at a web server and a mail server of this test."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RIG = "name: bench\nsimulated: true\ndevices: {}\n"
 
 
 class Hook(BaseHTTPRequestHandler):
-    """Takes what it is posted, after as many refusals as were asked for."""
+    """Accepts posts, after as many refusals as requested."""
 
     taken: list[dict[str, Any]]
     refusals: int = 0
@@ -45,7 +45,7 @@ class Hook(BaseHTTPRequestHandler):
 
 
 class MailServer(socketserver.StreamRequestHandler):
-    """As much of SMTP (RFC 5321) as delivers one message."""
+    """As much of SMTP (RFC 5321) as is needed to deliver one message."""
 
     letters: list[str]
 

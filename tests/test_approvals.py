@@ -1,4 +1,4 @@
-"""A protocol is its bytes: who approved them is recorded, and the same version with other limits is flagged."""
+"""A protocol is its bytes: their approval is recorded, and the same version with other limits is flagged."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_the_auditor_sees_which_limits_and_what_differs(web: WebSite) -> None:
 
 
 def first_page(web: WebSite, run_id: str) -> str:
-    """Once the digest, which is computed in the background, is there."""
+    """The first page, once the digest, computed in the background, is ready."""
     page = ""
     while "Re-dos" not in page:
         page = words(web.browser("auditor").get(f"/audit/runs/{run_id}").text)

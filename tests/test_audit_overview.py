@@ -1,4 +1,4 @@
-"""The overview of a run: accuracy with limits, all gates, times of the site, what was verified elsewhere."""
+"""The overview of a run: accuracy with limits, all gates, times of the site, verifications made elsewhere."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def words(html: str) -> str:
 
 
 def read(web: tuple[WebSite, str], page: str = "") -> str:
-    """A page of the run's audit, once what it computes in the background is there."""
+    """A page of the run's audit, once its background computation is ready."""
     site, run_id = web
     browser = site.browser("auditor")
     while True:

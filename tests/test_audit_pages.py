@@ -1,4 +1,4 @@
-"""The auditor's pages: what they show is what the evidence holds, whatever is asked of them."""
+"""The auditor's pages show exactly what the evidence holds, whatever is requested."""
 
 from __future__ import annotations
 
@@ -265,7 +265,7 @@ def test_provenance_runs_from_scans_to_the_registration(tmp_path: Path) -> None:
         assert not isinstance(graph, Progress)
         mesh, job = "file second_scan scan_mesh", "job second_scan locate_spheres"
         assert (mesh, job) in graph.edges
-        # The spheres that the scan gave reach the registration as numbers, not as a file.
+        # The sphere positions from the scan reach the registration as numbers, not as a file.
         assert any(source == job and graph.nodes[target].step == "registration" for source, target in graph.by_value)
         drawing = draw(graph)
         place = {box.node.key: box.x for box in drawing.boxes}

@@ -1,4 +1,4 @@
-"""The report of a run: what it says, in HTML and in PDF, and that it never hides what is wrong."""
+"""The report of a run, in HTML and PDF: what it states, and that it never hides a fault."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ AT = datetime(2026, 11, 21, 11, 30, tzinfo=UTC)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with deviations, signed, in the folder data."""
+    """A signed run with deviations, in the folder data."""
     made = tmp_path_factory.mktemp("reported")
     run_id = record_reported_run(made)
     with Store.open(made / "data") as store:
@@ -64,7 +64,7 @@ class _Words(HTMLParser):
 
 
 def words_of(html: str) -> str:
-    """The text between the tags, in order, white space made one blank."""
+    """The text between the tags, in order, with white space normalised."""
     parser = _Words()
     parser.feed(html)
     return " ".join(" ".join(parser.found).split())
@@ -260,7 +260,7 @@ def test_command_records_what_leaves_before_it_is_there(tmp_path: Path, monkeypa
     assert head in html.read_text()
     monkeypatch.setattr(
         "service.cli.evidence.audit_report._writable", lambda _data: False
-    )  # a copy on a medium that cannot be written
+    )  # a copy on a read-only medium
     assert json.loads(CliRunner().invoke(app, words).stdout)["recorded"] is False
     assert len(told()) == 1
     assert verify(data, run_id).ok

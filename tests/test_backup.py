@@ -1,4 +1,4 @@
-"""Backups: made while a run goes on, only what is new, never half of one for a whole one; restored and verified."""
+"""Backups made during a run: incremental, never partial, restored and verified."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.support.tampering import cut
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """One signed run of three viewpoints."""
+    """A signed run of three viewpoints."""
     folder = tmp_path / "data"
     with Store.open(folder) as store:
         run = start_run(store)
@@ -43,7 +43,7 @@ def data(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def small(tmp_path: Path) -> Path:
-    """One run of no viewpoint, not signed."""
+    """An unsigned run without viewpoints."""
     folder = tmp_path / "small"
     with Store.open(folder) as store:
         start_run(store)
@@ -87,7 +87,7 @@ def test_a_completed_run_comes_back_and_verifies(tmp_path: Path) -> None:
 
 
 def test_backups_during_a_run_hold_one_moment_of_it_each(tmp_path: Path, data: Path) -> None:
-    """A capture as fast as it can, signed all the time, and backups beside it."""
+    """A capture at full speed that is signed continuously, with backups beside it."""
     over = threading.Event()
 
     def go_on() -> None:
@@ -108,7 +108,7 @@ def test_backups_during_a_run_hold_one_moment_of_it_each(tmp_path: Path, data: P
         over.set()
         runner.join()
     assert [report.state.faults for report in reports] == [()] * 4
-    assert reports[-1].present >= reports[0].state.artefacts  # only what is new was copied
+    assert reports[-1].present >= reports[0].state.artefacts  # only new files were copied
     sizes = [report.state.artefacts for report in reports]
     assert sizes == sorted(sizes)
     assert sizes[-1] > sizes[0]
@@ -158,7 +158,7 @@ def test_killed_or_without_power_at_any_point_no_half_backup_looks_whole(tmp_pat
         assert (again.state.faults, again.copied + again.present) == ((), again.state.artefacts)
         last = BackupFolder(backup, DurableFiles(), RandomIds())
         assert all(last.artefacts.verified_path(path.name) for path in files_of(small))
-    assert 0 < whole < 6  # of those that died after the last rename
+    assert 0 < whole < 6  # those that died after the last rename
 
 
 def test_an_interrupted_restoration_is_no_data_folder(tmp_path: Path, small: Path) -> None:
@@ -187,7 +187,7 @@ def test_a_file_that_the_data_folder_lost_is_told_and_older_backups_stay(tmp_pat
     status, back = command("store", "restore", tmp_path / "backup", tmp_path / "restored")
     assert status == 1
     assert any(image.name in fault for fault in back["faults"])
-    # An earlier backup has the file still, and goes on having it.
+    # An earlier backup still has the file, and keeps it.
     status, made = command("store", "backup", tmp_path / "whole", "--data", data, "--keep", 1)
     assert (status, len(states(tmp_path / "whole"))) == (0, 1)
     assert command("store", "restore", tmp_path / "whole", tmp_path / "mended")[0] == 0

@@ -1,4 +1,4 @@
-"""The machine dies in the middle of a capture: the run goes on in the folder restored from the last backup."""
+"""The machine dies in the middle of a capture: the run continues in the folder restored from the last backup."""
 
 from __future__ import annotations
 

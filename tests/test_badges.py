@@ -1,4 +1,4 @@
-"""PIN and badge in the place of a password: only where the site allows it, hashed, limited, revocable, recorded."""
+"""PIN and badge instead of a password: only where the site allows it; hashed, limited, revocable, recorded."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ def web(tmp_path: Path) -> Generator[WebSite]:
 
 
 def allow(web: WebSite, signing: str) -> None:
-    """The rig file of a site that takes more than passwords."""
+    """Write the rig file of a site that accepts more than passwords."""
     rig = web.folder / "rig.yaml"
     rig.write_text(f"{rig.read_text()}signing: {signing}\n")
     web.site.rig = load_rig(rig)
 
 
 def waiting(web: WebSite, step: str, question: str, protocol: str = PROTOCOL) -> tuple[Bench, Browser]:
-    """A run that waits for a person, on the technician's screen, which controls it."""
+    """A run that waits for a person, controlled by the technician's screen."""
     bench = left_at(web, step, question, protocol)
     browser = web.browser("technician")
     web.take_control(bench.run_id, browser)
@@ -198,7 +198,7 @@ def test_a_revoked_badge_signs_nothing(web: WebSite) -> None:
     with pytest.raises(SignInRefusedError):
         web.people.check_secret("grace", "badge", BADGE)
     assert enrol(web, "grace", BADGE) == 303
-    assert web.browser("technician").send_form("/account/badge/revoke").status_code == 303  # who has lost it herself
+    assert web.browser("technician").send_form("/account/badge/revoke").status_code == 303  # her own, lost
     with pytest.raises(SignInRefusedError):
         web.people.check_secret("grace", "badge", BADGE)
     with pytest.raises(AccountError, match="has no badge"):

@@ -1,4 +1,4 @@
-"""The worker beside a run: when it is killed another takes its place, and the run is told."""
+"""The worker beside a run: when it is killed, it is replaced and the run is told."""
 
 from __future__ import annotations
 

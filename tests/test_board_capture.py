@@ -1,4 +1,4 @@
-"""Calibration on a bench whose camera photographs a board: planned to succeed, images replaced, shortfalls mended."""
+"""Calibration on a bench whose camera photographs a board: planning, replaced images, and mended shortfalls."""
 
 from __future__ import annotations
 

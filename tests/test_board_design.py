@@ -1,4 +1,4 @@
-"""Planned board poses: the whole board in every frame whatever is true within the tolerances, the image covered."""
+"""Planned board poses: within the tolerances the whole board is in every frame, and together they cover the image."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_every_planned_pose_holds_the_whole_board_within_the_tolerances(
     known = nominal(tolerances)
     found = board_candidates(known, BOARD, wishes, APPROACH)
     assert len(found.T_base_camera) > 20
-    hands, boards, zoom, shift = known.draws(200, seed=99)  # others than the planner has looked at
+    hands, boards, zoom, shift = known.draws(200, seed=99)  # not those that the planner has used
     size = np.array([CAMERA.width, CAMERA.height])
     cut = 0
     for T in found.T_base_camera:

@@ -1,4 +1,4 @@
-"""A board that is described wrongly is named: found by trying counts, printing, dictionary and frame."""
+"""The mistake in a wrong board description is named: found by trying counts, printing, dictionary and frame."""
 
 from __future__ import annotations
 

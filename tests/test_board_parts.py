@@ -1,4 +1,4 @@
-"""A checkerboard seen in part: its corners are told apart by the arm's pose, or not at all."""
+"""A partly visible checkerboard: its corners are identified by the arm's pose, or not at all."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ MIDDLE = BOARD.points().mean(axis=0)
 
 
 def camera_pose(shift_m: tuple[float, float]) -> Transform:
-    """T_base_camera, the board's frame being the base: tilted, and moved aside so that the frame cuts the board."""
+    """T_base_camera, with the board's frame as base: tilted, and shifted so that the board is partly cut off."""
     away = Rotation.from_euler("x", 20, degrees=True).apply([0.0, 0.0, -0.62])
     T = look_at(MIDDLE + away, MIDDLE, np.array([1.0, 0.0, 0.0]))
     return T @ transform(np.eye(3), np.array([*shift_m, 0.0]))
 
 
 def taken_from(T_base_camera: Transform) -> tuple[Picture, Array]:
-    """An image and the true corners."""
+    """An image and its true corners."""
     grey = photograph(SHADE, LENS, inverse(T_base_camera), np.random.default_rng(4), samples=3)
     return grey, LENS.project(apply(inverse(T_base_camera), BOARD.points()))
 

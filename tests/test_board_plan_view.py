@@ -1,4 +1,4 @@
-"""The run page's drawing of planned board images: before the step from the files, afterwards as recorded."""
+"""The run page's drawing of planned board images: from the files before the step, as recorded afterwards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A board image that is not used says so wherever it is shown, with the reason in plain words, problems first."""
+"""A rejected board image is shown as such everywhere, with a plain reason, and problems come first."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def begin(web: WebSite) -> str:
 
 
 def look(web: WebSite, run_id: str, name: str, shade: int, **result: Any) -> str:
-    """One board image, and what the worker saw in it; the image's hash."""
+    """Record a board image and the worker's findings in it; returns the image's hash."""
     sha256 = capture(web, run_id, "calibration", name, EYE, kind="board_image", shade=shade)
     arguments = {"image": {"viewpoint": name, "sha256": sha256}}
     web.store.enqueue_job(run_id, NewJob("board_view", "calibration", 1, name, arguments), actor="runner")
@@ -68,7 +68,7 @@ def test_an_image_without_a_board_is_told_as_it_arrives(web: WebSite) -> None:
     sheet = page[page.index("Contact sheet") :]
     assert "Not used no board of 16 × 23 inner corners in the image" in sheet
     assert "Kept" not in sheet
-    assert sheet.index("b001") < sheet.index("b003") < sheet.index("b002")  # what is wrong first, then the newest
+    assert sheet.index("b001") < sheet.index("b003") < sheet.index("b002")  # problems first, then the newest
     one = words(browser.get(f"/runs/{run_id}/capture?step=calibration&viewpoint=b001").text)
     assert "Board Not used no board of 16 × 23 inner corners in the image" in one
     assert "1 not used" in words(browser.get(f"/runs/{run_id}").text)

@@ -1,4 +1,4 @@
-"""The whole demonstration protocol, clicked through by a technician and read by an auditor, in a real browser."""
+"""The whole demonstration protocol, operated by a technician and read by an auditor, in a real browser."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.waiting import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-MOST_MENDS = 4  # of one step, as of the automatic operator
+MOST_MENDS = 4  # per step, as of the automatic operator
 PRESSED_IN_VAIN = 3  # in the whole run
 
 
@@ -66,7 +66,7 @@ def _protocols(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def run(server: Served, browser: Browser) -> str:
-    """A completed run; its name."""
+    """Complete a run; returns its id."""
     with screen(browser, server.url) as tablet:
         tablet.sign_in("tina")
         tablet.go("/")
@@ -80,23 +80,23 @@ def run(server: Served, browser: Browser) -> str:
             assert time.monotonic() < deadline_s, f"{server.log()}\n{tablet.words()}\nmissed last: {missed}"
             try:
                 technician.do_what_is_asked()
-            except PlaywrightTimeoutError as error:  # the page went on between two looks: look again
+            except PlaywrightTimeoutError as error:  # the page changed meanwhile: look again
                 missed = str(error)
         assert technician.held >= 5  # calibration and four captures
-        assert technician.signed >= 3  # before the scene is changed for good
+        assert technician.signed >= 3  # before irreversible changes of the scene
     return name
 
 
 class Technician:
-    """Reads the page and does the one thing that it asks for; knows nothing of the protocol."""
+    """Reads the page and does the one thing that it asks for, without knowing the protocol."""
 
     def __init__(self, tablet: Screen) -> None:
         self.tablet, self.page = tablet, tablet.page
         self.held = self.signed = self.in_vain = 0
-        self.mends: Counter[str] = Counter()  # title of a step → how often its advice was followed
+        self.mends: Counter[str] = Counter()  # title of a step → number of times its advice was followed
 
     def do_what_is_asked(self) -> None:
-        """Tick, sign, confirm or hold, follow advice; or wait while the software works."""
+        """Tick, sign, confirm or hold, or follow advice; wait while the software works."""
         page = self.page
         trouble = page.locator(".notice-stop:has(dl)")  # what happened, and what helps
         if trouble.count():
@@ -119,9 +119,9 @@ class Technician:
             page.wait_for_timeout(400)
 
     def _follow_advice(self, trouble: Locator) -> None:
-        """Try again where the page says what helps and recommends it; any other trouble is an error.
+        """Try again where the page recommends it and says what helps; any other trouble is an error.
 
-        On a busy machine the watchdog may stop the arm: the page says so, and that a person lets it move on.
+        On a busy machine the watchdog may stop the arm: the page says so, and that a person must permit motion again.
         """
         words = trouble.inner_text(timeout=1_000)
         recommended = self.page.locator("table.ways tbody tr").first.inner_text(timeout=1_000)
@@ -159,14 +159,15 @@ class Technician:
         )
 
     def _asked(self) -> tuple[str, str]:
-        """The step, and the actions that are offered: the next question may come between two looks."""
+        """The step, and the offered actions; the question may change between two calls."""
         heading = self.page.get_by_role("heading", level=1).inner_text(timeout=5_000)
         return heading, self.page.locator(".actions").inner_text(timeout=5_000)
 
     def _until_something_else_is_asked(self, asked: tuple[str, str], gone: Callable[[], bool]) -> None:
-        """Another step comes, the same one asks for something else, or the page says why not: then he looks again.
+        """Wait until another step comes, the same step asks for something else, or the page gives a reason.
 
-        While a page on a busy machine has lost its connection, a press does nothing; then he presses again.
+        While a page on a busy machine has lost its connection, a press has no effect; the technician then presses
+        again.
         """
         deadline_s = time.monotonic() + 20
         while self._asked() == asked and not gone() and not self.page.locator("#problem").is_visible():
@@ -208,7 +209,7 @@ def test_the_auditor_reads_everything_and_changes_nothing(server: Served, browse
         desk.go(f"/audit/runs/{run}/verification")
         page.get_by_role("button", name="Verify now").click()
         expect(page.get_by_role("heading", name="Verifies")).to_be_visible(timeout=60_000)
-        # Scene and calibration have their figures beside the pictures.
+        # Scene and calibration show figures beside the pictures.
         desk.go(f"/runs/{run}/scene")
         expect(page.get_by_role("table").first).to_be_visible(timeout=60_000)
         desk.go(f"/runs/{run}/calibration")
@@ -218,7 +219,7 @@ def test_the_auditor_reads_everything_and_changes_nothing(server: Served, browse
 
 
 def refused(page: Page, path: str, fields: dict[str, str]) -> int:
-    """Status of a POST that the page itself does not offer, sent with the sign-in's own token."""
+    """Status of a POST that the page itself does not offer, sent with the user's own token."""
     return page.evaluate(
         """async ([path, fields]) => (await fetch(path, {
             method: "POST",

@@ -1,4 +1,4 @@
-"""What gloved hands and badge readers do, in a real browser: the plan, a badge, the live view, the keyboard."""
+"""Gloved hands and badge readers in a real browser: the plan, a badge, the live view, the keyboard."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from tests.support.web import password_of, web_site
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 BADGE = "0004711815"
-DENSE = PROTOCOL.replace("count: 4", "count: 54")  # as many viewpoints as a station of the paper's protocol has
+DENSE = PROTOCOL.replace("count: 4", "count: 54")  # as many viewpoints as a station of the paper's protocol
 AT_THE_LENS = PROTOCOL.replace("id: fixation", "id: camera_set_up")
-# A reader's keys: far faster than the test could press them, and the letters end in the field that has the focus.
+# A badge reader's keys: far faster than the test could press them; the letters end in the focused field.
 READ = """(badge) => {
     for (const key of badge) {
         const field = document.activeElement;
@@ -70,7 +70,7 @@ def box(found: Locator) -> FloatRect:
 
 
 def dense_run(data: Path) -> str:
-    """Its plan has 54 viewpoints on one arc, and nobody drives it."""
+    """A run that nobody drives, whose plan has 54 viewpoints on one arc."""
     rig = data.parent / "stations.yaml"
     rig.write_text(RIG)
     loaded = parse_protocol(DENSE.encode(), params_models(), name="dense.yaml")
@@ -79,7 +79,7 @@ def dense_run(data: Path) -> str:
 
 
 def where(page: Page, viewpoint: str) -> tuple[float, float]:
-    """The middle of a viewpoint's symbol on the screen."""
+    """The centre of a viewpoint's symbol on the screen."""
     x, y = page.evaluate(
         """(name) => {
             const group = document.querySelector(`g[data-viewpoint="${name}"]`);
@@ -93,7 +93,7 @@ def where(page: Page, viewpoint: str) -> tuple[float, float]:
 
 
 def apart_px(page: Page) -> float:
-    """How far two neighbours lie from each other on the screen."""
+    """The distance between two neighbours on the screen."""
     (x, y), (to_x, to_y) = where(page, "v027"), where(page, "v028")
     return float(np.hypot(to_x - x, to_y - y))
 
@@ -141,24 +141,24 @@ def test_the_plan_is_made_larger_until_a_finger_is_enough(server: Served, browse
         expect(word).to_have_text("16.0×")
         expect(larger).to_be_disabled()
         assert apart_px(page) == pytest.approx(16 * near, rel=0.01)
-        # News of the run does not take it away.
+        # A run update does not remove it.
         record(server, run_id, StepNote(step="capture", attempt=1, note="looked at", data={}))
         expect(page.locator("html[data-changed]")).to_be_attached(timeout=20_000)
         assert apart_px(page) == pytest.approx(16 * near, rel=0.01)
         page.get_by_role("button", name="The whole plan").click()
         assert apart_px(page) == pytest.approx(near, rel=0.01)
 
-        # The wheel: what is under the pointer stays there.
+        # With the wheel, the point under the pointer stays in place.
         at = where(page, "v027")
         page.mouse.move(*at)
         for _ in range(8):
             page.mouse.wheel(0, -100)
         expect(word).to_have_text(re.compile(r"^1\d\.\d×"))
-        assert where(page, "v027") == pytest.approx(at, abs=16)  # the pointer is on whole pixels, made larger
+        assert where(page, "v027") == pytest.approx(at, abs=16)  # the pointer is on whole pixels, magnified
         scrolled = page.evaluate("scrollY")
         page.get_by_role("button", name="The whole plan").click()
 
-        # Two fingers.
+        # Pinch with two fingers.
         devtools = page.context.new_cdp_session(page)
         x, y = where(page, "v027")
         for kind, reach in (("touchStart", 20), ("touchMove", 60), ("touchMove", 200), ("touchEnd", 0)):
@@ -167,10 +167,10 @@ def test_the_plan_is_made_larger_until_a_finger_is_enough(server: Served, browse
         expect(word).to_have_text(re.compile(r"^([89]|1\d)\.\d×"))
         assert page.evaluate("[scrollY, visualViewport.scale]") == [scrolled, 1], "the page itself stays"
         assert apart_px(page) > 24
-        # Now a finger meets one only.
+        # A finger now touches only one symbol.
         page.touchscreen.tap(*where(page, "v027"))
         expect(page).to_have_url(re.compile("viewpoint=v027"))
-        expect(word).not_to_have_text("1.0×")  # and the next one is as near
+        expect(word).not_to_have_text("1.0×")  # and the next one is just as close
 
 
 # --- a badge -----------------------------------------------------------------------------------------------------
@@ -202,12 +202,12 @@ def test_a_badge_held_to_the_reader_signs_and_leaves_nothing_in_the_fields(serve
         meaning.focus()
         page.keyboard.press("Control+End")
         words = meaning.input_value()
-        # A person's typing is none: it is slower, and Enter in a text is a new line.
+        # A person's typing is not a badge: it is slower, and Enter in a text is a new line.
         page.keyboard.type("123456", delay=150)
         page.keyboard.press("Enter")
         assert meaning.input_value() == f"{words}123456\n"
         meaning.fill(words)
-        page.evaluate(READ, "0004711816")  # somebody else's
+        page.evaluate(READ, "0004711816")  # somebody else's badge
         expect(page.get_by_text("Name and badge do not belong together")).to_be_visible(timeout=30_000)
         assert signed_by(server, run_id) == []
         assert meaning.input_value() == words
@@ -224,7 +224,7 @@ def test_a_pin_is_typed_on_the_screen(server: Served, browser: Browser) -> None:
         expect(dialog.get_by_label("Your password")).to_be_visible()
         dialog.get_by_text("PIN", exact=True).click()
         expect(dialog.get_by_label("Your PIN")).to_be_visible()
-        for digit in "2468":  # all of them in sight above the foot of the dialog
+        for digit in "2468":  # all of them are visible above the foot of the dialog
             key = dialog.get_by_role("button", name=digit, exact=True)
             assert min(box(key)["width"], box(key)["height"]) >= 48
             key.click()
@@ -241,7 +241,7 @@ def test_a_reason_is_chosen_or_written(server: Served, browser: Browser) -> None
         assert all(box(row)["height"] >= 48 for row in dialog.locator(".presets label").all())
         dialog.get_by_text("Another one, in these words").click()
         dialog.get_by_role("button", name="Skip the step").click()
-        expect(dialog).to_be_visible()  # the words are missing
+        expect(dialog).to_be_visible()  # the reason is missing
         dialog.get_by_text("A device is out of order").click()
         dialog.get_by_label("Reason").fill("the drill")
         dialog.get_by_role("button", name="Skip the step").click()
@@ -296,7 +296,7 @@ def test_the_lens_is_focused_by_the_live_view_of_its_step(server: Served, browse
                 for (let i = 0; i < d.length; i += 4) if (d[i] === 255 && d[i + 1] === 40 && d[i + 3] === 255) n += 1;
                 return n; }"""
         )
-        assert red > 0.8 * found  # the frame of the magnifier lies over some
+        assert red > 0.8 * found  # the magnifier's frame covers some
         frames.append(cv2.GaussianBlur(sharp, (0, 0), 6))
         expect(figure).to_have_text(re.compile(r"^[123]?\d %"), timeout=20_000)
         assert int(marks.get_attribute("data-found") or 0) < 0.5 * found
@@ -304,7 +304,7 @@ def test_the_lens_is_focused_by_the_live_view_of_its_step(server: Served, browse
         expect(figure).to_have_text(re.compile(r"^(9[5-9]|100) %"), timeout=20_000)
         panel.get_by_role("button", name="Mark sharp edges").click()
         expect(marks).to_have_attribute("data-found", "0")
-        # The magnifier shows what was touched, in pixels of the frame.
+        # The magnifier shows the touched area, in pixels of the frame.
         frames.append(np.where(np.arange(1024) < 512, 30, 220).astype(np.uint8)[None].repeat(680, 0))
         expect(panel.locator("[data-live-light]")).to_contain_text(
             "Mean 125 of 255; 0.0 % at the white end", timeout=20_000
@@ -319,7 +319,7 @@ def test_the_lens_is_focused_by_the_live_view_of_its_step(server: Served, browse
             assert page.evaluate(middle)[0] == pytest.approx(light, abs=3)
         frames.append(np.full((680, 1024), 255, np.uint8))
         expect(panel.locator("[data-live-light]")).to_contain_text("100.0 % at the white end", timeout=20_000)
-        # It belongs to this step.
+        # The event belongs to this step.
         step = OperatorAction(action="skip", step="camera_set_up", reason="focused the day before")
         record(server, run_id, step)
         expect(panel).to_be_hidden(timeout=20_000)
@@ -349,7 +349,7 @@ def test_shortcuts_lead_to_everything_and_move_nothing(server: Served, browser: 
         assert end.get_by_label("Reason").input_value() == "p e ?"
         page.keyboard.press("Escape")
         expect(end).to_be_hidden()
-        # What types by itself releases nothing.
+        # Automatic typing does not release the shutter.
         page.evaluate(READ, "e001e")
         page.wait_for_timeout(400)
         expect(end).to_be_hidden()

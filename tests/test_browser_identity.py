@@ -1,4 +1,4 @@
-"""A technician at a tablet: fills in the start form, takes a note with a photograph, finds the run again."""
+"""A technician at a tablet fills in the start form, takes a note with a photograph, and finds the run again."""
 
 from __future__ import annotations
 

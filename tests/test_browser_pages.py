@@ -1,4 +1,4 @@
-"""Every page in a real browser: accessible, nothing cut off or too small, led by keys alone, without script too."""
+"""Every page in a real browser: accessible, not cut off, large enough, usable by keyboard, also without script."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ACCOUNTS: dict[Role, str] = {
     "auditor": "lise",
     "administrator": "ada",
 }
-# Route → who looks, and what at: {completed} and so on are runs of ShownSite. Several addresses where they differ.
+# Route → who looks, and at which pages: {completed} etc. are runs of ShownSite. Several addresses if they differ.
 PAGES: dict[str, tuple[tuple[Role | None, str], ...]] = {
     "/sign-in": ((None, "/sign-in"),),
     "/set-up/{token}": ((None, "/set-up/{link}"),),
@@ -89,7 +89,7 @@ PAGES: dict[str, tuple[tuple[Role | None, str], ...]] = {
     "/audit/site": (("auditor", "/audit/site"),),
     "/audit/site/events/{seq}": (("auditor", "/audit/site/events/2"),),
 }
-# What a GET answers with that is no page of its own.
+# GET routes that are not pages.
 NO_PAGES = {
     "/vendor/plotly.js",
     "/health",  # for machines
@@ -115,7 +115,7 @@ VIEWS = [view for views in PAGES.values() for view in views]
 
 @dataclass
 class Desk:
-    """One browser, one server, a screen for every role that was needed."""
+    """One browser, one server, and a screen for each role used."""
 
     browser: Browser
     server: Served
@@ -126,7 +126,7 @@ class Desk:
     complaints: list[str] = field(default_factory=list[str])
 
     def screen(self, role: Role | None) -> Screen:
-        """A tablet with somebody of that role before it; the technician's has control of the runs under way."""
+        """A tablet with a person of that role; the technician's controls the runs in progress."""
         if role not in self.screens:
             shown = self.open_screens.enter_context(screen(self.browser, self.server.url))
             self.screens[role] = shown
@@ -146,7 +146,7 @@ class Desk:
 
     @contextmanager
     def attending(self, path: str) -> Generator[str]:
-        """The address; if it is of a run under way, that run is driven meanwhile, as the only one of its rig."""
+        """Yield the address; the run in progress to which it belongs is driven meanwhile, alone on its rig."""
         address = self.address(path)
         runs = {run_id: STANDING for run_id in self.site.under_way if run_id in address}
         if self.site.calibrated in runs:
@@ -197,7 +197,7 @@ def test_no_page_is_forgotten(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("role", "path"), VIEWS, ids=[f"{role}:{path}" for role, path in VIEWS])
 def test_page(desk: Desk, role: Role | None, path: str) -> None:
-    """One load: axe, sizes, sideways scrolling, keys, and what the page asked for and complained of."""
+    """One load: axe, sizes, horizontal scrolling, keys, and the page's requests and complaints."""
     shown = desk.screen(role)
     page = shown.page
     page.emulate_media(color_scheme="light")
@@ -210,7 +210,7 @@ def test_page(desk: Desk, role: Role | None, path: str) -> None:
 
 
 def page_faults(page: Page) -> list[str]:
-    """What is wrong with the page that is loaded."""
+    """The faults of the loaded page."""
     page.evaluate(CHECKS)
     faults = [f"light tablet: {fault}" for fault in accessibility_faults(page)]
     faults += [f"too small: {fault}" for fault in page.evaluate("check.small()")]
@@ -225,9 +225,9 @@ def page_faults(page: Page) -> list[str]:
 
 
 def tab_faults(page: Page) -> list[str]:
-    """Controls that Tab does not reach, that do not show the focus, or that come out of turn."""
+    """Controls that Tab does not reach, that show no focus, or that come out of order."""
     count, faults = page.evaluate("check.follow()"), []
-    for _ in range(6):  # a date has several stops, and a frame has controls of its own
+    for _ in range(6):  # a date has several stops, and a frame has its own controls
         for _ in range(count + 3):
             page.keyboard.press("Tab")
         faults = page.evaluate("check.way()")
@@ -336,7 +336,7 @@ def test_a_checklist_is_worked_through_without_script(desk: Desk) -> None:
 
 
 def test_a_page_that_cannot_fetch_the_news_says_so_and_goes_on_trying(desk: Desk) -> None:
-    """A run that waits for a person tells nothing more: what a page misses once it would never show."""
+    """A run that waits for a person sends no more updates, so a page would never show one that it missed."""
     asked: list[Route] = []
     repaired = threading.Event()
 
@@ -354,7 +354,7 @@ def test_a_page_that_cannot_fetch_the_news_says_so_and_goes_on_trying(desk: Desk
         shown.go(f"/runs/{run}")
         banner = shown.page.locator("#robot-banner")
         expect(banner).to_contain_text(re.compile("stands", re.IGNORECASE))
-        shown.page.wait_for_timeout(1_000)  # for the page's own first look
+        shown.page.wait_for_timeout(1_000)  # for the page's own first request
         shown.page.route("**/parts/**", answer)
         fields.update(WORKING)
         lost = shown.page.get_by_text("Connection lost")
@@ -365,7 +365,7 @@ def test_a_page_that_cannot_fetch_the_news_says_so_and_goes_on_trying(desk: Desk
 
 
 def actions(desk: Desk, run_id: str) -> list[str]:
-    """What people have done in the run, skipped steps apart."""
+    """What people have done in the run, except for skipped steps."""
     with Store.open(desk.server.data) as store:
         payloads = [event.payload for event in store.events(run_id)]
     return [p.action for p in payloads if isinstance(p, OperatorAction) and p.action != "skip"]
@@ -373,7 +373,7 @@ def actions(desk: Desk, run_id: str) -> list[str]:
 
 @contextmanager
 def plain_page(browser: Browser, url: str) -> Generator[Page]:
-    """A browser whose owner has switched script off."""
+    """A browser with scripts disabled."""
     context = browser.new_context(
         viewport={"width": TABLET[0], "height": TABLET[1]}, java_script_enabled=False, base_url=url
     )

@@ -1,4 +1,4 @@
-"""The report as a browser shows it: the scene turns, and on paper its drawing stands there."""
+"""The report in a browser: the scene can be turned, and on paper its drawing replaces it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.support.reported_run import record_reported_run
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Generator[Page]:
-    """The report of a registered run, from a file, without any network."""
+    """The report of a registered run, from a file and without network."""
     folder = tmp_path_factory.mktemp("report")
     record_reported_run(folder, registered=True)
     run = read_run(folder / "data", "latest")

@@ -60,7 +60,7 @@ def server(rig: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture(scope="module")
 def people(server: Served, browser: Browser) -> None:
-    """Set-up as it happens: a one-time link for the administrator, who invites the others."""
+    """Set up the people as in practice: a one-time link for the administrator, who invites the others."""
     with screen(browser, server.url) as first:
         page = first.page
         page.goto(server.set_up)
@@ -87,7 +87,7 @@ def people(server: Served, browser: Browser) -> None:
                 fill_secrets(own.page)
                 own.page.get_by_role("button", name=re.compile("Set up|account", re.IGNORECASE)).click()
                 expect(own.page.get_by_text("The account is ready")).to_be_visible()
-                # The link works once.
+                # The link works only once.
                 assert own.page.goto(link).status in (404, 409, 410)  # type: ignore[union-attr]
 
 
@@ -99,7 +99,7 @@ def fill_secrets(page: Page) -> None:
 
 
 def start(tablet: Screen) -> str:
-    """A run of the short protocol; its name."""
+    """Begin a run of the short protocol; returns its id."""
     tablet.go("/")
     tablet.page.get_by_role("button", name="Start A short protocol").click()
     tablet.page.get_by_role("button", name="Start the run").click()
@@ -125,13 +125,13 @@ def confirm_list(page: Page) -> None:
 
 
 def captured(server: Served, run: str) -> list[ViewpointCaptured]:
-    """The viewpoints in the evidence by now."""
+    """The viewpoints recorded so far."""
     with Store.open(server.data, create=False) as store:
         return [e.payload for e in store.events(run) if isinstance(e.payload, ViewpointCaptured)]
 
 
 def images(page: Page, run: str) -> int:
-    """How many images the run has, as another page of the same browser reads it."""
+    """The number of the run's images, as read by another page of the same browser."""
     return page.evaluate(
         """async (run) => {
             const text = await (await fetch(`/audit/runs/${run}/artefacts?kind=image`)).text();
@@ -153,7 +153,7 @@ def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
         assert accessibility_faults(page) == []
         confirm_list(page)
 
-        # The robot moves only for somebody who holds the button long enough; by key as well as by hand.
+        # The robot moves only if the button is held long enough, by hand or by key.
         go = page.get_by_role("button", name="Confirm: the robot takes 8 images at station 1")
         expect(go).to_be_visible(timeout=LONG_MS)
         go.click()
@@ -166,13 +166,13 @@ def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
         page.keyboard.up("Enter")
         expect(page.get_by_text("Working").first).to_be_visible(timeout=LONG_MS)
 
-        # Pause is told as done once the arm stands still.
+        # The pause is reported once the arm stands still.
         expect(page.get_by_text(re.compile(r"[2-7] of 8")).first).to_be_visible(timeout=LONG_MS)
         page.get_by_role("button", name="Pause").click()
         expect(page.get_by_role("heading", name="Paused. The robot stands still.")).to_be_visible(timeout=LONG_MS)
         assert accessibility_faults(page) == []
 
-        # A viewpoint is taken again, with a reason; the earlier image stays in the record.
+        # A viewpoint is retaken, with a reason; the earlier image stays in the record.
         tablet.go(f"/runs/{run}/capture")
         page.locator("#sheet, .sheet, main").last.get_by_role("link", name=re.compile("v1_001")).last.click()
         page.get_by_text("Redo v1_001…").click()
@@ -200,7 +200,7 @@ def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
         confirm_list(page)
         expect(page.get_by_role("heading", name="The run is complete")).to_be_visible(timeout=LONG_MS)
 
-        # Who took part cannot release it, and nothing leaves before somebody has.
+        # People who took part cannot release the run, and nothing is exported before its release.
         tablet.go(f"/runs/{run}/exports")
         expect(page.get_by_role("button", name="Sign and release")).to_have_count(0)
 
@@ -215,7 +215,7 @@ def test_a_technician_is_led_through_a_run_and_a_second_person_releases_it(
         page.get_by_role("button", name="Evidence bundle").click()
         expect(page.get_by_role("link", name=re.compile("SIMULATED.*zip")).first).to_be_visible(timeout=LONG_MS)
 
-        # One altered byte: the evidence fails, and with it every further export.
+        # One altered byte: the evidence fails, and every further export with it.
         photograph = max(
             (path for path in (server.data / "artefacts").rglob("*") if path.is_file()),
             key=lambda p: p.stat().st_size,
@@ -264,19 +264,19 @@ def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a
         expect(second.page.get_by_text("Tina Example has control")).to_be_visible()
         expect(second.page.get_by_role("button", name=re.compile("Confirm"))).to_have_count(0)
 
-        # What one ticks, the other sees; a reload restores it.
+        # What one screen ticks, the other shows; a reload restores it.
         first.page.get_by_role("checkbox").nth(1).click()
         expect(second.page.get_by_text("done", exact=True)).to_have_count(2, timeout=LONG_MS)
         first.page.reload()
         expect(first.page.locator("[aria-checked=true]")).to_have_count(2)
 
-        # Control is asked for and handed over.
+        # Control is requested and handed over.
         second.page.get_by_role("button", name="Ask for control").click()
         first.page.get_by_role("button", name="Hand over").click()
         expect(first.page.locator("main").get_by_text("Tom Example has control")).to_be_visible(timeout=LONG_MS)
         confirm_list(second.page)
 
-        # The connection of one tablet is lost: it says so, its controls are off; the other goes on.
+        # One tablet loses its connection: it says so and disables its controls; the other goes on.
         go = second.page.get_by_role("button", name="Confirm: the robot takes 8 images")
         expect(go).to_be_enabled(timeout=LONG_MS)
         cable.cut()
@@ -286,15 +286,15 @@ def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a
         expect(second.page.get_by_text("Connection lost")).to_be_hidden(timeout=LONG_MS)
         expect(go).to_be_enabled()
 
-        # The foot pedal takes the same way as the button; one press shows, two move.
+        # The foot pedal acts like the button: one press arms, two move the robot.
         press_pedal(rig["world"])
         expect(second.page.get_by_text("Foot pedal pressed once").first).to_be_visible(timeout=LONG_MS)
-        second.page.wait_for_timeout(800)  # less would be a bounce
+        second.page.wait_for_timeout(800)  # a shorter pause would be a bounce
         press_pedal(rig["world"])
         expect(second.page.get_by_text("Working").first).to_be_visible(timeout=LONG_MS)
 
-        # The web process is killed in the middle of the capture: the runner does not notice.
-        # Read from the evidence: quicker than a page on a busy machine.
+        # The web process is killed in the middle of the capture: the runner is not affected.
+        # Read from the evidence, which is faster than a page on a busy machine.
         until(lambda: len(captured(server, run)) >= 2, server.log)
         server.kill(signal.SIGKILL)
         assert len(captured(server, run)) < 8, "the capture was over before the web process was killed"
@@ -306,7 +306,7 @@ def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a
         assert images(second.page, run) == 8
         confirm_list(second.page)
 
-        # The runner dies: the screen says so and what is safe, and starts it again when told to.
+        # The runner dies: the screen says so and what is safe, and restarts it on request.
         expect(second.page.get_by_role("heading", name="Remove the control spheres")).to_be_visible(timeout=LONG_MS)
         runner = json.loads((server.data / "monitor" / f"{run}.json").read_text())["pid"]
         os.kill(runner, signal.SIGKILL)
@@ -314,7 +314,7 @@ def test_two_tablets_a_lost_connection_and_a_killed_web_process_do_not_disturb_a
         second.page.get_by_role("button", name="Go on").click()
         expect(second.page.get_by_text("Everything captured is safe")).to_have_count(0, timeout=LONG_MS)
 
-        # The screen is left alone with the run open: a PIN brings it back, and the page was readable meanwhile.
+        # A screen is left with the run open: a PIN unlocks it, and the page was readable meanwhile.
         second.page.get_by_role("button", name="Lock").click()
         expect(second.page.get_by_label("PIN")).to_be_visible()
         second.page.get_by_label("PIN").fill(PIN)

@@ -1,4 +1,4 @@
-"""What the robot does stays in sight, in a real browser: however far a page is scrolled, whatever step comes up."""
+"""The robot's state stays visible in a real browser, however far a page is scrolled and whatever step comes up."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("sight")
-    with web_site(folder):  # its people
+    with web_site(folder):  # creates its people
         pass
     with served(folder / "rig.yaml", folder / "data", "--protocols", str(folder / "protocols")) as running:
         yield running
 
 
 def in_sight(page: Page, selector: str) -> bool:
-    """Whether all of an element lies in the window, and nothing over its middle."""
+    """Whether an element lies entirely in the window and nothing covers its centre."""
     return page.evaluate(
         """(selector) => {
             const e = document.querySelector(selector), b = e.getBoundingClientRect();
@@ -61,7 +61,7 @@ def test_the_banner_stays_and_a_new_step_begins_at_its_head(server: Served, brow
         assert scrolled(page) == 0
         assert in_sight(page, "#robot-banner .robot-banner")
         assert in_sight(page, ".step-head h1")
-        # The same where the step stops: what happened is above what can be done about it.
+        # The same for a stopped step: what happened is above what can be done about it.
         page.evaluate("window.scrollTo(0, 900)")
         page.get_by_role("button", name="Pause").focus()
         failed = StepFailed(step="capture", attempt=1, error="DeviceError", message="no link", recovery="ask")
@@ -113,7 +113,7 @@ def test_sound_and_notification_are_by_choice(server: Served, browser: Browser) 
         expect(choice).to_have_attribute("aria-pressed", "false")
         choice.click()
         expect(choice).to_have_attribute("aria-pressed", "true")
-        assert page.evaluate("heard.length") > 0  # how it sounds
+        assert page.evaluate("heard.length") > 0  # it sounds
         page.evaluate("heard.length = 0")
         failed = StepFailed(step="capture", attempt=1, error="DeviceError", message="no link", recovery="ask")
         go = OperatorAction(action="confirm", step="capture")
@@ -122,6 +122,6 @@ def test_sound_and_notification_are_by_choice(server: Served, browser: Browser) 
         assert page.evaluate("heard") == [880, 440, 880, 440]
         assert page.evaluate("noted") == [["Stopped: Capture: No link → look at the device.", f"Run {run_id}"]]
         expect(page).to_have_title(re.compile("^Stopped: Capture: No link"))
-        # The choice is the screen's: another page of it tells as well, here that the run has ended.
+        # The choice belongs to the screen: another page of it also reports, here that the run has ended.
         tablet.go("/account")
         expect(page.get_by_role("button", name="Alerts")).to_have_attribute("aria-pressed", "true")

@@ -1,4 +1,4 @@
-"""Tablet and paper, in a real browser: how much the step has of the screen, what keeps its place, links, paper."""
+"""Tablet and paper in a real browser: the step's share of the screen, stable positions, links, printing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("tablet")
-    with web_site(folder):  # its people
+    with web_site(folder):  # creates its people
         pass
     with served(folder / "rig.yaml", folder / "data", "--protocols", str(folder / "protocols")) as running:
         yield running
@@ -43,13 +43,13 @@ def box(page: Page, selector: str) -> FloatRect:
 def test_the_step_has_most_of_a_small_screen(
     server: Served, browser: Browser, size: tuple[int, int], least_px: int
 ) -> None:
-    """451 of 768 px and 479 of 800 px (59 and 60 %); at 768 px it was 250 to 390 px, by step and state."""
+    """451 of 768 px and 479 of 800 px (59 and 60 %); at 768 px it was once 250 to 390 px, by step and state."""
     with at_the_table(server, browser, size) as (tablet, _run_id):
         page = tablet.page
         own_px = box(page, ".part-actions")["y"] - box(page, ".step-head")["y"]
         assert own_px >= least_px
         assert own_px / size[1] > 0.5
-        # What is pressed with gloves keeps its size, and what the robot does stays in sight.
+        # Buttons for gloved hands keep their size, and the robot's state stays visible.
         assert box(page, ".main-action button")["height"] >= 100
         assert box(page, "#robot-banner .robot-banner")["height"] >= 48
 

@@ -1,4 +1,4 @@
-"""Five tasks by somebody who reads only the page: how many clicks each takes is stated in docs/screens/tasks.md."""
+"""Five tasks by somebody who knows only the page; the clicks that each takes are stated in docs/screens/tasks.md."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STATED = REPOSITORY / "docs" / "screens" / "tasks.md"
 
 @dataclass
 class Person:
-    """Somebody before a screen, whose touches and words typed are counted, and the seconds of each task."""
+    """A person at a screen, whose clicks, typed fields and seconds per task are counted."""
 
     tablet: Screen
     page: Page = field(init=False)
@@ -38,13 +38,13 @@ class Person:
         self.page = self.tablet.page
 
     def click(self, button: Locator) -> None:
-        """Press what is in sight, once it can be pressed."""
+        """Press a visible button once it is enabled."""
         expect(button).to_be_enabled(timeout=LONG_MS)
         button.click()
         self.clicks += 1
 
     def hold(self, button: Locator) -> None:
-        """Press what lets the robot move, until it says that it was held; again where the page changed meanwhile."""
+        """Hold the button that moves the robot until it reports success; again if the page changed meanwhile."""
         held = button.locator("xpath=self::*[contains(@class, 'held')]")
         for _ in range(3):
             expect(button).to_be_enabled(timeout=LONG_MS)
@@ -58,7 +58,7 @@ class Person:
         self.clicks += 1
 
     def _taken(self, button: Locator) -> bool:
-        """Whether the page goes on, within ten seconds."""
+        """Whether the page goes on within ten seconds."""
         for _ in range(50):
             if button.and_(self.page.locator(":not(:disabled)")).count() == 0:
                 return True
@@ -71,7 +71,7 @@ class Person:
         self.fields += 1
 
     def tick_all(self) -> None:
-        """A checklist, from its first item to its last."""
+        """Tick every item of a checklist, in order."""
         unticked = self.page.locator("[role=checkbox][aria-checked=false]:not([disabled])")
         expect(unticked.first).to_be_visible(timeout=LONG_MS)
         while left := unticked.count():
@@ -85,13 +85,13 @@ class Person:
 
 @dataclass
 class Tasks:
-    """What was measured: clicks, fields filled in and seconds of each task."""
+    """The measurements: clicks, fields and seconds of each task."""
 
     measured: dict[str, tuple[int, int, float]] = field(default_factory=dict[str, tuple[int, int, float]])
 
     @contextmanager
     def task(self, name: str, person: Person) -> Generator[None]:
-        """Measure what the person does inside; at the end the page says what to do next."""
+        """Measure what the person does inside the block; at its end the page says what to do next."""
         clicks, fields, began_s = person.clicks, person.fields, time.monotonic()
         yield
         seconds = time.monotonic() - began_s
@@ -120,7 +120,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def _protocols(folder: Path) -> Path:
-    """Steps of demo.yaml: too few board poses for the calibration, and a gate that only a supervisor lets pass."""
+    """Steps of demo.yaml, with too few board poses for the calibration, and a gate that only supervisors accept."""
     protocol = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     steps: dict[str, dict[str, Any]] = {step["id"]: step for step in protocol["steps"]}
     calibration, capture = steps["camera_calibration"], steps["viewpoint_capture_1"]
@@ -148,7 +148,7 @@ def stated() -> dict[str, tuple[int, int]]:
 
 
 def failed(page: Page) -> Locator:
-    """What the page says when figures are outside their limits."""
+    """The page's message when figures are outside their limits."""
     return page.locator(".notice-stop.stopped")
 
 

@@ -1,4 +1,4 @@
-"""The error budget: closures are near 1 when the stated errors are right, and say by how much they are wrong."""
+"""The error budget: closures are near 1 if the stated errors are right, and otherwise show the factor."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SIGMA_M = 0.02e-3
 
 
 def measured(centres: Any, seed: int, sigma_m: float = SIGMA_M, stated_m: float = SIGMA_M) -> MeasuredSpheres:
-    """Centres as an instrument gives them: in error by `sigma_m`, said to be by `stated_m`."""
+    """Centres as measured by an instrument: with errors of `sigma_m`, stated as `stated_m`."""
     noise = np.random.default_rng(seed).normal(size=np.shape(centres)) * sigma_m
     return MeasuredSpheres(centres + noise, np.tile(np.eye(3) * stated_m**2, (len(centres), 1, 1)), 0.03e-3)
 

@@ -1,4 +1,4 @@
-"""Evidence bundles, and the verifier that goes along with them: everything that is changed is named."""
+"""Evidence bundles and their stand-alone verifier: every change is named."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ RECORDS = ("events.jsonl", "site_events.jsonl", "artefacts.jsonl", "jobs.jsonl",
 
 @dataclass(frozen=True)
 class Site:
-    """A data folder with a completed run, its bundle, and the bundle unpacked."""
+    """A data folder with a completed run, and its bundle, packed and unpacked."""
 
     data: Path
     run_id: str
@@ -83,14 +83,14 @@ def unpacked(site: Site, tmp_path: Path) -> Path:
 
 
 def check(path: Path, **options: Any) -> list[str]:
-    """What the verifier names, called in this process."""
+    """The faults that the verifier names when called in this process."""
     found = bundle_verifier.Check()
     found.run(path, options.get("key"), options.get("certificates"))
     return [f"{fault['where']}: {fault['what']}" for fault in found.faults]
 
 
 def run_verifier(script: Path, *arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """As somebody runs it elsewhere: nothing of this project can be imported."""
+    """Run the verifier as elsewhere: nothing of this project can be imported."""
     words = [sys.executable, "-I", str(script), *arguments]
     return subprocess.run(words, cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
 
@@ -250,7 +250,7 @@ def test_nothing_leaves_before_a_second_person_has_released_it(tmp_path: Path) -
             export_bundle(store, run_id, tmp_path / "b.zip", actor="ada")
         completed = store.events(run_id)[-1]
         released = RunReleased(meaning="read and released", signed_sha256=completed.sha256)
-        store.record(run_id, [released], actor="Ada")  # took part: without effect
+        store.record(run_id, [released], actor="Ada")  # she took part in the run, so this has no effect
         with pytest.raises(IllegalTransitionError):
             export_bundle(store, run_id, tmp_path / "b.zip", actor="ada")
         store.record(run_id, [released], actor="Grace H.")
@@ -328,7 +328,7 @@ def test_every_missing_file_is_named_and_every_other_too(unpacked: Path) -> None
 
 
 def seal(folder: Path) -> None:
-    """Make the manifest fit again, without the key: everything but its signature then holds."""
+    """Make the manifest consistent without the key: then only its signature is invalid."""
     crate = json.loads((folder / "ro-crate-metadata.json").read_text())
     for entity in crate["@graph"]:
         if "sha256" in entity and (folder / entity["@id"]).is_file():
@@ -347,7 +347,7 @@ def change_lines(path: Path, change: Callable[[list[dict[str, Any]]], None]) -> 
 
 
 def rewrite(records: list[dict[str, Any]]) -> None:
-    """Another person from the third event on, with every hash and link made to fit."""
+    """Change the person from the third event on, and make every hash and link consistent."""
     previous = ""
     for event in records[2:]:
         event["actor"] = "Eve" if not previous else event["actor"]
@@ -405,7 +405,7 @@ def test_another_spelling_of_a_record_is_named(unpacked: Path) -> None:
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where something stands within a record."""
+    """The paths of all values within a record."""
     if path:
         yield path
     if isinstance(value, dict | list):
@@ -435,7 +435,7 @@ def test_any_value_of_any_kind_in_any_place_is_named_and_breaks_nothing(unpacked
         found = check(unpacked)
         said = [fault for fault in found if not fault.startswith("manifest.json, manifest.sig")]
         assert found, (path.name, number, way, last)
-        # Of jobs and keys the chain says the most; the rest of their rows only the manifest covers.
+        # Jobs and keys are mostly covered by the chain; the rest of their rows only by the manifest.
         assert said or path.name in ("jobs.jsonl", "keys.jsonl"), (path.name, number, way, last)
         for name, content in before.items():
             (unpacked / name).write_bytes(content)
@@ -458,7 +458,7 @@ def test_a_forged_site_is_found_by_its_fingerprint_only(site: Site, tmp_path: Pa
         forged = export_bundle(store, run_id, tmp_path / "forged.zip", actor="ada").path
         own = public_keys(store)
     assert check(forged) == []
-    assert check(forged, key=own[0].key_id) == []  # an older key that vouches for the present one
+    assert check(forged, key=own[0].key_id) == []  # an older key that vouches for the current one
     assert check(forged, key=":".join(own[1].key_id[i : i + 2].upper() for i in range(0, 64, 2))) == []
     (fault,) = check(forged, key=site.key_id)
     assert "knows no key" in fault

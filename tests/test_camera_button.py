@@ -35,7 +35,7 @@ def _world() -> Generator[tuple[World, str]]:
 
 
 def _open_when_ready(camera: Camera) -> None:
-    """A body that still builds its scene leaves the client without an answer for longer than that waits."""
+    """Retry, because a camera that is still building its scene answers later than the client waits."""
     for _ in range(30):
         camera.open()
         try:
@@ -79,7 +79,7 @@ def test_an_image_announced_while_the_camera_is_asked_something_else_is_not_lost
 ) -> None:
     world, camera = held
     world.press_shutter(Press())
-    for _ in range(30):  # longer than an exposure takes: its announcement comes in between
+    for _ in range(30):  # longer than an exposure takes, so that its announcement arrives in between
         camera.report()
         time.sleep(0.1)
     (image,) = camera.released_images(tmp_path, 90.0)

@@ -1,4 +1,4 @@
-"""What is not known of the camera is in the uncertainty of what is computed with it: hand-eye and camera poses."""
+"""The camera's calibration uncertainty is included in the stated uncertainty of hand-eye and camera poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NAMES = ("fx", "fy", "cx", "cy")
 
 def _known(sigma_f_px: float, sigma_c_px: float) -> CameraCovariance:
     matrix = np.diag(np.square([sigma_f_px, sigma_f_px, sigma_c_px, sigma_c_px]))
-    matrix[0, 1] = matrix[1, 0] = 0.99 * sigma_f_px**2  # both focal lengths err alike
+    matrix[0, 1] = matrix[1, 0] = 0.99 * sigma_f_px**2  # the errors of both focal lengths are correlated
     return CameraCovariance(NAMES, matrix)
 
 
@@ -55,7 +55,7 @@ def test_hand_eye_states_what_another_calibration_of_the_camera_would_change() -
 
 
 def _adjusted(tracks: Tracks, poses: Array, camera: CameraModel) -> State:
-    """Poses and points at the least squares of the tracks, the camera held."""
+    """Poses and points that minimise the reprojection errors of the tracks, with the camera held fixed."""
     state, data = State(poses, tracks.points, np.empty((0, 4, 4)), camera), Data(tracks)
     for _ in range(25):
         normal = normal_equations([linearise(state, data, Sigmas())["tracks"]])

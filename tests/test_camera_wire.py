@@ -1,4 +1,4 @@
-"""The simulated camera as python-gphoto2 sees it, each on its own side of a socket."""
+"""The simulated camera as seen by python-gphoto2, over a socket."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_settings_are_set_and_survive_a_session(camera: RunningCamera, widget: s
 
 
 def test_the_focal_position_is_read_and_moved_by_hand_in_manual_focus_only(camera: RunningCamera) -> None:
-    """Read-only, 0 to 100; `manualfocus` moves it by steps of the client's own scale."""
+    """Read-only, 0 to 100; `manualfocus` moves it by steps on the client's own scale."""
     before, refused, *_ = vendor_session(
         camera.gphoto_port,
         ["value", "focalposition"],
@@ -85,7 +85,7 @@ def test_the_focal_position_is_read_and_moved_by_hand_in_manual_focus_only(camer
 
 
 def test_an_empty_value_is_refused_and_the_link_goes_on(camera: RunningCamera) -> None:
-    """What libgphoto2 sends for `capturetarget` by its name is a data phase of nothing."""
+    """libgphoto2 sends an empty data phase for `capturetarget` set by name."""
     words = (["set", "capturetarget", "card+sdram"], ["value", "cameramodel"], ["set", "iso", "200"])
     refused, model, seconds = vendor_session(camera.gphoto_port, *words)
     assert refused["error"] < 0
@@ -94,7 +94,7 @@ def test_an_empty_value_is_refused_and_the_link_goes_on(camera: RunningCamera) -
 
 
 def test_a_value_that_is_not_offered_is_refused_and_nothing_changes(camera: RunningCamera) -> None:
-    # The client reads a setting from its cache for two seconds.
+    # The client caches a setting for two seconds.
     words = (["set", "iso", "100"], ["set", "iso", "123"], ["sleep", 2.2], ["value", "iso"])
     answers = vendor_session(camera.gphoto_port, *words)
     assert answers[1] == {"error": -2}
@@ -105,7 +105,7 @@ def test_settings_take_no_delayed_acknowledgements() -> None:
     with camera_simulator() as camera:
         steps = [["set", "iso", value] for value in ("100", "200") * 6]
         times_s = vendor_session(camera.gphoto_port, *steps)
-    # Without TCP_QUICKACK every one takes 44 ms: half of them may lose their slice of a busy machine.
+    # Without TCP_QUICKACK each takes 44 ms; on a busy machine up to half of them may be delayed.
     assert sorted(times_s)[len(times_s) // 2] < 0.02
 
 
@@ -215,7 +215,7 @@ def test_init_can_be_refused() -> None:
 
 @contextmanager
 def world_socket(answer: dict[str, Any]) -> Generator[str]:
-    """Answers every line with the same JSON object; yields its HOST:PORT."""
+    """Answer every line with the same JSON object; yields its HOST:PORT."""
 
     class Handler(socketserver.StreamRequestHandler):
         def handle(self) -> None:

@@ -1,4 +1,4 @@
-"""`manual_capture` with a camera without a cable: a person follows the words, his photographs come as files."""
+"""`manual_capture` with a camera without a cable: a person follows the words, and photographs arrive as files."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class CardPerson(Person):
 
     folder: Path = Path()
     watch: PhotoWatch | None = None
-    began: datetime = field(default_factory=lambda: datetime.now(UTC))  # of the step, from the first words on
+    began: datetime = field(default_factory=lambda: datetime.now(UTC))  # start of the step, from its first words on
 
     def read(self, message: str) -> None:
         if not message.startswith("next: "):
             return
-        self.rig.card = self.watch  # the robot's images, of the calibration, came through the cable
+        self.rig.card = self.watch  # the robot's calibration images came through the cable
         self.presses += 1
         if self.presses == 1:
             self.began = datetime.now(UTC)
@@ -50,14 +50,14 @@ class CardPerson(Person):
         put(self.folder, f"DSC{self.presses:05d}.JPG", self.file(self.presses, 400 if mishap == "dial" else 100))
 
     def file(self, number: int, iso: int = 100) -> bytes:
-        """Of one press."""
+        """The file of one press."""
         return photograph(number, self.began + timedelta(seconds=number), iso=iso)
 
 
 def card_run(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, folder: Path, mishaps: dict[int, str]
 ) -> tuple[Bench, CardPerson]:
-    """The run of tests.support.held_run with a folder for a camera."""
+    """The run of tests.support.held_run with a folder as camera."""
     card = folder / "card"
     card.mkdir()
 
@@ -108,7 +108,7 @@ def test_after_a_restart_nothing_is_taken_twice_and_nothing_is_lost(
     assert len(bench.payloads(ViewHeld)) == 3
     bench.operator.on_show = serve
     assert isinstance(bench.rig.card, PhotoWatch)
-    bench.rig.card.open()  # as the next process does: it finds all four in the folder
+    bench.rig.card.open()  # as the next process does; it finds all four in the folder
     assert bench.run().status == "completed"
     found = [Path(view.found_at).name for view in bench.payloads(ViewHeld)]
     assert found == [f"DSC{n:05d}.JPG" for n in range(1, person.presses + 1)]

@@ -1,4 +1,4 @@
-"""The checklist to print: everything of a protocol that hands need, from the start page and from a run."""
+"""The printable checklist: all manual work of a protocol, from the start page and from a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command line: what it prints, what it refuses, and its exit status."""
+"""The command line: its output, refusals and exit status."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ COMMANDS = (
 
 
 def invoke(*arguments: object) -> Result:
-    """The command's output and exit status; anything but an exit is a defect."""
+    """Run the command; any exception other than an exit is a defect."""
     result = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
     assert "Traceback" not in result.output
     return result
 
 
 def answer_of(result: Result) -> Any:
-    """What --json printed: one line."""
+    """The single line that --json printed."""
     (line,) = result.stdout.splitlines()
     return json.loads(line)
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
-    """A data folder, a completed run, and a later one that has just begun."""
+    """A data folder with a completed run and a later one that has just begun."""
     folder = tmp_path_factory.mktemp("recorded")
     return folder / "data", *record_runs(folder)
 
@@ -302,13 +302,13 @@ def test_doctor_says_what_is_missing(tmp_path: Path) -> None:
 
 
 def test_doctor_says_that_the_library_of_an_arm_is_not_installed(tmp_path: Path) -> None:
-    absent = tmp_path / "absent"  # stands before the installed library, as if there were none
+    absent = tmp_path / "absent"  # hides the installed library, as if there were none
     absent.mkdir()
     for name in ("dashboard_client", "rtde_control"):
         (absent / f"{name}.py").write_text(f"raise ModuleNotFoundError('no {name}', name='{name}')\n")
     rig = tmp_path / "rig.yaml"
     rig.write_text("name: bare\ndevices:\n  robot: {driver: ur, host: 127.0.0.9}\n")
-    # In a process of its own: this one may have loaded the library for another test.
+    # In a separate process, because this one may already have imported the library.
     done = subprocess.run(
         [COMMAND, "doctor", "--rig", str(rig), "--data", str(tmp_path / "data"), "--json"],
         env={**os.environ, "PYTHONPATH": str(absent)},

@@ -1,4 +1,4 @@
-"""Clocks: every offset that a run knows of, recorded, shown, scraped, and told where it is beyond its limit."""
+"""Clocks: every known offset of a run is recorded, shown and scraped, and reported when it exceeds its limit."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def opened(device: str, kind: str, offset_s: float | None, **more: object) -> De
 
 
 def readings(tmp_path: Path, *payloads: Payload | tuple[float, Payload]) -> dict[str, ClockReading]:
-    """Of a run of these events; a number before one is a time to wait (s)."""
+    """The clock readings of a run with these events; a number before an event is a wait (s)."""
     clock = SteppedClock()
     with Store.open(tmp_path / "data", clock) as store:
         run_id = start_run(store)
@@ -75,7 +75,7 @@ def test_a_clock_that_counts_from_power_on_counts_by_its_change_alone(tmp_path: 
         late = capture("v3", -23048.4)
         assert late.within is False
         assert late.offset_s == pytest.approx(0.5)
-        # Opened anew it counts anew: the controller was switched off and on.
+        # After reopening it counts from zero: the controller was switched off and on.
         store.record(run_id, [opened("robot", "robot", 12.0, clock="uptime")], actor="runner")
         assert capture("v4", 12.0).offset_s == 0.0
 
@@ -111,7 +111,7 @@ def test_the_hosts_clock_is_held_against_the_network(tmp_path: Path) -> None:
 
 @pytest.fixture
 def chrony(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """A chronyc that says what it is told to."""
+    """A chronyc that prints what it is told to."""
     monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
 
     def says(way: str, leap: str = "Normal", status: int = 0) -> None:
@@ -128,7 +128,7 @@ def test_chrony_is_asked(chrony: Callable[..., None]) -> None:
     assert host_clock().offset_s == -1.25
     chrony("slow", leap="Not synchronised")
     assert host_clock() == HostClock(source="chrony", synchronised=False, offset_s=None)
-    chrony("slow", status=1)  # it runs not: the kernel is asked
+    chrony("slow", status=1)  # it is not running: the kernel is asked
     assert host_clock().source == "kernel"
 
 

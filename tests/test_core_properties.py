@@ -107,12 +107,12 @@ class Runs(RuleBasedStateMachine):
 
     @initialize(decisions=st.integers(min_value=0, max_value=30))
     def start_anywhere(self, decisions: int) -> None:
-        """Every depth of the protocol is as likely as the next."""
+        """Make every depth of the protocol equally likely."""
         self._progress(decisions, (0.5, 0.05), 3.0)
 
     @rule(decisions=st.integers(min_value=1, max_value=14), figure=FIGURES, views=st.sampled_from([2.0, 3.0, 3.0]))
     def steady_progress(self, decisions: int, figure: tuple[float, float], views: float) -> None:
-        """Nothing is in the way for a while; the figures may be bad."""
+        """Progress without obstacles for a while; the figures may be bad."""
         self._progress(decisions, figure, views)
 
     def _progress(self, decisions: int, figure: tuple[float, float], views: float) -> None:
@@ -142,7 +142,7 @@ class Runs(RuleBasedStateMachine):
         views=st.sampled_from([2.0, 3.0, 3.0]),
     )
     def runner(self, viewpoint: str, outcome: str, error: str, figure: tuple[float, float], views: float) -> None:
-        """One decision executed, for better or worse."""
+        """Execute one decision, with any outcome."""
         self._one_decision(viewpoint, outcome, error, figure, views)
 
     def _one_decision(
@@ -153,7 +153,7 @@ class Runs(RuleBasedStateMachine):
         figure: tuple[float, float],
         views: float,
     ) -> None:
-        """What the runner does."""
+        """Execute a decision as the runner does."""
         decision = self.log.decision
         match decision:
             case RunStep(step, attempt, begin):
@@ -207,7 +207,7 @@ class Runs(RuleBasedStateMachine):
                 return StepMeasured(step=step, attempt=attempt, measures=measures)
 
     def _released(self, step: str) -> None:
-        """What must be true before any work begins, said without the core's own helpers."""
+        """What must be true before any work begins, checked without the core's own helpers."""
         now = self.log.state.steps[step]
         if PROTOCOL.step(step).confirm:
             assert now.confirmed
@@ -231,7 +231,7 @@ class Runs(RuleBasedStateMachine):
 
     @rule(pick=st.integers(min_value=0, max_value=9), viewpoint=st.booleans())
     def legal_redo(self, pick: int, viewpoint: bool) -> None:
-        """One of the redos that are offered must be accepted, whatever is under way."""
+        """Every redo that is offered must be accepted, whatever is in progress."""
         state = self.log.state
         captured_now = sorted(state.step.captured)
         if viewpoint and captured_now and not state.terminal:
@@ -248,7 +248,7 @@ class Runs(RuleBasedStateMachine):
 
     @rule(doubts=st.integers(min_value=0, max_value=7))
     def abort(self, doubts: int) -> None:
-        """Seldom, or no run would get far."""
+        """Rare, or no run would get far."""
         if doubts == 7:
             self.log.act("abort", reason="enough")
 
@@ -259,7 +259,7 @@ class Runs(RuleBasedStateMachine):
         doubts=st.integers(min_value=0, max_value=3),
     )
     def race(self, meanwhile: str, outcome: str, viewpoint: str, doubts: int) -> None:
-        """An operator acts while the hardware works; what it had done is then recorded, and never turned away."""
+        """An operator acts while the hardware works; the work done is then recorded and never refused."""
         decision = self.log.decision
         if not isinstance(decision, RunStep) or decision.begin or (meanwhile == "abort" and doubts):
             return
@@ -294,7 +294,7 @@ class Runs(RuleBasedStateMachine):
 
     @rule()
     def restart(self) -> None:
-        """The process dies; all that is left is what was recorded."""
+        """The process dies; only the record remains."""
         self.log.state = fold(PROTOCOL, self.log.events)
 
     # --- what must always hold ---
@@ -337,7 +337,7 @@ class Runs(RuleBasedStateMachine):
 
     @invariant()
     def what_was_before_an_irreversible_step_stands(self) -> None:
-        """From the first moment of spraying on, its captures have passed, and nothing before it is ever reset."""
+        """Once spraying has begun, its captures have passed, and nothing before it is ever reset."""
         if not any(isinstance(e.payload, StepStarted) and e.payload.step == "spray" for e in self.log.events):
             return
         before = {step: self.log.state.steps[step] for step in ("fix_it", "capture")}
@@ -393,7 +393,7 @@ def _quick_run(choose: Callable[[AskOperator], str]) -> Log:
 
 
 def test_every_prefix_of_a_run_can_be_resumed() -> None:
-    """The fold of any prefix decides exactly what the live run decided there."""
+    """The fold of any prefix gives exactly the live run's decision at that point."""
     log = _quick_run(lambda question: question.for_)
     assert log.decision == FinishRun(0)
     live = Log(PROTOCOL)

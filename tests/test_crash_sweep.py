@@ -1,4 +1,4 @@
-"""The crash sweep, short: a death at every kind of point leaves nothing behind; a store that forgets shows in it."""
+"""The short crash sweep: a death at every kind of point leaves no fault; a store that forgets is detected."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ main()
 
 
 def sweep(folder: Path, *words: str, code: str = "") -> tuple[int, dict[str, Any]]:
-    """Status and result of the sweep, whose processes are forked from a process without threads."""
+    """Status and result of the sweep, run in a process without threads because it forks."""
     program = ["-c", code] if code else ["-m", "bench.torture.crash"]
     done = subprocess.run(
         [sys.executable, *program, *words, "--random-runs", "0", "--out", str(folder)],

@@ -1,4 +1,4 @@
-"""The fold of a run's events, what is decided on it, and which operator actions are allowed."""
+"""The fold of a run's events, the decision it leads to, and the allowed operator actions."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def at_scan() -> Log:
 
 
 def refused(log: Log, match: str, **action: object) -> None:
-    """The action is refused by the rules, and has no effect but a listed deviation if it is in the log anyway."""
+    """The rules refuse the action; if it is in the log anyway, its only effect is a listed deviation."""
     value = OperatorAction.model_validate(action)
     with pytest.raises(IllegalTransitionError, match=match):
         check_action(log.protocol, log.state, value, "Ada")
@@ -94,7 +94,7 @@ def failure(log: Log, error: str = "DeviceTimeoutError", recovery: str = "retry"
 
 
 def kinds(log: Log) -> list[str]:
-    """Kinds of the deviations, without refused actions."""
+    """The kinds of the deviations, without refused actions."""
     return [d.kind for d in log.state.deviations if d.kind != "refused"]
 
 
@@ -128,7 +128,7 @@ def test_the_decisions_of_a_run_in_order(log: Log) -> None:
     assert log.question.sign_sha256 == log.events[-1].sha256
     log.accept()
 
-    assert log.question.for_ == "sign"  # the release of what cannot be undone comes before its confirmation
+    assert log.question.for_ == "sign"  # an irreversible step is released before it is confirmed
     assert log.question.sign_sha256 == log.events[-1].sha256
     log.sign()
     assert log.question.for_ == "confirm"
@@ -181,7 +181,7 @@ def test_progress_survives_in_the_state() -> None:
     assert [d.kind for d in log.state.deviations] == ["viewpoint_skipped"]
     log.capture(["b"])
     assert log.state.step.skipped_viewpoints == ()
-    log.capture(["b"])  # taken again: the later one counts, the earlier one stays listed
+    log.capture(["b"])  # retaken: the later one counts, the earlier one stays listed
     assert log.state.step.captured == {"b": log.state.seq}
     assert log.state.superseded[-1].captured == {"b": log.state.seq - 1}
 
@@ -420,7 +420,7 @@ def test_redo_supersedes_the_step_and_resets_the_later_ones() -> None:
     assert [(s.step, s.attempt) for s in log.state.superseded] == [("fix_it", 1), ("capture", 1)]
     assert kinds(log) == ["redo", "reset_by_redo"]
     assert "a" in log.state.superseded[1].captured
-    # Records of the overtaken work arrive late:
+    # Records of the superseded work arrive late:
     log.capture([])
     log.append(captured("capture", 1, "b"))
     log.append(StepMeasured(step="capture", attempt=1, measures=GOOD))
@@ -461,7 +461,7 @@ def test_imported_photographs_count_as_views_and_the_run_says_so() -> None:
     log.append(imported("capture", log.state.step.attempt, "a"))
     assert set(log.state.step.captured) == {"a"}
     assert log.state.superseded[-1].reason == "imported again"
-    assert log.state.origin == "captured"  # what the root of the chain says, also of runs from before it said so
+    assert log.state.origin == "captured"  # as stated at the root of the chain, also for older runs without the field
 
 
 def test_a_redo_races_with_the_last_record(log: Log) -> None:
@@ -513,7 +513,7 @@ def test_nothing_before_it_can_be_redone_once_it_has_begun() -> None:
     refused(log, "the scene changed with 'spray'", action="redo", step="capture", reason="blurred")
     log.append(failure(log, "SafetyStopError", "ask"))  # half of it counts
     log.act("redo", reason="can was empty")
-    assert log.question.for_ == "sign"  # released anew
+    assert log.question.for_ == "sign"  # released again
     refused(log, "the scene changed", action="redo", step="capture", reason="blurred")
     log.do()
     log.do(rms_mm=0.01)
@@ -630,7 +630,7 @@ def test_folding_a_thousand_events_is_quick() -> None:
     for index in range(1000):
         log.append(captured("capture", 1, f"v{index}"))
     assert len(fold(log.protocol, log.events).step.captured) == 1000
-    # 96 calls an event when this was written, whatever their number.
+    # 96 calls per event when this was written, whatever their number.
     assert calls_of(lambda: fold(log.protocol, log.events)) < 200 * len(log.events)
 
 

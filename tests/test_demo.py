@@ -38,7 +38,7 @@ def test_table_has_the_papers_rows_and_its_reason(demo: dict[str, Any]) -> None:
     for source in ("robot_corrected", "triangulated", "colmap", "glomap", "hybrid"):
         assert rows[source]["mean_radial_error_mm"] <= 0.15
         assert rows[source]["true_error_mm"] <= 0.15
-    # The arm's systematic error, which structure from motion does not share.
+    # The arm's systematic error, which does not affect structure from motion.
     assert rows["robot"]["mean_radial_error_mm"] > 2 * rows["colmap"]["mean_radial_error_mm"]
 
 

@@ -1,4 +1,4 @@
-"""The CT suite's folder: geometry, gaps, odd series, and files of other makers that pydicom ships."""
+"""The CT suite's folder: geometry, gaps, odd series, and files from several manufacturers that pydicom ships."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from drivers.dicom_folder import DRIVER, DicomFolder, DicomFolderConfig
 from drivers.errors import DeviceUnavailableError, UnreadableFileError
 from drivers.interfaces import Array, CtSeries
 
-# Only what the package itself holds; get_testdata_file would look on the network for what it does not.
+# Only files in the package itself; get_testdata_file would look for others on the network.
 SHIPPED = Path(pydicom.data.__file__).parent / "test_files"
 Change = Callable[[Dataset, int], None]
 SHAPE = (5, 6, 8)  # K, J, I
@@ -55,7 +55,7 @@ def write_series(
     uid: str | None = None,
     reverse: bool = False,
 ) -> Array:
-    """A series of SHAPE; returns T_ct_voxel in metres."""
+    """Write a series of SHAPE; returns T_ct_voxel in metres."""
     folder.mkdir(parents=True, exist_ok=True)
     R = np.eye(3) if rotation is None else rotation
     origin = np.array([12.5, -40.25, 7.0])
@@ -114,7 +114,7 @@ def test_voxels_lie_where_the_headers_say(tmp_path: Path, rotation: Array, synta
 
 
 def test_slices_numbered_against_the_normal_stay_right_handed(tmp_path: Path) -> None:
-    # A left-handed recipe (k against row × column) must come out as the same body in space, re-sorted.
+    # A left-handed series (k against row × column) must give the same body in space, re-sorted.
     mirrored = OBLIQUE @ np.diag([1.0, 1.0, -1.0])
     T = write_series(tmp_path, rotation=mirrored)
     volume = source(tmp_path).read(only(tmp_path))
@@ -223,7 +223,7 @@ def test_a_missing_folder_is_a_missing_device(tmp_path: Path) -> None:
         DRIVER.build(DRIVER.config.model_validate({"folder": tmp_path / "none"})).open()
 
 
-# Files that pydicom ships, of scanners by several makers
+# Files that pydicom ships, from scanners of several manufacturers
 
 
 def test_shipped_scan_of_five_slices(tmp_path: Path) -> None:
@@ -256,7 +256,7 @@ def test_shipped_single_slices_lack_a_spacing(tmp_path: Path, name: str) -> None
 
 @pytest.mark.parametrize("name", ["CT_small.dcm", "693_J2KI.dcm"])
 def test_shipped_slices_uncompressed_and_jpeg_2000_decode_in_a_series(tmp_path: Path, name: str) -> None:
-    # A second slice of the same file, one spacing on, makes a series of it.
+    # A second slice of the same file, one spacing further, makes it a series.
     ds = pydicom.dcmread(SHIPPED / name)
     ds.save_as(tmp_path / "1.dcm")
     ds.SOPInstanceUID = ds.file_meta.MediaStorageSOPInstanceUID = generate_uid()
@@ -285,7 +285,7 @@ def test_every_shipped_file_is_listed_or_named_but_never_a_crash(tmp_path: Path)
 
 
 def test_a_series_in_transfer_is_not_taken_for_a_short_one(tmp_path: Path) -> None:
-    """Its first slices look like a complete series; only that it stays unchanged tells."""
+    """Its first slices look like a complete series; only waiting shows that it is not."""
     now_s = 100.0
     folder = DicomFolder(DicomFolderConfig(folder=tmp_path, stable_s=5.0), monotonic=lambda: now_s)
     uid = generate_uid()
@@ -294,7 +294,7 @@ def test_a_series_in_transfer_is_not_taken_for_a_short_one(tmp_path: Path) -> No
     assert "still arriving" in series.problems[0]
     now_s += 4.0
     write_series(tmp_path, skip=(0, 1, 2), uid=uid)
-    now_s += 2.0  # six seconds after the first slices, but they were not the last
+    now_s += 2.0  # six seconds after the first slices, but more slices came later
     assert "still arriving" in folder.series()[0].problems[0]
     now_s += 5.1
     (series,) = folder.series()
@@ -326,7 +326,7 @@ def test_a_length_of_four_gigabytes_asks_for_no_more_than_the_file_holds(tmp_pat
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
-# The slices of `write_series` as GDCM's encoder writes them, JPEG Lossless of first-order prediction.
+# The slices of `write_series` as written by GDCM's encoder: JPEG Lossless with first-order prediction.
 LOSSLESS = [
     "/9j/wwALEAAGAAgBAREA/8QAFgABAQEAAAAAAAAAAAAAAAAAAQQQ/9oACAEBAAEAAMqq0KqtCqrQqq0KqtCqr//Z",
     *(

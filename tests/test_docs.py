@@ -1,4 +1,4 @@
-"""The documents keep what they promise: every command in them is run, and what is generated is up to date."""
+"""The documents are correct: every command in them is run, and generated parts are up to date."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SPAN = re.compile(r"`((?:orthocapture|make|python3?|pip|\.venv/bin/\S+) [^`]+)`
 
 
 def commands_of(text: str) -> list[str]:
-    """Every command of a document: the lines of its shell blocks, and commands between backticks."""
+    """Every command in a document: the lines of its shell blocks, and commands in backticks."""
     found: list[str] = []
     for language, block in _FENCE.findall(text):
         if language in SHELLS:
@@ -54,7 +54,7 @@ class Site:
     begun: str  # the latest run; it waits for its first confirmation
 
     def run(self, command: str, *, typed: str = "") -> subprocess.CompletedProcess[str]:
-        """The command, to its end, as its reader would type it."""
+        """Run the command to its end, as its reader would type it."""
         words = shlex.split(command)
         words[0] = str(SCRIPTS / words[0])
         return subprocess.run(
@@ -84,7 +84,7 @@ def succeeds(site: Site, command: str) -> None:
 
 
 def asks_and_is_aborted(site: Site, command: str) -> None:
-    """A run asks its first question; the answer typed here ends it, which is status 1: not completed."""
+    """A run asks its first question; the typed answer ends it with status 1, since it is not completed."""
     done = site.run(command, typed="abort only reading the manual\n")
     assert done.returncode == 1, done.stderr
     assert "Type one of: confirm" in done.stderr.replace("\n", " ")
@@ -92,7 +92,7 @@ def asks_and_is_aborted(site: Site, command: str) -> None:
 
 
 def says_how_to_get_the_data(site: Site, command: str) -> None:
-    """With none of the sets there; the committed table stays as it is."""
+    """With no data set present; the committed table stays unchanged."""
     before = sorted(path.name for path in (ROOT / "bench" / "results").glob("real_data*"))
     words = [sys.executable, *shlex.split(command)[1:-1], str(site.folder)]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=110, check=False)
@@ -104,7 +104,7 @@ def says_how_to_get_the_data(site: Site, command: str) -> None:
 
 
 def serves_until_terminated(site: Site, command: str) -> None:
-    """The worker takes a job that it has to refuse, and ends when told to."""
+    """The worker takes a job that it must refuse, and ends when told to."""
     words = shlex.split(command)
     with Store.open(site.folder / "runs") as store:
         job = NewJob("locate_spheres", "fixation", 1, "docs", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
@@ -120,7 +120,7 @@ def serves_until_terminated(site: Site, command: str) -> None:
 
 
 def registers(site: Site, command: str) -> None:
-    """Photographs, camera, poses and mesh under the names of the command; DIR is the folder of the images."""
+    """Photographs, camera, poses and mesh under the names in the command; DIR is the folder of the images."""
     made = scene(4, 800, seed=11)
     images = site.folder / "images"
     images.mkdir()
@@ -141,7 +141,7 @@ def registers(site: Site, command: str) -> None:
 
 
 def serves_pages(site: Site, command: str) -> None:
-    """The web process answers, on a free port, and ends when told to."""
+    """The web process answers on a free port, and ends when told to."""
     words = shlex.split(command + " --port 0 --json")
     with subprocess.Popen(
         [SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.PIPE, text=True
@@ -187,7 +187,7 @@ RUN_HERE: dict[str, Check] = {
     "orthocapture store gc --data runs": succeeds,
     "python -m bench.real_data --data DIR": says_how_to_get_the_data,
 }
-# Commands that take minutes or a whole rig: the test of the suite that runs them.
+# Commands that take minutes or a whole rig, with the test that runs them.
 RUN_ELSEWHERE = {
     "orthocapture compare RUN OTHER --data runs": (
         "tests/test_runs_beside_runs.py::test_two_runs_side_by_side_in_the_terminal"
@@ -326,7 +326,7 @@ def test_commands_are_found_in_blocks_tables_and_text() -> None:
 
 
 def test_the_generated_documents_are_up_to_date() -> None:
-    """`make reference` makes them anew."""
+    """`make reference` regenerates them."""
     for name, text in pages().items():
         assert (REFERENCE / name).read_text(encoding="utf-8") == text, f"{name}: run `make reference`"
 
@@ -338,7 +338,7 @@ def test_links_of_the_documents_lead_somewhere() -> None:
 
 
 def test_what_the_readme_says_of_a_corrected_arm_is_what_was_measured() -> None:
-    """For the simulated arm's own family of errors, and for an arm that errs otherwise (bench/hand_eye)."""
+    """For errors of the simulated arm's own model, and for an arm with other errors (bench/hand_eye)."""
     measured = json.loads((ROOT / "bench" / "results" / "hand_eye-2026-11-21.json").read_text())
     text = " ".join((ROOT / "README.md").read_text().split())
     for kind, words in (("systematic", "poses good to {} … {} mm once"), ("odd", "{} … {} mm are left")):

@@ -1,4 +1,4 @@
-"""`orthocapture doctor` tells what each device reports: problems, clocks, and marks that agree with them."""
+"""`orthocapture doctor` shows what each device reports: problems, clocks, and matching marks."""
 
 from __future__ import annotations
 

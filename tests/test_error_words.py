@@ -1,4 +1,4 @@
-"""What stops a run names its place and what to do: of drivers, steps and the store as a person meets them."""
+"""Every error that stops a run names its place and a remedy: from drivers, steps and the store."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from service.store.verification.verify import verify
 from tests.support.bench_run import PROTOCOL, begin_run
 
 ROOT = Path(__file__).parents[1]
-# Steps and drivers speak to a person whatever they raise; elsewhere some errors are for programmers only.
+# Errors of steps and drivers always reach a person; elsewhere some are only for programmers.
 SPEAKING = [
     *(ROOT / "drivers").rglob("*.py"),
     *(ROOT / "service" / "steps").rglob("*.py"),
@@ -38,7 +38,7 @@ CLASSES = {
 
 
 def raised(path: Path) -> Iterator[tuple[int, set[str]]]:
-    """Line and keywords of each error of the tree that a file makes."""
+    """Line and keywords of each error of the tree that a file raises."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in CLASSES:
             yield node.lineno, {str(keyword.arg) for keyword in node.keywords}
@@ -81,7 +81,7 @@ def test_a_data_folder_that_is_gone_is_told_with_what_to_do(tmp_path: Path) -> N
 
 
 def test_a_run_that_could_not_be_signed_says_how_it_is(tmp_path: Path) -> None:
-    """The disk is full when the run ends; the run resumed as told is signed, and verifies."""
+    """The disk is full when the run ends; after resuming as told, the run is signed and verifies."""
     disk = FaultyDisk("append", 1, errno.ENOSPC)
     with Store.open(tmp_path / "data", files=disk) as store:
         bench = begin_run(store, PROTOCOL, tmp_path)

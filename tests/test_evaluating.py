@@ -1,4 +1,4 @@
-"""The jobs `register` and `evaluate` on exact outlines: table, budget, reduced resolution, and no control spheres."""
+"""The jobs `register` and `evaluate` on exact outlines: table, budget, lower resolution, no control spheres."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ EVERYTHING = np.vstack([REGISTRATION_M, CONTROL_M])
 
 @dataclass(frozen=True)
 class Registered:
-    """A registration and the control spheres that it does not know."""
+    """A registration, and control spheres that were not used for it."""
 
     outlines: list[tuple[SphereOutline, ...]]
     controls: list[Assignment]
@@ -39,7 +39,7 @@ def test_exact_outlines_have_no_error_and_a_shift_has_its_size() -> None:
     exact = evaluate(outlines, assignments, truth, CONTROL_M, RADIUS_M, made.camera)
     assert exact.mean_radial_error_mm < 1e-6
     assert exact.mean_reprojection_error_px < 1e-6
-    # A sphere moved by d across the view meets its outline's rays at d |cos|, 2 d / pi on average.
+    # A sphere moved by d across the view meets its outline's rays at d |cos|, 2 d / π on average.
     shifted = np.array([T @ transform(np.eye(3), np.array([0.001, 0.0, 0.0])) for T in truth])
     moved = evaluate(outlines, assignments, shifted, CONTROL_M, RADIUS_M, made.camera)
     assert moved.mean_radial_error_mm == pytest.approx(2 / np.pi, rel=0.08)
@@ -63,7 +63,7 @@ def test_no_control_sphere_is_refused() -> None:
 
 
 def registered(seed: int, noise_px: float, pose_sigma: tuple[float, float] = (0.0, 0.0)) -> Registered:
-    """A capture of ten spheres and three control spheres, and its registration."""
+    """A capture of ten registration and three control spheres, and its registration."""
     made = scene(6, seed=seed)
     rng = np.random.default_rng(seed)
     found = [exact_outlines(made, i, EVERYTHING, noise_px, seed) for i in range(6)]

@@ -1,4 +1,4 @@
-"""Files that no one here made: meshes and photographs that other people's packages ship."""
+"""Files made by others: meshes and photographs shipped with packages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_stanford_bunny_is_read() -> None:
     scan = read_mesh_file(shipped("pymeshfix", "StanfordBunny.ply"), "mm")
     assert len(scan.mesh.faces) > 30_000
     assert np.allclose(np.ptp(scan.mesh.vertices_m, axis=0), [0.0500, 0.0387, 0.0494], atol=1e-4)
-    assert scan.findings["holes"] > 0  # the scan that everyone knows is open at its base
+    assert scan.findings["holes"] > 0  # the well-known scan is open at its base
     assert np.allclose(np.linalg.norm(scan.mesh.normals, axis=1), 1.0, atol=1e-6)
 
 
@@ -47,7 +47,7 @@ def test_an_obj_without_its_materials_is_incomplete(tmp_path: Path) -> None:
         read_mesh_file(monkey, "m")
     copy = Path(shutil.copy(monkey, tmp_path))
     (tmp_path / "monkey.mtl").write_text("newmtl Material\nKd 0.6 0.6 0.6\n")
-    # Now it is parsed, and is 3.7 units across: metres, as of a room, may be; nobody scans a head of 4 mm.
+    # It parses and is 3.7 units across: metres are plausible, as for a room; nobody scans a head of 4 mm.
     with pytest.raises(UnreadableFileError, match=r"0\.003674 m"):
         read_mesh_file(copy, "mm")
     vertices_m = read_mesh_file(copy, "m").mesh.vertices_m

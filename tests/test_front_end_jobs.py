@@ -1,4 +1,4 @@
-"""Features and matches as jobs: one by one as images arrive or all at once, the model is the same bit for bit."""
+"""Features and matches as jobs: the model is bitwise the same, whether images come one by one or all at once."""
 
 from __future__ import annotations
 

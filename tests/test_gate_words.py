@@ -1,4 +1,4 @@
-"""A gate that is judged with its uncertainty: every reader sees its bounds, and `not decided` where that is so."""
+"""A gate judged with its uncertainty: every reader sees its bounds, and `not decided` where that is the case."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_first_page_counts_what_is_not_decided_apart(undecided: tuple[Path, 
         computed.close()
     assert not isinstance(digest, Progress)
     counted = first_page.counts(digest)
-    assert (counted["failed_gates"], counted["undecided_gates"]) == (1, 1)  # too few views before the re-do
+    assert (counted["failed_gates"], counted["undecided_gates"]) == (1, 1)  # too few views before the redo
     (one,) = first_page.findings(digest, "undecided_gates")
     assert one.name == "Gate not decided"
     assert f"{BOUNDED}, allowed ≤ 0.35: not decided" in one.text

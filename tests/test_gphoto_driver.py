@@ -184,7 +184,7 @@ def test_shutter_refused_by_a_camera_that_answers(tmp_path: Path) -> None:
 
 
 def test_setting_refused_for_good_and_for_a_moment() -> None:
-    # The first set is the library's own, of the priority mode, when it connects.
+    # The first set comes from the library itself when it connects (priority mode).
     with rig([{"on": "set", "kind": "reject", "nth": 2, "times": 1}]) as (camera, _):
         assert camera.apply(PAPER) == PAPER
     with (

@@ -1,4 +1,4 @@
-"""A mapping that grows by versions: each version stays as it was, whatever is put behind it."""
+"""A mapping that grows by versions: each version stays unchanged, whatever is added later."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KEYS = st.sampled_from(["a", "b", "c", "d"])
 @given(st.lists(st.tuples(st.integers(0, 30), KEYS, st.integers()), max_size=30))
 def test_every_version_is_the_dict_that_it_would_have_been(puts: list[tuple[int, str, int]]) -> None:
     versions: list[tuple[PersistentMap[int], dict[str, int]]] = [(PersistentMap({"a": 0}), {"a": 0})]
-    for choice, key, value in puts:  # of any version, not only of the newest
+    for choice, key, value in puts:  # of any version, not only the newest
         grown, plain = versions[choice % len(versions)]
         versions.append((grown.put(key, value), {**plain, key: value}))
     for grown, plain in versions:

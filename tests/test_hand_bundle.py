@@ -1,4 +1,4 @@
-"""Without a CT: images alone, one after the other, refine the spheres and the cameras; against the truth."""
+"""Without a CT: successive images refine spheres and cameras, compared with ground truth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MIDDLE_M = SPHERES_M.mean(axis=0)
 
 
 def around(tilt_deg: float, azimuth_deg: float) -> Transform:
-    """A camera 0.7 m from the middle, in the world of the truth."""
+    """A camera 0.7 m from the centre, in the world frame."""
     tilt, azimuth = np.radians([tilt_deg, azimuth_deg])
     way = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)])
     return look_at(MIDDLE_M + 0.7 * way, MIDDLE_M, np.array([0.0, 1.0, 0.0]))
@@ -29,7 +29,7 @@ ROUGH_M = SPHERES_M + np.random.default_rng(3).normal(0.0, 0.002, SPHERES_M.shap
 
 
 def readings(noise_px: float = 0.15) -> list[Reading]:
-    """Of images whose cameras are known to a centimetre and a degree, as rough spheres tell them."""
+    """Readings of images whose cameras are known to a centimetre and a degree, as from rough spheres."""
     rng = np.random.default_rng(8)
     made = Scene(np.eye(4), np.array(POSES), CAMERA)
     found: list[Reading] = []
@@ -42,14 +42,14 @@ def readings(noise_px: float = 0.15) -> list[Reading]:
 
 
 def spheres_error_m(bundle: Bundle) -> float:
-    """Largest, of the shape alone."""
+    """Largest sphere error, of the shape alone."""
     true, found = SPHERES_M[bundle.known], bundle.spheres_m[bundle.known]
     T, _ = align_points(true, found)
     return float(np.linalg.norm(apply(T, found) - true, axis=1).max())
 
 
 def poses_error_m(bundle: Bundle) -> float:
-    """Largest distance between the true camera and the found one, the scene laid over the true one."""
+    """Largest distance between true and estimated camera, after aligning the scenes."""
     T, _ = align_points(SPHERES_M[bundle.known], bundle.spheres_m[bundle.known])
     return max(
         float(np.linalg.norm((T @ bundle.poses[f"h_{i}"])[:3, 3] - true[:3, 3]))
@@ -80,7 +80,7 @@ def test_the_stated_uncertainty_is_that_of_the_errors() -> None:
 
 
 def test_outlines_that_are_all_too_wide_are_within_the_stated_uncertainty() -> None:
-    wide_rad = 0.03 / CAMERA.fx  # of a pixel: light that shines past every edge
+    wide_rad = 0.03 / CAMERA.fx  # in pixels: light that shines past every edge
     grown = [replace(r, half_angles_rad=r.half_angles_rad + wide_rad) for r in readings(0.0)]
     bundle = adjust_together(grown, ROUGH_M, CAMERA, RADIUS_M)
     assert bundle is not None

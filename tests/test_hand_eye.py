@@ -1,4 +1,4 @@
-"""Hand-eye calibration against known truth: accuracy, honest errors, half-turned boards, refusals."""
+"""Hand-eye calibration against ground truth: accuracy, consistent uncertainties, half-turned boards, refusals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _session(
     seed: int = 0,
     T_base_board: Transform = T_BASE_BOARD,
 ) -> tuple[Array, Array]:
-    """Robot poses with noise, and exact board poses, of a camera looking at the board from all sides."""
+    """Noisy robot poses and exact board poses of a camera that looks at the board from all sides."""
     rng = np.random.default_rng(seed)
     hands: list[Transform] = []
     boards: list[Transform] = []
@@ -68,7 +68,7 @@ def test_noisy_robot_stays_within_the_bootstrap_sigma() -> None:
         assert result.second_axis_deg > 20
         assert result.condition < 10
         ratios.append(_error_mm(result.T_flange_camera) / result.sigma_mm)
-    # neither several times too proud nor too modest
+    # the stated uncertainty is neither far too small nor far too large
     assert 0.3 < float(np.sqrt(np.mean(np.square(ratios)))) < 2.0
 
 
@@ -81,7 +81,7 @@ def test_half_turned_boards_are_turned_back(flips: list[bool], seed: int) -> Non
     mixed = np.where(np.array(flips)[:, None, None], boards @ turn, boards)
     result = calibrate_hand_eye(hands, mixed, T_board_turned=turn, bootstrap=2)
     assert _error_mm(result.T_flange_camera) < 0.5
-    # the group may be turned as a whole: nobody can tell, and it does not matter
+    # the whole group may be turned: this cannot be detected and does not matter
     assert list(result.turned) in (flips, [not f for f in flips])
 
 

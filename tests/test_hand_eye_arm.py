@@ -1,4 +1,4 @@
-"""Hand-eye with the weights of robot and images, and the arm's own error: accuracy, honesty, files, suggestions."""
+"""Hand-eye with weighted robot and images, and the arm's own errors: accuracy, uncertainty, files, suggestions."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_no_correction_where_the_arm_has_only_noise() -> None:
     shots = plan(scene, "exvivo_spine", "hand_eye")
     session = board_session(scene, shots)
     rng = np.random.default_rng(0)
-    # The poses that the arm really took, with noise: nothing systematic is left.
+    # The true poses of the arm, with noise: no systematic error remains.
     true = [inverse(scene.T_world_base["station_1"]) @ scene.true_flange(q, "station_1") for q in session.joints_rad]
     poses = np.array(true)
     poses[:, :3, 3] += rng.normal(0, 0.3e-3, (len(poses), 3))

@@ -1,4 +1,4 @@
-"""`orthocapture calibrate hand-eye` says whether poses and images fit, and which mistake explains it if not."""
+"""`orthocapture calibrate hand-eye` says whether poses and images agree, and which mistake explains it if not."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_poses_of_other_images_fit_nothing(photographs: BoardFolder, tmp_path: P
 
 
 def test_a_camera_beside_the_robot_is_placed_in_the_base(photographs: BoardFolder, tmp_path: Path) -> None:
-    # The same images, read the other way round: what was the board's place is the camera's flange.
+    # The same images, interpreted the other way round: the board's pose becomes the flange's.
     poses = photographs.poses(tmp_path / "poses.csv", [inverse(T) for T in photographs.T_base_flange.values()])
     out = tmp_path / "hand_eye.json"
     done = _run(photographs, poses, out, "--setup", "eye-to-hand")

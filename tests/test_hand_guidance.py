@@ -1,4 +1,4 @@
-"""The words that lead a hand-held camera: a simulated hand that follows them arrives."""
+"""Guidance for a hand-held camera: a simulated hand that follows the words arrives."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_who_follows_the_words_arrives(here: Grip, there: Grip) -> None:
     for _ in range(3):
         grip = follow(words(grip.T_world_camera(), target), grip, np.zeros(3))
     away_m, turned_rad = _apart(grip.T_world_camera(), target)
-    assert away_m < 0.01  # half a centimetre a direction is not told
+    assert away_m < 0.01  # less than half a centimetre per direction is not reported
     assert turned_rad < np.radians(5.0)
 
 
@@ -91,7 +91,7 @@ def test_a_place_looks_at_its_aim(azimuth_deg: float, walk_round: bool) -> None:
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
     assert T[2, 3] - aim[2] == pytest.approx(0.6 * np.cos(np.radians(35.0)))
     if walk_round:
-        assert T[2, 0] == pytest.approx(0.0)  # level: the person walks round instead of leaning the camera
+        assert T[2, 0] == pytest.approx(0.0)  # level: the person walks around instead of leaning the camera
 
 
 def test_a_tour_of_the_hemisphere_covers_it_and_goes_to_the_nearest_place_first() -> None:

@@ -1,4 +1,4 @@
-"""One hand-held image: the camera's pose from its spheres, by exact outlines, and what makes an image unusable."""
+"""One hand-held image: the camera's pose from its spheres with exact outlines, and what makes an image unusable."""
 
 from __future__ import annotations
 

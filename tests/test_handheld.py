@@ -16,7 +16,7 @@ WIDTH = "1024"
 
 
 def small_protocol(folder: Path) -> Path:
-    """handheld_spine.yaml with fewer images, and the poses that need least time."""
+    """handheld_spine.yaml with fewer images, at the poses that take the least time."""
     protocol = yaml.safe_load((REPOSITORY / "protocols" / "handheld_spine.yaml").read_text())
     steps: dict[str, Any] = {step["id"]: step for step in protocol["steps"]}
     board, hand = steps["board_capture"], steps["handheld_capture"]
@@ -58,7 +58,7 @@ def test_the_hand_covers_the_hemisphere_in_spite_of_its_mistakes(run: dict[str, 
     assert measures["hemisphere_coverage"] >= 0.9
     assert measures["predicted_target_error_mm"] < 0.15
     taken = [run["steps"][name]["measures"] for name in ("board_capture", "handheld_capture")]
-    # Of every fourth press: a blurred board and a finger still leave an image that can be used, as does half a way.
+    # Of the mishaps of every fourth press, a blurred board, a finger and half a way still leave a usable image.
     assert sum(m["images_not_used"] for m in taken) >= 2, "settings turned, and an image taken twice"
     assert sum(m["images_used"] for m in taken) >= 19
 

@@ -1,4 +1,4 @@
-"""By hand without a cable and without a CT: photographs come as files, and tell where the spheres are."""
+"""By hand without a cable and without a CT: photographs arrive as files, and the spheres are located from them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
 def without_ct(folder: Path) -> Path:
-    """The small protocol without the steps of the CT and without what compares with it."""
+    """The small protocol without the CT steps and without comparisons with them."""
     path = small_protocol(folder)
     protocol = yaml.safe_load(path.read_text())
     protocol["steps"] = [step for step in protocol["steps"] if not step["id"].startswith("ct_")]

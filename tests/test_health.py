@@ -1,4 +1,4 @@
-"""`/health` and `/metrics`: true of the data folder, for whoever may know, and without a label that grows."""
+"""`/health` and `/metrics`: consistent with the data folder, restricted to permitted clients, and bounded labels."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def site(tmp_path: Path) -> Generator[WebSite]:
 
 
 def of_this_machine(site: WebSite, address: str = "127.0.0.1") -> Browser:
-    """A program that has signed in nowhere."""
+    """A program that has not signed in."""
     browser = Browser(site.app, base_url=HOST, client=(address, 50000))
     browser.site = site.site
     site.browsers.append(browser)
@@ -33,7 +33,7 @@ def of_this_machine(site: WebSite, address: str = "127.0.0.1") -> Browser:
 
 
 def scrape(site: WebSite) -> dict[str, dict[tuple[str, ...], float]]:
-    """Value by name and labels (in the order of their names), read with Prometheus' own parser."""
+    """Value by name and labels (sorted by name), parsed with Prometheus' own parser."""
     answer = of_this_machine(site).get("/metrics")
     assert answer.status_code == 200, answer.text
     found: dict[str, dict[tuple[str, ...], float]] = {}
@@ -63,7 +63,7 @@ def test_a_job_without_a_worker_is_not_healthy_until_one_lives(site: WebSite) ->
     enqueue(site, site.begin_run())
     answer = site.browser().get("/health")
     assert (answer.status_code, answer.json()["worker"]["what"]) == (503, "1 jobs wait, and no worker lives")
-    # A folder of no store beside it: the worker has nothing to do and lives.
+    # In an empty folder beside it: the worker has nothing to do and stays alive.
     words = [sys.executable, "-m", "service.cli.main", "worker", "--data", str(site.site.data), "--json"]
     with subprocess.Popen(words, stdout=subprocess.DEVNULL) as worker:
         try:
@@ -73,7 +73,7 @@ def test_a_job_without_a_worker_is_not_healthy_until_one_lives(site: WebSite) ->
                 time.sleep(0.1)
             assert site.browser().get("/health").json()["worker"]["ok"]
         finally:
-            worker.kill()  # it can no longer take its sign away
+            worker.kill()  # so that it can no longer remove its heartbeat file
             worker.wait()
     assert scrape(site)["orthocapture_workers"][()] == 0
 
@@ -149,7 +149,7 @@ def test_metrics_are_for_this_machine_and_for_readers(site: WebSite) -> None:
         assert of_this_machine(site, address).get("/metrics").status_code == 200
     stranger = of_this_machine(site, "192.168.1.20")
     assert stranger.get("/metrics", headers={"accept": "application/json"}).status_code == 401
-    for header in ("x-forwarded-for", "forwarded", "via"):  # a proxy on this machine asks for somebody else
+    for header in ("x-forwarded-for", "forwarded", "via"):  # a proxy on this machine forwards somebody else's request
         answer = of_this_machine(site).get("/metrics", headers={header: "127.0.0.1", "accept": "application/json"})
         assert answer.status_code == 401
     assert site.browser("auditor").get("/metrics").status_code == 200

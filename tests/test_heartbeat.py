@@ -1,4 +1,4 @@
-"""What screens are told of the robot while the runner's main loop is in a long call: what goes on, and since when."""
+"""What screens show of the robot during a long call of the runner's main loop: the activity, and since when."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RUN = "run"
 
 
 class Bench:
-    """A reporter over a folder, and what it says."""
+    """A reporter on a folder, and its output."""
 
     def __init__(self, folder: Path, robots: Mapping[str, RobotArm]) -> None:
         self.folder = folder
@@ -59,7 +59,7 @@ def active(tmp_path: Path) -> Generator[RunState]:
 
 
 def banner(state: RunState, **fields: object) -> Banner:
-    """Of a snapshot of this moment."""
+    """The banner for a snapshot of this moment."""
     return robot_banner(state, Snapshot.model_validate({"at_utc_s": time.time(), **fields}), driven=True)
 
 
@@ -67,7 +67,7 @@ def test_a_long_call_is_told_while_it_lasts(bench: Bench) -> None:
     bench.reporter.attend("working", "capture", 1)
     bench.reporter.show("viewpoints", 12, 54)
     bench.reporter.busy("taking v1_013 and fetching it from the camera, 61 MP")
-    # This thread, the runner's, does not come back to the reporter from here on.
+    # This thread is the runner's and does not return to the reporter from here on.
     until(
         lambda: bench.told.lasting == "taking v1_013 and fetching it from the camera, 61 MP",
         lambda: str(bench.told),
@@ -101,7 +101,7 @@ def test_the_arm_is_watched_from_beside_the_call(bench: Bench, arm: BenchArm) ->
 
 
 class HeldUp(BenchArm):
-    """Its process is in a call of the main loop's: whoever asks beside it waits."""
+    """Its process is in a long call of the main loop: other callers wait."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""drivers.host: a driver in a child process that may crash, hang, blunder or lose its parent."""
+"""drivers.host: a driver in a child process that may crash, hang, misbehave or lose its parent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hybrid poses: exact data give exact poses, errors are weighed by their size, covariances are honest."""
+"""Hybrid poses: exact data give exact poses, errors are weighted by their size, covariances are consistent."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_noise_is_estimated_and_covariances_are_honest() -> None:
 
 
 def test_covariance_of_world_poses_follows_from_the_joint_one() -> None:
-    """Moving the estimate within its parameters moves the world poses as the derivative says."""
+    """Moving the estimate in its parameters moves the world poses as the derivative predicts."""
     answer = adjust(noisy(3))
     rng = np.random.default_rng(0)
     n = len(answer.T_scan_camera)
@@ -120,10 +120,10 @@ def test_a_wrong_principal_point_is_found_with_the_calibration_as_prior() -> Non
 
 @pytest.mark.parametrize("robot", [True, False])
 def test_what_is_not_known_of_the_camera_is_in_the_uncertainty(robot: bool) -> None:
-    """Cameras off by their calibration's own sigmas: without its covariance what is stated is far too small."""
+    """Cameras with errors of their calibration's covariance: without it the stated sigma is far too small."""
     names, sigmas = ("fx", "fy", "cx", "cy", "k1"), np.array([4.0, 4.0, 2.0, 2.0, 0.004])
     matrix = np.diag(sigmas**2)
-    matrix[0, 1] = matrix[1, 0] = 0.98 * 16.0  # both focal lengths err alike
+    matrix[0, 1] = matrix[1, 0] = 0.98 * 16.0  # the errors of both focal lengths are correlated
     known = CameraCovariance(names, matrix)
     rng = np.random.default_rng(11)
     stated: list[Array] = []
@@ -194,7 +194,7 @@ def test_derivatives_of_every_component() -> None:
         calibrated=made.camera,
         lens_covariance=np.diag([1.0, 2.0, 3.0, 4.0]),
     )
-    # scan coordinates, a little off so that no residual is zero
+    # scan coordinates, slightly off so that no residual is zero
     X = np.vstack([np.column_stack([rng.uniform(-0.2, 0.2, (len(made.tracks.points), 2)),
                                     rng.uniform(0, 0.1, len(made.tracks.points))]), REGISTRATION_M])  # fmt: skip
     state = State(
@@ -221,5 +221,5 @@ def test_covariance_of_structure_from_motion_is_honest() -> None:
         values, vectors = np.linalg.eigh(C)
         along = vectors[:, 7:].T @ error
         ratios.append(float(np.mean(along**2 / values[7:])))
-        assert values[6] < 1e-8 * values[7]  # seven directions are free
+        assert values[6] < 1e-8 * values[7]  # seven degrees of freedom are undetermined
     assert 0.6 < np.mean(ratios) < 1.6

@@ -1,4 +1,4 @@
-"""Identity of image spheres: hypotheses of one image and verification over the set."""
+"""Identity of spheres: hypotheses from one image, verified over the image set."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ EVERYTHING = np.vstack([REGISTRATION_M, CONTROL_M])
 def noisy_set(
     made: Scene, seed: int, noise_px: float = 0.1, n_false: int = 2
 ) -> tuple[list[tuple[SphereOutline, ...]], list[dict[int, int]]]:
-    """Outlines of all images with false ones appended, and the true markers (control spheres belong to none)."""
+    """Outlines of all images with false ones added, and the true markers (control spheres belong to none)."""
     outlines: list[tuple[SphereOutline, ...]] = []
     truth: list[dict[int, int]] = []
     for i in range(len(made.T_world_camera)):

@@ -1,4 +1,4 @@
-"""Blurred and black images told from sharp ones, by the images alone and by those beside them."""
+"""Blurred and black images are detected from the images themselves and from neighbouring ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images that are not whole: refused in words, before a decoder makes room for what they claim."""
+"""Damaged images are refused with a message before a decoder allocates the memory that they claim."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_a_png_with_a_changed_byte_is_refused(tmp_path: Path, png: bytes) -> Non
 
 
 def test_a_png_that_claims_gigabytes_is_refused_at_once(tmp_path: Path, png: bytes) -> None:
-    """A decoder made room for four gigabytes, which took 14 s (found by bench/torture/fuzz)."""
+    """A decoder once allocated four gigabytes, which took 14 s (found by bench/torture/fuzz)."""
     claims = png[:33] + b"\xff\xda\x00\x12IDAT" + png[41:]
     (tmp_path / "a.png").write_bytes(claims)
     with pytest.raises(DataError, match="the PNG ends before its picture is complete"):

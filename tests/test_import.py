@@ -1,4 +1,4 @@
-"""`orthocapture import`: a folder becomes a run that says so, interrupted or not; odd files are left out."""
+"""`orthocapture import`: a folder becomes an imported run, interrupted or not; odd files are left out."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ PROTOCOL = REPOSITORY / "protocols" / "import_spine.yaml"
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four tiny photographs, two of them of the board, and something that is called a scan: for the listing alone."""
+    """Four tiny photographs, two of them of the board, and a file named like a scan: only for listing."""
     folder = tmp_path_factory.mktemp("import") / "small"
     photographer = Photographer(folder, 240)
     photographer.photographs("calibration", over_the_board(2), board=True)
@@ -57,7 +57,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(small: Path, tmp_path: Path) -> Path:
-    """A copy to spoil."""
+    """A copy to modify."""
     return Path(shutil.copytree(small, tmp_path / "brought"))
 
 
@@ -196,7 +196,7 @@ def spine(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Photographer]
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The protocol with one kind of structure from motion, and without the CT that the folder has not."""
+    """The protocol with one kind of structure from motion, and without the CT, which the folder lacks."""
     protocol = yaml.safe_load(PROTOCOL.read_text())
     steps = {step["id"]: step for step in protocol["steps"]}
     steps["registration"]["params"] |= {"poses": ["colmap"]}
@@ -209,7 +209,7 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def true_error_mm(data: Path, run: str, photographer: Photographer) -> float:
-    """Of the registration, at the middle of the spheres, against where the camera was in truth."""
+    """Error of the registration at the centre of the spheres, against the true camera poses."""
     with Store.open(data) as store:
         summary = summarise(store, run, recorded_run(store, run)[0])
         cameras = summary.result("registration")["registrations"]["colmap"]["T_scan_camera"]
@@ -267,7 +267,7 @@ def test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere(
 
 
 def imported_so_far(data: Path) -> list[str]:
-    """Hashes of the photographs in the record, of a run that may be being written."""
+    """Hashes of the recorded photographs, of a run that may still be written."""
     if not database_path(data).is_file():
         return []
     with Store.open(data, create=False) as store:
@@ -276,7 +276,7 @@ def imported_so_far(data: Path) -> list[str]:
 
 
 def says_so(data: Path, run: str, folder: Path) -> None:
-    """Report, data set and replay of an import."""
+    """Check report, data set and replay of an import."""
     words = "how the images were captured is not in evidence"
     description = json.loads((folder / "dataset" / "dataset.json").read_text())
     assert description["origin"] == "imported"

@@ -1,4 +1,4 @@
-"""Board corners in rendered images, their numbering, and the camera that is calibrated from them."""
+"""Board corners in rendered images, their numbering, and the camera calibrated from them."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ BORDER = 80  # texels of white around the squares
 
 
 def _board(columns: int, rows: int) -> tuple[Slab, Array]:
-    """A checkerboard lying at z = 0 and its true inner corners (rows, columns, 3) in the world."""
+    """A checkerboard at z = 0 and its true inner corners (rows, columns, 3) in the world."""
     texels = round(SQUARE_M / TEXEL_M)
     squares = np.indices((rows + 1, columns + 1)).sum(axis=0) % 2
     texture = np.pad(np.kron(squares, np.ones((texels, texels))) * 200 + 25, BORDER, constant_values=225)
     low = -np.array(texture.shape[::-1]) * TEXEL_M / 2
     high = low + (np.array(texture.shape[::-1]) - 1) * TEXEL_M
     y, x = np.mgrid[1 : rows + 1, 1 : columns + 1]
-    # a texel's centre lies at its index, so the edge between two squares lies half a texel before
+    # a texel's centre lies at its index, so the edge between two squares lies half a texel before it
     corners = np.stack(
         [low[0] + (BORDER + x * texels - 0.5) * TEXEL_M, low[1] + (BORDER + y * texels - 0.5) * TEXEL_M], -1
     )
@@ -53,12 +53,12 @@ def _poses(count: int, tilt_deg: float, seed: int = 0) -> list[Transform]:
             [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt)]
         )
         target = np.append(rng.uniform(-0.05, 0.05, 2), 0.0)
-        out.append(look_at(eye, target, np.array([1.0, 0.0, 0.0])))  # long side across the picture
+        out.append(look_at(eye, target, np.array([1.0, 0.0, 0.0])))  # long side across the image
     return out
 
 
 def _corners(camera: CameraModel, pose: Transform, sigma_px: float, rng: np.random.Generator) -> Array:
-    """Ideal corners of a board centred in the world, facing the camera, with noise."""
+    """Ideal corners of a board centred in the world and facing the camera, with noise."""
     centre = board_points(COLUMNS, ROWS, SQUARE_M).mean(axis=0)
     T_world_board = transform(Rotation.from_euler("x", np.pi), np.array([-centre[0], centre[1], 0.0]))
     points = apply(inverse(pose) @ T_world_board, board_points(COLUMNS, ROWS, SQUARE_M))
@@ -78,7 +78,7 @@ def board() -> tuple[Slab, Array]:
 def picture(board: tuple[Slab, Array]) -> tuple[NDArray[np.uint8], Transform]:
     pose = _poses(3, 35)[1]
     sharp = render([board[0]], CAMERA, pose, 1)
-    return np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.6), dtype=np.uint8), pose  # as a lens would
+    return np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.6), dtype=np.uint8), pose  # blurred as by a lens
 
 
 def test_corners_are_found_to_a_twentieth_of_a_pixel(
@@ -142,7 +142,7 @@ def test_camera_is_recovered_within_its_sigma() -> None:
     assert result.sigma["fx"] < 0.5
     assert result.tilt_deg.max() > 30
     assert 0.5 < result.coverage <= 1
-    # the poses are the ones the corners were made with
+    # the poses are those with which the corners were made
     expected = np.linalg.norm(poses[0][:3, 3])
     origin = inverse(result.T_camera_board[0])[:3, 3]
     centre = board_points(COLUMNS, ROWS, SQUARE_M).mean(axis=0)
@@ -171,7 +171,7 @@ def test_views_that_determine_nothing_are_refused() -> None:
 
 
 def _random_views(count: int, seed: int, *, noise_px: float = 0.04, shared_px: float = 0.0) -> list[BoardView]:
-    """Noisy corners; with `shared_px` the corners of one image are warped together, each image in its own way."""
+    """Noisy corners; with `shared_px` the corners of each image are also warped together, differently per image."""
     rng = np.random.default_rng(seed)
     points = BOARD.points()
     views: list[BoardView] = []
@@ -219,11 +219,11 @@ def test_leaving_a_view_out_is_what_a_new_adjustment_without_it_gives() -> None:
 
 
 def test_projection_uncertainty_is_the_spread_of_projections_over_calibrations() -> None:
-    """Each calibration's camera is moved to see the boards where they are, as whoever finds its pose will do."""
+    """Each calibrated camera is moved to fit the boards, as happens when its pose is estimated."""
     projected: list[Array] = []
     once = calibrate_intrinsics(_random_views(12, 0), BOARD, SIZE)
     stated = projection_uncertainty(once, 0.8, columns=6, rows=4)
-    inflation = once.inflation  # a dozen images tell it roughly; here it is known to be one
+    inflation = once.inflation  # a dozen images determine it only roughly; here it is known to be one
     rng = np.random.default_rng(5)
     clean = _random_views(12, 0, noise_px=0.0)
     truth = calibrate_intrinsics(clean, BOARD, SIZE)
@@ -243,7 +243,7 @@ def test_projection_uncertainty_is_the_spread_of_projections_over_calibrations()
     ratio = np.array(observed) / stated.sigma_px.ravel() * np.sqrt(inflation)
     assert 0.75 < np.median(ratio) < 1.3
     assert 0.5 < ratio.min() < ratio.max() < 1.8
-    # px to mm at that distance: f pixels a radian
+    # px to mm at that distance: f pixels per radian
     assert stated.centre_mm == pytest.approx(stated.centre_px * 800 / CAMERA.fx, rel=0.02)
     with pytest.raises(DataError, match="not in front"):
         projection_uncertainty(truth, -1.0)

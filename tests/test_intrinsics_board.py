@@ -1,4 +1,4 @@
-"""Boards of every kind in photographs with known corners: turned, cut, blurred, unevenly lit."""
+"""Boards of every kind in photographs with known corners: turned, cut off, blurred, unevenly lit."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ def test_boards_that_cannot_be_are_refused() -> None:
 
 
 def test_a_small_board_in_a_dark_room_is_found_as_it_is() -> None:
-    # Stretching the histogram makes texture of the dark room's noise: of 14 boards so photographed (a public set of
-    # bench/real_data.py) OpenCV finds all without it, and 4 with it.
+    # Stretching the histogram turns the noise of a dark room into texture: of 14 boards photographed so (a public set
+    # of bench/real_data.py) OpenCV finds all without stretching, and 4 with it.
     rng = np.random.default_rng(1)
     paper = np.full((400, 520), 95.0)
     for row in range(7):

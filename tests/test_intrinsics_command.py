@@ -1,4 +1,4 @@
-"""`orthocapture calibrate intrinsics` on photographs of a board, and what it says of a lens that was touched."""
+"""`orthocapture calibrate intrinsics` on photographs of a board, and its message about a lens that was touched."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _save(path: Path, grey: np.ndarray[Any, Any], *, focal_length_mm: float = 50
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eight views of a board, one of another size, and a picture of nothing."""
+    """Eight views of a board, one of another size, and an image without a board."""
     folder = tmp_path_factory.mktemp("boards")
     rng = np.random.default_rng(4)
     shade = checkerboard(BOARD.columns, BOARD.rows, BOARD.square_m)
@@ -146,7 +146,7 @@ def test_optics_are_compared_where_both_sides_state_them() -> None:
 
 
 class _Recorded:
-    """The captures of two steps, as the evidence has them, and what was noted."""
+    """The captures of two steps as in the evidence, and the notes made."""
 
     def __init__(self, focal_lengths_mm: dict[str, list[float]]) -> None:
         self.notes: list[Any] = []

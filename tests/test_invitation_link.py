@@ -1,4 +1,4 @@
-"""The page of a one-time link. That its code can be read is seen in a browser: tests/test_browser_tablet.py."""
+"""The page of a one-time link. tests/test_browser_tablet.py checks in a browser that its code can be read."""
 
 from __future__ import annotations
 

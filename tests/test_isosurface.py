@@ -1,4 +1,4 @@
-"""Surfaces of volumes: accuracy, orientation, handedness, slabs."""
+"""Isosurfaces of volumes: accuracy, orientation, handedness, slabs."""
 
 from __future__ import annotations
 

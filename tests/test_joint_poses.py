@@ -1,4 +1,4 @@
-"""Poses whose errors hang together: the stated covariance of the registration follows."""
+"""Poses with correlated errors: the stated covariance of the registration takes them into account."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def registered(seed: int, errors: np.ndarray) -> tuple[RegistrationResult, np.nd
 
 
 def test_errors_that_all_images_share_are_stated_in_full() -> None:
-    # Half of each pose's error is common to all images, as a frame that leans; half is its own.
+    # Half of each pose's error is common to all images, like a tilted frame; half is its own.
     sigma = np.array([0.05e-3] * 3 + [0.05e-3] * 3)
     joint = np.kron(np.ones((N, N)), np.diag(sigma**2)) + np.kron(np.eye(N), np.diag((0.3 * sigma) ** 2))
     root = np.linalg.cholesky(joint)

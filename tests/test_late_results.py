@@ -1,4 +1,4 @@
-"""Results that come after the evaluation: every reader is told of them, and of those that have not come yet."""
+"""Results that come after the evaluation: every reader is told of them, and of those still missing."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def record(folder: Path, store: Store) -> Run:
 
 
 def arrive(run: Run) -> None:
-    """One source before, and one after the end; both from the same features."""
+    """One source before the end and one after it, both from the same features."""
     for name, error_mm, late_s in (("triangulated", 0.03, None), ("colmap", 0.0125, 720.0)):
         run.job("evaluate", "evaluation", f"{name}-x", LATER)
         run.finish("evaluate", table(**{name: error_mm}), late_s)
@@ -174,7 +174,7 @@ def test_what_came_later_is_told_and_takes_nobodys_place(run: Run) -> None:
     assert first_page.counts(digest)["late_results"] == 2
     assert [f.seq for f in first_page.findings(digest, "late_results")] == [first.seq, second.seq]
     assert all(f.is_note for f in first_page.findings(digest, "late_results"))
-    assert first_page.findings(digest) == []  # no deviation
+    assert first_page.findings(digest) == []  # not a deviation
 
 
 def test_the_first_page_shows_what_came_and_what_is_still_to_come(run: Run, tmp_path: Path) -> None:
@@ -262,7 +262,7 @@ def test_ctrl_c_while_waiting_ends_in_order_and_says_what_goes_on(run: Run) -> N
 
 
 def long_job(run: Run, count: int) -> None:
-    """Features of images of noise, which take their time; nobody waits for them."""
+    """Compute features of noise images, which takes long and which nobody waits for."""
     draw = np.random.default_rng(1)
     images: list[dict[str, str]] = []
     for number in range(count):
@@ -323,7 +323,7 @@ def _left_while_it_waits(
     exported = orthocapture("audit", "export", run_id, str(bundle), "--data", str(data))
     assert exported.returncode == 0, exported.stderr
     assert verify_bundle([str(bundle)]) == 0
-    assert jobs(data, run_id)["features"] == "running"  # all this while it was computed
+    assert jobs(data, run_id)["features"] == "running"  # all this during the computation
     os.killpg(waiting.pid, signal.SIGINT)  # what Ctrl-C does
     until(lambda: bool(shown()) and waiting.poll() is not None, shown, 60.0)
     assert waiting.returncode == 0, shown()

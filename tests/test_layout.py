@@ -1,4 +1,4 @@
-"""Layouts of spheres: symmetric ones fail and say what to move, the simulator's pass, motion does not matter."""
+"""Layouts of spheres: symmetric ones fail with advice, the simulator's pass, and rigid motion does not matter."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_flat_and_one_sided_spheres_are_told() -> None:
 
 
 def _photographed(scene: Scene, count: int, seed: int = 0) -> list[Photograph]:
-    """Outlines as the detector gives them by a nominal camera, of the true lens from the technician's places."""
+    """Outlines as detected with the nominal camera, imaged through the true lens from the technician's positions."""
     rng = np.random.default_rng(seed)
     lens = scene.camera_intrinsics(1920)
     true = CameraModel.from_record(lens.to_json())
@@ -152,7 +152,7 @@ def _photographed(scene: Scene, count: int, seed: int = 0) -> list[Photograph]:
 
 @pytest.mark.parametrize("seed", [21, 47])
 def test_further_photographs_decide_what_one_leaves_open(seed: int) -> None:
-    """Of scene 21 the photograph told less than the CT: its spheres can be mistaken, those of 47 cannot."""
+    """Scene 21's photograph showed less than the CT: its spheres can be confused, those of scene 47 cannot."""
     scene = Scene.generate(seed)
     photographs = _photographed(scene, 3)
     truth = check_layout(np.concatenate([scene.registration_m, scene.control_m]))
@@ -179,7 +179,7 @@ def test_a_photograph_of_something_else_is_left_out() -> None:
 
 
 def test_an_outline_of_a_known_sphere_is_not_read_as_one_more() -> None:
-    """In this drawn layout one reading of the second photograph put two spheres in one place."""
+    """In this layout one reading of the second photograph put two spheres in the same place."""
     outcome = judge("irregular", 1106)
     assert outcome.good
     assert outcome.passed
@@ -198,7 +198,7 @@ def test_bounds_hold_the_truth_as_often_as_they_say() -> None:
         above += margin.lower_m > truth
         below += margin.upper_m < truth
     assert above <= 3
-    assert below <= 6  # the least of several upper bounds
+    assert below <= 6  # the smallest of several upper bounds
 
 
 def test_a_move_is_told_as_the_photograph_shows_it() -> None:

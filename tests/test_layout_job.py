@@ -1,4 +1,4 @@
-"""The job `layout` on a photograph by a lens that was not calibrated yet."""
+"""The job `layout` on a photograph taken with a lens that is not calibrated yet."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, cam
 def test_a_large_photograph_by_a_lens_that_was_not_calibrated_shows_all_spheres(
     tmp_path: Path, k1: float, width: int
 ) -> None:
-    """At full size the distortion bends outlines by so much that the detector finds seven of them."""
+    """At full size the distortion bends outlines so much that the detector finds only seven of them."""
     lens = replace(camera(2880), k1=k1)
     spheres = np.concatenate([REGISTRATION_M, CONTROL_M])
     image = render(lens, spheres * [1, -1, -1] + [0, 0, 0.8], 1, oversample=1)

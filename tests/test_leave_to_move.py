@@ -1,4 +1,4 @@
-"""After a restart the robot moves when a person has let it: anew, by name, whatever was confirmed before."""
+"""After a restart the robot moves only after a person has confirmed again, by name, whatever was confirmed before."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def restart(log: Log) -> None:
 
 
 def at_the_capture(text: str = TOY) -> Log:
-    """A run whose first process has come to the step that moves the robot."""
+    """A run whose first process has reached the step that moves the robot."""
     log = Log(toy_protocol(text))
     log.append(SessionStarted(resumed=False, software={}, host="h", pid=1))
     log.act("skip", step="fix_it", reason="no need")
@@ -42,7 +42,7 @@ def running(text: str = TOY) -> Log:
 
 
 def failing(text: str = TOY) -> Log:
-    """A passing trouble, which is tried again without a question."""
+    """A temporary failure, which is retried without asking."""
     log = running(text)
     failed = StepFailed(step="capture", attempt=1, error="DeviceTimeoutError", message="no answer", recovery="retry")
     log.append(failed)

@@ -1,4 +1,4 @@
-"""What crashes leave is listed and, when asked, removed; never anything recorded or about to be."""
+"""Leftovers of crashes are listed and, on request, removed; never anything recorded or about to be recorded."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ with Store.open(Path(sys.argv[1])) as store, store.lease(store.find_run("latest"
 
 
 def crash_left(store: Store, name: str) -> Path:
-    """A whole file whose record never came."""
+    """Store a file whose record never came."""
     return store.artefact_path(put_image(store, name).sha256)
 
 
@@ -89,7 +89,7 @@ def test_what_is_young_stays_also_where_old_bytes_were_stored_again(tmp_path: Pa
 
 
 def test_what_a_runner_at_work_may_still_record_stays(tmp_path: Path) -> None:
-    """Whatever the age: its lease is older than the file."""
+    """Whatever the file's age: its lease is older."""
     with Store.open(tmp_path) as store:
         run = start_run(store)
         with subprocess.Popen(
@@ -121,7 +121,7 @@ def must_stay(store: Store) -> None:
 
 
 def must_record(store: Store, run: str, ref: ArtefactRef) -> None:
-    """The file is there for its record."""
+    """Check that the file is there for its record."""
     store.record(run, [captured(ref, "v1")], actor="camera", artefacts=[NewArtefact(ref, "camera")])
     assert leftovers(store, min_age_s=0) == []
     assert verify(store.database_path.parent).ok

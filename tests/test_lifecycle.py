@@ -1,4 +1,4 @@
-"""The lifecycle: which transitions the generated machine has, and which not."""
+"""The lifecycle: the transitions that the generated machine has, and no others."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_abort_from_anywhere_but_the_end() -> None:
 
 
 def test_the_table_is_exactly_the_rules() -> None:
-    """No transition beyond those that the rules list: nothing slipped in from the library's defaults."""
+    """There are no transitions beyond the listed rules, such as defaults of the library."""
     expected: set[tuple[str, str]] = set()
     for paused in (False, True):
         for index, step in enumerate(STEPS):
@@ -119,7 +119,7 @@ def test_the_diagram_shows_every_step_and_every_rule() -> None:
         assert f"    {arrow}\n" in page
     for arrow in ("run --> aborted: abort", "paused --> aborted: abort"):
         assert page.count(f"    {arrow}\n") == 1
-    # Every trigger of the table is either drawn or, for the redos, said in words.
+    # Every trigger of the table is drawn or, for the redos, described in words.
     for trigger, _, _ in transition_table(protocol.step_ids):
         assert f": {trigger}\n" in page or trigger.startswith("redo_"), trigger
     assert "spray (irreversible)" in page

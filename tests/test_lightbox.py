@@ -76,7 +76,7 @@ def test_a_tower_that_stays_dark_is_a_fault() -> None:
 
 @contextmanager
 def answering(reply: Callable[[bytes], bytes]) -> Generator[str]:
-    """A pseudo-terminal where every line that arrives gets `reply`."""
+    """A pseudo-terminal on which every line that arrives is answered with `reply`."""
     master, slave = os.openpty()
     tty.setraw(slave)
     done = threading.Event()
@@ -171,7 +171,7 @@ def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
 
 
 def test_a_box_goes_on_after_a_client_that_asked_and_never_read(tmp_path: Path) -> None:
-    """Its answers filled the line, and it waited for ever (found by bench/torture/fuzz)."""
+    """Its answers filled the line, and the box blocked for ever (found by bench/torture/fuzz)."""
     with simulator("lightbox", "--link", str(tmp_path / "box")):
         with serial.Serial(str(tmp_path / "box"), timeout=0.5, write_timeout=5) as rude:
             for _ in range(400):

@@ -1,4 +1,4 @@
-"""What is asked of a run takes as long as the run is large, no longer: counted in lines executed, not seconds."""
+"""The cost of queries grows at most linearly with the size of a run: counted in executed lines, not seconds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from service.web.capture.view import views_of
 from tests.support.counting import lines_of
 
 SMALL, LARGE = 100, 200
-MOST = 2.3  # times as much for twice as many viewpoints
+MOST = 2.3  # limit of the ratio for twice as many viewpoints
 
 
 @contextmanager

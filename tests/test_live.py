@@ -1,4 +1,4 @@
-"""What an image brings while the capture runs: spheres, predicted error, coverage, which views to take next."""
+"""What each image adds during a capture: spheres, predicted error, coverage, and the views to take next."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ NO_SCATTER = np.zeros((6, 6))
 
 
 def informations(made: Scene, *, pose_noise_m: float = 0.0, seed: int = 0) -> list[ViewInformation]:
-    """Views with outlines of 0.1 px and camera poses that err by this much in 3D."""
+    """Views with outlines of 0.1 px and camera positions with errors of `pose_noise_m` in 3D."""
     rng = np.random.default_rng(seed)
     centre = apply(made.T_world_scan, CENTRE_M)
     out: list[ViewInformation] = []
@@ -178,7 +178,7 @@ def test_views_are_suggested_until_error_and_coverage_are_within_their_limits() 
 
 
 def hill() -> tuple[Array, Any]:
-    """A hemisphere on a board, in the midst of the spheres."""
+    """A hemisphere on a board, among the spheres."""
     board = trimesh.creation.box(
         (0.7, 0.5, 0.02), transform=trimesh.transformations.translation_matrix((0, 0, -0.01))
     )
@@ -282,7 +282,7 @@ STATION = "station_1"
 
 
 def erring_arm(made: Scene) -> tuple[Array, list[dict[str, Any]], dict[str, Any]]:
-    """T_base_world, what an arm that errs by a millimetre reports for each camera of a scene, and its correction."""
+    """T_base_world, the poses reported by an arm with millimetre errors for a scene's cameras, and its correction."""
     arm, T_flange_camera = arm_model("UR10e"), transform(np.eye(3), np.array([0.0, -0.055, 0.095]))
     deltas = np.random.default_rng(3).normal(0, 5e-4, (6, 4))
     correction = ArmCorrection("UR10e", deltas, np.zeros((6, 10)), np.zeros((6, 10)), np.ones(6))
@@ -438,13 +438,13 @@ class MeasuringRig(BenchRig):
     suite: BenchCt
 
     def ct(self) -> CtSource:
-        return cast(CtSource, self.suite)  # of its methods, those that the step uses
+        return cast(CtSource, self.suite)  # it has the methods that the step uses
 
 
 def measured_run(
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, folder: Path, *, held_out_mm: float
 ) -> Bench:
-    """A run whose images show the spheres exactly as they stand; a worker beside it."""
+    """A run whose images show the spheres exactly, with a worker beside it."""
     head, tail = PROTOCOL.split("  - id: capture\n")
     tail = tail.replace("    recovery: {retries: 2, wait_s: 0}", ENOUGH).replace(
         "distance_m: 0.6", "distance_m: 0.85"
@@ -530,7 +530,7 @@ def test_images_to_take_again_and_views_to_add_are_told_together_and_taken_by_on
     begin: Callable[[str], Bench], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     bench = measured_run(begin, monkeypatch, tmp_path, held_out_mm=0.5)
-    turned = {3}  # after the board's: v002
+    turned = {3}  # after the board images: v002
 
     def exif(applied: CameraSettings) -> CameraSettings:
         return other_settings(applied) if bench.rig.shutter.exposures in turned else applied

@@ -1,4 +1,4 @@
-"""Search where poses say that spheres are: the same outlines as a search of whole images, and nothing forced."""
+"""Search where poses predict spheres: the same outlines as from whole images, and no forced matches."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from tests.support.sphere_images import (
 )
 
 N, WIDTH = 7, 720
-OUTLINE_PX = 0.3  # of the outlines of these small images, sizes and common shifts included
+OUTLINE_PX = 0.3  # outline error in these small images, size errors and common shifts included
 SCENE_M = 0.65  # from the cameras
 EVERYTHING = np.vstack([REGISTRATION_M, CONTROL_M])
 Captured = tuple[Scene, list[Path], tuple[tuple[SphereOutline, ...], ...]]
@@ -61,7 +61,7 @@ def captured(tmp_path_factory: pytest.TempPathFactory) -> Captured:
 
 
 def erring(poses: Array, place_m: float, turn_rad: float) -> Array:
-    """Poses of a robot that errs, each by as much in another direction."""
+    """Poses of an inaccurate robot: errors of equal size in different directions."""
     rng = np.random.default_rng(5)
     out = np.array(poses)
     for T in out:
@@ -72,7 +72,7 @@ def erring(poses: Array, place_m: float, turn_rad: float) -> Array:
 
 
 def true_spheres(made: Scene, image: int, located: LocatedOutlines) -> list[tuple[int, float]]:
-    """Sphere and distance (px) from its true direction of every outline of an image."""
+    """Sphere and distance (px) from its true direction, for every outline of an image."""
     truth = made.centres_camera(image, EVERYTHING)
     truth /= np.linalg.norm(truth, axis=1, keepdims=True)
     out: list[tuple[int, float]] = []
@@ -105,7 +105,7 @@ def test_as_good_as_the_search_of_whole_images(captured: Captured, poses: str) -
         assert len({sphere for sphere, _ in found}) == len(found)
         named = {d: sphere for d, (sphere, _) in enumerate(found) if sphere < len(REGISTRATION_M)}
         assert assignment.markers == named
-        # What the whole search finds and is a sphere, this one finds too.
+        # Every sphere found in the whole image is found here too.
         for outline in whole[i]:
             off = min(float(np.linalg.norm(o.cone.axis - outline.cone.axis)) for o in located.outlines[i])
             assert off * made.camera.fx < 0.5
@@ -116,14 +116,14 @@ def test_as_good_as_the_search_of_whole_images(captured: Captured, poses: str) -
     )  # fmt: skip
     theirs = register_images(whole, given_poses, made.camera, REGISTRATION_M, RADIUS_M, estimate_scale=scale)
     assert len(ours.registration.residuals) >= len(theirs.registration.residuals)
-    # Poses that err move the registration whatever the outlines: exact outlines of the same spheres tell how far.
+    # Pose errors shift the registration whatever the outlines: exact outlines of the same spheres show how far.
     best = perfect(made, located, given_poses, scale)
     centre = REGISTRATION_M.mean(axis=0)
     off = apply(ours.registration.T_world_scan, centre) - apply(best.registration.T_world_scan, centre)
     outlines_m = 3 * OUTLINE_PX * SCENE_M / made.camera.fx / np.sqrt(len(best.registration.residuals))
     truth = inverse(made.T_world_scan) @ made.T_world_camera
     error_m, best_m = (true_error_m(r.registration.T_scan_camera, truth, centre) for r in (ours, best))
-    # Outlines that differ weight the poses a little differently: a tenth of these poses' own error.
+    # Slightly different outlines weight the poses differently: allow a tenth of these poses' own error.
     assert np.linalg.norm(off) < outlines_m + 0.1 * best_m
     assert error_m < 3 * ours.registration.sigma_at_m(centre)
 
@@ -133,7 +133,7 @@ def perfect(made: Scene, located: LocatedOutlines, poses: Array, scale: bool) ->
     assert located.assignments is not None
     outlines: list[tuple[SphereOutline, ...]] = []
     for i, assignment in enumerate(located.assignments):
-        exact, spheres = exact_outlines(made, i, REGISTRATION_M, margin_px=-40)  # cut ones too
+        exact, spheres = exact_outlines(made, i, REGISTRATION_M, margin_px=-40)  # including spheres that are cut off
         by_sphere = dict(zip(spheres, exact, strict=True))
         outlines.append(tuple(by_sphere[m] for m in assignment.markers.values()))
     known = [dataclasses.replace(a, markers=dict(enumerate(a.markers.values()))) for a in located.assignments]
@@ -182,7 +182,7 @@ def test_bad_arguments(captured: Captured, tmp_path: Path) -> None:
 
 
 def test_what_is_not_where_it_is_predicted_is_missing(captured: Captured) -> None:
-    """A marker moved since the scan, one gone, one of another colour: none is forced upon the registration."""
+    """A marker moved since the scan, one removed, one of another colour: none is forced into the registration."""
     made, _, whole = captured
     centres = made.centres_camera(0, EVERYTHING)
     expected = Prediction(
@@ -224,7 +224,7 @@ def test_anchors_are_spread(captured: Captured) -> None:
 
 
 def test_reduced_image_and_its_camera(tmp_path: Path) -> None:
-    made = scene(1, 1203, seed=3)  # odd: the last column of the reduced image stands for fewer pixels
+    made = scene(1, 1203, seed=3)  # odd: the last column of the reduced image covers fewer pixels
     picture = render(made.camera, made.centres_camera(0, REGISTRATION_M), 0, oversample=2)
     path = tmp_path / "view.jpg"
     assert cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, 97])

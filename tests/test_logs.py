@@ -1,4 +1,4 @@
-"""Logs: lines of JSON that say run, step, viewpoint, process; bounded; never on the last gigabyte; no secrets."""
+"""Logs: JSON lines with run, step, viewpoint and process; bounded; none on the last gigabyte; no secrets."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def lines(data: Path) -> list[dict[str, Any]]:
 
 @pytest.fixture
 def terminal() -> Generator[io.StringIO]:
-    """What the command line shows on stderr, as service.cli.main sets it up."""
+    """What the command line shows on stderr, as configured by service.cli.main."""
     shown = io.StringIO()
     handler = logging.StreamHandler(shown)
     root = logging.getLogger()
@@ -75,7 +75,7 @@ def test_a_run_says_of_what_it_speaks_and_the_terminal_shows_what_it_showed(
     (measured,) = [line for line in said if line["event"] == "step_measured" and line["step"] == "capture"]
     assert "viewpoint" not in measured
     assert "step_passed" in {line["event"] for line in said}
-    assert {line["logger"].split(".")[0] for line in said} == {"service"}  # not every library's every move
+    assert {line["logger"].split(".")[0] for line in said} == {"service"}  # no debug messages of libraries
     assert terminal.getvalue() == "the lens is cold\n"
 
 
@@ -155,7 +155,7 @@ def test_several_processes_share_a_log_that_is_bounded(tmp_path: Path) -> None:
     assert len(files) == 4
     assert all(path.stat().st_size <= 20_000 for path in files)
     assert sum(path.stat().st_size for path in files) > 60_000
-    said = lines(data)  # whole lines, all of them
+    said = lines(data)  # complete lines, all of them
     for name in ("a", "b", "c"):
         numbers = [int(line["event"].split()[1]) for line in said if line["process"] == name]
         assert numbers == sorted(numbers)

@@ -1,4 +1,4 @@
-"""Step kind `manual_capture` on the rig in memory: a person follows the words; what becomes of each image."""
+"""Step kind `manual_capture` on the in-memory rig: a person follows the words, and each image is judged."""
 
 from __future__ import annotations
 

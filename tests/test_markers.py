@@ -1,4 +1,4 @@
-"""The sphere detector: cones, sub-pixel outlines, and what must not spoil them."""
+"""The sphere detector: cones, sub-pixel outlines, and disturbances that it must tolerate."""
 
 from __future__ import annotations
 
@@ -73,21 +73,21 @@ def test_ransac_finds_the_cone_among_outliers(where: tuple[float, float, float],
     )
     assert result is not None
     cone, inlier = result
-    # By chance a cone near by may agree with as many points as the true one; what it finds is no worse than that.
+    # By chance a nearby cone can agree with as many points as the true one; then it is just as good.
     agreeing = np.abs(angles_to(truth, rays)) < 2e-4
     assert inlier.sum() >= 0.9 * agreeing.sum()
     if part > 0.6:
-        assert inlier[visible].all()  # a short arc's ends may be outside such a cone's tolerance
+        assert inlier[visible].all()  # the ends of a short arc may be outside such a cone's tolerance
     final = fit_cone(rays[visible], np.ones(int(visible.sum())), start)
     assert float(np.linalg.norm(final.axis - truth.axis)) < 1e-9
-    # A short arc passes an error within the tolerance on to the radius several times over.
+    # A short arc amplifies an error within the tolerance several times in the radius.
     assert np.isclose(cone.half_angle_rad, truth.half_angle_rad, atol=8e-4)
 
 
 def errors_px(
     found: tuple[SphereOutline, ...], centres: Array, fx: float
 ) -> tuple[list[float], list[float], list[int]]:
-    """Axis errors, radius errors and identities of detections against the true spheres."""
+    """Axis errors, radius errors and identities of detections, compared with the true spheres."""
     truth = [cone_of_sphere(c, RADIUS_M) for c in centres]
     axes, radii, ids = [], [], []
     for o in found:
@@ -207,7 +207,7 @@ CONDITIONS = [
     Look("orange", "blood", wires=6, stains=2),
     Look("green", "skin", srgb=False, quality=85),
 ]
-# None of them may be of any other thing; of those on which wires lie, not every one has enough outline left.
+# No detection may be anything else; spheres covered by wires may have too little outline left.
 LEAST_FOUND = [3, 3, 3, 3, 2, 3]
 
 
@@ -275,7 +275,7 @@ def test_a_stain_on_a_sphere_is_no_sphere_and_green_cloth_has_none() -> None:
 
 
 def test_an_arc_that_fills_the_image_is_no_outline_and_no_fault() -> None:
-    # A sphere larger than the image shows arcs alone: fits to them ran to radii below nothing, an IndexError.
+    # Of a sphere larger than the image only arcs are visible: fits gave negative radii, and an IndexError.
     rng = np.random.default_rng(0)
     width = 256
     y, x = np.mgrid[:width, :width].astype(np.float64)
@@ -311,7 +311,7 @@ def test_a_sphere_of_any_size_is_found_where_its_size_is_told() -> None:
 
 @pytest.mark.parametrize("side", [(1.0, 0.1), (-0.3, 1.0), (-0.8, -0.6), (0.2, -1.0)])
 def test_a_large_ball_half_in_shadow_before_a_dark_ground_is_found(side: tuple[float, float]) -> None:
-    # Its dark side passes into the ground without an edge: that was taken for the colour going on.
+    # Its dark side merges with the background without an edge, which was mistaken for more of the same colour.
     cam = camera(280)
     centre = np.array([[0.0, -0.001, RADIUS_M * cam.fx / (0.21 * cam.width)]])
     lamp = ((side[0], side[1], -0.6), 0.8)
@@ -327,9 +327,7 @@ def test_the_limb_of_a_glossy_ball_is_its_outline_not_the_horizon_that_it_mirror
     centre = np.array([[0.005, 0.0, 0.12]])
     look = Look(colour, "table", mirror=mirror, up=(0, 0, -1), posts=False, gloss=0.3)
     found = detect_spheres(render_look(cam, centre, look, seed=1), cam, options_for(None, 0.4))
-    assert (
-        len(found) == 1 or mirror < 0.3
-    )  # a grey ball hardly stands out from a grey table: refused rather than wrong
+    assert len(found) == 1 or mirror < 0.3  # a grey ball hardly differs from a grey table: refused rather than wrong
     assert all(abs(off) < 2.0 for off in errors_px(found, centre, cam.fx)[1])  # the ring is 12 px within
 
 

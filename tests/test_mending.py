@@ -1,4 +1,4 @@
-"""What a step advises when it falls short: the simulated technician does it and confirms, and gives up in the end."""
+"""A step's advice when it falls short: the simulated technician follows it, confirms, and finally gives up."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ADVICE = {
 
 
 class _World(socketserver.ThreadingTCPServer):
-    """The other end of the hands: writes down what it is asked to do, and does it."""
+    """The world to which the hands connect: records what it is asked to do, and does it."""
 
     daemon_threads = True
     allow_reuse_address = True
@@ -82,7 +82,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 
 def automatic_run(bench: Bench, world: _World) -> RunState:
-    """The run with --auto-confirm and the simulated world as the technician's hands."""
+    """The run with --auto-confirm, with the simulated world as the technician's hands."""
     protocol, _ = recorded_run(bench.store, bench.run_id)
     reporter = Reporter(bench.data, bench.run_id, OpenDevices, bench.rig.camera)
     host, port = world.server_address[:2]
@@ -95,7 +95,7 @@ def automatic_run(bench: Bench, world: _World) -> RunState:
 
 
 def advise(monkeypatch: pytest.MonkeyPatch, data: dict[str, Any] | None) -> None:
-    """The capture, whose own advice is to take images again, advises this when it falls short; None: nothing."""
+    """Replace the capture's own advice (to retake images) when it falls short; None: no advice."""
 
     def note(context: StepContext, _measures: Mapping[str, float], _images: int) -> None:
         if data is not None:

@@ -82,7 +82,7 @@ def test_partial_noisy_spheres_among_clutter(flipped: bool) -> None:
         assert 3e-5 < sphere.rms_m < 7e-5
         assert abs(sphere.radius_residual_m) < 3e-5
         assert np.all(np.linalg.eigvalsh(sphere.covariance) > 0)
-    # the promised uncertainty is of the size of the error: neither ten times too small nor too large
+    # the stated uncertainty is of the size of the error: not ten times too small or too large
     sigma = np.array([np.sqrt(np.trace(s.covariance)) for s in spheres])
     assert 0.2 < np.sqrt(np.mean(error**2)) / np.sqrt(np.mean(sigma**2)) < 5
 

@@ -1,4 +1,4 @@
-"""Spheres among shapes like them, small caps, clouds, shared noise: found, refused with reasons, uncertainty."""
+"""Spheres among similar shapes, small caps, clouds, correlated noise: found or refused, with uncertainty."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _scene(
 
 
 def _errors(spheres: tuple[MeshSphere, ...], centres: Array) -> tuple[Array, Array]:
-    """Distances (N,) and squared Mahalanobis lengths (N,) of a one-to-one assignment."""
+    """Distances (N,) and squared Mahalanobis distances (N,) of a one-to-one assignment."""
     found = np.array([s.centre_m for s in spheres])
     nearest = np.linalg.norm(found[:, None] - centres[None], axis=2).argmin(axis=1)
     assert sorted(nearest) == list(range(len(centres)))
@@ -67,7 +67,7 @@ def test_covariance_holds_for_noise_that_neighbours_share(shared_m: float) -> No
     for seed in range(4):
         centres, vertices, faces = _scene(seed + 20, 75, 5e-5, shared_m=shared_m)
         squares += _errors(locate_spheres(vertices, faces, RADIUS_M), centres)[1].tolist()
-    assert np.mean(np.array(squares) < 14.16) >= 0.95  # 3 sigma of three coordinates
+    assert np.mean(np.array(squares) < 14.16) >= 0.95  # 3 sigma in three dimensions
     assert 0.15 < np.mean(squares) / 3 < 2.0
 
 
@@ -80,7 +80,7 @@ def test_duplicate_shells_repeated_vertices_outliers_and_flipped_pieces() -> Non
         built.add(points, faces[:, ::-1] if number < 2 else faces)
         built.add(*cap(centre, np.deg2rad(70), rng))  # seen twice
     vertices, faces = built.build()
-    soup = vertices[faces].reshape(-1, 3)  # as STL has it
+    soup = vertices[faces].reshape(-1, 3)  # as in STL files
     stray = rng.random(len(soup)) < 0.01
     soup[stray] += rng.normal(0, 4e-3, (int(stray.sum()), 3))
     spheres = locate_spheres(soup, np.arange(len(soup)).reshape(-1, 3), RADIUS_M, expected=6)
@@ -88,7 +88,7 @@ def test_duplicate_shells_repeated_vertices_outliers_and_flipped_pieces() -> Non
 
 
 def test_facets_do_not_pull_the_centre_inwards() -> None:
-    """A facet lies inside of the sphere by up to e²/(8 R), 0.14 mm here; a cap's centre must not follow."""
+    """A facet lies up to e²/(8 R) inside the sphere, 0.14 mm here; the centre of a cap must not be shifted by it."""
     rng = np.random.default_rng(0)
     centre = np.array([0.1, 0.0, 0.2])
     points, faces = cap(centre, np.deg2rad(60), rng, level=3, white_m=0.0, pinholes=0.0)

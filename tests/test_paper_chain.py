@@ -1,4 +1,4 @@
-"""The paper's detector: finds the spheres, by its own boxes or by those of another detector."""
+"""The paper's detector finds the spheres, with its own boxes or those of another detector."""
 
 from __future__ import annotations
 

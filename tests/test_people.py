@@ -1,4 +1,4 @@
-"""Accounts and sign-ins: who gets in, who waits, what is recorded, and that secrets never are."""
+"""Accounts and sign-ins: who gets in, who must wait, what is recorded, and that secrets never are."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ IDLE_S = 600.0
 
 @dataclass
 class Office:
-    """People on a clock that stands still until told."""
+    """People with a clock that stands still unless told otherwise."""
 
     people: People
     store: Store
@@ -57,7 +57,7 @@ class Office:
         return token, person
 
     def outcomes(self, account: str | None = None) -> list[str]:
-        """Outcomes of sign-ins in the record, since the office was made."""
+        """Recorded outcomes of sign-ins since the office was created."""
         events = [event.payload for event in self.store.events(SITE)]
         signs = [p for p in events if isinstance(p, SignInRecorded) and account in (None, p.account)]
         return [p.outcome for p in signs]
@@ -92,7 +92,7 @@ def test_first_link_makes_the_administrator_once(tmp_path: Path) -> None:
         old, link = people.first_link(), people.first_link()
         assert old
         assert link
-        with pytest.raises(LinkError):  # a newer link voids it
+        with pytest.raises(LinkError):  # a newer link invalidates it
             people.accounts.set_up(old, "ada", "Ada Lovelace", "a good password", PIN)
         assert people.accounts.set_up(link, " Ada ", "Ada  Lovelace", "a good password", PIN) == "ada"
         assert people.first_link() is None
@@ -220,7 +220,7 @@ def test_a_password_is_hashed_for_every_refusal(office: Office, monkeypatch: pyt
         return bool(real(self, stored, given))
 
     monkeypatch.setattr(PasswordHasher, "verify", verify_and_count)
-    for account in ("grace", "nobody", "grace", "grace", "grace", "grace", "grace"):  # at the end it waits
+    for account in ("grace", "nobody", "grace", "grace", "grace", "grace", "grace"):  # waits at the end
         refused(lambda account=account: office.people.sign_in(account, "wrong"))
     assert hashed == ["wrong"] * 7
 
@@ -281,7 +281,7 @@ def test_an_idle_screen_locks_and_its_pin_opens_it(office: Office) -> None:
     assert open_still
     assert not open_still.locked
     office.clock.passed_s += IDLE_S - 1
-    by_itself = office.person(token)  # the page asks for its parts: that is nobody's act
+    by_itself = office.person(token)  # the page reloads its parts, which does not count as activity
     assert by_itself
     assert not by_itself.locked
     office.clock.passed_s += 1
@@ -423,7 +423,7 @@ def test_no_secret_reaches_the_record_or_the_database_in_clear(office: Office) -
     with closing(sqlite3.connect(database_path(office.data))) as connection:
         tables = ("accounts", "sessions", "invitations", "events", "control")
         text = "\n".join(str(row) for table in tables for row in connection.execute(f"SELECT * FROM {table}"))
-    # Short runs of digits occur in times and hashes by chance: a PIN would stand as a value of its own.
+    # Short digit sequences occur in times and hashes by chance: search for a PIN as a separate value.
     found = [secret for secret in secrets if re.search(rf"(?<![0-9A-Za-z]){re.escape(secret)}(?![0-9A-Za-z])", text)]
     assert found == []
     assert person.csrf not in "\n".join(event.model_dump_json() for event in office.store.events(SITE))

@@ -1,4 +1,4 @@
-"""Control of a run: one screen acts, the others look on, and the chain of the run says who had it when."""
+"""Control of a run: one screen acts, the others look on, and the run's chain records who had it when."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_asking_too_soon_does_not_take_it(room: Room) -> None:
         room.control.take(room.run, emmy)
     room.control.ask(room.run, emmy)
     room.clock.passed_s += 30
-    room.control.ask(room.run, emmy)  # impatience does not start the waiting anew
+    room.control.ask(room.run, emmy)  # asking again does not restart the waiting time
     with pytest.raises(ControlError):
         room.control.take(room.run, emmy)
     room.clock.passed_s += 30

@@ -1,4 +1,4 @@
-"""EXIF and completeness of photograph files, of several makers."""
+"""EXIF and completeness of photograph files from several manufacturers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_pictures_without_exif_are_read_and_say_so(path: Path) -> None:
 
 
 def sony(path: Path, focus_position: int) -> Path:
-    """A JPEG with the maker's note in which Sony's ILCE bodies tell their focus; exiv2 enciphers it as they do."""
+    """A JPEG with the maker note in which Sony's ILCE bodies state their focus, enciphered as in a camera."""
     Image.new("RGB", (90, 60), (90, 120, 80)).save(path, "JPEG")
     image = exiv2.ImageFactory.open(str(path))
     image.readMetadata()
@@ -114,7 +114,7 @@ def test_cut_off_jpeg(tmp_path: Path, progressive: bool) -> None:
     path = photograph(tmp_path / "DSC00001.JPG", image={271: "SONY"}, photo={}, progressive=progressive)
     check_jpeg_complete(path)
     whole = path.read_bytes()
-    # A preview appended after the picture, as Sony does, is no damage.
+    # A preview appended after the image, as by Sony, is not damage.
     path.write_bytes(whole + whole)
     check_jpeg_complete(path)
     for kept in (len(whole) - 2, len(whole) // 2, 30, 3):

@@ -54,7 +54,7 @@ def situation() -> Situation:
 
 
 def camera_at(eye: tuple[float, float, float]) -> Transform:
-    """A camera at a place relative to the scene's centre that looks at it."""
+    """A camera at a position relative to the scene's centre, looking at it."""
     centre = np.array(LAYOUT.scene_centre_m)
     return look_at(centre + np.array(eye), centre, -np.array(LAYOUT.approach))
 
@@ -104,7 +104,7 @@ def test_every_posture_reaches_the_pose_and_the_given_one_is_among_them(q: Array
         or abs(np.sin(q[2])) < 1e-3
         or abs(np.hypot(*(T[:2, 3] - arm.d_m[5] * T[:2, 2]))) < 0.2
     ):
-        return  # near a singularity a posture is a whole family, or two that have become one
+        return  # near a singularity a posture is a whole family, or two that have merged
     assert np.allclose(forward(arm, found), T, atol=1e-6)
     apart = np.abs(np.angle(np.exp(1j * (found - q)))).max(axis=1)
     assert apart.min() < 1e-5
@@ -287,7 +287,7 @@ def test_a_step_without_a_board_has_no_board_poses(tmp_path: Path) -> None:
 
 def test_a_plan_in_the_listed_order_does_not_compare_every_viewpoint_with_every_other(situation: Situation) -> None:
     poses = [camera_at((0.001 * number, -0.1, 0.62)) for number in range(150)]
-    planned(situation, *poses[:2])  # what is loaded once is not counted
+    planned(situation, *poses[:2])  # loads once what must not be counted
     tracemalloc.start()
     try:
         plan = planned(situation, *poses)

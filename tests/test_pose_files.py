@@ -1,4 +1,4 @@
-"""Pose, camera and sphere files: what is written is read back, and every fault is named with its place."""
+"""Pose, camera and sphere files: they survive a round trip, and every fault is named with its place."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_colmap_text_round_trip_and_convention(tmp_path: Path, capfd: pytest.Cap
     text = (tmp_path / "sparse" / "0" / "cameras.txt").read_text(encoding="utf-8").splitlines()
     fields = text[-1].split()
     assert fields[1] == "OPENCV"
-    # COLMAP's pixel centres lie at halves
+    # COLMAP's pixel centres are at half-integers
     assert [float(v) for v in fields[6:8]] == [CAMERA.cx + 0.5, CAMERA.cy + 0.5]
     assert capfd.readouterr() == ("", "")
     with pytest.raises(DataError, match="spaces"):
@@ -77,7 +77,7 @@ def test_colmap_text_round_trip_and_convention(tmp_path: Path, capfd: pytest.Cap
 
 
 def test_colmap_model_written_by_hand(tmp_path: Path) -> None:
-    """World-to-camera, quaternion scalar first: a camera 2 m before the origin, turned half around y."""
+    """World-to-camera, quaternion scalar first: a camera 2 m in front of the origin, turned by 180° about y."""
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
     (tmp_path / "images.txt").write_text("1 0 0 1 0 0 0 2 1 view.png\n\n")
     (tmp_path / "points3D.txt").write_text("")
@@ -115,7 +115,7 @@ def test_a_colmap_model_that_announces_endless_data_is_given_up(tmp_path: Path) 
 
 
 def test_transforms_json_is_opengl(tmp_path: Path) -> None:
-    """The identity there is a camera that looks along -z with y up: ours looks along -z with y down."""
+    """The identity in OpenGL is a camera that looks along -z with y up; ours looks along -z with y down."""
     frame = {"file_path": "./images/v.png", "transform_matrix": np.eye(4).tolist()}
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
     T = read_poses(tmp_path / "transforms.json")["images/v.png"]
@@ -145,7 +145,7 @@ def test_wrong_header_and_missing_pose(tmp_path: Path) -> None:
     path.write_text("name,x,y\n")
     with pytest.raises(DataError, match="first line"):
         read_poses(path)
-    path.write_text("﻿" + CSV + "images/a.jpg,0,0,0,0,0,0,1\r\n")  # as a spreadsheet saves it
+    path.write_text("﻿" + CSV + "images/a.jpg,0,0,0,0,0,0,1\r\n")  # as saved by a spreadsheet
     assert list(read_poses(path, ["a.jpg"])) == ["a.jpg"]
     with pytest.raises(DataError, match=r"1 of 2 images have no pose: b\.jpg"):
         read_poses(path, ["a.jpg", "b.jpg"])

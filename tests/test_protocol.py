@@ -15,7 +15,7 @@ from tests.support.core import KINDS, TOY, CaptureParams, ChecklistParams, load
 
 
 def line_of(text: str, part: str, nth: int = 1) -> int:
-    """The line, from 1, of the nth occurrence of `part`."""
+    """The line number, from 1, of the nth occurrence of `part`."""
     hits = [number for number, line in enumerate(text.splitlines(), start=1) if part in line]
     return hits[nth - 1]
 
@@ -49,7 +49,7 @@ def test_numbers_follow_yaml_1_2() -> None:
 
 
 FAULTS: list[tuple[str, str, str, str, str]] = [
-    # what is replaced, by what, text that marks the line, field, message
+    # old text, new text, text that marks the line, field, message
     ("title: A toy", "titel: A toy", "titel", "titel", r"unknown field \(did you mean 'title'\?\)"),
     ("registration: 10", "registraton: 10", "spheres:", "spheres.registration", "missing field"),
     ("  kind: checklist\n    title: Fix", "  title: Fix", "id: fix_it", "steps[0].kind", "missing field"),

@@ -1,4 +1,4 @@
-"""`orthocapture protocol check` knows what each kind measures, in which unit, and which limits make sense."""
+"""`orthocapture protocol check` knows each kind's measures, their units, and plausible limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Golden bytes of the simulated camera's wire, and the operations behind it without any socket."""
+"""Golden bytes of the simulated camera's wire, and its operations without a socket."""
 
 from __future__ import annotations
 

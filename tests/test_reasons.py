@@ -1,4 +1,4 @@
-"""Reasons to choose from: the protocol's own or good ones, beside free words; the text of both is recorded."""
+"""Reasons to choose from, the protocol's own or the defaults, beside free words; the text of both is recorded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`orthocapture register` on photographs of a scene whose truth is known, with every kind of input."""
+"""`orthocapture register` on photographs of a scene with ground truth, with every kind of input."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 @pytest.fixture
 def few(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Three of the photographs, looked at in this process: workers take longer to start than these take."""
+    """Three of the photographs, processed within this process because starting workers takes longer."""
     monkeypatch.setattr("service.cli.compute.register.os.cpu_count", lambda: 1)
     folder = tmp_path / "few"
     folder.mkdir()
@@ -109,7 +109,7 @@ def few(capture: Capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
 
 @pytest.fixture(scope="module")
 def record(capture: Capture) -> dict[str, Any]:
-    """Registered with all photographs, spheres.json and CSV."""
+    """The result of registering all photographs, with spheres.json and CSV."""
     out = capture.folder / "result.json"
     result = register(capture, out)
     assert f"{N_IMAGES} images" in result.output
@@ -118,7 +118,7 @@ def record(capture: Capture) -> dict[str, Any]:
 
 
 def register(capture: Capture, out: Path, **changes: object) -> Result:
-    """The command with the capture's files; `spheres`, `poses`, … replace an option, None leaves it out."""
+    """The command with the capture's files; `spheres`, `poses`, … replace an option, None omits it."""
     options: dict[str, object] = {
         "images": capture.folder / "images",
         "camera": capture.folder / "camera.json",
@@ -146,7 +146,7 @@ def registered(result: Result, out: Path) -> dict[str, Any]:
 
 
 def true_error_mm(record: dict[str, Any], capture: Capture) -> float:
-    """Greatest distance of a sphere from where it really is."""
+    """Largest distance of a sphere from its true position."""
     points = np.concatenate([capture.registration_scan_m, capture.control_scan_m])
     gap = apply(np.array(record["T_world_scan"]), points) - apply(capture.T_world_scan, points)
     return 1e3 * float(np.linalg.norm(gap, axis=1).max())
@@ -180,7 +180,7 @@ def test_detections_lie_on_the_spheres_they_are_said_to_be(capture: Capture, rec
                     x, y, z = apply(T_camera_scan, centres[detection[key]])
                     pinhole = np.array([capture.camera.fx * x / z, capture.camera.fy * y / z])
                     middle = np.array([capture.camera.cx, capture.camera.cy])
-                    # Distortion and the ellipse's eccentricity move it by less.
+                    # Distortion and the ellipse's eccentricity shift it by less.
                     assert np.linalg.norm(pinhole + middle - detection["centre_px"]) < 4
                     seen += 1
     assert seen > 5 * N_IMAGES
@@ -199,7 +199,7 @@ def test_mesh_and_control_indices(capture: Capture, tmp_path: Path) -> None:
     centres = np.array(record["spheres_mm"]["registration"])
     assert len(centres) == 13
     assert true_error_mm(record, capture) < 0.1
-    # The user reads the indices off this list, and runs again.
+    # The user reads the indices from this list and runs again.
     gaps = np.linalg.norm(centres[:, None] - 1e3 * capture.control_scan_m, axis=2)
     control = gaps.argmin(axis=0)
     assert gaps.min(axis=0).max() < 0.1
@@ -235,7 +235,7 @@ def test_scale_of_poses_that_are_not_metric(capture: Capture, few: Path, tmp_pat
     assert true_error_mm(record, capture) < 0.2
     assert record["mean_radial_error_mm"] < 0.2
     assert np.array(record["covariance"]).shape == (7, 7)
-    # Taken for metric they contradict the images, and nothing is written.
+    # If assumed metric they contradict the images, and nothing is written.
     refused(register(capture, tmp_path / "none.json", **options), tmp_path / "none.json", "poses contradict", "unit")
 
 

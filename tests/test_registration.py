@@ -1,4 +1,4 @@
-"""The registration solver: exact outlines give exact poses, derivatives are right, sigmas are honest."""
+"""The registration solver: exact outlines give exact poses, derivatives are right, sigmas are consistent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stated covariances of the registration are honest, whatever the source of the errors."""
+"""The stated covariances of the registration are consistent, whatever the source of the errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NOISE_PX = 0.1
 def solved(
     made: Scene, seed: int, *, pose_sigma: tuple[float, float] = (0.0, 0.0), sphere_sigma_m: float = 0.0
 ) -> RegistrationResult:
-    """One capture with errors of these sizes, which the solver is told of (but not of those of the poses)."""
+    """A registration with errors of these sizes, all known to the solver except those of the poses."""
     rng = np.random.default_rng([seed, 77])
     n = len(made.T_world_camera)
     found = [exact_outlines(made, i, REGISTRATION_M, NOISE_PX, seed) for i in range(n)]
@@ -43,7 +43,7 @@ def solved(
 
 
 def chi2(result: RegistrationResult, made: Scene) -> float:
-    """Squared error of all six numbers in the metric of the stated covariance, a degree of freedom."""
+    """Squared error of T_world_scan (six numbers) in the metric of the stated covariance, per degree of freedom."""
     e = apply(result.T_world_scan, TARGET) - apply(made.T_world_scan, TARGET)
     w = Rotation.from_matrix(made.T_world_scan[:3, :3] @ result.T_world_scan[:3, :3].T).as_rotvec()
     both = np.concatenate([made.T_world_scan[:3, 3] - result.T_world_scan[:3, 3], w])
@@ -70,7 +70,7 @@ def test_errors_have_the_size_stated(pose_sigma: tuple[float, float], sphere_sig
 
 
 def test_errors_of_poses_are_taken_off() -> None:
-    """Poses as bad as those of an uncalibrated arm cost less when their errors are integrated out."""
+    """Poses as bad as those of an uncalibrated arm do less harm if their errors are marginalised."""
     made = scene(8, seed=4)
     truth = inverse(made.T_world_scan) @ made.T_world_camera
     before: list[float] = []
@@ -81,14 +81,14 @@ def test_errors_of_poses_are_taken_off() -> None:
             5e-4, rel=0.6
         )
         for out, cameras in ((before, result.T_scan_camera), (after, result.T_scan_camera_refined)):
-            # where each camera sees the target, against the truth
+            # where each camera sees the target, compared with the truth
             seen = apply_each(cameras, truth, TARGET)
             out.append(float(np.mean(seen)))
     assert np.mean(after) < 0.3 * np.mean(before)
 
 
 def apply_each(cameras: Array, truth: Array, point: Array) -> Array:
-    """Distances (N,) between the places of a point in each camera as found and in truth."""
+    """Distances (N,) between estimated and true position of a point in each camera."""
     return np.array(
         [
             float(np.linalg.norm(apply(inverse(a), point) - apply(inverse(b), point)))
@@ -110,7 +110,7 @@ def test_map_equals_the_value_at_points() -> None:
 
 
 def test_what_no_view_can_tell_remains() -> None:
-    """A displacement that all outlines share in space stays in the prediction however many images there are."""
+    """A displacement shared by all outlines stays in the predicted error, however many images there are."""
     made = scene(6, seed=3)
     n = len(made.T_world_camera)
     found = [exact_outlines(made, i, REGISTRATION_M, 0.01, 0) for i in range(n)]
@@ -139,7 +139,7 @@ def test_covariances_of_the_wrong_shape_are_refused() -> None:
 
 
 def test_a_turned_frame_changes_nothing() -> None:
-    """The prediction belongs to the point, not to the frames."""
+    """The prediction is a property of the point and does not depend on the frames."""
     made = scene(5, seed=6)
     turned = transform(Rotation.from_rotvec([0.3, -1.0, 0.4]), np.array([0.5, -0.2, 1.0]))
     other = Scene(turned @ made.T_world_scan, turned @ made.T_world_camera, made.camera)
@@ -148,7 +148,7 @@ def test_a_turned_frame_changes_nothing() -> None:
 
 
 def test_refined_cameras_are_placed_as_well_as_stated() -> None:
-    """The scan against the cameras with the errors of an arm taken off."""
+    """The scan relative to the cameras, with the arm's errors removed."""
     made = scene(8, seed=4)
     truth = inverse(made.T_world_scan) @ made.T_world_camera
     squares: list[float] = []
@@ -169,7 +169,7 @@ def test_refined_cameras_are_placed_as_well_as_stated() -> None:
 @pytest.mark.parametrize("with_scale", [True, False])
 @pytest.mark.parametrize("seed", [1, 6, 8])
 def test_exact_outlines_and_poses_of_another_unit(seed: int, with_scale: bool) -> None:
-    """Residuals hundreds of times what the outlines state are the poses'; the scale may have to be found first."""
+    """Residuals hundreds of times the stated outline errors come from the poses; the scale may be needed first."""
     made = tracked_scene(seed)
     found = identify(made.outlines, REGISTRATION_M, made.camera, made.poses, radius_m=RADIUS_M, metric=False)
     assignments = [Assignment(a.markers, a.T_camera_scan, a.scale if with_scale else None) for a in found]

@@ -1,4 +1,4 @@
-"""The simulated camera's picture agrees with its own geometry to hundredths of a pixel, and with its settings."""
+"""The simulated camera's image agrees with its geometry to hundredths of a pixel, and with its settings."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def plain(renderer: Renderer, scene: Scene) -> Picture:
 
 
 def view(scene: Scene, T_world_camera: Array, **changes: Any) -> dict[str, Any]:
-    """What the world would answer, with the scene's true lens unless another is given."""
+    """The world's answer, with the scene's true lens unless another one is given."""
     lens: Intrinsics = changes.pop("lens", None) or scene.camera_intrinsics(WIDTH)
     lux = changes.pop("light_lux", NOMINAL_LUX)
     return {
@@ -59,7 +59,7 @@ def view(scene: Scene, T_world_camera: Array, **changes: Any) -> dict[str, Any]:
 
 
 def linear(picture: Picture) -> Array:
-    """Linear light 0..1 of sRGB bytes."""
+    """Linear light 0…1 of sRGB bytes."""
     v = picture.astype(np.float64) / 255.0
     return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
 
@@ -68,7 +68,7 @@ def linear(picture: Picture) -> Array:
 
 
 def outline(lens: Intrinsics, centre_camera: Array) -> Array:
-    """Pixels (2000, 2) of the rays that touch a sphere."""
+    """Pixels (2000, 2) of the rays tangent to a sphere."""
     distance = float(np.linalg.norm(centre_camera))
     axis = centre_camera / distance
     e1 = np.cross(axis, [0.0, 1.0, 0.0])
@@ -91,7 +91,7 @@ def test_a_sphere_covers_exactly_what_its_outline_encloses(scene: Scene) -> None
         )
         for frame in (black, white):
             draw_sphere(frame, centre, centre, RADIUS_M, scene.lamp_m)
-        # What of the background shines through, whatever the sphere's colour.
+        # The fraction of background that shines through, independent of the sphere's colour.
         cover = (1.0 - (white.colour - black.colour)).mean(axis=2).astype(np.float64)
         edge = outline(lens, centre)
         x, y = edge.T
@@ -112,11 +112,11 @@ def test_sphere_outlines_in_the_picture_lie_on_the_analytic_cone(plain: Picture,
     for outline_found in found:
         cone = outline_found.cone
         nearest = min(cones, key=lambda c: float(np.linalg.norm(c.axis - cone.axis)))
-        # Off the axis (2) and too large (1), in pixels.
+        # Offset from the axis (2) and excess size (1), in pixels.
         axis = camera.fx * (cone.frame()[:, :2].T @ nearest.axis)
         shifts.append(np.append(axis, camera.fx * (cone.half_angle_rad - nearest.half_angle_rad)))
     assert len(shifts) >= 7
-    # Shadow and gamma pull at the detector on spheres of 20 pixels: the exact coverage is tested above.
+    # Shadow and gamma bias the detector on spheres of 20 pixels; the exact coverage is tested above.
     centre_and_size_px = np.median(shifts, axis=0)
     assert np.abs(centre_and_size_px[:2]).max() < 0.15
     assert abs(centre_and_size_px[2]) < 0.03
@@ -137,7 +137,7 @@ def test_checkerboard_corners_lie_where_the_lens_projects_them(renderer: Rendere
     error = found - true
     assert np.sqrt(np.mean(np.sum(error**2, axis=1))) < 0.1
     assert np.abs(error.mean(axis=0)).max() < 0.02
-    # The distortion is in the picture: without it the corners would not fit.
+    # The image contains the distortion: without it the corners would not fit.
     pinhole = dataclasses.replace(lens, k1=0.0, k2=0.0, p1=0.0, p2=0.0)
     straight = pinhole.project(apply(inverse(ABOVE) @ T_world_board, board))
     assert np.linalg.norm(found - straight, axis=1).max() > 0.5
@@ -162,7 +162,7 @@ def test_rays_and_projection_are_inverse_over_the_whole_image(scene: Scene) -> N
 
 def test_a_scaled_lens_sees_the_same_directions(scene: Scene) -> None:
     small = scene.camera_intrinsics(WIDTH)
-    # The corners of the image, which are half a pixel outside of the outermost pixel centres.
+    # The corners of the image lie half a pixel outside the outermost pixel centres.
     corners = [np.array([[-0.5, -0.5], [lens.width - 0.5, lens.height - 0.5]]) for lens in (scene.lens, small)]
     assert np.allclose(scene.lens.rays(corners[0]), small.rays(corners[1]), atol=1e-9)
 
@@ -210,7 +210,7 @@ def test_control_spheres_and_spray_change_only_what_they_touch(
         patch = np.s_[row - 3 : row + 4, column - 3 : column + 4]
         there, away = with_spheres[patch].mean(axis=(0, 1)), plain[patch].mean(axis=(0, 1))
         assert np.abs(there - away).max() > 25
-    # A coat of chalk: paler than wet tissue.
+    # A coat of chalk is paler than wet tissue.
     coated = np.abs(sprayed.astype(float) - plain).max(axis=2) > 25
     assert 0.02 < coated.mean() < 0.6
     assert np.ptp(sprayed[coated], axis=1).mean() < 0.7 * np.ptp(plain[coated], axis=1).mean()

@@ -1,4 +1,4 @@
-"""Replaying a run: equal when nothing changed, and where and by how much not when something did."""
+"""Replaying a run: equal if nothing changed; otherwise it shows where and by how much results differ."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.support.recorded_run import record_run
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recorded run, in the folder data."""
+    """A recorded run in the folder data."""
     made = tmp_path_factory.mktemp("recorded")
     record_run(made)
     return made
@@ -39,7 +39,7 @@ def again(folder: Path, **options: Any) -> ReplayReport:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file but SQLite's own, which come and go with a connection."""
+    """Every file except SQLite's temporary ones, which come and go with a connection."""
     files = (path for path in folder.rglob("*") if path.is_file() and not path.name.endswith(("-shm", "-wal")))
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
@@ -49,7 +49,7 @@ def hand(monkeypatch: pytest.MonkeyPatch, kind: str, handler: Handler) -> None:
 
 
 def moved_spheres(context: JobContext) -> JobAnswer:
-    """As if the search for spheres had been changed: every centre 0.1 mm further."""
+    """As if the search for spheres had changed: every centre is shifted by 0.1 mm."""
     answer = locate_spheres(context)
     spheres = [[x + 1e-4, y, z] for x, y, z in answer.result["spheres_m"]]
     measures = {**answer.measures, "sphere_change_max_mm": 0.4}
@@ -100,7 +100,7 @@ def test_end_to_end_carries_the_change_to_the_registration(folder: Path, monkeyp
     report = again(folder, end_to_end=True)
     assert report.jobs[2].verdict == "different"
     (drift,) = report.drifts
-    # The scan's spheres moved by 0.1 mm in its own frame: so much moves every camera in it.
+    # The scan's spheres moved by 0.1 mm in its own frame, so every camera moves by as much in it.
     assert drift.registration == "colmap"
     assert drift.against_cameras_mm == pytest.approx(0.1, abs=0.01)
 

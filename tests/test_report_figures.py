@@ -1,4 +1,4 @@
-"""The figures of a report as files: SVG that draws, CSV that says the same; and how large a whole report is."""
+"""The figures of a report as files (valid SVG, CSV with the same values), and the size of a whole report."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from service.store.verification.verify import verify
 from tests.support.reported_run import record_reported_run
 
 _SVG = "{http://www.w3.org/2000/svg}"
-_LARGEST_BYTES = 3_000_000  # of a report to be sent by post
+_LARGEST_BYTES = 3_000_000  # limit for a report sent by mail
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the figures of a registered run."""
+    """The folder with the figures of a registered run."""
     folder = tmp_path_factory.mktemp("figures")
     record_reported_run(folder, registered=True)
     out = folder / "new" / "figures"

@@ -1,4 +1,4 @@
-"""The report as PDF: what it says, on numbered pages with contents, and what a screen reader is told."""
+"""The report as PDF: its statements, numbered pages with contents, and its tags for screen readers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photographs at a lower resolution: what is seen where agrees with the camera that goes with it."""
+"""Photographs at a lower resolution: image positions agree with the matching camera model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run that is killed in the middle of the viewpoint capture goes on at the next viewpoint."""
+"""A run that is killed during the viewpoint capture continues at the next viewpoint."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def captured(data: Path) -> list[dict[str, Any]]:
 
 
 def events(data: Path) -> list[dict[str, Any]]:
-    """The events so far, read as an auditor reads them."""
+    """The events so far, as an auditor reads them."""
     if not (data / "orthocapture.sqlite").exists():
         return []
     answer = orthocapture("audit", "show", "latest", "--data", str(data), "--json")

@@ -1,4 +1,4 @@
-"""A capture that falls short offers the images that would mend it: only those are taken again."""
+"""A capture that falls short offers the images that would mend it: only those are retaken."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from tests.support.waiting import until
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
 
 SMALL = ("--scene", "3", "--image-width", "480", "--speed-up", "10")
-# The rigs of other tests do not stand in the way of these.
+# These rigs use an address of their own, so that they do not wait for those of other tests.
 OWN_HOST = "127.0.0.61"
 
 
@@ -60,7 +60,7 @@ class Hands:
 
 @contextmanager
 def rig_process(folder: Path) -> Generator[tuple[subprocess.Popen[str], dict[str, Any], list[psutil.Process]]]:
-    """A rig that the test ends itself; with its ready line and all its processes."""
+    """A rig that the test ends itself; yields it with its ready line and all its processes."""
     with RigLock(OWN_HOST), (folder / "rig.log").open("w") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", "simulators", "rig", "--dir", str(folder), "--host", OWN_HOST, *SMALL],
@@ -88,7 +88,7 @@ def listens(host: str, port: int) -> bool:
 
 def test_files_world_and_hands(tmp_path: Path) -> None:
     with simulated_rig(tmp_path, *SMALL, host=OWN_HOST) as ready, Hands(ready["world"]) as hands:
-        # What the ready line promises is there, and the service reads it.
+        # Everything in the ready line exists, and the service can read it.
         assert ready["ready"] is True
         assert Path(ready["rig"]) == tmp_path / "rig.yaml"
         for key in ("rig", "truth", "ct_folder", "scan_folder"):
@@ -101,7 +101,7 @@ def test_files_world_and_hands(tmp_path: Path) -> None:
         assert rig.section.hands == ready["world"]
         assert set(rig.section.stations) == {"station_1", "station_2"}
 
-        # The truth is in its file alone.
+        # The ground truth is only in its own file.
         truth = json.loads(Path(ready["truth"]).read_text())
         assert truth["scene"] == 3
         assert "no operation 'truth'" in hands.ask("truth")["error"]
@@ -116,7 +116,7 @@ def test_files_world_and_hands(tmp_path: Path) -> None:
             centre = T_world_base[:3, :3] @ np.array(section.scene_centre_m) + T_world_base[:3, 3]
             assert 0 < np.linalg.norm(centre - [0, 0, 0.05]) < 0.02
 
-        # Bad requests get an answer and leave the connection as it was.
+        # Bad requests are answered and do not affect the connection.
         for line in ("{", "[]", "7", '{"op": "fly"}', '{"op": "robot", "arm": "robot"}'):
             assert hands.send(line)["ok"] is False
         assert "juggle" in hands.act("juggle")["error"]
@@ -131,7 +131,7 @@ def test_files_world_and_hands(tmp_path: Path) -> None:
         assert np.array(after["scene"]["board"]).shape == (4, 4)
         assert (after["scene"]["spray"], after["scene"]["control_spheres"]) == (True, False)
         assert (after["station"], after["pedal_presses"]) == ("station_2", 1)
-        # The arm has been carried to the other side of the table.
+        # The arm has been moved to the other side of the table.
         positions = [np.array(v["T_world_camera"])[:3, 3] for v in (before, after)]
         assert np.linalg.norm(positions[0] - positions[1]) > 0.1
         first = after["scene"]["board"]
@@ -140,7 +140,7 @@ def test_files_world_and_hands(tmp_path: Path) -> None:
         hands.act("place_board")
         assert hands.ask("view")["scene"]["board"] != first
 
-        # A scan lands in the scan folder, its truth only in the truth.
+        # A scan arrives in the scan folder, its ground truth only in the truth file.
         answer = hands.act("hand_scan")
         assert answer["ok"] is True
         assert "truth" not in answer
@@ -196,7 +196,7 @@ def test_a_killed_rig_takes_its_devices_with_it(tmp_path: Path) -> None:
 
 
 def two_station_protocol(folder: Path) -> Path:
-    """Two viewpoints at each station, and in between what moves the camera to the other one."""
+    """Two viewpoints at each station, with a step between that moves the camera to the other one."""
     protocol = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     by_id = {step["id"]: step for step in protocol["steps"]}
     change = {
@@ -252,7 +252,7 @@ def test_two_controllers_are_found_and_used(tmp_path: Path) -> None:
         for station, T_world_base in truth["T_world_base"].items():
             recorded = np.array(T_world_base) @ np.array(event.T_base_flange) @ T_flange_camera
             error_m = float(np.linalg.norm(recorded[:3, 3] - true[:3, 3]))
-            # The arm's own error is below 5 mm; from the other base the camera would be somewhere else.
+            # The arm's own error is below 5 mm; from the wrong base the camera would be somewhere else.
             assert (error_m < 0.005) == (station == event.station), (event.viewpoint, station, error_m)
 
 

@@ -1,4 +1,4 @@
-"""What a rig file may not hold: keys given twice, text that is no YAML, nesting without end."""
+"""What a rig file may not contain: duplicate keys, invalid YAML, endless nesting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the bench of the whole protocol reads from a record, and the protocol that it shortens."""
+"""What the whole-protocol bench reads from a record, and how it shortens the protocol."""
 
 from __future__ import annotations
 

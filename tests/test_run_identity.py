@@ -1,4 +1,4 @@
-"""What a run is of and for, and the notes on its steps: entered, recorded, verified, shown and found again."""
+"""The purpose and identity of a run, and notes on its steps: entered, recorded, verified, shown and found again."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def web(tmp_path: Path) -> Generator[WebSite]:
 
 
 def typed(*arguments: str) -> Result:
-    """A command line, to its end."""
+    """Run a command line to its end."""
     return CliRunner().invoke(app, list(arguments))
 
 
@@ -60,7 +60,7 @@ def jpeg(width: int = 640, height: int = 480) -> bytes:
 
 
 def start(browser: Browser, **fields: str) -> str:
-    """Through the form; the new run's name."""
+    """Begin a run through the form; returns its id."""
     answer = browser.send_form("/runs", protocol="bench.yaml", **{**ENTERED, **fields})
     assert answer.status_code == 303, answer.text
     return answer.headers["location"].removeprefix("/runs/")
@@ -74,7 +74,7 @@ def note(
     step: str = "",
     name: str = "n.jpg",
 ) -> httpx.Response:
-    """Through the dialog's form."""
+    """Write a note through the dialog's form."""
     fields = {"csrf": browser.person.csrf, "text": text, "step": step}
     files = {"photograph": (name, photograph or b"", "image/jpeg")} if photograph is not None else None
     return browser.post(f"/runs/{run_id}/notes", data=fields, files=files, follow_redirects=False)
@@ -139,7 +139,7 @@ def test_nothing_has_to_be_entered_and_too_much_is_refused(web: WebSite) -> None
 def test_records_from_before_are_read(web: WebSite) -> None:
     run_id = web.record_run()
     (payload,) = (e.payload.model_dump(mode="json") for e in web.store.events(run_id)[:1])
-    del payload["about"]  # as runs were recorded that did not have it
+    del payload["about"]  # like runs recorded before the field existed
     read = PAYLOAD.validate_python(payload)
     assert isinstance(read, RunStarted)
     assert read.about is None
@@ -223,7 +223,7 @@ def test_a_request_beyond_all_limits_is_refused_before_it_is_read(web: WebSite) 
 def test_who_may_take_notes_and_when(web: WebSite) -> None:
     technician, other = web.browser("technician"), web.browser("supervisor")
     run_id = start(technician)
-    assert note(other, run_id, "seen from the other screen").status_code == 303  # needs no control
+    assert note(other, run_id, "seen from the other screen").status_code == 303  # needs no control of the run
     assert note(web.browser("auditor"), run_id, "no").status_code == 403
     forged = technician.post(f"/runs/{run_id}/notes", data={"csrf": "forged", "text": "no"}, follow_redirects=False)
     assert forged.status_code == 403
@@ -264,7 +264,7 @@ def test_runs_are_found_by_what_people_said_of_them(web: WebSite) -> None:
     assert find(q="liquid") == [spine]
     assert find(q="balgrist") == [knee, spine]
     assert find(q="bench ada") == [done]
-    assert find(q="numpy") == []  # what the software is made of is not what a run is of
+    assert find(q="numpy") == []  # the software's packages are not the subject of a run
     assert find(result="aborted") == [spine]
     assert find(result="completed") == [done]
     assert find(result="open") == [knee]

@@ -1,4 +1,4 @@
-"""A run, from its first question to its end: what the runner does, records, refuses and survives."""
+"""A run from its first question to its end: what the runner does, records, refuses and survives."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_a_completed_run_is_not_touched_again(bench: Bench) -> None:
 def test_the_end_of_a_run_that_could_not_be_signed_is_signed_when_it_is_resumed(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The disk was full in that moment, or the process was killed; nobody may be there to compute anything more."""
+    """The disk was full at that moment, or the process was killed, and there may be nothing left to compute."""
     sign = timestamping.checkpoint
 
     def full(store: Store, run_id: str) -> Checkpoint:
@@ -261,7 +261,7 @@ def test_an_irreversible_step_waits_for_its_captures_and_a_signature(begin: Call
         say("sign", meaning="go"),
         say("redo", step="capture", reason="it is needed after all"),
     )
-    # Now that the captures are there: a confirmation without signature, a signature of nothing, then the right one.
+    # After the captures: a confirmation without signature, a signature of the wrong thing, then the right one.
     bench.script("spraying", "sign", say("confirm"), say("sign", signed_sha256="0" * 64))
     state = bench.run()
     assert state.status == "completed"
@@ -293,7 +293,7 @@ def test_the_pedal_confirms_what_is_asked_now_and_nothing_that_is_asked_later(be
         return None
 
     bench.script("fixation", "confirm", nothing, press)
-    # Somebody leans on the pedal while the robot works: that is no answer to the next question.
+    # Presses of the pedal while the robot works do not answer the next question.
     bench.rig.arm.on_move = lambda _move: press(bench.operator.asked[-1], bench.state())
     bench.script("spraying", "confirm", nothing, nothing)
     assert bench.run().status == "completed"
@@ -317,7 +317,7 @@ def test_where_the_robot_will_move_the_pedal_is_pressed_twice_within_seconds(ben
     def look(_question: AskOperator, _state: RunState) -> None:
         assert not bench.rig.arm.moves
 
-    # The second press comes too late and arms anew, the third bounces, the fourth counts.
+    # The second press comes too late and arms again, the third bounces, the fourth counts.
     bench.script("capture", "confirm", look, press(0), press(10), press(0.1), look, press(2))
     assert bench.run().status == "completed"
     confirmed = [a for a in bench.payloads(OperatorAction) if a.step == "capture"]
@@ -508,7 +508,7 @@ def test_a_failed_job_shows_the_workers_reason_and_a_repeated_step_enqueues_it_a
         if job.kind == "board_view":
             bench.store.finish_job(job, measures={}, duration_s=0.1, result={"seen": False, "reason": "no board"})
         elif not bench.payloads(StepNote)[1:]:
-            bench.store.fail_job(job, OSError("no memory"), retry=True)  # the store notes it and tries again
+            bench.store.fail_job(job, OSError("no memory"), retry=True)  # the store records it and retries
         elif not bench.payloads(JobFailed):
             bench.store.fail_job(job, ComputeError("the board is seen in no image"), retry=False)
         else:
@@ -556,7 +556,7 @@ def test_what_a_worker_has_computed_is_not_computed_again_after_a_crash(begin: C
 
 
 class KilledError(BaseException):
-    """The process is gone."""
+    """The process was killed."""
 
 
 def _die_before_recording(bench: Bench, monkeypatch: pytest.MonkeyPatch, nth: int) -> None:
@@ -582,7 +582,7 @@ def test_killed_between_exposure_and_record_leaves_an_orphan_and_no_viewpoint_is
         with pytest.raises(KilledError):
             bench.run()
     assert bench.captured() == VIEWS[: nth - 1]
-    bench.must_verify()  # orphans are no fault of the evidence
+    bench.must_verify()  # orphans are not a fault of the evidence
     files = [path for path in (bench.data / "artefacts").rglob("*") if path.is_file()]
     rows = {row.ref.sha256 for row in bench.store.artefacts(bench.run_id)}
     assert len(files) - len(rows) == 2  # photograph and pose log

@@ -26,7 +26,7 @@ from tests.support.web import WebSite, web_site
 
 @dataclass(frozen=True)
 class Two:
-    """A site with two runs of two contents of one protocol, one of which is more accurate."""
+    """A site with two runs, of two contents of one protocol, one of which is more accurate."""
 
     web: WebSite
     good: str
@@ -151,7 +151,7 @@ def test_a_spreadsheet_takes_no_word_for_a_formula(tmp_path: Path) -> None:
         assert web.browser("technician").send_form(
             "/runs", protocol="bench.yaml", specimen="=1+1"
         ).status_code == 303  # fmt: skip
-        assert typed("history", "--data", str(web.site.data)).stdout.count("\n") == 1  # no figures: the names alone
+        assert typed("history", "--data", str(web.site.data)).stdout.count("\n") == 1  # no figures: only the header
     record_reported_run(tmp_path, person="=grace")
     shown = typed("history", "--data", str(tmp_path / "data"))
     assert shown.stdout.count("\n") == 2

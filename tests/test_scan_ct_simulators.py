@@ -1,4 +1,4 @@
-"""Simulated scanner and CT suite, read through the drivers: accuracy of spheres, frames, incompleteness, faults."""
+"""Simulated scanner and CT suite, read through the drivers: accuracy of spheres, frames, incomplete files, faults."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def test_ct_spheres_are_where_they_are_to_a_tenth_of_a_voxel(ct: Ct) -> None:
 def test_ct_surface_lies_on_the_specimen(ct: Ct) -> None:
     vertices, _ = surface(ct.volume.hounsfield, ct.volume.T_ct_voxel, -475)
     world = apply(ct.T_world_ct, vertices)
-    # The back of the specimen away from wires and spheres: heights against the truth's grid.
+    # The specimen's back away from wires and spheres: heights compared with the true grid.
     grid = SCENE.specimen.grid_m
     i, j = np.meshgrid(np.arange(40, 280, 7), [50, 60, 160, 170], indexing="ij")
     truth = grid[i, j].reshape(-1, 3)

@@ -68,9 +68,9 @@ def test_normals_of_the_file_are_kept_and_missing_ones_computed(tmp_path: Path) 
 def test_findings_name_holes_components_and_bad_edges(tmp_path: Path) -> None:
     vertices = np.array(SPHERE.vertices)
     faces = np.array(SPHERE.faces)
-    open_sphere = faces[~np.any((faces == 0) | (faces == 100), axis=1)]  # two vertices and their faces out
+    open_sphere = faces[~np.any((faces == 0) | (faces == 100), axis=1)]  # remove two vertices and their faces
     island = open_sphere + len(vertices)
-    # A third face on an edge that two have already, and one that collapses.
+    # A third face on an edge that already has two, and a degenerate face.
     extra = np.array([[*open_sphere[0, :2], island[0, 0]], [5, 5, 6]])
     mesh = trimesh.Trimesh(
         np.concatenate([vertices, vertices + 400.0]), np.concatenate([open_sphere, extra, island]), process=False
@@ -78,7 +78,7 @@ def test_findings_name_holes_components_and_bad_edges(tmp_path: Path) -> None:
     findings = read_mesh_file(write(tmp_path, "a.ply", mesh)).findings
     assert findings["non_manifold_edges"] == 1
     assert findings["degenerate_faces"] == 1
-    assert findings["components"] == 1  # the extra face joins them
+    assert findings["components"] == 1  # the extra face connects them
     assert findings["unreferenced_vertices"] == 4
     mesh = trimesh.Trimesh(mesh.vertices, np.concatenate([open_sphere, island]), process=False)
     findings = read_mesh_file(write(tmp_path, "b.ply", mesh)).findings
@@ -218,7 +218,7 @@ def test_an_export_counts_when_it_has_stopped_changing(tmp_path: Path) -> None:
     assert scanner.exports() == ()
     assert "waiting" in scanner.pending()[0]
     time.sleep(0.1)
-    path.write_bytes(data)  # written again: the time starts anew
+    path.write_bytes(data)  # written again: the waiting time restarts
     scanner.exports()
     time.sleep(0.1)
     assert scanner.exports() == ()

@@ -1,4 +1,4 @@
-"""A runner that nobody types at: started by the web, told by events and the pedal, heard through its snapshot."""
+"""A runner without a terminal: started by the web, controlled by events and the pedal, reporting in its snapshot."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
 class Watched:
-    """A run as another process sees it."""
+    """A run as seen by another process."""
 
     def __init__(self, store: Store, data: Path, run_id: str, protocol: Protocol) -> None:
         self.store, self.data, self.run_id, self.protocol = store, data, run_id, protocol
@@ -73,7 +73,7 @@ def test_a_run_driven_from_screens_and_pedal_survives_its_starter(tmp_path: Path
         # A web process that starts meanwhile finds the runner by its lease.
         assert Launcher(data, store).driven(run_id)
 
-        # The pedal presses the button of the screen: with items open it is refused, and the record says so.
+        # The pedal acts as the screen's button: with open items it is refused, which is recorded.
         press_pedal(ready["world"])
         until(lambda: watched.state().deviation_count == 1, "the refusal is recorded")
         assert "not ticked" in watched.state().deviations[0].text

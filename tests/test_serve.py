@@ -32,7 +32,7 @@ def test_it_serves_this_machine_records_its_start_and_signs_at_its_end(rig: Path
         with urlopen(server.url + "/sign-in", timeout=20) as page:
             assert page.status == 200
             assert "default-src 'none'" in page.headers["Content-Security-Policy"]
-        # A page elsewhere whose name was made to point here gets nothing.
+        # A page whose foreign host name was made to resolve to this machine (DNS rebinding) gets nothing.
         with pytest.raises(HTTPError) as refused:
             urlopen(Request(server.url + "/sign-in", headers={"Host": "evil.example"}), timeout=20)
         assert refused.value.code in (400, 403, 421)

@@ -1,4 +1,4 @@
-"""`orthocapture serve` against clients that mean it harm: who is shut out, what it costs, what is written down."""
+"""`orthocapture serve` against hostile clients: who is shut out, what it costs, what is logged."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.serving import Server, serving
 from tests.support.waiting import until
 
 HALF = b"GET /account HTTP/1.1\r\nHost: localhost\r\n"
-WAIT_S = 30.0  # for what comes at once on a machine that has nothing else to do
+WAIT_S = 30.0  # for what takes no time on an idle machine
 WHOLE = b"GET /sign-in HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 
@@ -38,7 +38,7 @@ def rig(tmp_path: Path) -> Path:
 
 @contextmanager
 def clients(server: Server, count: int, sent: bytes, *, source: str = "127.0.0.1") -> Generator[list[socket.socket]]:
-    """So many connections, on each of which the same bytes were sent."""
+    """Open `count` connections, on each of which the same bytes are sent."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, max(soft, 4096)), hard))
     with ExitStack() as stack:
@@ -46,13 +46,13 @@ def clients(server: Server, count: int, sent: bytes, *, source: str = "127.0.0.1
         for _ in range(count):
             client = socket.create_connection(server.address, timeout=WAIT_S, source_address=(source, 0))
             opened.append(stack.enter_context(client))
-            with suppress(OSError):  # it may have been made to leave already
+            with suppress(OSError):  # the server may have closed it already
                 client.sendall(sent)
         yield opened
 
 
 def is_over(client: socket.socket, *, within_s: float = 0.0) -> bool:
-    """Whether the server ends the connection; what it sends before is thrown away."""
+    """Whether the server closes the connection; what it sends before is discarded."""
     client.settimeout(max(within_s, 0.001))
     try:
         while client.recv(65536):
@@ -65,7 +65,7 @@ def is_over(client: socket.socket, *, within_s: float = 0.0) -> bool:
 
 
 def dribbles_in_vain(client: socket.socket, *, within_s: float) -> bool:
-    """Whether the server ends the connection although a byte comes every fifth of a second."""
+    """Whether the server closes the connection although a byte arrives every fifth of a second."""
     deadline_s = time.monotonic() + within_s
     while time.monotonic() < deadline_s:
         if is_over(client, within_s=0.2):
@@ -99,7 +99,7 @@ def test_one_address_leaves_room_for_others(rig: Path) -> None:
     ):
         until(lambda: sum(not is_over(client) for client in (*here, *there)) == 12, "the others leave", WAIT_S)
         left = [client for client in (*here, *there) if not is_over(client)]
-        assert left == [*here[-5:], *there[-7:]]  # the newest, of both
+        assert left == [*here[-5:], *there[-7:]]  # the newest of both
         assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S).status_code == 200
 
 
@@ -117,7 +117,7 @@ def test_a_client_that_is_slow_on_purpose_is_left(rig: Path) -> None:
         assert b"HTTP/1.1 408" in promised.recv(65536)
         assert is_over(promised, within_s=WAIT_S)
         assert idle.recv(20).startswith(b"HTTP/1.1 200")
-        assert dribbles_in_vain(idle, within_s=WAIT_S)  # before uvicorn's own five seconds, which a byte begins anew
+        assert dribbles_in_vain(idle, within_s=WAIT_S)  # before uvicorn's own five seconds, which each byte restarts
         time.sleep(1)
         stalled.settimeout(WAIT_S)
         head, _, taken = stalled.recv(65536).partition(b"\r\n\r\n")
@@ -153,7 +153,7 @@ def test_when_no_more_files_can_be_opened_it_neither_spins_nor_floods_the_log(ri
             assert httpx.get(f"{server.url}/sign-in", timeout=WAIT_S).status_code == 200
         log = server.log.read_text()
     assert log.count("out of system resource") == 1
-    assert len(log) < 10_000  # a traceback or two; the flood was of megabytes a second
+    assert len(log) < 10_000  # a traceback or two; the flood was megabytes per second
 
 
 def test_what_is_no_http_is_told_once_and_counted(rig: Path) -> None:
@@ -187,7 +187,7 @@ def test_a_sign_in_has_six_streams_the_newest_and_strangers_do_not_end_them(rig:
                 streams.append(client)
             for client in streams[:24]:
                 heard = b""
-                while not heard.endswith(b"0\r\n\r\n"):  # the answer's end
+                while not heard.endswith(b"0\r\n\r\n"):  # the end of the answer
                     heard += client.recv(4096)
                 assert b"event: replaced" in heard
             stack.enter_context(clients(server, 200, HALF))

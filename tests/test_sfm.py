@@ -34,7 +34,7 @@ def views(camera: CameraModel, tmp_path_factory: pytest.TempPathFactory) -> dict
     scene = slabs()
     out: dict[str, tuple[Path, Transform]] = {}
     for k, T in enumerate(ring_of_poses(8)):
-        path = folder / f"blob{k}"  # as in a content-addressed store: no suffix
+        path = folder / f"blob{k}"  # no suffix, as in a content-addressed store
         path.write_bytes(
             cv2.imencode(".jpg", render(scene, camera, T, k), [cv2.IMWRITE_JPEG_QUALITY, 96])[1].tobytes()
         )
@@ -58,7 +58,7 @@ def _unit_m(model: SfmModel, views: dict[str, tuple[Path, Transform]]) -> float:
 
 
 def _tracks_reproject(model: SfmModel) -> None:
-    """Image and point of every observation belong together, in our pixels."""
+    """Image and point of every observation belong together, in our pixel convention."""
     poses, tracks = list(model.T_world_camera.values()), model.tracks
     for i, T in enumerate(poses):
         mine = tracks.image == i
@@ -71,7 +71,7 @@ def test_both_mappers_share_features_and_find_the_poses(
 ) -> None:
     images = {name: path for name, (path, _) in views.items()}
     prior = {name: T for name, (_, T) in views.items()}
-    # a picture of something else cannot be registered and must be reported
+    # an image of something else cannot be registered and must be reported
     stray = tmp_path / "stray.png"
     cv2.imwrite(str(stray), np.random.default_rng(0).integers(0, 255, (camera.height, camera.width), dtype=np.uint8))
     images["stray.png"] = stray
@@ -108,7 +108,7 @@ def test_both_mappers_share_features_and_find_the_poses(
 def test_pieces_in_any_order_make_the_same_model(
     camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path
 ) -> None:
-    """Image by image as they arrive, kept as bytes in between, in two orders: the files of the model are the same."""
+    """Image by image as they arrive, in two orders, stored as bytes in between: the model's files are identical."""
     prior = {name: T for name, (_, T) in views.items()}
     planned = pairs_of(views, prior, OPTIONS)
     models: list[SfmModel] = []
@@ -136,7 +136,10 @@ def test_pieces_in_any_order_make_the_same_model(
 def test_rough_metric_poses_are_triangulated_and_adjusted(
     camera: CameraModel, views: dict[str, tuple[Path, Transform]], tmp_path: Path
 ) -> None:
-    """From poses off by 2 mm and 0.2°: as good as from nothing, in metres and in their frame; a stray is missing."""
+    """From poses off by 2 mm and 0.2°: as accurate as without priors, metric and in their frame.
+
+    A stray is missing.
+    """
     rng = np.random.default_rng(3)
     start: dict[str, Transform] = {}
     for name, (_, T) in views.items():
@@ -222,14 +225,14 @@ def test_pairs_are_neighbours_and_connected() -> None:
     for _ in range(24):
         reach |= {j for i, j in pairs if i in reach} | {i for i, j in pairs if j in reach}
     assert reach == set(range(24))
-    # an image without a pose is matched with all others, and no prior means all pairs
+    # an image without a pose is matched with all others; without any prior all pairs are matched
     del prior["v07"]
     assert sum(7 in pair for pair in choose_pairs(names, prior, 6, 60.0)) == 23
     assert len(choose_pairs(names, None, 8, 60.0)) == 24 * 23 / 2
 
 
 def test_twice_as_many_images_are_twice_the_work() -> None:
-    """Of two thousand the choice once took minutes, and memory for every pair."""
+    """For two thousand images the selection once took minutes, and memory for every pair."""
 
     def work(count: int) -> int:
         names = [f"v{k:03d}" for k in range(count)]
@@ -240,7 +243,7 @@ def test_twice_as_many_images_are_twice_the_work() -> None:
 
 
 def test_across_stations_every_pair_is_kept() -> None:
-    """Poses of two base frames say nothing about pairs between them."""
+    """Poses in two base frames say nothing about pairs between them."""
     poses = ring_of_poses(12)
     names = [f"v{k:02d}" for k in range(12)]
     prior = {name: poses[k % 6] for k, name in enumerate(names)}
@@ -251,7 +254,7 @@ def test_across_stations_every_pair_is_kept() -> None:
 
 
 def test_two_far_stations_are_bridged() -> None:
-    """Two tight groups of views, further apart than the angle limit, still get pairs that join them."""
+    """Two tight groups of views, further apart than the angle limit, still get pairs that connect them."""
     poses = ring_of_poses(24, tilt_deg=45)
     names = [f"v{k:02d}" for k in range(24)]
     prior = {names[k]: poses[k] for k in (1, 3, 5, 13, 15, 17)}

@@ -1,4 +1,4 @@
-"""`orthocapture sfm`: a COLMAP model that register reads, robot poses in other frames, refusals."""
+"""`orthocapture sfm`: a COLMAP model that register reads, robot poses in different frames, refusals."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def rms_m(folder: Path, poses: dict[str, Transform]) -> float:
 def test_robot_poses_of_two_frames_are_noticed_and_not_believed(
     capture: tuple[Path, dict[str, Transform]], tmp_path: Path
 ) -> None:
-    """The robot's poses of the second half are in another base frame; the model comes out all the same."""
+    """The second half of the robot's poses is in another base frame; the model is correct anyway."""
     folder, poses = capture
     other = look_at(np.array([0.5, 0.1, 0.2]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
     robot = {name: T if k < 3 else inverse(other) @ T for k, (name, T) in enumerate(poses.items())}
@@ -67,7 +67,7 @@ def test_robot_poses_of_two_frames_are_noticed_and_not_believed(
 
 
 def test_wrong_principal_point_is_refined(capture: tuple[Path, dict[str, Transform]], tmp_path: Path) -> None:
-    """Six pixels off, held, would turn the cameras; refined, most of it is found."""
+    """Six pixels off: held fixed it would turn the cameras; refined, most of it is found."""
     folder, poses = capture
     camera = camera_of_width(480)
     wrong = CameraModel(480, 320, camera.fx, camera.fy, camera.cx + 3, camera.cy - 3, camera.k1, camera.k2)

@@ -1,4 +1,4 @@
-"""What a database cannot hide: signatures stand in a log beside it too, and nothing forged is signed."""
+"""What a database cannot hide: signatures are also in a log beside it, and nothing forged is signed."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.support.tampering import WORDS_AGAIN, cut, rewrite_to_the_end, withou
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """Two runs, each of four events, signed after the third and at the end."""
+    """Two runs of four events each, signed after the third and at the end."""
     folder = tmp_path / "data"
     with Store.open(folder, SteppedClock(), CountedIds()) as store:
         for _ in range(2):
@@ -51,7 +51,7 @@ def faults(data: Path) -> list[str]:
 
 
 def sign_again(data: Path) -> None:
-    """What the next program does, which has verified nothing yet."""
+    """Sign as the next program does, which has verified nothing yet."""
     with Store.open(data) as store:
         capture(store, run_of(data), "v9")
         checkpoint(store, run_of(data))
@@ -63,7 +63,7 @@ def deleted(run: str) -> list[str]:
 
 
 def forge(data: Path) -> None:
-    """Rewrite the captures with all hashes, and take the run's signatures away."""
+    """Rewrite the captures with all hashes, and delete the run's signatures."""
     run = run_of(data)
     rewrite_to_the_end(data, run, 2, actor="Eve")
     tamper(
@@ -177,7 +177,7 @@ def test_a_log_that_was_cut_or_changed_shows_against_its_copy(data: Path, tmp_pa
     assert report.faults == ()
     assert f"{copy} has not the last 2 lines of {NAME} yet" in report.notes
     bring_up_to_date(data, copy)
-    # Everything cut back to the first run, log and all: within the folder nothing tells.
+    # Everything is rolled back to the first run, log included: nothing within the folder shows it.
     lines = (data / NAME).read_bytes().splitlines(keepends=True)
     (data / NAME).write_bytes(b"".join(lines[:-2]))
     tamper(data, *cut(run_of(data), 5), *cut(SITE, 7))
@@ -196,7 +196,7 @@ def test_a_copy_that_cannot_be_written_is_told_and_caught_up_with(data: Path, tm
     keep_elsewhere(data, copy, told.append)
     assert "the copy of the log of signatures cannot be written: No such file or directory" in told[0]
     copy.parent.mkdir()
-    copy.write_bytes((data / NAME).read_bytes()[:100])  # half a line, of a share that went away
+    copy.write_bytes((data / NAME).read_bytes()[:100])  # half a line, from a share that disappeared
     keep_elsewhere(data, copy, told.append)
     assert len(told) == 1
     assert copy.read_bytes() == (data / NAME).read_bytes()

@@ -1,4 +1,4 @@
-"""Checkpoints: who rewrites the evidence is found out; keys are made, kept, changed and lost without a gap."""
+"""Checkpoints: rewriting the evidence is detected; keys are made, kept, changed and lost without a gap."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RUN = "20261121-120000-000003"
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
-    """A run of three events, not signed."""
+    """An unsigned run of three events."""
     with Store.open(tmp_path / "data", SteppedClock(), CountedIds()) as opened:
         assert start_run(opened) == RUN
         capture(opened, RUN, "v1")
@@ -109,7 +109,7 @@ def test_a_chain_rewritten_to_its_end_is_found(store: Store) -> None:
     found = faults(store, RUN)
     assert found[0].startswith(f"run {RUN}, event 3: checkpoint: it signs an event with hash")
     assert "rewritten" in found[0]
-    # The index of events was not rewritten with them, nor what the site's chain says of them.
+    # The index of events was not rewritten with them, nor the site's chain about them.
     others = ("checkpoint: ", "index of events", "words by which", "the site's chain says")
     assert all(any(part in fault for part in others) for fault in found)
 
@@ -123,7 +123,7 @@ def test_a_row_altered_together_with_its_hash_is_found(store: Store) -> None:
 
 
 def test_the_sites_chain_is_protected_by_the_runs(store: Store) -> None:
-    """Its newest events are cut off with their checkpoints: every run that was signed afterwards remembers them."""
+    """Its newest events are removed with their checkpoints: every run signed afterwards still refers to them."""
     checkpoint(store, SITE)
     site_event(store)
     checkpoint(store, RUN)
@@ -160,7 +160,7 @@ def test_tampering_with_checkpoints_is_named(store: Store, name: str) -> None:
 
 
 def test_another_key_in_the_sites_chain_is_found(store: Store) -> None:
-    """Whoever replaces the key's event has to rewrite the site's chain, which the runs' checkpoints name."""
+    """Replacing the key's event requires rewriting the site's chain, which the runs' checkpoints refer to."""
     checkpoint(store, RUN)
     rewrite_to_the_end(folder(store), SITE, 2, actor="Eve")
     found = faults(store, RUN)
@@ -191,13 +191,13 @@ def test_a_new_key_is_vouched_for_by_the_old_one_which_is_destroyed(store: Store
     assert checkpoint(store, SITE).key_id == second.key_id
     report = verify(folder(store))
     assert (report.faults, report.notes) == ((), ())
-    # Without the signature that introduced it, the new key is anybody's.
+    # Without the signature that introduced it, the new key could be anybody's.
     tamper(folder(store), f"DELETE FROM checkpoints WHERE run_id = 'site' AND seq = {second.seq}")
     assert "not vouched for" in " ".join(verify(folder(store), RUN).notes)
 
 
 def test_an_old_key_signs_nothing_new(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A copy of the old private key, kept by somebody, used after its replacement."""
+    """A copy of the old private key is used after its replacement."""
     checkpoint(store, RUN)
     (first,) = public_keys(store)
     stolen = KeyFolder(folder(store), store.files).load(first.key_id)

@@ -1,4 +1,4 @@
-"""What the simulated technician can do with a photograph: hold the camera elsewhere, move the sphere he points at."""
+"""The simulated technician's handling of a photograph: hold the camera elsewhere, move the indicated sphere."""
 
 from __future__ import annotations
 

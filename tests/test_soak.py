@@ -1,4 +1,4 @@
-"""The soak, short: each part at a small size, and what its judges say of figures that creep, wait or slow down."""
+"""A short soak: each part at a small size, and its judgement of figures that creep, wait or slow down."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SMALL = (
 
 def test_each_part_runs_small_and_its_figures_stand_beside_the_others(tmp_path: Path) -> None:
     for part in ("captures", "together", "large", "speed"):
-        main([*SMALL, "--only", part, "--results", str(tmp_path)])  # so small a size says nothing of speed
+        main([*SMALL, "--only", part, "--results", str(tmp_path)])  # such a small size says nothing about speed
     (written,) = tmp_path.glob("soak-*.json")
     found: dict[str, Any] = json.loads(written.read_text())
     assert set(found) == {"captures", "large", "together", "speed"}
@@ -32,14 +32,14 @@ def test_each_part_runs_small_and_its_figures_stand_beside_the_others(tmp_path: 
     assert found["captures"]["captured"] >= 2
     assert {"runner: threads", "web: descriptors", "driver of the robot: resident memory, MB", "database, MB"} <= {
         row["what"] for row in found["captures"]["rows"]
-    } or found["captures"]["samples"] < 16  # on a machine that has no time
-    of_speed = (" waited ", "this says nothing")  # no seconds are judged here
+    } or found["captures"]["samples"] < 16  # on a machine that is too busy
+    of_speed = (" waited ", "this says nothing")  # durations are not judged here
     assert [fault for fault in found["together"]["faults"] if not any(words in fault for words in of_speed)] == []
     assert {row["who"]: row["processes"] for row in found["together"]["rows"]} == {
         "runner": 1, "worker": 4, "status": 3, "pages": 3, "audit show": 2, "person": 1,
     }  # fmt: skip
     assert found["large"]["sizes"] == [8, 16, 32, 64]
-    assert found["large"]["artefact_bytes"] > 0.014e9  # those that the runner itself took are small
+    assert found["large"]["artefact_bytes"] > 0.014e9  # those taken by the runner itself are small
     assert found["large"]["disk_bytes"] < 0.5 * found["large"]["artefact_bytes"], "the photographs are not sparse"
     assert {"status", "audit show", "audit verify", "page: capture", "ingest of a viewpoint"} <= {
         row["what"] for row in found["large"]["rows"]
@@ -50,7 +50,7 @@ def test_each_part_runs_small_and_its_figures_stand_beside_the_others(tmp_path: 
 
 
 def samples(**per_capture: float) -> list[Sample]:
-    """Six hundred of them over an hour, with noise; named figures of the web process grow with each capture."""
+    """Six hundred samples over an hour, with noise; the named figures of the web process grow with each capture."""
     draw = random.Random(3)
     out: list[Sample] = []
     for number in range(600):

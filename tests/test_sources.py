@@ -1,4 +1,4 @@
-"""What a registration waits for, what comes later, in which order, and what becomes of a result that comes late."""
+"""What a registration waits for, what comes later, in which order, and what happens to late results."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_step_waits_for_what_its_gates_name_and_for_what_takes_seconds(
 
 
 class _Run:
-    """A run whose registration has begun; its jobs finish as the test says."""
+    """A run whose registration has begun; its jobs finish on the test's command."""
 
     def __init__(self, demo: Protocol) -> None:
         self.protocol = demo
@@ -98,7 +98,7 @@ class _Run:
             self._put(new.step, job)
 
     def finish(self, kind: str, *, status: str = "finished") -> None:
-        """Every open job of a kind."""
+        """Finish every open job of a kind."""
         for step, now in self.state.steps.items():
             for job in now.jobs.values():
                 if job.kind == kind and job.status == "enqueued":
@@ -127,7 +127,7 @@ class _Run:
 
 def test_each_job_is_due_when_its_input_is_there_and_once(tmp_path: Path) -> None:
     run = _Run(protocol())
-    assert run.due() == []  # the outlines are being found
+    assert run.due() == []  # the outlines are being searched
     run.finish("detect_spheres")
     first = run.due()
     assert [(job.kind, job.arguments["poses"], job.priority) for job in first] == [
@@ -154,7 +154,7 @@ def test_each_job_is_due_when_its_input_is_there_and_once(tmp_path: Path) -> Non
         "global",
         "incremental",
         "triangulated",
-    ]  # side by side
+    ]  # in parallel
     run.finish("register")
     found = registration_ways(run.protocol, run.state, run.protocol.step("registration"))
     assert found is not None
@@ -254,7 +254,7 @@ def test_a_result_that_arrives_after_the_end_of_a_run_is_recorded_as_late_signed
         assert end.late_s is not None
         report = verify(data, run_id)
         assert report.ok
-        assert report.unsigned_events[run_id] == 0  # a checkpoint of its own covers it
+        assert report.unsigned_events[run_id] == 0  # it has a checkpoint of its own
         recorded, _ = recorded_run(store, run_id)
         state = fold(recorded, store.events(run_id))
         assert state.status == "completed"

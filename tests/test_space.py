@@ -1,4 +1,4 @@
-"""Disk space: foreseen from what is planned and was written, said before a run, and asked about before it is gone."""
+"""Disk space: forecast from plan and past use, stated before a run, and asked about before it runs out."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SetFree = Callable[[int], None]
 
 @pytest.fixture
 def set_free(monkeypatch: pytest.MonkeyPatch) -> SetFree:
-    """A disk with so much free."""
+    """A disk with this much free space."""
     usage = shutil.disk_usage("/")
     free = [100 * GB]
     monkeypatch.setattr(shutil, "disk_usage", lambda _path: usage._replace(free=free[0]))
@@ -62,7 +62,7 @@ def test_the_forecast_is_planned_views_times_what_views_have_taken() -> None:
     assert (found.views_left, found.view_bytes, found.known_from) == (100, 65_000_000, "an earlier run")
     assert found.needed_bytes == 100 * 65_000_000 + 2 * GB
     assert found.verdict == "enough"
-    # By its own figures as soon as it has some; what its jobs have not written yet is still to come.
+    # By its own figures as soon as it has some; its jobs' pending output is added.
     here = Usage(views=10, view_bytes=10 * 80_000_000, computed_bytes=0, other_bytes=0)
     found = forecast(protocol(100), None, here, before, 100 * GB, simulated=False)
     assert found.known_from == "this run"
@@ -96,11 +96,11 @@ def test_a_run_pauses_with_a_question_before_the_disk_is_full_and_goes_on(bench:
     def fill(number: int) -> None:
         if number == 2:
             set_free(LEAST_FREE_BYTES + 100)
-        bench.ahead_s += 3  # the disk is looked at every two seconds
+        bench.ahead_s += 3  # the disk is checked every two seconds
 
     def answer(question: AskOperator, _state: RunState) -> OperatorAction | None:
         asked.append(question.text)
-        assert len(bench.captured()) == 2  # none was begun that could not have been recorded
+        assert len(bench.captured()) == 2  # no exposure was begun that could not have been recorded
         set_free(100 * GB)
         return OperatorAction(action="confirm", step="capture")
 
@@ -119,9 +119,9 @@ def test_a_run_pauses_with_a_question_before_the_disk_is_full_and_goes_on(bench:
 
 def test_a_run_that_will_not_fit_says_so_once_with_the_figures(tmp_path: Path, set_free: SetFree) -> None:
     with Store.open(tmp_path / "data") as store:
-        set_free(LEAST_FREE_BYTES + 30_000_000)  # for 20 views of a simulated rig, guessed at 4 MB
+        set_free(LEAST_FREE_BYTES + 30_000_000)  # for 20 views of a simulated rig, estimated at 4 MB
         bench = begin_run(store, PROTOCOL.replace("count: 4", "count: 20"), tmp_path)
-        assert bench.run().status == "completed"  # they are smaller than was guessed
+        assert bench.run().status == "completed"  # they are smaller than estimated
         notes = [note.data for note in bench.payloads(StepNote) if note.note == "disk_space"]
         assert [(note["verdict"], note["views_left"]) for note in notes] == [("short", 20)]
         (told,) = [words for words in bench.operator.told if "The disk will not do" in words]

@@ -88,7 +88,7 @@ def test_an_unwritable_output_is_told_before_the_mesh_is_read(tmp_path: Path) ->
 
 
 def _fillet(radius: float) -> tuple[Array, NDArray[np.int64]]:
-    """A narrow strip of a sphere, as a fillet between two surfaces has one, with surfaces that go on as planes."""
+    """A narrow strip of a sphere, like a fillet between two surfaces, which continue as planes."""
     along, across = np.meshgrid(np.linspace(-1.2, 1.2, 40), np.linspace(-0.16, 0.16, 8))
     points = radius * np.stack(
         [np.sin(along) * np.cos(across), np.sin(across), np.cos(along) * np.cos(across)], axis=-1
@@ -105,7 +105,7 @@ def test_a_strip_of_a_sphere_is_no_cap() -> None:
 
 
 def test_models_of_few_vertices_never_end_in_a_fault() -> None:
-    # Long facets cover a sphere's area with vertices in two places: a matrix of rank two (LinAlgError).
+    # Long facets cover a sphere's area with vertices at two places: a matrix of rank two (LinAlgError).
     rng = np.random.default_rng(1)
     for _ in range(120):
         ball = trimesh.creation.icosphere(subdivisions=int(rng.integers(0, 3)), radius=1.0)

@@ -1,4 +1,4 @@
-"""Smeared lens, covered board, blurred and black images over the camera's wire: noticed, mended, nobody is asked."""
+"""Smeared lens, covered board, blurred and black images over the camera's wire: noticed and mended without asking."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Ran:
-    """What a run recorded and told."""
+    """What a run recorded and printed."""
 
     state: RunState
     payloads: Sequence[object]
@@ -40,7 +40,7 @@ class Ran:
 
 
 def protocol(folder: Path, *wanted: str) -> Path:
-    """Steps of demo.yaml, with board poses that the software plans and one arc of viewpoints."""
+    """Steps of demo.yaml, with board poses planned by the software and one arc of viewpoints."""
     document = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     steps = {step["id"]: step for step in document["steps"]}
     calibration = steps["camera_calibration"]
@@ -79,7 +79,7 @@ def run(folder: Path, faults: Sequence[Mapping[str, Any]], *wanted: str, host: s
 
 
 def test_a_covered_board_a_blurred_and_a_black_image_are_taken_again_at_once(tmp_path: Path) -> None:
-    first_view = BOARDS + 1 + 1  # one board image is taken in addition
+    first_view = BOARDS + 1 + 1  # one additional board image is taken
     faults = (
         {"kind": "covered", "nth": 4, "value": 0.5},
         {"kind": "blur", "nth": first_view + 1},

@@ -1,4 +1,4 @@
-"""The log of starts: differences, clock jumps, what was left open, and ends of chains that may not move back."""
+"""The start-up log: differences, clock jumps, unfinished work, and chain ends that may not move back."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_differences_since_the_last_start_are_told(
         str(protocol): (first.configuration[str(protocol)], second.configuration[str(protocol)]),
     }
     assert second.clock_jump_s == 0.0
-    clock.passed_s, clock.set_s = 100.0 - 3600.0 + 7.0, -3600.0  # somebody put the clock back by an hour
+    clock.passed_s, clock.set_s = 100.0 - 3600.0 + 7.0, -3600.0  # somebody set the clock back by an hour
     assert record_start(store, rig, [], "x").clock_jump_s == -3600.0
     assert [event.payload.kind for event in store.events(SITE)] == ["site_opened", *["service_started"] * 3]
     protocol.unlink()

@@ -1,4 +1,4 @@
-"""The composition root: devices by name and by role, reported when opened, built anew when they stayed away."""
+"""The composition root: devices by name and by role, reported when opened, rebuilt after they were away."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_an_arm_is_driven_by_one_process_whatever_rig_file_names_it(tmp_path: Pa
             station.robot("station_1")
         holder.kill()
         holder.wait()
-        for _ in range(2):  # a device that could not be opened is let go of
+        for _ in range(2):  # a device that could not be opened is closed
             with pytest.raises(DeviceError) as refused:
                 station.robot("station_1")
             assert "another process" not in str(refused.value)

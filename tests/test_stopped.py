@@ -1,4 +1,4 @@
-"""A stopped run looks stopped, at home and at its step: what it lacks, and what to do, in one line."""
+"""A stopped run looks stopped, on the first page and at its step: one line says what it lacks and what to do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run on a simulated arm, over its real wires: whatever has stopped the arm is asked about before it moves on."""
+"""A run on a simulated arm over its real wires: after any stop of the arm, a person is asked before it moves on."""
 
 from __future__ import annotations
 
@@ -69,13 +69,13 @@ VIEWS = ["v001", "v002", "v003"]
 
 
 def slowly(number: int) -> NDArray[np.uint8]:
-    """A picture that takes as long as a real one: samples of the arm arrive meanwhile."""
+    """A picture that takes as long as a real one, so that samples of the arm arrive meanwhile."""
     time.sleep(0.5)
     return numbered(number)
 
 
 class OneArm(Station):
-    """A station whose camera is in memory; its arm is the real driver's."""
+    """A station with the real driver for its arm and an in-memory camera."""
 
     def __init__(self, folder: Path, host: str) -> None:
         path = folder / "rig.yaml"
@@ -104,7 +104,7 @@ class OneArm(Station):
 
 
 class Run:
-    """A run on it, and who answers its questions."""
+    """A run on it, with a person who answers its questions."""
 
     def __init__(self, store: Store, folder: Path, host: str) -> None:
         self.station = OneArm(folder, host)
@@ -145,7 +145,7 @@ def arm_at(number: int, *options: str) -> Generator[tuple[str, ArmWatch]]:
 
 
 def looks_for(seconds: float, arm: ArmWatch, words: str) -> Callable[[AskOperator, RunState], OperatorAction | None]:
-    """Let the question stand for so long, in which nothing may move, and confirm."""
+    """Leave the question open for some time, in which nothing may move, then confirm."""
     began: list[tuple[float, int]] = []
 
     def look(question: AskOperator, _state: RunState) -> OperatorAction | None:
@@ -161,7 +161,7 @@ def looks_for(seconds: float, arm: ArmWatch, words: str) -> Callable[[AskOperato
 
 
 def stop_and_release(host: str) -> None:
-    """Somebody runs into the arm, and clears the stop at the pendant: all of it while nobody asks the robot."""
+    """Cause a stop of the arm and clear it on the pendant while nobody queries the robot."""
     client = RtdeClient(host)
     client.pause()
     client.close()

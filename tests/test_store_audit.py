@@ -1,4 +1,4 @@
-"""The audit finds every kind of tampering, names it, and excuses what a crash leaves."""
+"""The audit finds and names every kind of tampering, and excuses what a crash leaves."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RUN = "20261121-120000-000003"
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """Seven events, signed: run_started, three viewpoints, job_enqueued, job_finished, step_note."""
+    """Seven signed events: run_started, three viewpoints, job_enqueued, job_finished, step_note."""
     folder = tmp_path / "data"
     with Store.open(folder, SteppedClock(), CountedIds()) as store:
         run = start_run(store)

@@ -66,7 +66,7 @@ def test_canonical_json_survives_reading_back(value: object) -> None:
     assert canonical(parse_canonical(text)) == text
     assert parse_canonical(text) == value
     assert canonical_parsed(parse_canonical(text)) == text
-    assert json.loads(text, parse_int=float) == value  # as any JSON reader with doubles sees it
+    assert json.loads(text, parse_int=float) == value  # as read by any JSON parser that uses doubles
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_database_is_durable_and_strict(store: Store) -> None:
 def test_migrations_make_the_tables_of_the_metadata(store: Store) -> None:
     engine = create_engine(f"sqlite:///{store.database_path}")
     with engine.connect() as connection:
-        # The full-text index brings tables of its own, which SQLAlchemy has no words for.
+        # The full-text index has tables of its own, which SQLAlchemy does not know.
         options = {"include_name": lambda name, kind, _parent: kind != "table" or not name.startswith("event_words")}
         assert compare_metadata(MigrationContext.configure(connection, opts=options), metadata) == []
     engine.dispose()

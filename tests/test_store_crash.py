@@ -58,7 +58,7 @@ def leftovers(report: AuditReport) -> list[str]:
 
 
 def sweep(data: Path, crash_at: int | None) -> tuple[CrashingFiles, bool]:
-    """Record one viewpoint on a seam that crashes; the seam, and whether `record` returned."""
+    """Record one viewpoint with crashing file operations; returns them, and whether `record` returned."""
     ids = CountedIds()
     ids.count = 100
     files = CrashingFiles()

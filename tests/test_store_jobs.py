@@ -1,4 +1,4 @@
-"""Jobs and run leases: once only, one worker at a time, recovered from the dead, refused to the late."""
+"""Jobs and run leases: once only, one worker at a time, recovered from dead workers, refused to late ones."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def test_racing_workers_do_each_job_once(tmp_path: Path) -> None:
 def test_one_runner_drives_a_run(store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch) -> None:
     run = start_run(store)
     note = StepNote(step="s", attempt=1, note="n")
-    with monkeypatch.context() as elsewhere:  # of another host nothing is known but the time
+    with monkeypatch.context() as elsewhere:  # on another host only the time is known
         elsewhere.setattr(socket, "gethostname", lambda: "the other computer")
         first = store.lease(run, "runner 1", 10)
     with pytest.raises(LeaseHeldError, match="runner 1"):
@@ -241,7 +241,7 @@ def test_leases_of_a_killed_process_are_taken_over_at_once(tmp_path: Path) -> No
             with pytest.raises(LeaseHeldError, match="the killed one"):
                 store.lease(run, "next", 10)
             assert store.claim_job("next", 10) is None
-            os.kill(holder.pid, signal.SIGSTOP)  # continued, it would go on with the arm
+            os.kill(holder.pid, signal.SIGSTOP)  # if continued, it would go on with the arm
             with pytest.raises(LeaseHeldError, match="the killed one"):
                 store.lease(run, "next", 10)
             os.kill(holder.pid, signal.SIGKILL)

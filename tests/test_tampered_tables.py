@@ -1,4 +1,4 @@
-"""Rows beside the chains that somebody changed: words of the search, sign-ins, links, secrets, stamps, jobs."""
+"""Changed rows beside the chains: words of the search, sign-ins, links, secrets, stamps, jobs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.support.web import PIN, QUICK_HASHES, password_of, populate
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with jobs of every end, people of every kind, and a time stamp."""
+    """A run with jobs of every outcome, people of every kind, and a time stamp."""
     folder = tmp_path_factory.mktemp("recorded") / "data"
     with (
         time_stamp_authority(tmp_path_factory.mktemp("authority")) as authority,
@@ -153,7 +153,7 @@ def test_what_was_put_in_past_the_software_is_named(data: Path, name: str) -> No
 
 
 def test_words_that_are_there_and_cannot_be_found_are_a_fault(data: Path) -> None:
-    words = {f"word{i}": f"{i * 7919 % 100_003:x}" for i in range(3000)}  # more than a page of the index holds
+    words = {f"word{i}": f"{i * 7919 % 100_003:x}" for i in range(3000)}  # more than fits into one page of the index
     with Store.open(data) as store:
         store.record(run_of(data), [StepNote(step="s", attempt=1, note="n", data=words)], actor="runner")
     assert faults(data) == []
@@ -243,7 +243,7 @@ def test_text_of_the_log_that_means_the_same_is_still_another_text(data: Path) -
     end = last.index(b'=="}\n')
     letter = last[end - 1 : end]
     alphabet = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"
-    other = alphabet[alphabet.index(letter) ^ 1 : (alphabet.index(letter) ^ 1) + 1]  # the bit says nothing
+    other = alphabet[alphabet.index(letter) ^ 1 : (alphabet.index(letter) ^ 1) + 1]  # the bit has no meaning
     (data / NAME).write_bytes(b"".join([*lines[:-1], last[: end - 1] + other + last[end:]]))
     assert faults(data) == [f"{NAME}, line {len(lines)}: its own signature is not valid"]
     (data / NAME).write_bytes(b"".join([*lines[:-1], last.replace(b'"number":', b'"number": ')]))
@@ -251,11 +251,11 @@ def test_text_of_the_log_that_means_the_same_is_still_another_text(data: Path) -
 
 
 def test_whatever_people_do_verifies(tmp_path: Path) -> None:
-    """Every act on accounts and screens leaves rows that are what the events tell."""
+    """Every act on accounts and screens leaves rows that agree with the events."""
     clock = SteppedClock()
     with Store.open(tmp_path / "data", clock) as store:
         people = People(store, QUICK_HASHES)
-        people.first_link()  # a second one voids it
+        people.first_link()  # a second link invalidates the first
         populate(people)
         accounts = people.accounts
 
@@ -287,13 +287,13 @@ def test_whatever_people_do_verifies(tmp_path: Path) -> None:
                 people.unlock(marie, "0000")
         people.sign_out(person("emmy"))
         clock.passed_s += 13 * 3600.0
-        person("emmy")  # the sign-ins of the morning have ended
+        person("emmy")  # the sessions of the morning have ended
         checkpoint(store, SITE)
     assert faults(tmp_path / "data") == []
 
 
 def rewrite_schema(data: Path, table: str, old: str, new: str) -> None:
-    """What SQLite reads of a table, changed past SQLite, as a flipped bit does."""
+    """Change the schema that SQLite reads for a table without SQLite noticing, as a flipped bit does."""
     with closing(sqlite3.connect(database_path(data))) as connection:
         connection.execute("PRAGMA writable_schema = ON")
         connection.execute("UPDATE sqlite_master SET sql = replace(sql, ?, ?) WHERE name = ?", (old, new, table))

@@ -1,4 +1,4 @@
-"""A person at a terminal: questions are shown, typed answers go into the record, nothing is confirmed by accident."""
+"""A person at a terminal: questions are shown, typed answers are recorded, nothing is confirmed by accident."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Terminal:
                 self.shown += os.read(self._master, 65536).decode(errors="replace")
 
     def type(self, text: str) -> None:
-        """Type a line; what is awaited next must come after it."""
+        """Type a line; the text awaited next must appear after it."""
         self.shown = ""
         os.write(self._master, text.encode() + b"\n")
 

@@ -1,4 +1,4 @@
-"""What a person sees in a terminal of 80 columns: no lost word, no cut number, one style of help, near names."""
+"""Output in a terminal of 80 columns: no lost word, no truncated number, one style of help, suggested names."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _run(*words: str, **more: str) -> subprocess.CompletedProcess[str]:
 
 
 def _plain(shown: str) -> str:
-    """What was shown as running words, without the box around it."""
+    """The displayed text as running words, without the box around it."""
     return " ".join(re.sub(r"[│╭╮╰╯─]", " ", shown).split())
 
 
@@ -64,7 +64,7 @@ def test_no_word_of_an_instruction_is_lost(columns: int) -> None:
         )  # fmt: skip
         shown.truncate(0)
         shown.seek(0)
-        operator.print_question(question)  # what the poll shows, without a terminal to poll
+        operator.print_question(question)  # as shown by the poll, but without a terminal
         assert max(map(len, shown.getvalue().splitlines())) <= columns
         words = _plain(shown.getvalue())
         for text in (step.title, step.why, question.text, *step.checklist):

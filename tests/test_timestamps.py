@@ -1,4 +1,4 @@
-"""RFC 3161 time stamps against an authority that answers with `openssl ts`, and against one that misbehaves."""
+"""RFC 3161 time stamps from an authority that answers with `openssl ts`, and from one that misbehaves."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_checkpoint_is_stamped_once_and_verified_with_and_without_certificates
     other = make_certificates(tmp_path / "other")
     (fault,) = verify(data, run, certificates=other).faults
     assert "time stamp of http://127.0.0.1" in fault.what
-    # The stand-alone verifier has its own reading of DER and CMS.
+    # The stand-alone verifier has its own parser for DER and CMS.
     for certificates, faults, said in (
         (None, 0, "its signature was not checked"),
         (authority.certificates, 0, "it existed at"),
@@ -167,7 +167,7 @@ def test_an_authority_that_is_slow_delays_the_end_no_longer_than_allowed(
         (trouble,) = bench.payloads(DeviceTrouble)
         assert "nothing within 0.4 s" in trouble.message
         assert store.checkpoints(bench.run_id)[-1].seq == len(store.events(bench.run_id))
-        authority.behaviour = "good"  # the next look at the run asks again
+        authority.behaviour = "good"  # the next check of the run asks again
         bench.authority = ask(authority)
         assert bench.run().status == "aborted"
         assert len(store.timestamps(bench.run_id)) == 1

@@ -1,4 +1,4 @@
-"""A sample of the torture of the evidence: whatever is altered is told with its place, or documented as not told."""
+"""A sample of the evidence sweep: every change is detected with its place, or documented as undetected."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from bench.torture.audit.tally import Tally
 
 @pytest.fixture(scope="module")
 def about(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
-    """What a short sweep of a fixed seed found."""
+    """The result of a short sweep with a fixed seed."""
     folder = tmp_path_factory.mktemp("torture")
     words = ["--sample", "60", "--seed", "5", "--work", str(folder), "--results", str(folder / "results")]
     assert main(words) in (0, 1)

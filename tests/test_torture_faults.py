@@ -1,4 +1,7 @@
-"""The fault matrix, short: cases of each device hold to rules and table; a program that breaks a rule shows."""
+"""A short fault matrix: cases of each device obey the rules and the table.
+
+A program that breaks a rule is detected.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ from service.store.store import Store
 from tests.support.bench_run import PROTOCOL, begin_run
 from tests.support.rig import REPOSITORY
 
-# Of each device one that ends the same way on any machine, of the robot one of its own as well.
+# One case of each device that ends the same way on any machine; for the robot also one of its own faults.
 CHOSEN = (
     "robot/rtde/inputs/reject",
     "robot/itself/protective_stop",
@@ -40,7 +43,7 @@ sys.exit(main())
 
 
 def sweep(folder: Path, *words: str, code: str = "") -> tuple[int, str, list[dict[str, Any]]]:
-    """Status, output and verdicts of the sweep, whose processes are forked from a process without threads."""
+    """Status, output and verdicts of the sweep, run in a process without threads because it forks."""
     program = ["-c", code] if code else ["-m", "bench.torture.faults"]
     done = subprocess.run(
         [sys.executable, *program, *words, "--out", str(folder / "verdicts.json")],

@@ -1,4 +1,4 @@
-"""Bad input for every parser: the short version of `make torture-fuzz`, what it once found, and that it does find."""
+"""Fuzzing of every parser, in short: `make torture-fuzz`, its past findings, and that it finds known faults."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from bench.torture.fuzz.watch import Sweep
 from service.compute.images.files import read_image
 from service.core.errors import DataError
 
-FOUND = Path(__file__).parent / "data" / "fuzz"  # by target, inputs that showed a fault once
-INPUTS = 24  # of each target, times its pace
+FOUND = Path(__file__).parent / "data" / "fuzz"  # by target: inputs that once showed a fault
+INPUTS = 24  # per target, times its pace
 
 
 @pytest.mark.parametrize("group", GROUPS)

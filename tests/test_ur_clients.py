@@ -1,4 +1,4 @@
-"""The simulated controller under clients that it was not written for: ur_rtde, and RTDE as UR's guide has it."""
+"""The simulated controller with clients for which it was not written: ur_rtde, and RTDE after UR's guide."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_frames_are_cut_from_any_pieces() -> None:
 # --- kinematics and motion ---------------------------------------------------------------------------------
 
 
-# Forward kinematics of six postures of each model by the package ur-analytic-ik 0.1.0, which is not ours.
+# Forward kinematics of six postures of each model by an independent package, ur-analytic-ik 0.1.0.
 POSTURES = [json.loads(line) for line in (DATA / "ur_forward_kinematics.jsonl").read_text().splitlines()]
 
 
@@ -278,7 +278,7 @@ def test_unmodified_ur_rtde(controller: tuple[str, str]) -> None:
 
 @pytest.fixture(scope="module")
 def rare_calls() -> dict[str, Any]:
-    """What the client says to calls that are seldom made, in one session."""
+    """The client's answers to rare calls, in one session."""
     host = address(48)
     with simulated_ur(host, "--version", "5.12", "--model", "UR10e", "--speed-up", "5"):
         command = [sys.executable, "-m", "tests.support.ur_vendor_calls", host]

@@ -39,7 +39,7 @@ PAYLOAD = Payload(1.6, (0.0, 0.0, 0.08))
 
 @contextlib.contextmanager
 def opened(host: str, **config: float) -> Generator[RobotArm]:
-    config = {"watchdog_s": 1.0, **config}  # these tests share their machine; tests/test_watchdog.py tests the usual
+    config = {"watchdog_s": 1.0, **config}  # the machine is shared; tests/test_watchdog.py tests the default
     arm = hosted(RobotArm, "drivers.ur:DRIVER", UrConfig(host=host, **config), call_timeout_s=30, name="robot")
     try:
         arm.open()
@@ -151,7 +151,7 @@ def test_linear_motion_runs_straight(robot: RobotArm) -> None:
     begin = time.monotonic()
     robot.move_linear(goal, speed_m_s=0.1, acceleration_m_s2=0.5)
     wait_for(lambda: not robot.is_moving())
-    wait_for(lambda: robot.settle(SettleCriteria()).settled)  # the last tenth of a millimetre is crept
+    wait_for(lambda: robot.settle(SettleCriteria()).settled)  # the last tenth of a millimetre is slow
     path = np.array([s.T_base_flange[:3, 3] for s in robot.samples(begin, time.monotonic())]) - start[:3, 3]
     direction = np.array([0.0, 2.0, 1.0]) / np.sqrt(5)
     assert np.max(np.linalg.norm(path - np.outer(path @ direction, direction), axis=1)) < 2e-4
@@ -213,7 +213,7 @@ def test_protective_stop_is_surfaced_and_cleared_by_a_person_only() -> None:
             move(arm, turned(arm, 0.1))
         assert any("protective stop" in p for p in arm.report().problems)
 
-        arm.open()  # reconnecting is no way out
+        arm.open()  # reconnecting does not help
         assert arm.state().sample.safety is SafetyState.PROTECTIVE_STOP
         with pytest.raises(SafetyStopError):
             arm.configure(PAYLOAD, T_FLANGE_TCP)
@@ -235,7 +235,7 @@ def test_protective_stop_is_surfaced_and_cleared_by_a_person_only() -> None:
 
 def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten() -> None:
     host = address(62)
-    # The plan sets the stop off at a message that only this test sends: nobody asks the arm anything meanwhile.
+    # The plan causes the stop at a message that only this test sends: nobody queries the arm meanwhile.
     with faulty(62, {"on": "rtde_P", "kind": "protective_stop"}), opened(host) as arm, watched_arm(host) as watch:
         travel(arm, turned(arm, 0.1))
         client = RtdeClient(host)
@@ -258,7 +258,7 @@ def test_a_stop_that_came_and_was_released_between_two_motions_is_not_forgotten(
                 move(arm, turned(arm, 0.1))
         assert any("nobody has confirmed since" in problem for problem in arm.report().problems)
         with pytest.raises(SafetyStopError, match="nobody has confirmed since"):
-            arm.let_move("Ada", begin)  # she confirmed before it was over
+            arm.let_move("Ada", begin)  # she confirmed before the stop was over
         time.sleep(0.5)
         assert watch.moved_for_s(since) == 0.0
         assert not watch.now.program_runs, "nothing is sent anew either"
@@ -352,7 +352,7 @@ def test_dropped_link_ends_in_an_error_and_a_reconnect() -> None:
 
 
 def test_motion_that_ended_on_a_dead_stream_is_not_taken_for_an_arm_at_rest() -> None:
-    drop: dict[str, object] = {"on": "move", "kind": "drop", "value": "receivers"}  # no samples; the command lives
+    drop: dict[str, object] = {"on": "move", "kind": "drop", "value": "receivers"}  # no samples; commands still pass
     with faulty(61, drop), opened(address(61), stale_after_s=3.0) as arm:
         with pytest.raises(DeviceUnavailableError, match="no new sample"):
             travel(arm, turned(arm, 0.1))

@@ -1,4 +1,4 @@
-"""What drives an arm is killed or stands still, for real: the arm comes to rest, and moves on for a person only."""
+"""The programs that drive an arm are really killed or suspended: the arm stops, and moves on only for a person."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.waiting import until
 
 pytestmark = pytest.mark.slow
 AT_REST_WITHIN_S = 0.5
-WATCHED_S = 4.0  # what moved by itself did so after 2.3 s
+WATCHED_S = 4.0  # an arm that moved by itself did so after 2.3 s
 
 
 class Program:
@@ -97,7 +97,7 @@ def send(program: Program, *signals: tuple[str, signal.Signals]) -> None:
 
 
 def comes_to_rest(arm: ArmWatch, since: int) -> float:
-    """Wait, and see how long the arm went on. It must stand at the end, and have stood all the while from then on."""
+    """Wait and return how long the arm kept moving; it must stop and remain at rest."""
     time.sleep(WATCHED_S)
     assert arm.now.speed_rad_s == 0.0
     return arm.moved_for_s(since)
@@ -118,7 +118,7 @@ def test_killed(victims: tuple[str, ...]) -> None:
         send(program, *((victim, signal.SIGKILL) for victim in victims))
         went_on_s = comes_to_rest(arm, since)
         assert went_on_s <= AT_REST_WITHIN_S, f"{went_on_s:.3f} s, {arm.way_rad(since):.3f} rad"
-        if victims == ("driver",):  # the program has opened it anew, and tries to go on
+        if victims == ("driver",):  # the program has reopened it and tries to continue
             assert program.next("error")["error"] == "DeviceUnavailableError"
             assert "since it was connected" in program.next("error")["message"]
             goes_on_for_a_person(program, arm)
@@ -158,7 +158,7 @@ def test_a_program_that_lives_but_no_longer_looks_at_its_moving_arm() -> None:
 
 
 def test_a_short_lapse_at_rest_needs_nobody() -> None:
-    """A busy machine is no reason to ask: the program is sent again, since nothing moved and no stop was seen."""
+    """A busy machine is no reason to ask: the script is sent again, since nothing moved and no stop was seen."""
     host = address(73)
     with simulated_ur(host), watched_arm(host) as arm:
         program = Program(host, hangs=False, unattended_s=5.0)

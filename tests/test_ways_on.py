@@ -1,4 +1,4 @@
-"""Whatever stops a step, there is a way on: every choice that is listed is taken by a runner, and leads on."""
+"""Every stopped step has a way on: every listed choice is taken by a runner, and leads on."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.support.bench_run import Bench, begin_run
 from tests.support.core import GOOD, Log, toy_protocol
 from tests.support.core import TOY as TOY_TEXT
 
-# One step of each kind; every gate may be accepted and every step but the irreversible ones skipped.
+# One step of each kind; every gate may be accepted, and every step but the irreversible ones skipped.
 PROTOCOL = """\
 id: all_kinds
 version: "1"
@@ -57,7 +57,7 @@ STEPS = ("hands", "layout", "ct", "lens", "views", "coat", "scan", "register", "
 
 @dataclass
 class Fakes:
-    """Steps whose work is a figure or an error, in place of those that need devices."""
+    """Steps that yield a figure or an error, in place of those that need devices."""
 
     failing: bool = True
     error: OrthocaptureError | None = None  # None: a figure outside its limit
@@ -74,7 +74,7 @@ class Fakes:
 
 
 class Walker(ScriptedOperator):
-    """Takes, wherever a step is stopped, every choice that is offered once; what leaves the step, last."""
+    """Takes every offered choice once wherever a step is stopped; those that leave the step come last."""
 
     def __init__(self, leave_by: OperatorVerb, ends_at: str = "") -> None:
         super().__init__()
@@ -206,7 +206,7 @@ def test_a_step_whose_requirement_cannot_be_done_again_may_be_left_out() -> None
     log.do()
     assert log.state.current == "spray_again"
     ways = {way.verb: way for way in ways_on(log.protocol, log.state) if way.available}
-    assert set(ways) == {"skip", "abort"}  # a redo would lead across the irreversible step
+    assert set(ways) == {"skip", "abort"}  # a redo would cross the irreversible step
     log.act("skip", reason="it cannot be released any more")
     assert log.state.current == "scan"
 

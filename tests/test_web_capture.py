@@ -1,4 +1,4 @@
-"""Capture page, 3D view and calibration page: what is recorded, in words and figures, as far as it is known."""
+"""Capture page, 3D view and calibration page: the record in words and figures, as far as it is known."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Shown:
 
 
 def words(html: str) -> str:
-    """What a page says, without its tags."""
+    """The text of a page, without its tags."""
     return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", " ", html)))
 
 
@@ -75,7 +75,7 @@ def test_the_plan_shows_how_every_viewpoint_stands(shown: Shown) -> None:
     page = shown.page()
     for said in ("Done 1", "Next 1", "Failed 1", "Left out by the plan 1", "too near to the table", "1 of 4"):
         assert said in page, said
-    assert "no <file> arrived" in page  # escaped in the page, or it would have been taken for a tag
+    assert "no <file> arrived" in page  # escaped in the page, otherwise it would be parsed as a tag
 
 
 def test_a_run_of_a_thousand_viewpoints_is_shown_in_pages_and_drawn_without_overlap(tmp_path: Path) -> None:

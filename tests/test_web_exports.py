@@ -1,4 +1,4 @@
-"""Release and export on the screen: who may, what is blocked and why, and that nothing else can be fetched."""
+"""Release and export on the screen: who may, what is blocked and why, and that nothing else can be downloaded."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def web(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WebSite]:
 
 @pytest.fixture(scope="module")
 def run(web: WebSite) -> str:
-    """Completed, with a release still to be given."""
+    """A completed run that still needs its release."""
     return web.record_run(NEEDS_RELEASE)
 
 
@@ -195,14 +195,14 @@ def test_a_data_set_leaves_with_all_that_belongs_to_it(
     mesh = trimesh.load_mesh(io.BytesIO(files["mesh.ply"]), file_type="ply")
     assert len(mesh.faces) == 4
     assert verify(web.site.data, run).ok
-    # What cannot be recorded does not leave.
+    # An export that cannot be recorded is not made.
     with monkeypatch.context() as patched:
         patched.setattr(Store, "record", _refuse)
         for what in ("dataset", "report", "bundle"):
             with pytest.raises(StoreError, match="no space"):
                 export(web.site.data, run, what, tmp_path / f"{what}.zip", "emmy", lambda *_: None)
     assert [path.name for path in tmp_path.iterdir()] == ["poses.csv"]
-    # The report that goes along in a bundle shows the scene.
+    # The report within a bundle shows the scene.
     made = export(web.site.data, run, "bundle", tmp_path / "b.zip", "emmy", lambda *_: None)
     assert bundle_verifier.main([str(made)]) == 0
     with zipfile.ZipFile(made) as archive:

@@ -1,4 +1,4 @@
-"""The page of a capture by hand: words, verdicts, hemisphere, and the buttons that release and end."""
+"""The page of a hand-held capture: words, verdicts, hemisphere, and the buttons that release and finish."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.support.web import Browser, WebSite, password_of, web_site
 
 @pytest.fixture
 def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[tuple[WebSite, Browser, Bench]]:
-    """A run in which four images were taken, the second one blurred."""
+    """A run with four images, the second one blurred."""
     with web_site(tmp_path) as site:
         bench = left_held_run(site.begin_run, monkeypatch, tmp_path)
         browser = site.browser("technician")
@@ -31,13 +31,13 @@ def shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[tuple[We
 
 
 def last_answer(bench: Bench) -> Mapping[str, Any]:
-    """What the worker said of the last image."""
+    """The worker's answer about the last image."""
     jobs = [job for job in bench.state().steps["capture"].jobs.values() if job.kind == "hand_view"]
     return max(jobs, key=lambda job: job.enqueued_seq).result
 
 
 def words(html: str) -> str:
-    """What a page says, without its tags."""
+    """The text of a page, without its tags."""
     return re.sub(r"\s+", " ", unescape(re.sub(r"<[^>]+>", " ", html)))
 
 

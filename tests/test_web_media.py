@@ -1,4 +1,4 @@
-"""Pictures and files for the screens: of this run alone, small, unaltered, and nothing by a hostile name."""
+"""Pictures and files for the screens: only of this run, small, unaltered, and no hostile file names."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ HOSTILE = '../../etc/pass"wd\r\nSet-Cookie: a=b; .jpg'
 
 @dataclass(frozen=True)
 class Shown:
-    """A run with one image, and somebody who looks at it."""
+    """A run with one image, and a person who looks at it."""
 
     site: WebSite
     browser: Browser

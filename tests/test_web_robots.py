@@ -1,4 +1,4 @@
-"""The banners of driven robots on pages that are not their runs'; runs under way first; the sealed record."""
+"""Banners of driven robots on pages of other runs; runs in progress first; the sealed record."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def web(tmp_path: Path) -> Generator[WebSite]:
 
 
 def tell(web: WebSite, run_id: str, **fields: object) -> None:
-    """What a runner writes down."""
+    """Write a snapshot as a runner does."""
     write_snapshot(web.site.data, run_id, Snapshot.model_validate({"at_utc_s": time.time(), **fields}))
 
 
 def keys(page: str) -> list[str]:
-    """How the robots stand that the page tells of."""
+    """The states of the robots that the page shows."""
     shown = re.sub(r'<template id="robots-lost">.*?</template>', "", page, flags=re.DOTALL)
     return re.findall(r'data-robot="(\w+)"', shown)
 
@@ -109,7 +109,7 @@ def test_runs_under_way_come_first_of_all_runs(web: WebSite) -> None:
 
 
 def listed(page: str, section: str) -> list[str]:
-    """Runs of a section, in order."""
+    """The runs of a section, in order."""
     _, _, after = page.partition(f'<h2 id="{section}">')
     return list(dict.fromkeys(re.findall(r'href="/runs/([\w-]+)"', after.partition("</section>")[0])))
 
@@ -118,12 +118,12 @@ def listed(page: str, section: str) -> list[str]:
 
 
 def signed_to(web: WebSite) -> int:
-    """The last event of the site's chain that is signed."""
+    """The last signed event of the site's chain."""
     return max((item.seq for item in web.store.checkpoints(SITE)), default=0)
 
 
 def invite(browser: Browser, name: str) -> int:
-    """By the administrator."""
+    """Let the administrator send an invitation; returns the status."""
     return browser.send_form("/accounts", account=name, full_name="Tom Example", role="auditor").status_code
 
 

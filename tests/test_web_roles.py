@@ -1,4 +1,4 @@
-"""Every route of the application against every role: who may, who may not, and what a locked screen may still do."""
+"""Every route of the application with every role: who may, who may not, and what a locked screen may still do."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.store.records import SITE
 from service.web.security.guards import Guard
 from tests.support.web import Browser, WebSite, web_site
 
-# What people who are not signed in may ask for. Everything else has a guard.
+# What people who are not signed in may request. Everything else has a guard.
 PUBLIC = {
     ("GET", "/sign-in"),
     ("POST", "/sign-in"),
@@ -27,14 +27,14 @@ PUBLIC = {
     ("GET", "/vendor/plotly.js"),
     ("GET", "/health"),
 }
-# What a locked screen may do beside looking.
+# What a locked screen may do besides looking.
 OPEN_WHILE_LOCKED = {("POST", "/sign-out"), ("POST", "/lock"), ("POST", "/unlock"), ("POST", "/theme")}
 ENDLESS = ("/runs/{run_id}/stream", "/runs/{run_id}/live-view")
 
 
 @dataclass(frozen=True)
 class Way:
-    """A method of a route and the permission that it asks for; "" for a public one."""
+    """A method of a route and its required permission; "" for a public one."""
 
     method: str
     path: str
@@ -46,14 +46,14 @@ class Way:
         return self.method, self.path
 
     def address(self, run_id: str) -> str:
-        """With the run's name and, for everything else, something that is not there."""
-        # Streams never end by themselves: they are asked of a run that is not there.
+        """The address with the run's id, and with non-existent values for everything else."""
+        # Streams never end by themselves, so they are requested for a run that does not exist.
         run = "nowhere" if self.path in ENDLESS else run_id
         return re.sub(r"{[^}]*}", "1", self.path.replace("{run_id}", run))
 
 
 def ways(app: FastAPI) -> list[Way]:
-    """Every method of every route, mounted files apart."""
+    """Every method of every route, except for mounted files."""
     found: list[Way] = []
     for context in iter_route_contexts(app.routes):
         if not context.path or context.methods is None:
@@ -81,7 +81,7 @@ def run_id(site: WebSite) -> str:
 
 
 def ask(browser: Browser, way: Way, run_id: str, *, csrf: str = "", **headers: str) -> httpx.Response:
-    """A request with nothing in it but the token of its form."""
+    """A request with nothing but the token of its form."""
     data = {"csrf": csrf} if way.method != "GET" and csrf else None
     headers = {"accept": "application/json", **headers}
     return browser.request(way.method, way.address(run_id), data=data, headers=headers, follow_redirects=False)
@@ -131,7 +131,7 @@ def test_each_role_may_what_the_table_says_and_nothing_else(site: WebSite, run_i
         if way.permission is None:
             continue
         if may(role, way.permission):
-            if way.method == "GET":  # what a POST does is the business of other tests; its guard is asked below
+            if way.method == "GET":  # POSTs have effects and are tested elsewhere; their guard is tested below
                 answer = ask(browser, way, run_id)
                 assert answer.status_code not in (401, 403, 423, 500), (way, answer.text)
         else:
@@ -143,10 +143,10 @@ def test_each_role_may_what_the_table_says_and_nothing_else(site: WebSite, run_i
 
 @pytest.mark.parametrize("role", ROLES)
 def test_a_form_of_an_allowed_role_gets_past_the_guard(site: WebSite, run_id: str, role: Role) -> None:
-    """On a run that has ended, with an empty form: what is left to refuse it is the matter itself."""
+    """On a run that has ended, with an empty form: only the handler itself can refuse it."""
     for way in ways(site.app):
         if way.method == "POST" and way.permission is not None and may(role, way.permission):
-            browser = site.browser(role)  # a screen of its own: one of the forms signs it out
+            browser = site.browser(role)  # a separate screen, since one of the forms signs it out
             answer = ask(browser, way, run_id, csrf=browser.person.csrf)
             assert not is_refused_by_role(answer), (way, answer.text)
             assert answer.status_code not in (401, 423, 500), (way, answer.status_code, answer.text)

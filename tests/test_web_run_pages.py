@@ -33,7 +33,7 @@ def run_id(web: WebSite) -> str:
 
 
 def tell(web: WebSite, run_id: str, **fields: object) -> None:
-    """What a runner writes down."""
+    """Write a snapshot as a runner does."""
     write_snapshot(web.site.data, run_id, Snapshot.model_validate({"at_utc_s": time.time(), **fields}))
 
 

@@ -1,4 +1,4 @@
-"""What the run page shows, for whatever has been recorded: never a failure, and always the next thing to do."""
+"""The run page for any record: never a failure, and always the next thing to do."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def figures(protocol: Protocol, step: str, *, good: bool) -> dict[str, float]:
 
 
 def go(log: Log, way: str, pick: int = 0) -> None:
-    """One more thing happens, where it can."""
+    """Let one more thing happen, if it can."""
     state, step = log.state, log.protocol.step(log.state.current)
     if state.terminal:
         return
@@ -65,7 +65,7 @@ def go(log: Log, way: str, pick: int = 0) -> None:
 
 
 def work(log: Log, way: str) -> None:
-    """What the runner, or the person whom it asks, does next."""
+    """Do what the runner, or the person whom it asks, does next."""
     state = log.state
     step, now = state.current, state.step
     decision = decide(log.protocol, state)
@@ -197,7 +197,7 @@ def test_paused_is_shown_only_once_the_robot_stands_still() -> None:
     still = Snapshot(doing="paused", robot="standing")
     assert view_of(log, still).standing
     assert robot_banner(log.state, still, driven=True).title.startswith("Paused")
-    # A runner that has fallen silent says nothing of the robot.
+    # A silent runner says nothing about the robot.
     silent = robot_banner(log.state, Snapshot(), driven=True)
     assert silent.key == "unknown"
 
@@ -231,7 +231,7 @@ def test_the_time_left_is_measured_and_never_across_a_restart() -> None:
     log.capture(["v1", "v2"])
     log.append(SessionStarted(resumed=True, software={}, host="h", pid=1))
     log.capture(["v3", "v4"])
-    assert view_intervals_s(log.events, "viewpoint_capture_1") == [1.0, 1.0]  # the log's clock: a second an event
+    assert view_intervals_s(log.events, "viewpoint_capture_1") == [1.0, 1.0]  # the log's clock: one second per event
     assert view_of(log).progress.step_left == duration(4.0)
 
 

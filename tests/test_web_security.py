@@ -1,4 +1,4 @@
-"""What stands around the pages: headers, cookies, one-time links, limits, hostile input, errors that tell nothing."""
+"""Security of the pages: headers, cookies, one-time links, limits, hostile input, errors that reveal nothing."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def run_id(site: WebSite) -> str:
 
 
 def must_be_shielded(answer: httpx.Response) -> None:
-    """Safety headers, and nothing of the inside."""
+    """Check the security headers, and that nothing internal is revealed."""
     for name in SAFETY_HEADERS:
         assert name in answer.headers, (answer.url, name)
     assert "cache-control" in answer.headers, answer.url
@@ -209,7 +209,7 @@ def test_an_address_that_fails_too_often_is_not_listened_to(tmp_path: Path) -> N
         assert refused.headers["retry-after"] == "300"
         events = len(site.store.events(SITE))
         browser.sign_in("grace")
-        assert len(site.store.events(SITE)) == events  # and does not fill the record either
+        assert len(site.store.events(SITE)) == events  # nor does it fill the record
         clock.passed_s += 300
         assert browser.sign_in("grace").status_code == 303
 
@@ -223,7 +223,7 @@ def test_a_restart_forgives_no_failed_try_and_counts_no_other(tmp_path: Path) ->
         clock.passed_s = 100
         assert browser.sign_in("emmy", "wrong").status_code == 401
         browser = site.browser("technician")
-        browser.send_form("/account/pin", password="wrong", pin="1111")  # a wrong password, but no sign-in
+        browser.send_form("/account/pin", password="wrong", pin="1111")  # a wrong password, but not a sign-in
         browser.send_form("/lock")
         browser.send_form("/unlock", pin="1111")
     clock.passed_s = 200
@@ -233,7 +233,7 @@ def test_a_restart_forgives_no_failed_try_and_counts_no_other(tmp_path: Path) ->
         refused = browser.sign_in("emmy")
         assert (refused.status_code, refused.headers["retry-after"]) == (429, "100")
     with web_site(tmp_path, clock=clock) as site:
-        assert site.browser().sign_in("emmy").status_code == 429  # that it has to wait is recorded too, and no try
+        assert site.browser().sign_in("emmy").status_code == 429  # the wait is recorded too, but not counted as a try
         clock.passed_s = 299
         assert site.browser().sign_in("emmy").status_code == 429
     clock.passed_s = 301
@@ -433,7 +433,7 @@ def _send(site: WebSite, run_id: str, role: Role | None, case: schemathesis.Case
 
 
 def _screen(site: WebSite, run_id: str, role: Role | None) -> Browser:
-    """The last screen of the role; a new one when a request has locked it or signed it out."""
+    """The last screen of the role; a new one if a request has locked it or signed it out."""
     for browser in reversed(site.browsers):
         if role is None:
             return browser

@@ -1,4 +1,4 @@
-"""The worker's children: side by side, replaced when they die, and what is waited for goes first."""
+"""The worker's children: in parallel, replaced when they die, with awaited jobs first."""
 
 from __future__ import annotations
 
