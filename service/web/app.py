@@ -13,14 +13,16 @@ import service.web.home.pages
 import service.web.monitoring.pages
 import service.web.run.pages
 import service.web.scene.pages
+from service.people.credentials.tries import failed_tries
 from service.web.audit import devices, exports, gates
 from service.web.capture import media
 from service.web.home import checklist, compare, history, start
 from service.web.monitoring.pages import install_metrics
+from service.web.page.errors import install_errors
 from service.web.people import account, badges
 from service.web.run import actions, news, notes
-from service.web.security.guards import install_security
 from service.web.security.seal import sealed
+from service.web.security.shield import TRIES_WINDOW_S, Limiter, Shield
 from service.web.site import Site
 
 _ROUTERS: tuple[APIRouter, ...] = (
@@ -59,7 +61,9 @@ def create_app(site: Site) -> FastAPI:
         dependencies=[Depends(sealed, scope="function")],
     )
     app.state.site = site
-    install_security(app)
+    app.state.limiter = Limiter(site.store.clock, failed_tries(site.store, TRIES_WINDOW_S))
+    app.add_middleware(Shield, hosts=site.hosts)
+    install_errors(app)
     install_metrics(app)
     for router in _ROUTERS:
         app.include_router(router)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import stat
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock, Thread
 from typing import Literal
 
+from service.audit.background.child_process import ChildProcesses, ChildState
 from service.core.errors import DataError, IllegalTransitionError
 from service.core.records.events import Event, EvidenceExported
-from service.store.durable_effects import Clock, utc_text
+from service.store.durable_effects import Clock
 
 FOLDER = "exports"
 What = Literal["bundle", "hashes", "dataset", "report", "report_pdf"]
@@ -25,26 +22,6 @@ _SUFFIX: dict[What, str] = {
     "report": "report.html",
     "report_pdf": "report.pdf",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Exporting:
-    """An export under way, or how the last one ended."""
-
-    export: What
-    by: str
-    since_utc: str
-    what: str
-    done: int
-    total: int
-    problem: str = ""  # why nothing was exported
-    remedy: str = ""
-    file_name: str = ""  # when it is ready
-
-    @property
-    def pending(self) -> bool:
-        """Whether it is still under way."""
-        return not self.problem and not self.file_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,42 +41,33 @@ class Exports:
     def __init__(self, data: Path, clock: Clock) -> None:
         self._data = data
         self._clock = clock
-        self._now: dict[str, Exporting] = {}
-        self._threads: dict[str, Thread] = {}
-        self._lock = Lock()
+        self._children = ChildProcesses("service.audit.export.process", "export", clock)
 
     @property
     def folder(self) -> Path:
         """Where the files lie."""
         return self._data / FOLDER
 
-    def now(self, run_id: str) -> Exporting | None:
-        """How far the present export of a run is, or how the last one ended."""
-        with self._lock:
-            return self._now.get(run_id)
+    def state(self, run_id: str) -> ChildState | None:
+        """How far the present export of a run is, or how the last one ended: its result is the file's name."""
+        return self._children.state(run_id)
 
     def start(self, run_id: str, export: What, by: str) -> None:
         """Begin one. Raises IllegalTransitionError while another of the run is under way."""
         self.folder.mkdir(exist_ok=True)
-        with self._lock:
-            now = self._now.get(run_id)
-            if now is not None and now.pending:
-                raise IllegalTransitionError(
-                    f"{now.by} is exporting this run already", where=run_id, remedy="Wait until that one is ready"
-                )
-            begun = Exporting(export, by, utc_text(self._clock.utc_now()), "starting", 0, 0)
-            self._now[run_id] = begun
-            at = f"{self._clock.utc_now():%Y%m%d-%H%M%S}"
-            target = self.folder / f"{run_id}-exported-{at}-{_SUFFIX[export]}"
-            thread = Thread(target=self._follow, args=(run_id, begun, target), name=f"export {run_id}", daemon=True)
-            self._threads[run_id] = thread
-        thread.start()
+        at = f"{self._clock.utc_now():%Y%m%d-%H%M%S}"
+        target = self.folder / f"{run_id}-exported-{at}-{_SUFFIX[export]}"
+        if not self._children.start(run_id, [str(self._data), run_id, export, str(target), by], by=by):
+            now = self._children.state(run_id)
+            raise IllegalTransitionError(
+                f"{now.by if now else 'somebody'} is exporting this run already",
+                where=run_id,
+                remedy="Wait until that one is ready",
+            )
 
     def wait(self, run_id: str, timeout_s: float) -> None:
         """Until the present one has ended."""
-        thread = self._threads.get(run_id)
-        if thread is not None:
-            thread.join(timeout_s)
+        self._children.wait(run_id, timeout_s)
 
     def files(self, events: Sequence[Event]) -> list[ExportedFile]:
         """Everything that was exported of a run, newest first."""
@@ -132,40 +100,3 @@ class Exports:
         except OSError:
             return None
         return path if stat.S_ISREG(found.st_mode) and found.st_size == record.size_bytes else None
-
-    def _follow(self, run_id: str, begun: Exporting, target: Path) -> None:
-        words = [sys.executable, "-m", "service.audit.export.process"]
-        words += [str(self._data), run_id, begun.export, str(target), begun.by]
-        ended = _ended(begun, problem="the export ended without a result", remedy="Look at the list, and try again")
-        try:
-            with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-                assert process.stdout is not None  # a pipe was asked for
-                for content in process.stdout:
-                    line = json.loads(content)
-                    if "result" in line:
-                        ended = _ended(begun, file_name=str(line["result"]))
-                    elif "problem" in line:
-                        problem = line["problem"]
-                        ended = _ended(begun, problem=str(problem["what"]), remedy=str(problem["remedy"]))
-                    else:
-                        self._set(run_id, _ended(begun, what=line["what"], done=line["done"], total=line["total"]))
-        except (OSError, ValueError) as error:
-            ended = _ended(begun, problem=f"the export could not be done: {error}")
-        self._set(run_id, ended)
-
-    def _set(self, run_id: str, now: Exporting) -> None:
-        with self._lock:
-            self._now[run_id] = now
-
-
-def _ended(
-    begun: Exporting,
-    *,
-    what: str = "",
-    done: int = 0,
-    total: int = 0,
-    problem: str = "",
-    remedy: str = "",
-    file_name: str = "",
-) -> Exporting:
-    return Exporting(begun.export, begun.by, begun.since_utc, what, done, total, problem, remedy, file_name)

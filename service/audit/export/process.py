@@ -1,22 +1,21 @@
 """Exports one thing in a process of its own, so that pages stay quick: `python -m service.audit.export.process`.
 
-Its progress goes out line by line, its result last, as JSON. It ends the export whether or not anybody listens.
+It finishes the export even when nobody follows it any more.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from service.audit.background.child_process import Progress, report
 from service.audit.bundle.export import export_bundle, marked_name, record_export, require_exportable
 from service.audit.bundle.report import bundle_report
 from service.audit.bundle.zip_file import writing_bundle
-from service.core.errors import ConfigurationError, OrthocaptureError
+from service.core.errors import ConfigurationError
 from service.store.files.artefacts import chunks_of
 from service.store.files.space_used import require_export_space
 from service.store.store import Store
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from service.audit.record.run import RecordedRun
     from service.store.verification.verify import AuditReport
 
-Progress = Callable[[str, int, int], None]
 _OLDEST = (1980, 1, 1, 0, 0, 0)  # zip knows no earlier time; the files say themselves what they are of
 
 
@@ -37,9 +35,9 @@ def export(data: Path, run_id: str, what: str, target: Path, actor: str, progres
     with Store.open(data, create=False) as store:
         if what in ("bundle", "hashes"):
             hashes_only = what == "hashes"
-            report = bundle_report(data, run_id, with_pictures=not hashes_only)
+            html = bundle_report(data, run_id, with_pictures=not hashes_only)
             made = export_bundle(
-                store, run_id, target, actor=actor, hashes_only=hashes_only, report=report, progress=progress
+                store, run_id, target, actor=actor, hashes_only=hashes_only, report=html, progress=progress
             )
             return made.path
         if what == "dataset":
@@ -90,32 +88,11 @@ def _write_report(run: RecordedRun, audit: AuditReport, path: Path, *, pdf: bool
 
 
 def main(arguments: list[str]) -> None:
-    """Write the lines."""
+    """Export, and write to stdout how far it is and which file was made."""
     data, run_id, what, target, actor = arguments
-    listening = True
-    last = 0.0
-
-    def say(**line: Any) -> None:
-        nonlocal listening
-        try:
-            if listening:
-                sys.stdout.write(json.dumps(line) + "\n")
-                sys.stdout.flush()
-        except BrokenPipeError:  # the web process was restarted: the export goes on
-            listening = False
-
-    def progress(doing: str, done: int, total: int) -> None:
-        nonlocal last
-        if time.monotonic() - last > 0.2:
-            last = time.monotonic()
-            say(what=doing, done=done, total=total)
-
-    try:
-        made = export(Path(data), run_id, what, Path(target), actor, progress)
-    except OrthocaptureError as error:
-        say(problem={"what": error.what, "where": error.where, "remedy": error.remedy})
-    else:
-        say(result=made.name)
+    report(
+        lambda progress: export(Path(data), run_id, what, Path(target), actor, progress).name, outlives_parent=True
+    )
 
 
 if __name__ == "__main__":

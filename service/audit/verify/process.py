@@ -1,59 +1,40 @@
 """Verifies one run in a process of its own, so that pages stay quick: `python -m service.audit.verify.process`.
 
-Reads the data folder only. Its progress goes out line by line, its result last, as JSON.
+Reads the data folder only, and ends when nobody follows it any more.
 """
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
+from service.audit.background.child_process import Progress, report
 from service.audit.verify.verifications import LISTED
-from service.core.errors import StoreError
 from service.store.verification.verify import verify
 
 
-def main(data: Path, run_id: str) -> None:
-    """Write the lines."""
-    begun = last = time.monotonic()
-
-    def say(**line: Any) -> None:
-        sys.stdout.write(json.dumps(line) + "\n")
-        sys.stdout.flush()
-
-    def progress(what: str, done: int, total: int) -> None:
-        nonlocal last
-        if time.monotonic() - last > 0.2:
-            last = time.monotonic()
-            say(what=what, done=done, total=total)
-
-    say(what="reading the events", done=0, total=0)
-    try:
-        report = verify(data, run_id, progress)
-    except StoreError as error:
-        say(problem=str(error))
-        return
+def verification(data: Path, run_id: str, progress: Progress) -> dict[str, object]:
+    """Verify a run: the fields of a `Verification`. Raises StoreError."""
+    begun_s = time.monotonic()
+    progress("reading the events", 0, 0)
+    found = verify(data, run_id, progress)
     faults = [
-        {"run_id": fault.run_id, "seq": fault.seq, "file": fault.file, "what": fault.what} for fault in report.faults
+        {"run_id": fault.run_id, "seq": fault.seq, "file": fault.file, "what": fault.what} for fault in found.faults
     ]
-    say(
-        result={
-            "ok": report.ok,
-            "events": report.events,
-            "artefacts": report.artefacts,
-            "files": report.files,
-            "bytes_hashed": report.bytes_hashed,
-            "head_sha256": report.heads.get(run_id, ""),
-            "faults": faults[:LISTED],
-            "fault_count": len(faults),
-            "notes": list(report.notes)[:LISTED],
-            "duration_s": time.monotonic() - begun,
-        }
-    )
+    return {
+        "ok": found.ok,
+        "events": found.events,
+        "artefacts": found.artefacts,
+        "files": found.files,
+        "bytes_hashed": found.bytes_hashed,
+        "head_sha256": found.heads.get(run_id, ""),
+        "faults": faults[:LISTED],
+        "fault_count": len(faults),
+        "notes": list(found.notes)[:LISTED],
+        "duration_s": time.monotonic() - begun_s,
+    }
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    report(lambda progress: verification(Path(sys.argv[1]), sys.argv[2], progress), outlives_parent=False)

@@ -7,14 +7,11 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
-from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock, Thread
 
 from pydantic import ValidationError
 
+from service.audit.background.child_process import ChildProcesses, ChildState
 from service.core.records.events import Record
 from service.store.durable_effects import Clock, utc_text
 from service.store.verification.verify import AuditReport
@@ -46,18 +43,6 @@ class Verification(Record):
     fault_count: int
     notes: tuple[str, ...]
     duration_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Verifying:
-    """A verification under way, or one that ended without a result."""
-
-    by: str
-    since_utc: str
-    what: str
-    done: int
-    total: int
-    problem: str = ""
 
 
 def keep_verification(data: Path, run_id: str, kept: Verification) -> None:
@@ -99,9 +84,7 @@ class Verifications:
     def __init__(self, data: Path, clock: Clock) -> None:
         self._data = data
         self._clock = clock
-        self._running: dict[str, Verifying] = {}
-        self._threads: dict[str, Thread] = {}
-        self._lock = Lock()
+        self._children = ChildProcesses("service.audit.verify.process", "verification", clock)
 
     def last(self, run_id: str) -> Verification | None:
         """The last result; None when there is none that can be read."""
@@ -110,58 +93,19 @@ class Verifications:
         except (OSError, ValidationError):
             return None
 
-    def running(self, run_id: str) -> Verifying | None:
+    def running(self, run_id: str) -> ChildState | None:
         """How far the present one is; with a `problem`, why the last one gave no result."""
-        with self._lock:
-            return self._running.get(run_id)
+        state = self._children.state(run_id)
+        return state if state is not None and state.result is None else None
 
     def start(self, run_id: str, by: str) -> None:
         """Begin one, unless one is under way."""
-        with self._lock:
-            now = self._running.get(run_id)
-            if now is not None and not now.problem:
-                return
-            begun = Verifying(by, utc_text(self._clock.utc_now()), "starting", 0, 0)
-            self._running[run_id] = begun
-            thread = Thread(target=self._follow, args=(run_id, begun), name=f"verify {run_id}", daemon=True)
-            self._threads[run_id] = thread
-        thread.start()
+        self._children.start(run_id, [str(self._data), run_id], by=by, keep=lambda ended: self._keep(run_id, ended))
 
     def wait(self, run_id: str, timeout_s: float) -> None:
         """Until the present one has ended."""
-        thread = self._threads.get(run_id)
-        if thread is not None:
-            thread.join(timeout_s)
+        self._children.wait(run_id, timeout_s)
 
-    def _follow(self, run_id: str, begun: Verifying) -> None:
-        words = [sys.executable, "-m", "service.audit.verify.process", str(self._data), run_id]
-        problem = "the verification ended without a result"
-        try:
-            with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-                assert process.stdout is not None  # a pipe was asked for
-                for content in process.stdout:
-                    line = json.loads(content)
-                    if "result" in line:
-                        self._keep(run_id, begun, line["result"])
-                        problem = ""
-                    elif "problem" in line:
-                        problem = str(line["problem"])
-                    else:
-                        self._set(
-                            run_id, Verifying(begun.by, begun.since_utc, line["what"], line["done"], line["total"])
-                        )
-        except (OSError, ValueError) as error:
-            problem = f"the verification could not be done: {error}"
-        self._set(run_id, Verifying(begun.by, begun.since_utc, "", 0, 0, problem) if problem else None)
-
-    def _set(self, run_id: str, now: Verifying | None) -> None:
-        with self._lock:
-            if now is None:
-                self._running.pop(run_id, None)
-            else:
-                self._running[run_id] = now
-
-    def _keep(self, run_id: str, begun: Verifying, result: dict[str, object]) -> None:
-        fields = {"at_utc": utc_text(self._clock.utc_now()), "by": begun.by, **result}
-        kept = Verification.model_validate_json(json.dumps(fields))
-        keep_verification(self._data, run_id, kept)
+    def _keep(self, run_id: str, ended: ChildState) -> None:
+        fields = {"at_utc": utc_text(self._clock.utc_now()), "by": ended.by, **ended.result}
+        keep_verification(self._data, run_id, Verification.model_validate_json(json.dumps(fields)))

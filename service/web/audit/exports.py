@@ -39,12 +39,12 @@ def _exports(request: Request, site: Here) -> Exports:
     return found
 
 
-Exporting = Annotated[Exports, Depends(_exports)]
+ExportsOfSite = Annotated[Exports, Depends(_exports)]
 
 
 @router.get("/runs/{run_id}/exports", name="exports", dependencies=_READ, response_class=HTMLResponse)
 def exports_page(
-    request: Request, site: Here, audit: Auditing, exports: Exporting, person: Signed, run_id: RunId
+    request: Request, site: Here, audit: Auditing, exports: ExportsOfSite, person: Signed, run_id: RunId
 ) -> Response:
     """Whether the run may leave the system, what has left already, and how to make more."""
     log = site.run(run_id)
@@ -65,7 +65,7 @@ def exports_page(
         unfit=unfit,
         meanings=MEANINGS,
         may_export=person.may("export"),
-        exporting=exports.now(run_id),
+        exporting=exports.state(run_id),
         files=exports.files(log.events),
         signed_to=max((item.seq for item in site.store.checkpoints(run_id)), default=0),
     )
@@ -95,7 +95,7 @@ def release(
 
 @router.post("/runs/{run_id}/exports", name="start_export", dependencies=[Depends(requires("export"))])
 def start_export(
-    site: Here, exports: Exporting, person: Signed, run_id: RunId, what: Annotated[What, Form()]
+    site: Here, exports: ExportsOfSite, person: Signed, run_id: RunId, what: Annotated[What, Form()]
 ) -> RedirectResponse:
     """Begin an export. It verifies everything first, and ends without a file when anything differs."""
     log = site.run(run_id)
@@ -108,7 +108,7 @@ def start_export(
 
 @router.get("/runs/{run_id}/exports/{file_name}", name="exported_file", dependencies=_READ)
 def exported_file(
-    site: Here, exports: Exporting, run_id: RunId, file_name: Annotated[str, Path(max_length=200)]
+    site: Here, exports: ExportsOfSite, run_id: RunId, file_name: Annotated[str, Path(max_length=200)]
 ) -> FileResponse:
     """Download one of the recorded exports."""
     path, record = exports.path(site.run(run_id).events, file_name)

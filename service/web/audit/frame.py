@@ -10,13 +10,14 @@ from urllib.parse import urlencode
 
 from fastapi import Depends, FastAPI, Request
 
+from service.audit.background.child_process import ChildState
 from service.audit.background.incremental import Computed
 from service.audit.overview.digest import Digest, digests
 from service.audit.overview.first_page import verified
 from service.audit.provenance.graph import Graph, graphs
 from service.audit.record import queries
 from service.audit.record.queries import RunBasics
-from service.audit.verify.verifications import Verification, Verifications, Verifying
+from service.audit.verify.verifications import Verification, Verifications
 from service.core.records.import_list import imported_sentence
 from service.store.errors import UnknownRunError
 from service.web.site import Here, Site
@@ -78,7 +79,7 @@ class AuditFrame:
     here: str  # address of the present tab
     verification: Verification | None
     verified: str
-    verifying: Verifying | None
+    verifying: ChildState | None
     imported: str  # the sentence that says so; "" for a run that captured its photographs itself
 
 

@@ -19,6 +19,7 @@ from service.core.errors import ConfigurationError, DataError, IntegrityError, O
 from service.people import errors as people
 from service.store.errors import UnknownRunError
 from service.web.page.rendering import render
+from service.web.security.guards import token_of
 from service.web.security.shield import add_safety_headers
 
 _log = logging.getLogger("orthocapture.web")
@@ -92,9 +93,6 @@ def respond(request: Request, problem: Problem, headers: dict[str, str] | None =
 
 def _recognise(request: Request) -> None:
     """Who looks at the page of an error that came before any guard, such as an address that does not exist."""
-    # Imported here: security installs these handlers.
-    from service.web.security.guards import token_of  # noqa: PLC0415
-
     site = request.app.state.site
     if hasattr(request.state, "person"):
         return

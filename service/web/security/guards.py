@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 from hmac import compare_digest
-from typing import Annotated, cast
+from typing import Annotated
 
-from fastapi import Depends, FastAPI, Request, Response
+from fastapi import Depends, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from starlette.datastructures import FormData
 
 from service.people.control import Control
-from service.people.credentials.tries import failed_tries
 from service.people.errors import NotAllowedError, NotSignedInError, ScreenLockedError
 from service.people.person import Person
 from service.people.roles import Permission
-from service.web.page.errors import install_errors
-from service.web.security.shield import TRIES_WINDOW_S, Limiter, Shield
 from service.web.server.connections import Connection
 from service.web.site import Here, Site
 
 SAFE_METHODS = frozenset({"GET", "HEAD"})
 THEFT_REMEDY = "Load the page again and repeat; nothing was done"
-
-
-def install_security(app: FastAPI) -> None:
-    """Headers, limits and errors of the whole application. `app.state.site` is set before."""
-    site = cast(Site, app.state.site)
-    app.state.limiter = Limiter(site.store.clock, failed_tries(site.store, TRIES_WINDOW_S))
-    app.add_middleware(Shield, hosts=site.hosts)
-    install_errors(app)
 
 
 # --- cookies -------------------------------------------------------------------------------------------------

@@ -1,0 +1,149 @@
+"""Work for a run in a child process, followed from this one: how far it is, and how it ended.
+
+The child writes one line of JSON for each piece of news, see `report`; the parent keeps the last one.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from threading import Lock, Thread
+from typing import Any
+
+from service.core.errors import OrthocaptureError
+from service.store.durable_effects import Clock, utc_text
+
+Progress = Callable[[str, int, int], None]  # what is done now, how much of it is done, of how much
+_BETWEEN_REPORTS_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class ChildState:
+    """A child process under way, or how the last one ended."""
+
+    by: str  # who asked for it
+    since_utc: str
+    what: str = "starting"
+    done: int = 0
+    total: int = 0
+    problem: str = ""  # why there is no result
+    remedy: str = ""
+    result: Any = None  # plain data, once there is one
+
+    @property
+    def pending(self) -> bool:
+        """Whether it is still under way."""
+        return not self.problem and self.result is None
+
+
+class ChildProcesses:
+    """Runs one module in child processes, at most one at a time for each run."""
+
+    def __init__(self, module: str, name: str, clock: Clock) -> None:
+        """`name`: what the module makes, for messages: "export"."""
+        self._module = module
+        self._name = name
+        self._clock = clock
+        self._states: dict[str, ChildState] = {}
+        self._threads: dict[str, Thread] = {}
+        self._lock = Lock()
+
+    def state(self, run_id: str) -> ChildState | None:
+        """How far the present child is, or how the last one ended; None before the first."""
+        with self._lock:
+            return self._states.get(run_id)
+
+    def start(
+        self, run_id: str, arguments: Sequence[str], *, by: str, keep: Callable[[ChildState], None] | None = None
+    ) -> bool:
+        """Start a child unless one is under way for this run; whether it was started.
+
+        Args:
+            run_id: of which run.
+            arguments: of the module's command line.
+            by: who asked for it.
+            keep: called with the result before anybody else sees it; may raise OSError or ValueError.
+        """
+        with self._lock:
+            now = self._states.get(run_id)
+            if now is not None and now.pending:
+                return False
+            begun = ChildState(by, utc_text(self._clock.utc_now()))
+            self._states[run_id] = begun
+            thread = Thread(
+                target=self._follow, args=(run_id, arguments, begun, keep), name=f"{self._name} {run_id}", daemon=True
+            )
+            self._threads[run_id] = thread
+        thread.start()
+        return True
+
+    def wait(self, run_id: str, timeout_s: float) -> None:
+        """Until the present child has ended."""
+        thread = self._threads.get(run_id)
+        if thread is not None:
+            thread.join(timeout_s)
+
+    def _follow(
+        self, run_id: str, arguments: Sequence[str], begun: ChildState, keep: Callable[[ChildState], None] | None
+    ) -> None:
+        ended = replace(begun, problem=f"the {self._name} ended without a result", remedy="Try again")
+        command = [sys.executable, "-m", self._module, *arguments]
+        try:
+            with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+                assert process.stdout is not None  # a pipe was asked for
+                for line in process.stdout:
+                    told = replace(begun, **json.loads(line))
+                    if told.pending:
+                        self._set(run_id, told)
+                    else:
+                        ended = told
+            if keep is not None and not ended.problem:
+                keep(ended)
+        except (OSError, ValueError, TypeError) as error:
+            ended = replace(begun, problem=f"the {self._name} could not be done: {error}", remedy="Try again")
+        self._set(run_id, ended)
+
+    def _set(self, run_id: str, state: ChildState) -> None:
+        with self._lock:
+            self._states[run_id] = state
+
+
+def report(work: Callable[[Progress], Any], *, outlives_parent: bool) -> None:
+    """Do the work of a child process and write its progress, then its result or its problem, to stdout.
+
+    Args:
+        work: gets a function that reports progress; returns the result, as plain data.
+        outlives_parent: go on when nobody reads any more. Otherwise BrokenPipeError is raised.
+    """
+    last_s = -_BETWEEN_REPORTS_S
+    listening = True
+
+    def say(**line: object) -> None:
+        nonlocal listening
+        if not listening:
+            return
+        try:
+            sys.stdout.write(json.dumps(line) + "\n")
+            sys.stdout.flush()
+        except BrokenPipeError:  # the parent was restarted
+            if not outlives_parent:
+                raise
+            listening = False
+
+    def progress(what: str, done: int, total: int) -> None:
+        nonlocal last_s
+        if time.monotonic() - last_s > _BETWEEN_REPORTS_S:
+            last_s = time.monotonic()
+            say(what=what, done=done, total=total)
+
+    try:
+        result = work(progress)
+    except OrthocaptureError as error:
+        place = f" [{error.where}]" if error.where else ""
+        say(problem=f"{error.what}{place}", remedy=error.remedy)
+    else:
+        say(result=result)
