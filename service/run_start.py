@@ -12,7 +12,7 @@ from service.core.records.events import ActionAfterEnd, ActionRefused, OperatorA
 from service.core.run.state import RunState
 from service.rig import Rig, parse_recorded_rig, read_rig
 from service.run_record import recorded_protocol, recorded_root
-from service.runner import software_versions
+from service.runner.software import software_versions
 from service.store.files.space_used import forecast_of, require_space
 from service.store.records import NewArtefact
 from service.store.signatures.timestamps import Authority

@@ -37,7 +37,7 @@ from service.core.run.state import RunState
 from service.dataset.export import export_dataset
 from service.monitor.reporter import OpenDevices, Reporter
 from service.people.sessions import People
-from service.runner import Spoken
+from service.runner.operator import AnswerBy
 from service.steps import params_models
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -406,7 +406,7 @@ class Typed:
             "Ada", self.log.protocol, display, SimulatedHands(None), descriptor=self.slave, people=people
         )
 
-    def line(self, text: str) -> OperatorAction | Spoken | None:
+    def line(self, text: str) -> OperatorAction | AnswerBy | None:
         """What the operator makes of a typed line."""
         self.operator.poll(self.log.question, self.log.state)  # asks, and looks at an empty line buffer
         os.write(self.master, text.encode() + b"\n")
@@ -444,7 +444,7 @@ def test_at_the_terminal_a_supervisor_types_name_and_hidden_password(web: WebSit
         for text in ("accept one view less", "Emmy"):
             assert typed.line(text) is None
         spoken = typed.line(password_of("emmy"))
-        assert isinstance(spoken, Spoken)
+        assert isinstance(spoken, AnswerBy)
         assert (spoken.actor, spoken.action.role, spoken.action.identified) == ("emmy", "supervisor", "password")
         state = typed.log.append(spoken.action, spoken.actor)
         assert state.step.accepted is not None

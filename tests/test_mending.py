@@ -24,7 +24,7 @@ from service.core.run.state import RunState
 from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
-from service.runner import Runner
+from service.runner.loop import Runner
 from service.steps import params_models, viewpoint_capture
 from service.steps.context import StepContext
 from service.store.store import Store

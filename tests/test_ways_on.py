@@ -24,7 +24,7 @@ from service.core.recovery.ways_on import WayOn, takes_words, ways_on
 from service.core.recovery.words import AGAIN, REMEDIES
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.runner import Spoken
+from service.runner.operator import AnswerBy
 from service.steps import step_kinds
 from service.steps.context import StepContext, StepOutcome
 from service.store.store import Store
@@ -81,7 +81,7 @@ class Walker(ScriptedOperator):
         self.leave_by, self.ends_at = leave_by, ends_at
         self.taken: list[tuple[str, OperatorVerb, str]] = []  # stopped step, verb, step of the choice
 
-    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
         if question.for_ != "recovery":
             return super().poll(question, state)
         available = [way for way in question.ways if way.available]
@@ -97,13 +97,13 @@ class Walker(ScriptedOperator):
             return self._take(here, fresh[0], state)
         return self._take(here, next(way for way in available if way.verb == self.leave_by), state)
 
-    def _take(self, here: str, way: WayOn, state: RunState) -> OperatorAction | Spoken:
+    def _take(self, here: str, way: WayOn, state: RunState) -> OperatorAction | AnswerBy:
         self.taken.append((here, way.verb, way.step))
         action = OperatorAction(action=way.verb, step=way.step, reason="walked")
         if way.verb != "accept":
             return action
         signed = {"signed_sha256": state.step.gates_sha256, "role": "supervisor", "identified": "claimed"}
-        return Spoken(action.model_copy(update=signed), "Emmy")
+        return AnswerBy(action.model_copy(update=signed), "Emmy")
 
 
 @pytest.fixture
@@ -111,7 +111,7 @@ def begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Callable
     with Store.open(tmp_path / "data") as store:
 
         def begun(fakes: Fakes, walker: Walker) -> Bench:
-            monkeypatch.setattr("service.runner.step_kinds", fakes.kinds)
+            monkeypatch.setattr("service.runner.execution.step_kinds", fakes.kinds)
             bench = begin_run(store, PROTOCOL, tmp_path)
             bench.operator = walker
             return bench
@@ -244,7 +244,7 @@ def test_status_lists_them_for_other_programs(begin: Callable[[Fakes, Walker], B
         pass
 
     class Leaving(Walker):
-        def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
+        def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
             if question.for_ == "recovery":
                 raise LeftError
             return super().poll(question, state)

@@ -43,7 +43,7 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 from service.rig import CollisionSection, LensSection, OpticsSection
-from service.runner import Spoken
+from service.runner.operator import AnswerBy
 from service.steps.context import LeaveToMove, StationLayout
 
 TRAVEL_S = 0.02
@@ -371,7 +371,7 @@ class ScriptedOperator:
         default_factory=list[tuple[str, int, tuple[Mapping[str, Any], ...]]]
     )
 
-    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
         self.asked.append(question)
         answers = self.script.get((question.step, question.for_), [])
         return (answers.pop(0) if answers else agree)(question, state)

@@ -14,7 +14,7 @@ from service.core.run.fold import fold
 from service.core.run.state import RunState
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
-from service.runner import Runner
+from service.runner.loop import Runner
 from service.steps import params_models
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store

@@ -16,7 +16,6 @@ import numpy as np
 from bench.torture.crash.mortal import MortalFiles, Point
 from bench.torture.crash.remembered import remembering
 from bench.torture.crash.scene import CAMERA, LAYOUT, VIEWPOINTS, CrashRig, prepare_files
-from service import runner
 from service.core.gates.release import refuse_release
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import parse_protocol
@@ -24,6 +23,8 @@ from service.core.records.events import RunReleased, StepMeasured, StepStarted
 from service.core.run.fold import fold
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
+from service.runner import loop as runner_loop
+from service.runner.software import software_versions
 from service.steps import params_models
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.signing import checkpoint
@@ -31,7 +32,7 @@ from service.store.store import Store
 from service.worker import loop
 from tests.support.bench_rig import ScriptedOperator
 
-_SOFTWARE = runner.software_versions()
+_SOFTWARE = software_versions()
 Role = Literal["begin", "runner", "worker", "web"]
 _ARC = VIEWPOINTS.arcs[0]
 PROTOCOL = f"""\
@@ -188,7 +189,7 @@ def start(role: Role, place: Place, *, die_at: Point | None = None, person: str 
         # Helper processes would import everything again, a thousand times: compute the jobs in this process.
         os.cpu_count = lambda: 1
         np.seterr(all="ignore")
-        runner.software_versions = _SOFTWARE.copy  # also read the installed packages only once
+        runner_loop.software_versions = _SOFTWARE.copy  # also read the installed packages only once
         files = MortalFiles(place.data, place.journal(role), die_at)
         with Store.open(place.data, files=files) as store:
             _ROLES[role](store, place, parent, person)
@@ -217,7 +218,7 @@ def _run(store: Store, place: Place, parent: int, person: str) -> None:
         time.sleep(min(seconds, 0.01))
 
     operator = ScriptedOperator(name=person)
-    runner.Runner(store, run_id, protocol, rig, operator, signature_copy=place.signature_copy, wait=wait).run()
+    runner_loop.Runner(store, run_id, protocol, rig, operator, signature_copy=place.signature_copy, wait=wait).run()
 
 
 def _work(store: Store, place: Place, parent: int, _person: str) -> None:

@@ -12,7 +12,7 @@ from service.core.records.events import OperatorAction
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
-from service.runner import Spoken
+from service.runner.operator import AnswerBy
 from tests.support.bench_rig import ScriptedOperator, agree, answer
 from tests.support.ur_rtde_protocol import RtdeClient
 
@@ -39,7 +39,7 @@ class Person(ScriptedOperator):
     open: AskOperator | None = None
     stopped: list[AskOperator] = field(default_factory=list[AskOperator])
 
-    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
         """Return the person's answer to a question, or None while there is none yet. Raises LeftError."""
         if question.for_ != "recovery":
             return agree(question, state)

@@ -28,7 +28,7 @@ from service.core.protocol.models import parse_protocol
 from service.core.run.decide import AskOperator, initial_state
 from service.core.run.state import RunState
 from service.run_start import recorded_run, start_run
-from service.runner import Runner
+from service.runner.loop import Runner
 from service.steps import params_models
 from service.store.database.engine import database_path
 from service.store.store import Store

@@ -19,7 +19,7 @@ from service.core.errors import ConfigurationError, IntegrityError, Orthocapture
 from service.core.gates.verdict import evaluate_gates
 from service.core.records.events import ArtefactRef, GateVerdict, JobFinished, SessionStarted
 from service.core.run.state import JobState
-from service.runner import software_versions
+from service.runner.software import software_versions
 from service.store.events import parse_canonical, payload_text
 from service.store.verification.verify import verify
 from service.worker.job import JobAnswer, JobContext

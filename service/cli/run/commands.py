@@ -57,7 +57,7 @@ from service.run_start import (
     start_run,
     time_stamp_authority,
 )
-from service.runner import Runner
+from service.runner.loop import Runner
 from service.station import Station, layout_of
 from service.steps import params_models
 from service.steps.live import describe_view

@@ -13,7 +13,7 @@ from service.core.records.import_list import FileRole, ImportList, PhotographRol
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.core.text.terms import term
-from service.runner import Spoken
+from service.runner.operator import AnswerBy
 
 
 def part_of(protocol: Protocol, step_id: str) -> PhotographRole | FileRole | None:
@@ -37,7 +37,7 @@ class ImportOperator(TerminalOperator):
     listing: ImportList | None = None
     _retried: bool = False
 
-    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
         """Confirm or skip the import of a part; ask for anything else, where there is a terminal."""
         part = part_of(self.protocol, question.step)
         if question.for_ == "confirm" and part is not None and self.listing is not None:

@@ -27,7 +27,7 @@ from service.monitor.snapshot import Doing
 from service.people.authorisation import Identity, identity_for
 from service.people.errors import PeopleError
 from service.people.sessions import People
-from service.runner import Spoken
+from service.runner.operator import AnswerBy
 
 _MOST_MENDS = 4  # of one step: whoever has followed its advice so often decides by himself
 
@@ -151,7 +151,7 @@ class TerminalOperator(_Operator):
     _typed: bytes = b""
     _accepting: _Accepting | None = None
 
-    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | Spoken | None:
+    def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
         """Show a new question once, then look whether a line was typed."""
         if question != self._asked:
             self._asked = question
@@ -201,7 +201,7 @@ class TerminalOperator(_Operator):
         if why:
             self.display.console.print(Text("Why: ") + why, soft_wrap=False)
 
-    def _accept(self, accepting: _Accepting, line: str, state: RunState) -> Spoken | None:
+    def _accept(self, accepting: _Accepting, line: str, state: RunState) -> AnswerBy | None:
         """The name first, then the password, each a line of its own: the run is attended to between them."""
         if not accepting.name:
             accepting.name = line.strip() or self.name
@@ -224,7 +224,7 @@ class TerminalOperator(_Operator):
             role=who.role if who else "",
             identified=who.identified if who else "",
         )
-        return Spoken(action, who.name if who else accepting.name)
+        return AnswerBy(action, who.name if who else accepting.name)
 
     def close(self) -> None:
         """What is typed is shown again."""

@@ -1,0 +1,115 @@
+"""The work of one step: its context, its outcome or its failure in the record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from drivers.errors import DeviceError
+from service.core.errors import OrthocaptureError
+from service.core.protocol.models import Protocol, Step
+from service.core.records.events import DeviceTrouble, Payload, StepFailed, StepMeasured
+from service.core.recovery.policy import recovery_policy
+from service.logs.where import at
+from service.run_record import StepEvidence
+from service.runner.disk import DiskWatch
+from service.runner.held_run import HeldRun
+from service.runner.operator import Operator
+from service.steps import step_kinds
+from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
+
+_WRITE_NOTHING = ("checklist", "timed_application")  # step kinds that go on when the disk is full
+
+
+@dataclass(frozen=True)
+class StepExecution:
+    """Executes steps of a held run with the devices of its rig."""
+
+    run: HeldRun
+    protocol: Protocol
+    devices: Devices
+    operator: Operator
+    disk: DiskWatch
+    monotonic_s: Callable[[], float]
+    wait: Callable[[float], None]
+
+    def execute(self, step_id: str, attempt: int) -> None:
+        """Do the work of a step and record what came of it; an interruption by the operator is only told."""
+        step = self.protocol.step(step_id)
+        at(step=step_id, viewpoint="")
+        checkpoint = partial(self._checkpoint, step_id, attempt)
+        context = self._context(step, attempt, checkpoint)
+        if (leave := self.run.state.leave) is not None:
+            self.devices.let_move(LeaveToMove(leave.seq, leave.by, self.run.follower.leave_not_before_s))
+        try:
+            checkpoint()
+            if step.kind not in _WRITE_NOTHING:
+                self.disk.require()
+            outcome = step_kinds()[step.kind].execute(context, step.params)
+        except StepInterruptedError as interruption:
+            self.operator.tell(str(interruption))
+        except OrthocaptureError as error:
+            self._failed(step_id, attempt, error)
+        else:
+            self._measured(step_id, attempt, outcome)
+
+    def _context(self, step: Step, attempt: int, checkpoint: Callable[[], None]) -> StepContext:
+        operator = self.operator
+        return StepContext(
+            protocol=self.protocol,
+            step=step,
+            attempt=attempt,
+            run=self.run.state,
+            devices=self.devices,
+            evidence=StepEvidence(
+                self.run.follower,
+                self.run.lease,
+                step.id,
+                attempt,
+                checkpoint,
+                operator.show,
+                self.wait,
+                self.disk.require,
+            ),
+            checkpoint=checkpoint,
+            progress=operator.show,
+            monotonic_s=self.monotonic_s,
+            wait=self.wait,
+            operator=operator.name,
+            tell=operator.tell,
+            busy=operator.busy,
+        )
+
+    def _measured(self, step: str, attempt: int, outcome: StepOutcome) -> None:
+        self.run.append(
+            StepMeasured(
+                step=step,
+                attempt=attempt,
+                measures={name: float(value) for name, value in outcome.measures.items()},
+                artefacts=outcome.artefacts,
+                result=dict(outcome.result),
+                uncertainties=dict(outcome.uncertainties),
+            )
+        )
+
+    def _failed(self, step_id: str, attempt: int, error: OrthocaptureError) -> None:
+        state = self.run.refresh().steps[step_id]
+        name = type(error).__name__
+        policy = recovery_policy(self.protocol.step(step_id).recovery, name, state.failures + 1)
+        payloads: list[Payload] = []
+        if isinstance(error, DeviceError):
+            payloads.append(DeviceTrouble(device=error.where or step_id, error=name, message=str(error)))
+        payloads.append(StepFailed(step=step_id, attempt=attempt, error=name, message=str(error), recovery=policy))
+        self.run.append(*payloads)
+        kept = self.run.state.origin
+        self.operator.tell(f"{step_id}: {error}. What was {kept} is safe")
+
+    def _checkpoint(self, step: str, attempt: int) -> None:
+        """Called by steps wherever they may stop: notices what operators have asked for."""
+        state = self.run.refresh()
+        self.operator.attend("pausing" if state.paused else "working", state, pedal_armed=False)
+        if state.paused:
+            raise StepInterruptedError("paused")
+        if state.terminal or (state.current, state.step.attempt, state.phase) != (step, attempt, "running"):
+            raise StepInterruptedError(f"the operator has ended this attempt; the run is {state.status}")
