@@ -374,7 +374,9 @@ def main() -> int:
     parser.add_argument("--width", type=int, default=1920)
     parser.add_argument("--views", type=int, default=20)
     parser.add_argument("--sources", nargs="+", default=list(SOURCE), choices=list(SOURCE))
-    parser.add_argument("--effort", default="normal", choices=get_args(Effort), help="of structure from motion")
+    parser.add_argument(
+        "--effort", default="normal", choices=get_args(Effort), help="effort of structure from motion"
+    )
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--cache", type=Path, default=CACHE)
     parser.add_argument("--results", type=Path, default=RESULTS)

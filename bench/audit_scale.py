@@ -39,7 +39,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--events", type=int, default=100_000)
     parser.add_argument("--repeat", type=int, default=20, help="requests of each page after the first")
     parser.add_argument(
-        "--work", type=Path, help="folder for the run, kept and used again; a temporary one otherwise"
+        "--work", type=Path, help="folder in which to keep the run for reuse; default: a temporary folder"
     )
     parser.add_argument("--results", type=Path, default=RESULTS)
     options = parser.parse_args(words)

@@ -52,10 +52,10 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=[1, 2, 3], metavar="SEED", help="seeds (1 2 3)")
-    parser.add_argument("--image-width", type=int, default=1280, help="of the simulated photographs (1280)")
+    parser.add_argument("--image-width", type=int, default=1280, help="width of the simulated photographs (1280)")
     parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat(), help="today")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the two files (bench/results)")
-    parser.add_argument("--keep", type=Path, help="folder to keep the runs in; without it they are removed")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the result files (bench/results)")
+    parser.add_argument("--keep", type=Path, help="folder in which to keep the runs; default: remove them")
     return parser.parse_args(words)
 
 

@@ -168,7 +168,7 @@ METHODS = ("weighted", "park", "daniilidis", "tsai", "horaud", "andreff", "repro
 def main() -> None:
     """Measure, print and write both result files."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=5, help="how many (5)")
+    parser.add_argument("--seeds", type=int, default=5, help="number of seeds (5)")
     parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat())
     parser.add_argument("--results", type=Path, default=RESULTS)
     options = parser.parse_args()

@@ -58,14 +58,12 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, nargs="+", default=[7], metavar="SEED", help="seeds (7)")
-    parser.add_argument("--image-width", type=int, default=1280, help="of the simulated photographs (1280)")
+    parser.add_argument("--image-width", type=int, default=1280, help="width of the simulated photographs (1280)")
     parser.add_argument("--hand", default="usual", choices=("steady", "usual", "clumsy"), help="who holds the camera")
-    parser.add_argument(
-        "--made", type=Path, help="folder with data/ and rig/ of a run of one scene that was made before"
-    )
+    parser.add_argument("--made", type=Path, help="folder with data/ and rig/ of an existing run of one scene")
     parser.add_argument("--no-robot", action="store_true", help="leave out the demo with the robot")
     parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat(), help="today")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the two files (bench/results)")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder for the result files (bench/results)")
     return parser.parse_args(words)
 
 

@@ -170,8 +170,8 @@ def _cell(value: float | None) -> str:
 def main() -> None:
     """Measure and add the rows to the result."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--label", required=True, help="of the revision that is measured")
-    parser.add_argument("--images", type=int, default=1, help="of each usual condition")
+    parser.add_argument("--label", required=True, help="label of the measured revision")
+    parser.add_argument("--images", type=int, default=1, help="images per usual condition")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     cv2.setNumThreads(1)

@@ -122,7 +122,7 @@ def main() -> None:
     """Measure the folders and write the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", type=Path, nargs="*", help="rendered captures")
-    parser.add_argument("--most", type=int, default=6, help="images of a folder")
+    parser.add_argument("--most", type=int, default=6, help="maximum number of images per folder")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     cv2.setNumThreads(1)

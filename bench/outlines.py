@@ -150,10 +150,10 @@ def main() -> None:
     """Measure, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=Path, nargs="*", default=[])
-    parser.add_argument("--every", type=int, default=5, help="image of a scene")
-    parser.add_argument("--images", type=int, default=2, help="images of each condition")
+    parser.add_argument("--every", type=int, default=5, help="use every n-th image of a scene")
+    parser.add_argument("--images", type=int, default=2, help="images per condition")
     parser.add_argument("--only", default="", help="part of a condition's name")
-    parser.add_argument("--write", action="store_true", help="to bench/results")
+    parser.add_argument("--write", action="store_true", help="write to bench/results")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     lines = [

@@ -65,9 +65,9 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main() -> None:
     """Run the available sets, list the missing ones, and write the table if anything ran."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True, help="folder of the sets, each in a folder of its own")
+    parser.add_argument("--data", type=Path, required=True, help="folder with one subfolder per data set")
     parser.add_argument("--only", default="", help="part of a set's name")
-    parser.add_argument("--work", type=Path, default=Path("build/real-data"), help="for what the commands write")
+    parser.add_argument("--work", type=Path, default=Path("build/real-data"), help="folder for the commands' output")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     file = options.out / f"real_data-{datetime.now(UTC):%Y-%m-%d}.json"

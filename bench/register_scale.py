@@ -173,7 +173,7 @@ def main() -> None:
         print(json.dumps(measured(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))))
         return
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--files", nargs="*", metavar="FOLDER:N,N", help="folders and counts, instead of the default")
+    parser.add_argument("--files", nargs="*", metavar="FOLDER:N,N", help="folders and image counts")
     parser.add_argument("--solved", type=int, nargs="*", default=list(SOLVED))
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=Path, default=RESULTS)

@@ -197,7 +197,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--views", type=int, default=20)
     parser.add_argument("--every", type=int, default=1, help="take every n-th of the views")
     parser.add_argument("--effort", choices=("quick", "normal", "quality"), default="quality")
-    parser.add_argument("--workspaces", type=Path, help="folder that keeps features and matches for another time")
+    parser.add_argument("--workspaces", type=Path, help="folder in which to cache features and matches")
     parser.add_argument("--date", default=datetime.datetime.now(tz=datetime.UTC).date().isoformat(), help="today")
     parser.add_argument("--results", type=Path, default=RESULTS)
     options = parser.parse_args(words)

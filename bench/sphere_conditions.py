@@ -154,14 +154,14 @@ def _hex(look: Look) -> str:
 def main() -> None:
     """Measure, print and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--images", type=int, default=10, help="of each condition")
+    parser.add_argument("--images", type=int, default=10, help="images per condition")
     parser.add_argument("--width", type=int, default=1000)
-    parser.add_argument("--spheres", type=int, default=7, help="in an image")
+    parser.add_argument("--spheres", type=int, default=7, help="spheres per image")
     parser.add_argument("--only", default="", help="part of a condition's name")
     parser.add_argument("--detector", default="classical", choices=sorted(DETECTORS))
     parser.add_argument("--given", action="store_true", help="tell the detector the colour")
-    parser.add_argument("--notes", action="store_true", help="print every miss, false outline and wrong one")
-    parser.add_argument("--write", action="store_true", help="to bench/results")
+    parser.add_argument("--notes", action="store_true", help="print every missed, false or wrong outline")
+    parser.add_argument("--write", action="store_true", help="write to bench/results")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     lines = [

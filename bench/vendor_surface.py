@@ -177,7 +177,7 @@ def markdown(tables: dict[str, list[Row]]) -> str:
 def main() -> None:
     """Make every call, print progress, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", default="", help="methods with this in their name; writes no table")
+    parser.add_argument("--only", default="", help="only methods whose name contains this; writes no table")
     arguments = parser.parse_args()
     tables = robot_tables(arguments.only)
     if not arguments.only:

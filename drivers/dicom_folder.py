@@ -30,7 +30,9 @@ class DicomFolderConfig(DriverConfig):
     """The CT suite's section in rig.yaml."""
 
     folder: Path = Field(description="where the CT suite delivers its series, in sub-folders or not")
-    mesh_unit: MeshUnit = Field(default="auto", description="of segmented meshes: mm, m, or auto (from the size)")
+    mesh_unit: MeshUnit = Field(
+        default="auto", description="unit of segmented meshes: mm, m, or auto (from the size)"
+    )
     stable_s: float = Field(
         default=10.0, ge=0, description="how long a series or a segmented mesh must stay unchanged; 10 s on a share"
     )

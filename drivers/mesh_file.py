@@ -62,7 +62,7 @@ def read_mesh_file(path: Path, unit: MeshUnit = "auto", *, export: ScanExport | 
     """
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise UnreadableFileError(
-            f"this kind of file ({path.suffix or 'no extension'}) is not read",
+            f"this kind of file ({path.suffix or 'no extension'}) is not supported",
             where=str(path),
             remedy="Export the scan as OBJ, PLY or STL",
         )
@@ -182,7 +182,7 @@ def _parse(path: Path) -> tuple[Array, IntArray, Array | None]:
                 raise UnreadableFileError(
                     "the file has no faces, only points",
                     where=str(path),
-                    remedy="Export a triangle mesh; triangle strips and point clouds are not read",
+                    remedy="Export a triangle mesh; triangle strips and point clouds are not supported",
                 )
             vertices = np.array(mesh.vertices, dtype=np.float64)
             faces = np.array(mesh.faces, dtype=np.int64)
@@ -220,7 +220,7 @@ def _validate(path: Path, vertices: Array, faces: IntArray) -> None:
         raise UnreadableFileError(
             f"{len(bad)} of {len(vertices)} vertices have coordinates that are not numbers, first vertex {bad[0]}",
             where=str(path),
-            remedy="Export the scan again; if it stays so, clean the mesh in the scanner's software",
+            remedy="Export the scan again; if the problem remains, clean the mesh in the scanner's software",
         )
 
 
@@ -237,8 +237,8 @@ def credible_unit(path: Path, vertices: Array, unit: MeshUnit) -> tuple[str, str
     if unit == "auto":
         if len(fitting) != 1:
             raise UnreadableFileError(
-                f"the unit cannot be told: the bounding box is {diagonal:.6g} file units across, which is credible "
-                f"neither in millimetres nor in metres ({span})",
+                f"the unit cannot be determined: the bounding box is {diagonal:.6g} file units across, which is "
+                f"credible neither in millimetres nor in metres ({span})",
                 where=str(path),
                 remedy="Set the unit of the export in the scanner's software to millimetres and export again; "
                 "if this is a single object, configure its unit",

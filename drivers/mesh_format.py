@@ -163,7 +163,7 @@ def _ply_header(path: Path) -> _PlyHeader:
         if b"ply".startswith(head[:3]):
             raise IncompleteExportError("the PLY header is cut short", where=str(path), remedy=_AGAIN)
         raise UnreadableFileError(
-            "it does not begin as a PLY file does", where=str(path), remedy="Export the scan again as PLY"
+            "it does not begin like a PLY file", where=str(path), remedy="Export the scan again as PLY"
         )
     end = re.search(rb"end_header\r?\n", head)
     if end is None:

@@ -18,8 +18,10 @@ from drivers.plugin import DriverConfig, DriverSpec
 class ScanFolderConfig(DriverConfig):
     """The scanner's section in rig.yaml."""
 
-    folder: Path = Field(description="where the scanner's software exports to")
-    unit: MeshUnit = Field(default="auto", description="of the exported coordinates: mm, m, or auto (from the size)")
+    folder: Path = Field(description="folder into which the scanner's software exports")
+    unit: MeshUnit = Field(
+        default="auto", description="unit of the exported coordinates: mm, m, or auto (from the size)"
+    )
     only: str = Field(default="", description="file name of the only export to use; empty: use all exports")
     stable_s: float = Field(default=10.0, ge=0, description="how long an export must stay unchanged; 10 s on a share")
 

@@ -87,7 +87,7 @@ def _described(name: str) -> dict[str, object]:
 def _common(command: argparse.ArgumentParser) -> None:
     command.add_argument("--faults", metavar="FILE|JSON", default="[]", help="fault plan: a JSON list or a file")
     command.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
-    command.add_argument("--log-level", default="WARNING", help="of the log on stderr")
+    command.add_argument("--log-level", default="WARNING", help="level of the log on stderr")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -35,7 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--once", action="store_true", help="end after one series")
     parser.add_argument("--voxel-mm", type=float, default=0.4, help="edge of the cubic voxels")
     parser.add_argument(
-        "--control-spheres", action=argparse.BooleanOptionalAction, default=True, help="they are in place"
+        "--control-spheres",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="the control spheres are in place",
     )
     parser.add_argument("--implicit-vr", action="store_true", help="write implicit VR little endian")
 

@@ -36,16 +36,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="the arm takes 1/N of its time")
     parser.add_argument("--ct-voxel-mm", type=float, default=0.4, help="edge of the CT's voxels")
     parser.add_argument("--version", default="5.12", help="of Polyscope")
-    parser.add_argument("--arms", type=int, choices=(1, 2), default=1, help="one arm that is moved, or one a station")
+    parser.add_argument(
+        "--arms", type=int, choices=(1, 2), default=1, help="one arm that is moved, or one per station"
+    )
     parser.add_argument("--host", default="127.0.0.1", help="address of the first controller")
     parser.add_argument(
-        "--hand", choices=tuple(MISHAP_EVERY), help="no arm: a technician holds the camera, who makes mistakes or not"
+        "--hand",
+        choices=tuple(MISHAP_EVERY),
+        help="no arm: a technician holds the camera, and makes this many mistakes",
     )
     parser.add_argument(
         "--without-cable", action="store_true", help="with --hand: the camera sends its photographs into a folder"
     )
     parser.add_argument(
-        "--revive-after-s", type=float, metavar="S", help="a device that dies is switched on again; else the rig ends"
+        "--revive-after-s",
+        type=float,
+        metavar="S",
+        help="restart a device that died after S seconds; default: end the rig",
     )
 
 

@@ -49,16 +49,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--moved", type=parse_moved, default=(), metavar="JSON", help="registration spheres moved: [[index, x, y, z]]"
     )
-    parser.add_argument("--folder", type=Path, required=True, help="where to export to")
+    parser.add_argument("--folder", type=Path, required=True, help="folder to export to")
     parser.add_argument("--once", action="store_true", help="end after one export")
     parser.add_argument("--spray", action="store_true", help="the specimen is coated with scanning spray")
     parser.add_argument(
-        "--control-spheres", action=argparse.BooleanOptionalAction, default=False, help="they are in place"
+        "--control-spheres",
+        action=argparse.BooleanOptionalAction,
+        default=False,
+        help="the control spheres are in place",
     )
     parser.add_argument("--format", choices=("ply", "obj", "stl"), default="ply")
     parser.add_argument("--unit", choices=("mm", "m"), default="mm")
     parser.add_argument("--normals", action=argparse.BooleanOptionalAction, default=True, help="write vertex normals")
-    parser.add_argument("--spacing-mm", type=float, default=0.5, help="of the mesh on spheres")
+    parser.add_argument("--spacing-mm", type=float, default=0.5, help="vertex spacing of the mesh on spheres")
     parser.add_argument("--nth", type=int, help="number of the scan (default: exports in the folder, plus one)")
 
 

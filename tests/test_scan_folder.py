@@ -154,7 +154,7 @@ def test_damaged_content_is_refused(tmp_path: Path) -> None:
     refused(fake, UnreadableFileError, "does not begin")
     other = tmp_path / "scan.wrl"
     other.write_text("#VRML")
-    refused(other, UnreadableFileError, "not read")
+    refused(other, UnreadableFileError, "not supported")
     with pytest.raises(UnreadableFileError, match="no such file"):
         read_mesh_file(tmp_path / "missing.ply")
 
@@ -166,7 +166,7 @@ def test_units_are_inferred_or_refused_but_never_scaled_silently(tmp_path: Path)
     refused(metres, UnreadableFileError, "contradicts", unit="mm")
     assert read_mesh_file(metres, "m").unit_evidence.startswith("configured")
     odd = write(tmp_path, "inch.ply", trimesh.creation.icosphere(subdivisions=2, radius=6.0))
-    refused(odd, UnreadableFileError, "unit cannot be told")
+    refused(odd, UnreadableFileError, "unit cannot be determined")
     with pytest.raises(ValidationError):
         ScanFolderConfig.model_validate({"folder": tmp_path, "unit": "inch"})
 

@@ -83,17 +83,21 @@ def main(words: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if words is None else words
     parser = argparse.ArgumentParser(prog="python -m bench.soak", description=__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
-    parser.add_argument("--minutes", type=float, default=60.0, help="captures: for so long")
-    parser.add_argument("--sample-s", type=float, default=5.0, help="captures: seconds from one sample to the next")
-    parser.add_argument("--planned", type=int, default=4000, help="captures: viewpoints planned, more than are taken")
-    parser.add_argument("--uncalibrated", action="store_true", help="captures: begin at once; the worker is idle")
-    parser.add_argument("--viewpoints", type=int, default=10_000, help="large: in one run")
-    parser.add_argument("--gigabytes", type=float, default=50.0, help="large: of photographs (sparse)")
-    parser.add_argument("--together-minutes", type=float, default=5.0, help="together: for so long")
-    parser.add_argument("--rounds", type=int, default=7, help="speed: in turn with the tools")
-    parser.add_argument("--images", type=int, default=6, help="speed: in each round")
-    parser.add_argument("--image-mb", type=float, default=45.0, help="speed: of each image")
-    parser.add_argument("--work", type=Path, help="folder for what is made on the way; it is removed all the same")
+    parser.add_argument("--minutes", type=float, default=60.0, help="captures: duration")
+    parser.add_argument("--sample-s", type=float, default=5.0, help="captures: sampling interval")
+    parser.add_argument(
+        "--planned", type=int, default=4000, help="captures: planned viewpoints, more than can be taken"
+    )
+    parser.add_argument(
+        "--uncalibrated", action="store_true", help="captures: skip the calibration; the worker is idle"
+    )
+    parser.add_argument("--viewpoints", type=int, default=10_000, help="large: viewpoints of the run")
+    parser.add_argument("--gigabytes", type=float, default=50.0, help="large: size of the photographs (sparse)")
+    parser.add_argument("--together-minutes", type=float, default=5.0, help="together: duration")
+    parser.add_argument("--rounds", type=int, default=7, help="speed: rounds, alternating with the tools")
+    parser.add_argument("--images", type=int, default=6, help="speed: images per round")
+    parser.add_argument("--image-mb", type=float, default=45.0, help="speed: size of each image")
+    parser.add_argument("--work", type=Path, help="folder for temporary files, which are removed")
     parser.add_argument("--results", type=Path, default=RESULTS)
     options = parser.parse_args(words)
     stem = options.results / f"soak-{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"

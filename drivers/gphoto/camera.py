@@ -294,7 +294,7 @@ class GphotoCamera:
                 raise DeviceRefusedError(
                     f"The camera answers but did not release the shutter: {error.what}",
                     where=self._link.where,
-                    remedy="Check the display of the camera; dial on M, save destination not camera only",
+                    remedy="Check the camera's display; turn the dial to M, and do not save to the camera only",
                 ) from error
             else:
                 return trigger_s
@@ -307,7 +307,7 @@ class GphotoCamera:
                 names = ", ".join(one.name for one in added) or "none"
                 waited_s = self._config.capture_timeout_s
                 raise DeviceTimeoutError(
-                    f"{expected} file(s) were due {waited_s:g} s after the shutter, came: {names}",
+                    f"expected {expected} file(s) within {waited_s:g} s of the release, received: {names}",
                     where=self._link.where,
                     remedy="Check the save destination and the display of the camera, then take the exposure again",
                 )
@@ -320,7 +320,7 @@ class GphotoCamera:
         stem, _, suffix = _parse(added.name)
         target = folder / f"{stem}{suffix}"
         if target.exists():
-            raise self._stale(f"{target.name} came from the camera before")
+            raise self._stale(f"{target.name} was already downloaded")
         partial = target.with_name(target.name + ".part")
         file = self._link.call(
             f"Fetching {target.name}", lambda c: c.file_get(added.folder, added.name, gp.GP_FILE_TYPE_NORMAL)
@@ -344,7 +344,7 @@ class GphotoCamera:
         last = self._last
         name = image.files[0].camera_name
         if any(file.sha256 in self._hashes for file in image.files):
-            raise self._stale(f"{name} is byte for byte a file that came before")
+            raise self._stale(f"{name} is byte for byte the same as an earlier file")
         if last is None:
             return
         if image.counter == last.counter:

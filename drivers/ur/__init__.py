@@ -19,9 +19,11 @@ class UrConfig(DriverConfig):
     """A robot's section in rig.yaml."""
 
     host: str = Field(description="address of the controller; its ports are fixed: 30004, 29999, 30003")
-    connect_timeout_s: float = Field(default=5.0, gt=0, description="for each port to answer before connecting")
+    connect_timeout_s: float = Field(
+        default=5.0, gt=0, description="timeout for each port to answer before connecting"
+    )
     stale_after_s: float = Field(
-        default=1.0, gt=0, description="age of the newest sample beyond which the link is dead"
+        default=1.0, gt=0, description="age of the newest sample above which the link counts as dead"
     )
     stop_deceleration_rad_s2: float = Field(default=2.0, gt=0)
     watchdog_s: float = Field(

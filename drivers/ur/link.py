@@ -72,7 +72,7 @@ def _ask(host: str, port: int, question: bytes | None, timeout_s: float, name: s
                     f"the {name} server closed the connection", where=where, remedy="Restart the controller"
                 )
     except TimeoutError:
-        remedy = "Restart the controller; check that no firewall swallows the answer"
+        remedy = "Restart the controller; check that no firewall blocks the answer"
         raise DeviceUnavailableError(
             f"the {name} server did not answer within {timeout_s:g} s", where=where, remedy=remedy
         ) from None
@@ -104,7 +104,7 @@ def read_facts(dashboard: library.Dashboard, host: str, timeout_s: float) -> Con
         software = dashboard.polyscopeVersion()
     match = re.search(r"([0-9]{1,3})\.([0-9]{1,3})", software)
     if match is None:
-        raise DeviceFaultError(f"the controller names no version: {software!r}", where=host, remedy=_REMEDY)
+        raise DeviceFaultError(f"the controller reports no version: {software!r}", where=host, remedy=_REMEDY)
     version = (int(match.group(1)), int(match.group(2)))
     minimum = MINIMUM_VERSION.get(version[0], (0, 0))
     if version < minimum:
@@ -116,7 +116,7 @@ def read_facts(dashboard: library.Dashboard, host: str, timeout_s: float) -> Con
     # The vendor's client refuses to ask a CB3 these two questions, although the CB3 answers them.
     serial, model = _questions(host, "get serial number", "get robot model", timeout_s=timeout_s)
     if not (serial.isascii() and serial.isdigit() and len(serial) <= _LONGEST_SERIAL):
-        raise DeviceFaultError(f"the controller names no serial number: {serial!r}", where=host, remedy=_REMEDY)
+        raise DeviceFaultError(f"the controller reports no serial number: {serial!r}", where=host, remedy=_REMEDY)
     remote = True
     if version[0] >= 5:  # CB3 has no local mode
         with vendor(host, "asking for remote control"):

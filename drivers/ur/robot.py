@@ -215,9 +215,9 @@ class UrRobot:
 
         def set_both(control: library.Control) -> None:
             if not control.setTcp(pose.tolist()):
-                raise self._refusal("the tool centre point was not taken")
+                raise self._refusal("the controller did not accept the tool centre point")
             if not control.setPayload(payload.mass_kg, list(payload.centre_of_gravity_m)):
-                raise self._refusal(f"the payload of {payload.mass_kg:g} kg was not taken")
+                raise self._refusal(f"the controller did not accept the payload of {payload.mass_kg:g} kg")
             self._read_tool(control)
 
         self._perform("setting payload and tool", set_both)

@@ -71,7 +71,7 @@ class Watchdog:
             if self._control is not None:
                 return
             if not control.setWatchdog(1.0 / self._watchdog_s):
-                raise RuntimeError("the control script did not take its watchdog")
+                raise RuntimeError("the control script did not accept its watchdog")
             self._kicked_s, self._gap_s = time.monotonic(), 0.0
             self._control = control
             self._lapsed = False

@@ -22,11 +22,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on")
     parser.add_argument("--port", type=int, default=15740, help="port of both connections; 0 takes a free one")
     parser.add_argument("--world", metavar="HOST:PORT", help="take pictures of the rig's world")
-    parser.add_argument("--image-width", type=int, metavar="W", help=f"pixels (up to 9504; default {DEFAULT_WIDTH})")
+    parser.add_argument(
+        "--image-width", type=int, metavar="W", help=f"image width (up to 9504; default {DEFAULT_WIDTH})"
+    )
     parser.add_argument("--image", nargs="+", type=Path, metavar="FILE", help="serve these pictures in turn")
-    parser.add_argument("--exposures-log", type=Path, metavar="FILE", help="write one JSON line an exposure")
+    parser.add_argument("--exposures-log", type=Path, metavar="FILE", help="write one JSON line per exposure")
     parser.add_argument("--first-counter", type=int, default=1, help="number of the first file")
-    parser.add_argument("--announce", choices=("event", "property", "both"), default="both", help="of a new file")
+    parser.add_argument(
+        "--announce", choices=("event", "property", "both"), default="both", help="how to announce a file"
+    )
     parser.add_argument("--send-to", type=Path, metavar="DIR", help="no cable: send every file into this folder")
     parser.add_argument("--battery", type=int, default=87, metavar="PERCENT", help="charge of the battery")
     parser.add_argument("--fast", action="store_true", help="exposures take no time")

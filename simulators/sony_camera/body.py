@@ -121,7 +121,7 @@ class CameraBody:
 
     def _step_focus(self, steps: int) -> None:
         if self.properties.value(Code.FOCUS_MODE) != MANUAL_FOCUS:
-            raise NotWritableError("the focus is moved by hand in manual focus only")
+            raise NotWritableError("the focus can only be moved in manual focus")
         position = self.properties.value(Code.FOCAL_POSITION) + steps
         self.properties.put(Code.FOCAL_POSITION, min(100, max(0, position)))
 

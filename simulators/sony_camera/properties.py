@@ -83,7 +83,7 @@ class CameraProperty:
         """Decode a value from the client, which sends 4 bytes for some 2-byte types; only the first ones count."""
         layout = _FORMATS[self.datatype]
         if len(data) < struct.calcsize(layout):
-            raise RefusedValueError(f"{self.code.name}: {len(data)} bytes are no value")
+            raise RefusedValueError(f"{self.code.name}: {len(data)} bytes are not a valid value")
         return int(struct.unpack_from(layout, data)[0])
 
     def encode(self) -> bytes:

@@ -200,7 +200,9 @@ class WorldSource:
                 stream.flush()
                 line = stream.readline()
         except OSError as error:
-            raise SimulatorError(f"the world at {self._address[0]}:{self._address[1]} is silent: {error}") from error
+            raise SimulatorError(
+                f"the world at {self._address[0]}:{self._address[1]} does not answer: {error}"
+            ) from error
         try:
             answer: object = json.loads(line)
         except ValueError as error:

@@ -21,12 +21,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options of `simulators ur`."""
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on; the ports are UR's")
     parser.add_argument("--model", default="UR10e", choices=sorted(MODELS))
-    parser.add_argument("--version", default="5.12", help="of Polyscope: 3.15 for CB3, 5.12 or 5.25 for e-Series")
+    parser.add_argument(
+        "--version", default="5.12", help="Polyscope version: 3.15 for CB3, 5.12 or 5.25 for e-Series"
+    )
     parser.add_argument("--serial", default="", help="serial number (digits); made from the address by default")
     parser.add_argument("--speed-up", type=float, default=1.0, metavar="N", help="motions take 1/N of their time")
     parser.add_argument("--initial-joints", default="", metavar="Q1,…,Q6", help="joints at start-up in radians")
-    parser.add_argument("--world", default="", metavar="HOST:PORT", help="world socket that is told the joints")
-    parser.add_argument("--local", action="store_true", help="in local control, until SIGUSR1 turns the key")
+    parser.add_argument("--world", default="", metavar="HOST:PORT", help="world socket that receives the joints")
+    parser.add_argument("--local", action="store_true", help="start in local control; SIGUSR1 switches to remote")
     parser.add_argument("--arm", default="robot", help="name of the arm in the world and in fault plans")
 
 

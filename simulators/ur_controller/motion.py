@@ -176,7 +176,7 @@ class Speed:
                 raise MotionError("the tool velocity leads through a singularity")
             goal = np.linalg.solve(J, self.target)
             if np.max(np.abs(goal)) > MAX_JOINT_SPEED_RAD_S:
-                raise MotionError("the tool velocity asks too much of a joint")
+                raise MotionError("the tool velocity exceeds a joint's limit")
         # speedL's acceleration is that of the tool; joints get a generous multiple of it.
         step = max(self.acceleration, 1e-6) * dt_s * (4.0 if self._tool else 1.0)
         qd = self.qd + np.clip(goal - self.qd, -step, step)

@@ -105,7 +105,7 @@ class RtdeLink(Link):
         try:
             written = recipe.unpack(payload)
         except codec.FrameError as error:  # the frame itself was complete, so the link stays open
-            _LOG.warning("data package left out: %s", error)
+            _LOG.warning("data package ignored: %s", error)
             return
         self._server.controller.apply(written)
         self._server.interpreter.step()
@@ -207,7 +207,7 @@ class ScriptLink(Link):
         """Handle script text."""
         for program in self._reader.feed(data):
             if self._server.controller.local:
-                _LOG.warning("a program was left out: the controller is in local control")
+                _LOG.warning("a program was ignored: the controller is in local control")
             elif not self._server.faulty(self, "script"):
                 self._server.interpreter.load(program)
 

@@ -50,12 +50,12 @@ SWEEPS: Mapping[str, Callable[[Record], Sweep]] = {
 def main(words: Sequence[str] | None = None) -> int:
     """Run the sweeps, print and write the table. Returns 1 if the documentation and the findings disagree."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sample", type=int, help="so many changes of each sweep instead of all of them")
-    parser.add_argument("--seed", type=int, default=11, help="of the order of the changes")
-    parser.add_argument("--minutes", type=float, help="begin nothing new after so long")
+    parser.add_argument("--sample", type=int, help="number of changes per sweep, instead of all")
+    parser.add_argument("--seed", type=int, default=11, help="seed of the order of the changes")
+    parser.add_argument("--minutes", type=float, help="start nothing new after this time")
     parser.add_argument("--only", nargs="+", choices=SWEEPS, default=list(SWEEPS))
     parser.add_argument(
-        "--work", type=Path, help="folder for the record and what is done, used again; best in memory"
+        "--work", type=Path, help="folder for the record and the progress, kept for continuing; best in memory"
     )
     parser.add_argument("--results", type=Path, default=RESULTS)
     options = parser.parse_args(words)

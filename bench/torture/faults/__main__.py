@@ -112,12 +112,14 @@ def sweep(some: Sequence[Case], folder: Path, options: argparse.Namespace) -> li
 def main(arguments: Sequence[str] | None = None) -> int:
     """Sweep, compare and report; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m bench.torture.faults", description=__doc__)
-    parser.add_argument("--only", nargs="+", default=[], metavar="PATTERN", help="cases by name, as robot/rtde/*")
-    parser.add_argument("--sample", type=int, default=0, metavar="N", help="so many of them, drawn by --seed")
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="PATTERN", help="cases by name, such as robot/rtde/*"
+    )
+    parser.add_argument("--sample", type=int, default=0, metavar="N", help="a sample of N cases, drawn by --seed")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=0, help="begin no further case after this; 0: never")
+    parser.add_argument("--minutes", type=float, default=0, help="start no further case after this time; 0: never")
     parser.add_argument("--record", action="store_true", help="write docs/reference/faults.md and bench/results")
-    parser.add_argument("--list", action="store_true", help="name the cases and end")
+    parser.add_argument("--list", action="store_true", help="list the cases and exit")
     parser.add_argument("--out", type=Path, help="write the verdicts to this file (JSON)")
     options = parser.parse_args(arguments)
     some = chosen(options)

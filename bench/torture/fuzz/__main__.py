@@ -132,11 +132,11 @@ def markdown(rows: Sequence[dict[str, object]]) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Sweep and report; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m bench.torture.fuzz", description="Bad input for every parser.")
-    parser.add_argument("--seconds-per-target", type=float, default=60.0, help="of each engine's share together")
-    parser.add_argument("--inputs", type=int, default=UNLIMITED, help="at most so many, in place of the time alone")
-    parser.add_argument("--target", nargs="+", default=[], metavar="NAME", help="only these")
+    parser.add_argument("--seconds-per-target", type=float, default=60.0, help="total of all engines")
+    parser.add_argument("--inputs", type=int, default=UNLIMITED, help="limit on the inputs, besides the time")
+    parser.add_argument("--target", nargs="+", default=[], metavar="NAME", help="only these targets")
     parser.add_argument("--engine", choices=("both", "hypothesis", "atheris"), default="both")
-    parser.add_argument("--seed", type=int, default=0, help="the same inputs of hypothesis for the same seed")
+    parser.add_argument("--seed", type=int, default=0, help="seed of hypothesis, for reproducible inputs")
     parser.add_argument("--keep", type=Path, default=REPOSITORY / "build" / "fuzz", help="folder for findings")
     parser.add_argument("--record", action="store_true", help="write bench/results/fuzz-DATE")
     options = parser.parse_args(arguments)
