@@ -66,7 +66,7 @@ def retell(
 
 @dataclass
 class _Jobs:
-    """The jobs of the new run, whose order of completion is that of the source."""
+    """The jobs of the new run; the worker of the source finished them in an order of its own."""
 
     store: Store
     run_id: str
