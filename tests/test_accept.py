@@ -407,8 +407,8 @@ class Typed:
         )
 
     def line(self, text: str) -> OperatorAction | AnswerBy | None:
-        """What the operator makes of a typed line."""
-        self.operator.poll(self.log.question, self.log.state)  # asks, and looks at an empty line buffer
+        """The operator's interpretation of a typed line."""
+        self.operator.poll(self.log.question, self.log.state)  # asks, with an empty line buffer
         os.write(self.master, text.encode() + b"\n")
         while not select.select([self.slave], [], [], 0.1)[0]:
             pass
@@ -416,7 +416,7 @@ class Typed:
 
     @property
     def told(self) -> str:
-        """The last line."""
+        """The last line that was printed."""
         return self.screen.getvalue().splitlines()[-1]
 
     @property

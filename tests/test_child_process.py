@@ -1,4 +1,4 @@
-"""Child processes of the audit: one at a time for a run, followed to their end, whatever that is."""
+"""Child processes of the audit: one at a time per run, followed to their end, however they end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pose of the flange over an exposure: its mean, its spread, and one judgement of stillness."""
+"""The flange pose during an exposure: its mean, its spread, and the judgement whether the arm stands still."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TURNED = Rotation.from_euler("xyz", [0.4, -2.0, 1.1])
 
 
 def stream(turns_rad: Array, positions_m: Array | None = None) -> list[RobotSample]:
-    """Samples at 125 Hz of a flange that is turned by these rotation vectors (N, 3) and stands at `positions_m`."""
+    """Samples at 125 Hz of a flange with these rotation vectors (N, 3) and positions."""
     places = np.zeros((len(turns_rad), 3)) if positions_m is None else positions_m
     poses = [transform(TURNED * Rotation.from_rotvec(turn), p) for turn, p in zip(turns_rad, places, strict=True)]
     still, no_joints = np.zeros(6), np.zeros(6)
@@ -49,7 +49,7 @@ def test_the_rotation_of_an_exposure_is_the_mean_of_its_samples() -> None:
 
 @pytest.mark.parametrize("amplitude_m", [6e-6, 9e-6])
 def test_an_exposure_and_the_settling_before_it_are_judged_alike(amplitude_m: float) -> None:
-    """±9 µm along two axes are 18 µm each, and 25 µm from corner to corner."""
+    """±9 µm along two axes are 18 µm each, and 25 µm along the diagonal."""
     places = wobble(63, amplitude_m) + wobble(63, amplitude_m, axis=1)
     samples = stream(np.zeros((63, 3)), places)
     settled = judge(samples, SettleCriteria())

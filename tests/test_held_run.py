@@ -1,4 +1,4 @@
-"""What a runner holds and what it leaves behind: the lease of its run, and a signed chain."""
+"""What a runner holds and leaves behind: the lease of its run, and a signed chain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `pip install` brings is whole: from a wheel in an empty folder everything runs, as tests/test_demo.py does."""
+"""`pip install` brings everything: all commands run from a wheel in an empty folder, as in tests/test_demo.py."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_wheel_and_sdist_hold_every_file_of_the_packages(package: Package) -> No
 
 
 def test_nothing_is_looked_for_beside_a_source_file() -> None:
-    """What comes along is read with importlib.resources."""
+    """Packaged files are read with importlib.resources."""
     for name in PACKAGES:
         for path in (REPOSITORY / name).rglob("*.py"):
             assert "Path(__file__)" not in path.read_text(encoding="utf-8"), path

@@ -41,7 +41,7 @@ class Room:
         return self.control.holder(self.run).screen
 
     def record(self) -> list[tuple[str, str, str, str]]:
-        """Who, screen, from whom, how."""
+        """Changes of control as (who, screen, from whom, how)."""
         events = [(event.actor, event.payload) for event in self.store.events(self.run)]
         return [(who, p.screen, p.previous, p.how) for who, p in events if isinstance(p, ControlTaken)]
 

@@ -1,4 +1,4 @@
-"""A run that an earlier version recorded opens, verifies and replays with today's."""
+"""A run recorded by an earlier version opens, verifies and replays with the current one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.timeout(300)
 
 
 def quiet(_what: str, _done: int, _total: int) -> None:
-    """Nobody looks."""
+    """Ignore the progress."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The distribution as its users get it: sdist, wheel, and an environment with the wheel in place of the checkout."""
+"""The distribution as users get it: sdist, wheel, and an environment with the wheel instead of the checkout."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _SDIST = "from setuptools import build_meta; build_meta.build_sdist('../dist')"
 
 @dataclass(frozen=True)
 class Package:
-    """What was built, and the `bin` folder of an environment in which it is installed."""
+    """The built files, and the `bin` folder of an environment in which they are installed."""
 
     sdist: Path
     wheel: Path
     bin: Path
 
     def environment(self) -> dict[str, str]:
-        """The variables of a shell that has only this installed: nothing points to the checkout."""
+        """Environment variables without any reference to the checkout."""
         return {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
 
     def run(self, *words: str, cwd: Path, timeout_s: float = 100, **more: str) -> subprocess.CompletedProcess[str]:
-        """The installed `orthocapture`, to its end, from a folder of its own."""
+        """Run the installed `orthocapture` to its end in the folder `cwd`."""
         return subprocess.run(
             [self.bin / "orthocapture", *words], cwd=cwd, env=self.environment() | more, stdin=subprocess.DEVNULL,
             capture_output=True, text=True, timeout=timeout_s, check=False,
@@ -42,7 +42,7 @@ class Package:
 
 
 def installed_package(factory: pytest.TempPathFactory) -> Package:
-    """Builds the sdist from the checkout, the wheel from the sdist, and installs it; once for all test processes."""
+    """Build the sdist from the checkout and the wheel from the sdist, and install it; once for all test processes."""
     own = factory.getbasetemp()
     folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "package"
     folder.mkdir(exist_ok=True)
@@ -69,8 +69,8 @@ def _build(folder: Path) -> None:
     (root,) = unpacked.iterdir()
     _do(*_PIP, "wheel", "--no-build-isolation", "--no-deps", "--no-index", "--wheel-dir", str(dist), str(root))
     _do(sys.executable, "-m", "venv", "--without-pip", str(environment))
-    # The libraries are those of this environment. Lines of a .pth file lead to folders only: the checkout, which is
-    # installed there as editable, stays out.
+    # Uses the libraries of this environment. Lines of a .pth file add folders only, without their own .pth files, so
+    # the checkout, which is installed there as editable, is not found.
     (here,) = (environment / "lib").glob("python*/site-packages")
     (here / "libraries.pth").write_text("\n".join(site.getsitepackages()) + "\n")
     (wheel,) = dist.glob("*.whl")
