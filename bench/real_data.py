@@ -37,7 +37,7 @@ def run(one: PublicSet, data: Path, work: Path) -> dict[str, Any]:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Format the rows as Markdown, with the sets that were not run below."""
-    lines = ["| set | data | expected | came out | as expected | s |", "|---|---|---|---|---|---|"]
+    lines = ["| set | data | expected | result | as expected | s |", "|---|---|---|---|---|---|"]
     for row in rows:
         if row["ran"]:
             good = "yes" if row["as_expected"] else "**no**"
@@ -46,7 +46,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             )
     lines += [
         "",
-        "Not run on this machine, for want of the data or of time:",
+        "Not run on this machine, because the data or the time was missing:",
         "",
         "| set | data | expected | where to get it | licence |",
     ]
@@ -57,7 +57,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         for one in SETS
         if one.name not in ran
     ]
-    lines += ["", "Where those that were run come from:", ""]
+    lines += ["", "Sources of the sets that were run:", ""]
     lines += [f"- {one.name}: {one.where}; {one.licence}" for one in SETS if one.name in ran]
     return "\n".join(lines)
 
@@ -93,7 +93,7 @@ def main() -> None:
     here = machine()
     document = {"machine": here, "commit": commit(), "rows": rows}
     file.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    text = f"""# Stand-alone commands on data of others
+    text = f"""# Stand-alone commands on public data
 
 `python -m bench.real_data --data DIR`; {here["processor"]}, {here["cores"]} cores, shared with other work. OpenCV's
 figures are measured beside, on the same images, by its own detectors and solvers (bench/real_data_sets.py).

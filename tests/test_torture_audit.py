@@ -40,11 +40,11 @@ def test_what_is_not_documented_is_a_problem_and_so_is_what_is_documented_wrongl
     untold.untold["events.actor"] += 1
     untold.samples["events.actor"] = "events, row 3"
     assert problems({"column edited": untold}, documented_codes(DOCUMENT.read_text()), whole=False) == [
-        "events.actor is not told, and evidence.md does not say so (events, row 3)"
+        "events.actor is not detected, and evidence.md does not say so (events, row 3)"
     ]
     documented = {"leases.*": ("why", "what"), "events.*": ("why", "what")}
     assert problems({"column edited": untold}, documented, whole=True) == [
-        "evidence.md says that leases.* is not told, and it always was"
+        "evidence.md says that leases.* is not detected, but it always was"
     ]
     assert len(problems({"flip": Tally(number=1, crashes=["byte 7: Traceback"])}, documented, whole=False)) == 1
 

@@ -164,15 +164,15 @@ def problems(total: Mapping[str, Tally], documented: Mapping[str, object], *, wh
     for kind, tally in total.items():
         if tally.placed < tally.told:
             example = tally.samples["told without a place"]
-            found.append(f"{kind}: {tally.told - tally.placed} are told without a place, such as {example}")
+            found.append(f"{kind}: {tally.told - tally.placed} are detected without a place, such as {example}")
     seen = {code for _, code, _ in _codes(total)}
     for code in sorted(seen):
         if not any(fnmatchcase(code, pattern) for pattern in documented):
             sample = next(t.samples[c] for t in total.values() for c in t.untold if code in c.split("; "))
-            found.append(f"{code} is not told, and {DOCUMENT.name} does not say so ({sample})")
+            found.append(f"{code} is not detected, and {DOCUMENT.name} does not say so ({sample})")
     if whole:
         found += [
-            f"{DOCUMENT.name} says that {pattern} is not told, and it always was"
+            f"{DOCUMENT.name} says that {pattern} is not detected, but it always was"
             for pattern in documented
             if not any(fnmatchcase(code, pattern) for code in seen)
         ]
@@ -183,10 +183,10 @@ def report(about: Mapping[str, Any], total: Mapping[str, Tally], documented: Map
     """Format the findings as Markdown."""
     cpu = about["machine"]
     lines = [
-        f"# Evidence, altered in every way: what `audit verify` tells ({about['date']})",
+        f"# Evidence altered in every way: what `audit verify` detects ({about['date']})",
         "",
-        "`make torture-audit`. Told: a fault is named, or the record refused in words. Meaningless: all that SQLite",
-        "reads from the database was read and is what it was. Of a byte one bit is flipped, number offset modulo 8.",
+        "`make torture-audit`. Detected: a fault is named, or the record is refused with a message. Meaningless:",
+        "everything that SQLite reads from the database is unchanged. In each byte bit offset modulo 8 is flipped.",
         "",
         f"Commit {about['commit']}; {cpu['processor']}, {cpu['cores']} cores, Python {cpu['python']}; "
         f"load {about['load']}.",
@@ -195,14 +195,14 @@ def report(about: Mapping[str, Any], total: Mapping[str, Tally], documented: Map
         + "; ".join(f"{name} {one['done']} of {one['of']}" for name, one in about["sweeps"].items())
         + f" (in a random order, seed {about['seed']}).",
         "",
-        "| change | number | told | with its place | meaningless | not told | of these with a note | crashes |",
+        "| change | number | detected | with its place | meaningless | undetected | of these with a note | crashes |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for kind, t in sorted(total.items()):
         cells = (kind, t.number, t.told, t.placed, t.meaningless, sum(t.untold.values()), t.noted, len(t.crashes))
         lines.append(f"| {' | '.join(str(cell) for cell in cells)} |")
-    lines += ["", "Not told, why, and what tells it from outside (docs/explanation/evidence.md):", ""]
-    lines += ["| what | number | why | what tells it |", "|---|---|---|---|"]
+    lines += ["", "Undetected changes, why, and what reveals them from outside (docs/explanation/evidence.md):", ""]
+    lines += ["| what | number | why | revealed by |", "|---|---|---|---|"]
     numbers: dict[str, int] = {}
     for _kind, code, number in _codes(total):
         pattern = next((p for p in documented if fnmatchcase(code, p)), code)
@@ -210,8 +210,8 @@ def report(about: Mapping[str, Any], total: Mapping[str, Tally], documented: Map
     for pattern, number in sorted(numbers.items()):
         why, anchor = documented.get(pattern, ("**not documented**", ""))
         lines.append(f"| `{pattern}` | {number} | {why} | {anchor} |")
-    lines += ["", "Of the forgeries that are not told, so many are told by what was kept elsewhere:", ""]
-    lines += ["| forger | not told | told by |", "|---|---|---|"]
+    lines += ["", "Undetected forgeries that something kept elsewhere reveals:", ""]
+    lines += ["| forger | undetected | revealed by |", "|---|---|---|"]
     for kind, t in sorted(total.items()):
         if t.anchors:
             by = "; ".join(f"{anchor} {number}" for anchor, number in t.anchors.most_common())

@@ -96,7 +96,7 @@ def sweep(some: Sequence[Case], folder: Path, options: argparse.Namespace) -> li
         place = folder / f"case-{number}"
         verdict = tried(case, place, seed, options.seed)
         if not verdict.reached and not verdict.broken:
-            verdict.broken.append("what was to go wrong did not happen")
+            verdict.broken.append("the planned fault did not occur")
         verdicts.append(verdict)
         print(f"{verdict.name}: {', '.join(verdict.policy) or 'nothing'}; {verdict.end}; {verdict.seconds:.0f} s")
         for fault in verdict.broken:

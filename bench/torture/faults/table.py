@@ -127,7 +127,7 @@ def report(about: Mapping[str, Any], known: Container[str], new: Sequence[Verdic
         ),
         "",
         f"{len(verdicts)} of {about['cases']} cases were tried, "
-        f"{sum(v.reached for v in verdicts)} in which what was to go wrong did, **{len(broken)} with a fault**.",
+        f"{sum(v.reached for v in verdicts)} in which the planned fault occurred, **{len(broken)} with a fault**.",
         "",
         "| wire or state | cases | nothing | again, reopen or retry | asked | stopped | completed "
         "| left open | longest s |",

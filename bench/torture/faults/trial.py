@@ -316,7 +316,7 @@ class Trial:
         verdict.end = "completed" if status == "completed" else listed(person.open)
         if not verdict.end:
             verdict.end = f"the run is {status or 'stopped'}"
-            verdict.broken.append(f"{verdict.end}, and no way on is listed")
+            verdict.broken.append(f"{verdict.end}, but no way on is listed")
         views = VIEWS if self.case.scene not in ("scan", "ct") else ()
         logs = (self.folder / "program.log", self.folder / "said.log")
         verdict.broken += rules.broken(events, self._eye, self.data, views, status, logs)

@@ -110,7 +110,7 @@ def markdown(rows: Sequence[dict[str, object]]) -> str:
         "",
         "Inputs are mutated files that the simulators and exporters of this project wrote. Memory is what a process "
         "grew by at most, beside its bound. A finding is a crash, a hang, memory beyond the bound, an exception that "
-        "is not of the project's tree, or one that names no place or says not what to do.",
+        "is not of the project's tree, or one that names no place or no remedy.",
         "",
         "| target | parser | hypothesis | atheris | refused | inputs/s | peak MiB | bound | findings |",
         "|---|---|---:|---:|---:|---:|---:|---:|---|",

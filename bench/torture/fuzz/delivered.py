@@ -123,7 +123,7 @@ def _mesh(kind: str) -> Callable[[bytes, Path], None]:
                 _put(folder, name, content)
         scan = read_mesh_file(_put(folder, f"scan.{kind}", data))
         if not (np.isfinite(scan.mesh.vertices_m).all() and np.isfinite(scan.mesh.normals).all()):
-            raise MisbehavedError("a mesh that is not finite counts as one")
+            raise MisbehavedError("a mesh that is not finite is accepted")
 
     return parse
 

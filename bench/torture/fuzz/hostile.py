@@ -124,7 +124,7 @@ def _camera(data: bytes, folder: Path) -> None:
         rig.device.report()
         image = rig.device.capture(folder)
         if image.width > 1 << 16 or not image.files:
-            raise MisbehavedError(f"an image of {image.width} pixels in {len(image.files)} files counts as one")
+            raise MisbehavedError(f"an image of {image.width} pixels in {len(image.files)} files is accepted")
     finally:
         rig.device.close()
         _in_time(began_s, calls=5)
@@ -177,7 +177,7 @@ def _robot(data: bytes, folder: Path) -> None:
         rig.device.open()
         state = rig.device.state()
         if state.sample.joints_rad.shape != (6,):
-            raise MisbehavedError("a sample without six joints counts as one")
+            raise MisbehavedError("a sample without six joints is accepted")
         rig.device.report()
     finally:
         rig.device.close()

@@ -184,7 +184,7 @@ def _log(data: bytes, folder: Path) -> None:
     known = _recorded()
     faults, notes = log_findings(lines, {known.run_id: [known.stamped]}, {}, awaited=True)
     if not faults and not notes:
-        raise MisbehavedError("signatures of unknown keys count as good ones")
+        raise MisbehavedError("signatures of unknown keys are accepted")
     "\n".join([*(fault.what for fault in faults), *notes]).encode()
     with contextlib.suppress(FileNotFoundError):
         (folder / "copy").write_bytes(data[: len(data) // 2])

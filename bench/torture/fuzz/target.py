@@ -54,7 +54,7 @@ def fault_of(target: Target, error: BaseException) -> str:
         return f"leaks {type(error).__qualname__}"
     wrong = _wrong_words(str(error))
     if not wrong and target.says_place and isinstance(error, OrthocaptureError):
-        wrong = "names no place" if not error.where else "says not what to do" if not error.remedy else ""
+        wrong = "names no place" if not error.where else "names no remedy" if not error.remedy else ""
     return f"words: the message {wrong}" if wrong else ""
 
 
@@ -65,4 +65,4 @@ def _wrong_words(text: str) -> str:
         return "cannot be printed"
     if any(ord(c) < 32 and c not in "\n\t" for c in text):
         return "carries control characters"
-    return "is longer than anybody reads" if max(map(len, text.split("\n"))) > LONGEST_LINE else ""
+    return "is too long" if max(map(len, text.split("\n"))) > LONGEST_LINE else ""

@@ -135,7 +135,7 @@ class Sweep:
         self._collect(at if death is None else None)
         if death is None and process.returncode != 0:
             said = (self._folder / "output").read_bytes()[-2000:].decode(errors="replace")
-            raise HarnessError(f"{at.target}: the reading process ended with {process.returncode}: {said}")
+            raise HarnessError(f"{at.target}: the parsing process ended with {process.returncode}: {said}")
         return death
 
     def _watched(self, slot: Slot, process: subprocess.Popen[bytes]) -> _Death | None:
@@ -144,7 +144,7 @@ class Sweep:
             time.sleep(_POLL_S)
             at = slot.read()
             if not at.target and time.monotonic() - began_s > START_S:
-                raise HarnessError(f"the reading process did not come up within {START_S:g} s")
+                raise HarnessError(f"the parsing process did not start within {START_S:g} s")
             if at.busy and self._takes_too_long(process, at):
                 again = slot.read()
                 if again == at and at.bound_s > 0:

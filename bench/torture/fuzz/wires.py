@@ -327,7 +327,7 @@ def _facts(data: bytes, _: Path) -> None:
     with _Answering(_HOST, 29999, answers):
         facts = read_facts(_Dashboard(said.decode(errors="replace")), _HOST, 0.5)
     if not facts.serial.isascii() or len(facts.serial) > 40:
-        raise MisbehavedError(f"{facts.serial!r} counts as a serial number")
+        raise MisbehavedError(f"{facts.serial!r} is accepted as a serial number")
 
 
 def _box_answers(_: Path) -> list[bytes]:

@@ -111,7 +111,7 @@ def _rig(data: bytes, folder: Path) -> None:
 def _finite(poses: object) -> None:
     for T in poses.values() if isinstance(poses, dict) else (poses,):
         if not np.isfinite(np.asarray(T, dtype=np.float64)).all():
-            raise MisbehavedError("a pose that is not finite counts as one")
+            raise MisbehavedError("a pose that is not finite is accepted")
 
 
 def _pose_tables(folder: Path) -> list[bytes]:
