@@ -30,7 +30,8 @@ from service.run_start import recorded_run
 from service.store.errors import UnknownRunError
 from service.store.store import Store
 from service.store.verification.verify import verify
-from service.web.audit import pages as audit_pages
+from service.web.audit import corrections, overview, runs, signatures
+from service.web.evidence import artefacts, events
 from tests.support.large_run import Sizes, write_large_run
 from tests.support.recorded_run import record_run
 from tests.support.store import rows, tamper
@@ -402,7 +403,9 @@ def test_first_page_shows_deviations_before_everything_else(web: WebSite, run: s
 
 
 def test_auditors_change_nothing_but_may_verify(web: WebSite, run: str) -> None:
-    posts = [r for r in audit_pages.router.routes if isinstance(r, APIRoute) and "POST" in (r.methods or ())]
+    pages = (corrections, overview, runs, signatures, artefacts, events)
+    routes = [route for page in pages for route in page.router.routes]
+    posts = [r for r in routes if isinstance(r, APIRoute) and "POST" in (r.methods or ())]
     assert {route.name for route in posts} == {"correct", "verify"}
     auditor = web.browser("auditor")
     fields = {"of_seq": "2", "field": "host", "new": "x", "reason": "y"}

@@ -17,7 +17,15 @@ from service.core.errors import DataError
 from service.core.records.events import FilesKept
 from service.monitor.snapshot import frame_path, frames_wanted, write_frame
 from service.store.records import NewArtefact
-from service.web.record.pictures import Mark, cached, draw_marks, nearest_width, picture_size, reduced_jpeg, safe_name
+from service.web.record.pictures import (
+    DrawnOutline,
+    cached,
+    draw_marks,
+    nearest_width,
+    picture_size,
+    reduced_jpeg,
+    safe_name,
+)
 from tests.support.calibrated_run import begin_calibrated_run, capture
 from tests.support.core import EYE
 from tests.support.web import Browser, WebSite, web_site
@@ -202,7 +210,7 @@ def test_kinds_of_spheres_are_told_apart_without_colour() -> None:
     share: dict[str, float] = {}
     for kind in ("registration", "control", "unassigned"):
         picture = np.zeros((600, 640, 3), np.uint8)
-        draw_marks(picture, [Mark(kind, "", outline)], 1.0)
+        draw_marks(picture, [DrawnOutline(kind, "", outline)], 1.0)
         on = picture[np.rint(outline[:, 1]).astype(int), np.rint(outline[:, 0]).astype(int)].any(axis=1)
         share[kind] = float(on.mean())
     assert share["registration"] > 0.95

@@ -28,13 +28,13 @@ from service.steps import params_models
 from service.web.page.run_frame import robot_banner
 from service.web.page.run_words import limit, measure_name, planned_views
 from service.web.run.figures import duration, view_intervals_s
-from service.web.run.view import Looker, RunView, run_view
+from service.web.run.view import RunView, Viewer, run_view
 from tests.support.core import Log
 
 PROTOCOLS = Path(__file__).parents[1] / "protocols"
 DEMO: Protocol = load_protocol(PROTOCOLS / "demo.yaml", params_models()).protocol
 PAPER: Protocol = load_protocol(PROTOCOLS / "exvivo_spine.yaml", params_models()).protocol
-ME = Looker(may_operate=True, in_control=True, holder="Ada", holder_screen="AB12CD")
+ME = Viewer(may_operate=True, in_control=True, holder="Ada", holder_screen="AB12CD")
 STANDS = Snapshot(doing="asking", robot="standing")
 WAYS = ("on", "on", "on", "on", "redo", "skip", "pause", "resume", "fail", "bad", "tick", "capture", "abort")
 
@@ -100,9 +100,9 @@ def work(log: Log, way: str) -> None:
 
 
 def view_of(
-    log: Log, snapshot: Snapshot = STANDS, *, driven: bool = True, looker: Looker = ME, show: str = ""
+    log: Log, snapshot: Snapshot = STANDS, *, driven: bool = True, viewer: Viewer = ME, show: str = ""
 ) -> RunView:
-    return run_view(log, snapshot, looker, driven=driven, show=show)
+    return run_view(log, snapshot, viewer, driven=driven, show=show)
 
 
 def advance_to(protocol: Protocol, step: str) -> Log:

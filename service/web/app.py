@@ -5,7 +5,6 @@ from __future__ import annotations
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 
-import service.web.audit.pages
 import service.web.calibration.pages
 import service.web.capture.pages
 import service.web.handheld.pages
@@ -14,8 +13,9 @@ import service.web.monitoring.pages
 import service.web.run.pages
 import service.web.scene.pages
 from service.people.credentials.tries import failed_tries
-from service.web.audit import devices, exports, gates
+from service.web.audit import corrections, devices, exports, gates, overview, runs, signatures
 from service.web.capture import media
+from service.web.evidence import artefacts, events
 from service.web.home import checklist, compare, history, start
 from service.web.monitoring.pages import install_metrics
 from service.web.page.errors import install_errors
@@ -42,7 +42,12 @@ _ROUTERS: tuple[APIRouter, ...] = (
     media.router,
     service.web.scene.pages.router,
     service.web.calibration.pages.router,
-    service.web.audit.pages.router,
+    runs.router,
+    overview.router,
+    corrections.router,
+    signatures.router,
+    events.router,
+    artefacts.router,
     gates.router,
     devices.router,
     exports.router,

@@ -54,4 +54,4 @@ def _site(request: Request) -> Site:
     return cast(Site, request.app.state.site)
 
 
-Here = Annotated[Site, Depends(_site)]
+CurrentSite = Annotated[Site, Depends(_site)]

@@ -22,7 +22,7 @@ _GRACE_S = 0.25  # before a long computation begins: the page that asked is answ
 _REST_S = 0.001  # between two chunks, so that pages come first
 
 
-class Copied(Protocol):
+class Copyable(Protocol):
     """What can be computed."""
 
     def copy(self) -> Self:
@@ -30,11 +30,11 @@ class Copied(Protocol):
         ...
 
 
-T = TypeVar("T", bound=Copied)
+T = TypeVar("T", bound=Copyable)
 
 
 @dataclass(frozen=True, slots=True)
-class Step(Generic[T]):
+class PartialResult(Generic[T]):
     """A result after one more chunk of events."""
 
     value: T
@@ -54,18 +54,18 @@ class Progress:
 @dataclass(slots=True)
 class _Entry(Generic[T]):
     lock: Lock = field(default_factory=Lock)
-    step: Step[T] | None = None
+    step: PartialResult[T] | None = None
     future: Future[None] | None = None
     somebody_waits: bool = False
 
 
-class Computed(Generic[T]):
+class IncrementalResults(Generic[T]):
     """One value a run, made chunk by chunk by `advance(run_id, value before or None)`.
 
     Nothing of it is kept on the disk: what a page shows was read from the evidence by this very process.
     """
 
-    def __init__(self, store: Store, advance: Callable[[str, T | None], Step[T]], name: str) -> None:
+    def __init__(self, store: Store, advance: Callable[[str, T | None], PartialResult[T]], name: str) -> None:
         self._store = store
         self._advance = advance
         self._asked = ThreadPoolExecutor(max_workers=2, thread_name_prefix=f"{name}-asked")
@@ -140,7 +140,7 @@ class Computed(Generic[T]):
                 self._warm = True
                 time.sleep(_REST_S)
 
-    def _still_holds(self, run_id: str, step: Step[T]) -> bool:
+    def _still_holds(self, run_id: str, step: PartialResult[T]) -> bool:
         if step.seq < step.last:
             return False  # was interrupted
         with self._store.database.reading() as connection:

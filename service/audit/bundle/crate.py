@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from service.audit.bundle.zip_file import Listed
+from service.audit.bundle.zip_file import ManifestEntry
 from service.core.equipment.camera_bodies import bodies
 from service.core.gates.acceptance import describe_accepted
 from service.core.records.events import (
@@ -56,7 +56,7 @@ def crate(
     state: RunState,
     events: Sequence[Event],
     artefacts: Sequence[Artefact],
-    files: Sequence[Listed],
+    files: Sequence[ManifestEntry],
     full_names: Mapping[str, str],
     missing: Sequence[str] = (),
 ) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def crate(
     }
 
 
-def _file_entity(item: Listed) -> dict[str, Any]:
+def _file_entity(item: ManifestEntry) -> dict[str, Any]:
     return {
         "@id": item.path,
         "@type": "File",

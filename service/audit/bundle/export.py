@@ -16,7 +16,7 @@ from typing import Any
 from sqlalchemy import Connection, Table, select
 
 from service.audit.bundle.crate import METADATA, crate
-from service.audit.bundle.zip_file import BundleZip, Listed, ZipTime, writing_bundle
+from service.audit.bundle.zip_file import BundleZip, ManifestEntry, ZipTime, writing_bundle
 from service.audit.record.missing_results import not_in_yet
 from service.core.errors import IntegrityError
 from service.core.gates.release import refuse_export
@@ -56,7 +56,7 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Exported:
+class WrittenBundle:
     """A bundle as it was written and recorded."""
 
     path: Path
@@ -69,7 +69,7 @@ class Exported:
 
 
 @dataclass(frozen=True, slots=True)
-class Exportable:
+class ExportableRun:
     """A run whose evidence verifies and that may leave."""
 
     protocol: Protocol
@@ -95,7 +95,7 @@ def marked_name(name: str, *, simulated: bool) -> str:
     return f"{stem}-{MARK}.{suffix}" if dot else f"{name}-{MARK}"
 
 
-def require_exportable(store: Store, run_id: str, progress: Progress | None = None) -> Exportable:
+def require_exportable(store: Store, run_id: str, progress: Progress | None = None) -> ExportableRun:
     """Verify the evidence, every file included, and that people have released it.
 
     Raises:
@@ -113,7 +113,7 @@ def require_exportable(store: Store, run_id: str, progress: Progress | None = No
     refusal = refuse_export(protocol, fold(protocol, store.events(run_id)))
     if refusal is not None:
         raise refusal
-    return Exportable(protocol, root, report)
+    return ExportableRun(protocol, root, report)
 
 
 def record_export(
@@ -147,7 +147,7 @@ def export_bundle(
     hashes_only: bool = False,
     report: ReportMaker | None = None,
     progress: Progress | None = None,
-) -> Exported:
+) -> WrittenBundle:
     """Write a run's bundle and record that it was exported. That record is not in the bundle: it tells its hash.
 
     Args:
@@ -215,7 +215,7 @@ def export_bundle(
             bundle.add("manifest.json", [signed])
             bundle.add("manifest.sig", [signature.encode() + b"\n"])
     ((sha256, size),) = left
-    return Exported(target, sha256, size, head.seq, head.sha256, key_id, root.simulated)
+    return WrittenBundle(target, sha256, size, head.seq, head.sha256, key_id, root.simulated)
 
 
 def _write_records(
@@ -258,7 +258,7 @@ def _write_artefacts(
             progress("copying files", done, total)
 
 
-def _require_same(listed: Listed, sha256: str, path: Path) -> None:
+def _require_same(listed: ManifestEntry, sha256: str, path: Path) -> None:
     if listed.sha256 != sha256:
         raise IntegrityError(
             f"nothing is exported, because a file changed while it was copied: its SHA-256 is {listed.sha256}",

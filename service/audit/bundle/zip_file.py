@@ -18,7 +18,7 @@ ZipTime = tuple[int, int, int, int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class ManifestEntry:
     """A file of the bundle, as the manifest lists it."""
 
     path: str
@@ -32,9 +32,9 @@ class BundleZip:
     def __init__(self, archive: zipfile.ZipFile, at: ZipTime) -> None:
         self._archive = archive
         self._at = at
-        self.listed: list[Listed] = []
+        self.listed: list[ManifestEntry] = []
 
-    def add(self, path: str, chunks: Iterable[bytes], *, compress: bool = True) -> Listed:
+    def add(self, path: str, chunks: Iterable[bytes], *, compress: bool = True) -> ManifestEntry:
         """Write one file. What is stored as it came (images) is not compressed."""
         info = zipfile.ZipInfo(path, date_time=self._at)
         info.compress_type = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
@@ -46,7 +46,7 @@ class BundleZip:
                 digest.update(chunk)
                 size += len(chunk)
                 entry.write(chunk)
-        listed = Listed(path, digest.hexdigest(), size)
+        listed = ManifestEntry(path, digest.hexdigest(), size)
         self.listed.append(listed)
         return listed
 

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import TypeAdapter
 from sqlalchemy import Connection, text
 
-from service.audit.background.incremental import Computed, Step
+from service.audit.background.incremental import IncrementalResults, PartialResult
 from service.audit.record.queries import Facets, head, root
 from service.core.errors import IntegrityError, OrthocaptureError
 from service.core.protocol.models import Protocol, parse_protocol
@@ -118,12 +118,12 @@ class Digest:
         return [(name, "skipped" if s.skipped else s.phase) for name, s in steps if not s.signed]
 
 
-def digests(store: Store) -> Computed[Digest]:
+def digests(store: Store) -> IncrementalResults[Digest]:
     """Digests of a data folder's runs, kept up in the background."""
-    return Computed(store, lambda run_id, before: step(store, run_id, before), "digest")
+    return IncrementalResults(store, lambda run_id, before: step(store, run_id, before), "digest")
 
 
-def step(store: Store, run_id: str, before: Digest | None) -> Step[Digest]:
+def step(store: Store, run_id: str, before: Digest | None) -> PartialResult[Digest]:
     """One chunk further. Raises UnknownRunError, StoreError."""
     digest = before or Digest(run_id)
     with store.database.reading() as connection:
@@ -137,7 +137,7 @@ def step(store: Store, run_id: str, before: Digest | None) -> Step[Digest]:
         if not digest.problem:
             _advance(digest, row)
     digest.seq = upto
-    return Step(digest, upto, last, sha256)
+    return PartialResult(digest, upto, last, sha256)
 
 
 def _begin(digest: Digest, store: Store, connection: Connection) -> None:

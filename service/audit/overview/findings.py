@@ -190,7 +190,7 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
-class Replaced:
+class ReplacedStep:
     """A step that was done more than once: the old measures beside the new."""
 
     step: str
@@ -203,7 +203,7 @@ class Replaced:
         return list(dict.fromkeys(name for attempt in self.attempts for name in attempt.measures))
 
 
-def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[Replaced]:
+def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[ReplacedStep]:
     """The steps with a superseded or retried attempt, in the protocol's order."""
     rows = connection.execute(
         text(
@@ -227,7 +227,7 @@ def replaced_steps(connection: Connection, run_id: str, digest: Digest) -> list[
         if past.viewpoint is None:
             reasons.setdefault(past.step, []).append((past.seq, past.reason))
     return [
-        Replaced(name, reasons.get(name, [])[-20:], measured.get(name, [])[-6:])
+        ReplacedStep(name, reasons.get(name, [])[-20:], measured.get(name, [])[-6:])
         for name in digest.state.steps
         if len(measured.get(name, [])) > 1 or name in reasons
     ]

@@ -10,7 +10,7 @@ from typing import Any
 
 from sqlalchemy import Connection, text
 
-from service.audit.background.incremental import Computed, Step
+from service.audit.background.incremental import IncrementalResults, PartialResult
 from service.audit.record.artefact_queries import ArtefactRow, artefacts_of_events, one_artefact
 from service.audit.record.queries import EventRow, head, plain, read_rows
 from service.store.store import Store
@@ -71,12 +71,12 @@ class Graph:
         return [(self.nodes[b], n) for (a, b), n in self.edges.items() if a == key]
 
 
-def graphs(store: Store) -> Computed[Graph]:
+def graphs(store: Store) -> IncrementalResults[Graph]:
     """Graphs of a data folder's runs, kept up in the background."""
-    return Computed(store, lambda run_id, before: _step(store, run_id, before), "provenance")
+    return IncrementalResults(store, lambda run_id, before: _step(store, run_id, before), "provenance")
 
 
-def _step(store: Store, run_id: str, before: Graph | None) -> Step[Graph]:
+def _step(store: Store, run_id: str, before: Graph | None) -> PartialResult[Graph]:
     graph = before or Graph(run_id)
     with store.database.reading() as connection:
         last, sha256 = head(connection, run_id)
@@ -91,7 +91,7 @@ def _step(store: Store, run_id: str, before: Graph | None) -> Step[Graph]:
         else:
             _add_job(graph, row)
     graph.seq = upto
-    return Step(graph, upto, last, sha256)
+    return PartialResult(graph, upto, last, sha256)
 
 
 _FILES = (

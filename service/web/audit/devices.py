@@ -9,7 +9,7 @@ from service.audit.overview import findings
 from service.audit.overview.devices import bodies_of_run
 from service.audit.record import queries
 from service.core.equipment.clocks import clock_of, clock_readings, offset_told
-from service.web.audit.frame import Auditing, audit_frame
+from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render
 from service.web.security.guards import requires
 
@@ -22,7 +22,7 @@ router = APIRouter(tags=["audit"])
     dependencies=[Depends(requires("read"))],
     response_class=HTMLResponse,
 )
-def devices_page(request: Request, audit: Auditing, run_id: str) -> Response:
+def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
     """Devices with versions, clocks, troubles; sessions and software."""
     frame = audit_frame(audit, run_id, "/devices")
     with audit.site.store.database.reading() as connection:

@@ -14,10 +14,10 @@ from service.core.errors import ConfigurationError
 from service.core.gates.release import refuse_export, refuse_release
 from service.core.records.events import RunReleased
 from service.store.signatures.signing import checkpoint
-from service.web.audit.frame import Auditing, audit_frame
+from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render
-from service.web.security.guards import Signed, requires
-from service.web.site import Here
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite
 
 router = APIRouter(tags=["exports"])
 
@@ -30,7 +30,7 @@ _READ = [Depends(requires("read"))]
 _LOCK = Lock()
 
 
-def _exports(request: Request, site: Here) -> Exports:
+def _exports(request: Request, site: CurrentSite) -> Exports:
     state = request.app.state
     with _LOCK:
         if not hasattr(state, "exports"):
@@ -39,12 +39,17 @@ def _exports(request: Request, site: Here) -> Exports:
     return found
 
 
-ExportsOfSite = Annotated[Exports, Depends(_exports)]
+CurrentExports = Annotated[Exports, Depends(_exports)]
 
 
 @router.get("/runs/{run_id}/exports", name="exports", dependencies=_READ, response_class=HTMLResponse)
 def exports_page(
-    request: Request, site: Here, audit: Auditing, exports: ExportsOfSite, person: Signed, run_id: RunId
+    request: Request,
+    site: CurrentSite,
+    audit: CurrentAudit,
+    exports: CurrentExports,
+    person: SignedInPerson,
+    run_id: RunId,
 ) -> Response:
     """Whether the run may leave the system, what has left already, and how to make more."""
     log = site.run(run_id)
@@ -73,8 +78,8 @@ def exports_page(
 
 @router.post("/runs/{run_id}/release", name="release", dependencies=[Depends(requires("release"))])
 def release(
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     run_id: RunId,
     meaning: Annotated[str, Form(max_length=200)],
     password: Annotated[str, Form(max_length=1000)],
@@ -95,7 +100,7 @@ def release(
 
 @router.post("/runs/{run_id}/exports", name="start_export", dependencies=[Depends(requires("export"))])
 def start_export(
-    site: Here, exports: ExportsOfSite, person: Signed, run_id: RunId, what: Annotated[What, Form()]
+    site: CurrentSite, exports: CurrentExports, person: SignedInPerson, run_id: RunId, what: Annotated[What, Form()]
 ) -> RedirectResponse:
     """Begin an export. It verifies everything first, and ends without a file when anything differs."""
     log = site.run(run_id)
@@ -108,7 +113,7 @@ def start_export(
 
 @router.get("/runs/{run_id}/exports/{file_name}", name="exported_file", dependencies=_READ)
 def exported_file(
-    site: Here, exports: ExportsOfSite, run_id: RunId, file_name: Annotated[str, Path(max_length=200)]
+    site: CurrentSite, exports: CurrentExports, run_id: RunId, file_name: Annotated[str, Path(max_length=200)]
 ) -> FileResponse:
     """Download one of the recorded exports."""
     path, record = exports.path(site.run(run_id).events, file_name)

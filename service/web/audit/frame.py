@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 from fastapi import Depends, FastAPI, Request
 
 from service.audit.background.child_process import ChildState
-from service.audit.background.incremental import Computed
+from service.audit.background.incremental import IncrementalResults
 from service.audit.overview.digest import Digest, digests
 from service.audit.overview.first_page import verified
 from service.audit.provenance.graph import Graph, graphs
@@ -20,9 +20,8 @@ from service.audit.record.queries import RunBasics
 from service.audit.verify.verifications import Verification, Verifications
 from service.core.records.import_list import imported_sentence
 from service.store.errors import UnknownRunError
-from service.web.site import Here, Site
+from service.web.site import CurrentSite, Site
 
-LONGEST = 200  # characters of a filter; more is cut
 _LOCK = Lock()
 _TABS = (
     ("", "Overview"),
@@ -38,35 +37,35 @@ _TABS = (
 
 
 @dataclass
-class Audit:
+class AuditState:
     """What is computed for one data folder."""
 
     site: Site
-    digests: Computed[Digest]
-    graphs: Computed[Graph]
+    digests: IncrementalResults[Digest]
+    graphs: IncrementalResults[Graph]
     verifications: Verifications
 
 
-def _audit(request: Request, site: Here) -> Audit:
+def _audit(request: Request, site: CurrentSite) -> AuditState:
     state = request.app.state
     with _LOCK:
         if not hasattr(state, "audit"):
-            state.audit = Audit(
+            state.audit = AuditState(
                 site, digests(site.store), graphs(site.store), Verifications(site.data, site.store.clock)
             )
-        found: Audit = state.audit
+        found: AuditState = state.audit
     return found
 
 
 def close_audit(app: FastAPI) -> None:
     """End what is still being computed."""
-    found: Audit | None = getattr(app.state, "audit", None)
+    found: AuditState | None = getattr(app.state, "audit", None)
     if found is not None:
         found.digests.close()
         found.graphs.close()
 
 
-Auditing = Annotated[Audit, Depends(_audit)]
+CurrentAudit = Annotated[AuditState, Depends(_audit)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +82,7 @@ class AuditFrame:
     imported: str  # the sentence that says so; "" for a run that captured its photographs itself
 
 
-def audit_frame(audit: Audit, run_id: str, tab: str) -> AuditFrame:
+def audit_frame(audit: AuditState, run_id: str, tab: str) -> AuditFrame:
     """Of one run, for the page at `tab`. Raises UnknownRunError."""
     with audit.site.store.database.reading() as connection:
         found = queries.runs(connection, run_id)
@@ -107,8 +106,3 @@ def link(address: str, query: Mapping[str, object]) -> str:
     """An address with its query; empty fields are left out."""
     fields = {name: value for name, value in query.items() if value not in ("", None, 0)}
     return f"{address}?{urlencode(fields)}" if fields else address
-
-
-def cut(text: str) -> str:
-    """A filter as it is used and shown."""
-    return text[:LONGEST].replace("\0", "")

@@ -15,7 +15,7 @@ from service.audit.overview.digest import Digest
 from service.core.protocol.models import Protocol
 from service.core.results.registrations import evaluated, own_registration
 from service.core.run.state import RunState
-from service.web.audit.frame import Auditing, audit_frame
+from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render
 from service.web.run.figures import GateLine, gate_lines
 from service.web.security.guards import requires
@@ -36,7 +36,7 @@ class StepGates:
 
 
 @dataclass(frozen=True, slots=True)
-class Accuracy:
+class AccuracyRow:
     """One row of the accuracy table, held against the limit that the run's own registration was judged by."""
 
     poses: str
@@ -55,7 +55,7 @@ class Accuracy:
     dependencies=[Depends(requires("read"))],
     response_class=HTMLResponse,
 )
-def gates_page(request: Request, audit: Auditing, run_id: str) -> Response:
+def gates_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
     """Every gate of every step, in the order of the protocol."""
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
@@ -83,23 +83,23 @@ def gates_of(digest: Digest) -> list[StepGates]:
     return out
 
 
-def accuracy_of(digest: Digest | None) -> list[Accuracy]:
+def accuracy_of(digest: Digest | None) -> list[AccuracyRow]:
     """The accuracy on the control spheres of every source of poses; empty before the evaluation."""
     if digest is None or digest.protocol is None or digest.state is None:
         return []
     return _accuracy(digest.protocol, digest.state)
 
 
-def _accuracy(protocol: Protocol, state: RunState) -> list[Accuracy]:
+def _accuracy(protocol: Protocol, state: RunState) -> list[AccuracyRow]:
     rows: Sequence[Mapping[str, Any]] = evaluated(protocol, state)
     own = own_registration(protocol, state)
     gates = [gate for step in protocol.steps if step.kind == "evaluation" for gate in step.gates]
     most = next((gate.max for gate in gates if gate.measure.endswith(_ERROR)), None)
-    out: list[Accuracy] = []
+    out: list[AccuracyRow] = []
     for row in rows:
         error = row.get(_ERROR)
         out.append(
-            Accuracy(
+            AccuracyRow(
                 poses=str(row.get("poses", "")),
                 error_mm=error,
                 reprojection_px=row.get(_PIXELS),

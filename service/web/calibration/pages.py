@@ -25,7 +25,7 @@ from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
 from service.web.page.run_words import gate_word, limit, measure_name
 from service.web.security.guards import requires
-from service.web.site import Here, Site
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["calibration"])
 
@@ -34,7 +34,7 @@ RunId = Annotated[str, Path(max_length=64)]
 
 
 @router.get("/runs/{run_id}/calibration", name="calibration", dependencies=[Depends(requires("read"))])
-def calibration(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
+def calibration(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
     """Whether the calibration is good, in pixels and in millimetres, and what would make it better."""
     log = site.run(run_id)
     found = calibration_of(log)
@@ -52,7 +52,7 @@ def calibration(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
 
 
 @router.get("/runs/{run_id}/board-plan.svg", name="board_plan", dependencies=[Depends(requires("read"))])
-def board_plan(site: Here, run_id: RunId, step: Annotated[str, Query(max_length=64)]) -> Response:
+def board_plan(site: CurrentSite, run_id: RunId, step: Annotated[str, Query(max_length=64)]) -> Response:
     """The board images of a calibration step as they are planned: corners over the image, and the camera's places."""
     # The planning of poses brings scipy, which the start of the service does not wait for.
     from service.web.calibration.board_plan_view import board_plan_of  # noqa: PLC0415
@@ -66,7 +66,7 @@ def board_plan(site: Here, run_id: RunId, step: Annotated[str, Query(max_length=
     name="calibration_certificate",
     dependencies=[Depends(requires("read"))],
 )
-def certificate(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
+def certificate(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
     """The calibration on a page to print."""
     log = site.run(run_id)
     found = calibration_of(log)

@@ -213,7 +213,7 @@ class Signature:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class LaterCheck:
     """A later step that held its images against the calibration."""
 
     step: str
@@ -240,7 +240,7 @@ class Certificate:
     operator: str
     passed: tuple[int, str, str] | None
     signatures: tuple[Signature, ...]
-    checks: tuple[Check, ...]
+    checks: tuple[LaterCheck, ...]
     stops: tuple[str, ...]
 
 
@@ -264,7 +264,7 @@ def certificate_of(log: RunRecord, calibration: Calibration) -> Certificate:
         and state.steps[event.payload.step].signed
     ]
     checks = [
-        Check(step.title, len(done.captured), int(done.measures["optics_departures"]))
+        LaterCheck(step.title, len(done.captured), int(done.measures["optics_departures"]))
         for step, done in ((s, state.steps[s.id]) for s in log.protocol.steps)
         if step.id not in ids and "optics_departures" in done.measures
     ]

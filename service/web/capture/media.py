@@ -26,7 +26,7 @@ from service.store.files.artefacts import to_artefact
 from service.web.record.images import Capture, find_capture
 from service.web.record.pictures import IMAGE_WIDTHS, PICTURES, cached, nearest_width, reduced_jpeg, safe_name
 from service.web.security.guards import requires
-from service.web.site import Here, Site
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["media"])
 
@@ -43,7 +43,7 @@ _MEDIA_TYPE = re.compile(r"[a-z]+/[a-z0-9.+-]+")
 
 
 @router.get("/vendor/plotly.js", name="plotly_script", response_class=FileResponse)
-def plotly_script(request: Request, site: Here) -> Response:
+def plotly_script(request: Request, site: CurrentSite) -> Response:
     """plotly's script out of the installed package; charts and the 3D view load it in their sandboxed frames."""
     path = _plotly()
     stat = path.stat()
@@ -75,7 +75,7 @@ def _plotly() -> Path:
 )
 def run_file(
     request: Request,
-    site: Here,
+    site: CurrentSite,
     run_id: RunId,
     sha256: Sha256,
     thumbnail: Annotated[int | None, Query(ge=64, le=640)] = None,
@@ -109,7 +109,7 @@ def run_file(
 )
 def viewpoint_image(
     request: Request,
-    site: Here,
+    site: CurrentSite,
     run_id: RunId,
     viewpoint: Viewpoint,
     step: StepName = "",
@@ -139,7 +139,7 @@ def viewpoint_image(
     responses={204: {"description": "no frame yet"}},
     response_class=FileResponse,
 )
-def live_view(site: Here, run_id: RunId) -> Response:
+def live_view(site: CurrentSite, run_id: RunId) -> Response:
     """The camera's newest frame. Asking keeps the frames coming; a frame of some seconds ago is not shown as live."""
     site.run(run_id)
     ask_for_frames(site.data, run_id)

@@ -13,8 +13,8 @@ from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.record.board_images import BoardUse, board_uses
 from service.web.record.images import Capture, captures_of
-from service.web.security.guards import Signed, requires
-from service.web.site import Here, Site
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["capture"])
 
@@ -33,8 +33,8 @@ LISTED = 200  # viewpoints on one page of the table
 @router.get("/runs/{run_id}/capture", name="capture", dependencies=[Depends(requires("read"))])
 def capture(
     request: Request,
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     run_id: RunId,
     step: Name = "",
     viewpoint: Name = "",
@@ -52,8 +52,8 @@ def capture(
 @router.get("/runs/{run_id}/capture/parts/{names}", name="capture_parts", dependencies=[Depends(requires("read"))])
 def capture_parts(
     request: Request,
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     run_id: RunId,
     names: Parts,
     step: Name = "",

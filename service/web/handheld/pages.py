@@ -13,8 +13,8 @@ from service.people.control import Control
 from service.people.person import Person
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
-from service.web.security.guards import Signed, requires
-from service.web.site import Here, Site
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["capture by hand"])
 
@@ -24,7 +24,7 @@ Parts = Annotated[str, part_names("way", "image", "plan", "overlay")]
 
 
 @router.get("/runs/{run_id}/held", name="held", dependencies=[Depends(requires("read"))])
-def held(request: Request, site: Here, person: Signed, run_id: RunId, step: Name = "") -> HTMLResponse:
+def held(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, step: Name = "") -> HTMLResponse:
     """The page that a technician has beside the camera."""
     return render(
         request, "handheld/handheld.html.j2", frame=run_frame(site, run_id), **_shown(site, person, run_id, step)
@@ -33,7 +33,7 @@ def held(request: Request, site: Here, person: Signed, run_id: RunId, step: Name
 
 @router.get("/runs/{run_id}/held/parts/{names}", name="held_parts", dependencies=[Depends(requires("read"))])
 def held_parts(
-    request: Request, site: Here, person: Signed, run_id: RunId, names: Parts, step: Name = ""
+    request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, step: Name = ""
 ) -> HTMLResponse:
     """Parts of the page, all of one moment, for the script that keeps it up to date."""
     return render(request, "handheld/parts.html.j2", names=names.split(","), **_shown(site, person, run_id, step))
@@ -41,8 +41,8 @@ def held_parts(
 
 @router.post("/runs/{run_id}/held", name="ask_capture", dependencies=[Depends(requires("operate"))])
 def ask(
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     run_id: RunId,
     step: Annotated[str, Form(max_length=64)],
     attempt: Annotated[int, Form(ge=1, le=10_000)],

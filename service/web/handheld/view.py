@@ -29,7 +29,7 @@ SpotState = Literal["done", "open", "next"]
 
 
 @dataclass(frozen=True, slots=True)
-class Spot:
+class PlanMarker:
     """A place of the hemisphere, or the camera, on the drawing."""
 
     name: str
@@ -47,7 +47,7 @@ class Overlay:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class JudgedImage:
     """One image with what was found."""
 
     viewpoint: str
@@ -58,7 +58,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldNow:
+class HandheldView:
     """One step of this kind as it stands."""
 
     step: Step
@@ -67,9 +67,9 @@ class HeldNow:
     failures: tuple[str, ...]  # of work on the images: what failed, what to do
     photographs_from: str  # folder of a camera without a cable; "" for one that can be released from here
     overlay: Overlay | None
-    spots: tuple[Spot, ...]
-    camera: Spot | None
-    seen: tuple[Seen, ...]  # newest first
+    spots: tuple[PlanMarker, ...]
+    camera: PlanMarker | None
+    seen: tuple[JudgedImage, ...]  # newest first
     figures: tuple[tuple[str, str, str, bool | None], ...]  # name, value, limit, whether it is met
 
 
@@ -89,7 +89,7 @@ def step_to_show(log: RunRecord, wanted: str) -> Step | None:
     return begun[-1] if begun else next(iter(steps.values()), None)
 
 
-def held_now(log: RunRecord, step: Step) -> HeldNow:
+def held_now(log: RunRecord, step: Step) -> HandheldView:
     """All of it, from the record alone."""
     state = log.state.steps[step.id]
     jobs = {str(j.arguments["image"]["sha256"]): j for j in state.jobs.values() if j.kind in _KINDS}
@@ -106,7 +106,7 @@ def held_now(log: RunRecord, step: Step) -> HeldNow:
     result: Mapping[str, Any] = {} if last is None else last.result
     target = result.get("target")
     here = result.get("T_level_camera")
-    return HeldNow(
+    return HandheldView(
         step=step,
         running=running,
         words=str(result.get("words", "")) if running else "",
@@ -142,7 +142,7 @@ def _lowest(places: Sequence[Mapping[str, Any]]) -> float:
     return max([0.05, *radii])
 
 
-def _spots(places: Sequence[Mapping[str, Any]], target: str) -> tuple[Spot, ...]:
+def _spots(places: Sequence[Mapping[str, Any]], target: str) -> tuple[PlanMarker, ...]:
     lowest = _lowest(places)
     return tuple(
         _spot(
@@ -155,18 +155,18 @@ def _spots(places: Sequence[Mapping[str, Any]], target: str) -> tuple[Spot, ...]
     )
 
 
-def _spot(name: str, state: SpotState, T_level_camera: Any, lowest: float) -> Spot:
+def _spot(name: str, state: SpotState, T_level_camera: Any, lowest: float) -> PlanMarker:
     """From above, the side of the person at the bottom."""
     x, y = T_level_camera[0][3], T_level_camera[1][3]
     scale = _REACH / lowest
-    return Spot(name, state, round(SIZE / 2 + scale * x, 1), round(SIZE / 2 - scale * y, 1))
+    return PlanMarker(name, state, round(SIZE / 2 + scale * x, 1), round(SIZE / 2 - scale * y, 1))
 
 
-def _seen(viewpoint: str, sha256: str, job: JobState | None) -> Seen:
+def _seen(viewpoint: str, sha256: str, job: JobState | None) -> JudgedImage:
     if job is None or job.status == "enqueued":
-        return Seen(viewpoint, sha256, "waiting", "", "")
+        return JudgedImage(viewpoint, sha256, "waiting", "", "")
     if job.status == "failed":
-        return Seen(viewpoint, sha256, "not_used", job.message, "")
+        return JudgedImage(viewpoint, sha256, "not_used", job.message, "")
     m = job.measures
     parts: list[str] = []
     if m.get("spheres_expected"):
@@ -178,7 +178,7 @@ def _seen(viewpoint: str, sha256: str, job: JobState | None) -> Seen:
     if "corners" in m:
         parts.append(f"{m['corners']:.0f} corners")
     state: Literal["used", "not_used"] = "used" if job.result["used"] else "not_used"
-    return Seen(viewpoint, sha256, state, str(job.result["why"]), ", ".join(parts))
+    return JudgedImage(viewpoint, sha256, state, str(job.result["why"]), ", ".join(parts))
 
 
 def _figures(step: Step, measures: Mapping[str, float]) -> tuple[tuple[str, str, str, bool | None], ...]:

@@ -15,13 +15,15 @@ from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
 from service.web.page.run_words import irreversible_warning, limit, measure_name
 from service.web.security.guards import requires
-from service.web.site import Here
+from service.web.site import CurrentSite
 
 router = APIRouter(tags=["checklist"])
 
 
 @router.get("/protocols/{file}/checklist", name="protocol_checklist", dependencies=[Depends(requires("read"))])
-def protocol_checklist(request: Request, site: Here, file: Annotated[str, Path(max_length=200)]) -> HTMLResponse:
+def protocol_checklist(
+    request: Request, site: CurrentSite, file: Annotated[str, Path(max_length=200)]
+) -> HTMLResponse:
     """Of a protocol that can be started. Raises ConfigurationError for any other file."""
     known = {path.name: path for path in site.protocol_files()}
     if file not in known:
@@ -31,7 +33,7 @@ def protocol_checklist(request: Request, site: Here, file: Annotated[str, Path(m
 
 
 @router.get("/runs/{run_id}/checklist", name="run_checklist", dependencies=[Depends(requires("read"))])
-def run_checklist(request: Request, site: Here, run_id: Annotated[str, Path(max_length=64)]) -> HTMLResponse:
+def run_checklist(request: Request, site: CurrentSite, run_id: Annotated[str, Path(max_length=64)]) -> HTMLResponse:
     """Of the protocol that a run began with."""
     log = site.run(run_id)
     root = log.events[0].payload

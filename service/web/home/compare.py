@@ -11,7 +11,7 @@ from service.audit.runs.comparison import ComparedRun, compare_runs, root_of
 from service.audit.runs.search import RunWanted, find_runs
 from service.web.page.rendering import render
 from service.web.security.guards import requires
-from service.web.site import Here, Site
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["compare"])
 _OFFERED = 200  # runs to choose from
@@ -19,7 +19,7 @@ _OFFERED = 200  # runs to choose from
 
 @router.get("/compare", name="compare", dependencies=[Depends(requires("read"))])
 def compare_page(
-    request: Request, site: Here, run: Annotated[list[str] | None, Query(max_length=64)] = None
+    request: Request, site: CurrentSite, run: Annotated[list[str] | None, Query(max_length=64)] = None
 ) -> HTMLResponse:
     """Two runs, or the choice of two. Raises UnknownRunError."""
     chosen = list(dict.fromkeys(run or []))

@@ -14,14 +14,14 @@ from service.audit.runs.history import FIGURES, Figure, HistoryRow, Instrument, 
 from service.web.home.time_charts import TimeChart, TimePoint, time_chart
 from service.web.page.rendering import render
 from service.web.security.guards import requires
-from service.web.site import Here
+from service.web.site import CurrentSite
 
 router = APIRouter(tags=["history"])
 _READ = [Depends(requires("read"))]
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class InstrumentHistory:
     """One instrument with its charts and the rows behind them."""
 
     instrument: Instrument
@@ -32,7 +32,7 @@ class Course:
 
 @router.get("/history", name="history", dependencies=_READ)
 def history_page(
-    request: Request, site: Here, rigs: Annotated[str, Query(pattern="^(|real|simulated)$")] = ""
+    request: Request, site: CurrentSite, rigs: Annotated[str, Query(pattern="^(|real|simulated)$")] = ""
 ) -> HTMLResponse:
     """Every instrument that took part in a run with figures; of all rigs, the real or the simulated ones."""
     rows = [row for row in history(site.store) if not rigs or row.run.simulated == (rigs == "simulated")]
@@ -41,7 +41,7 @@ def history_page(
 
 
 @router.get("/history.csv", name="history_csv", dependencies=_READ)
-def history_file(site: Here) -> Response:
+def history_file(site: CurrentSite) -> Response:
     """All rows as CSV."""
     name = f"orthocapture-history-{datetime.now(UTC):%Y%m%d}.csv"
     return Response(
@@ -51,10 +51,10 @@ def history_file(site: Here) -> Response:
     )
 
 
-def _course(instrument: Instrument, rows: Sequence[HistoryRow]) -> Course:
+def _course(instrument: Instrument, rows: Sequence[HistoryRow]) -> InstrumentHistory:
     figures = tuple(f for f in FIGURES if instrument.kind in f.of and any(f.key in row.values for row in rows))
     charts = (_chart(figure, rows) for figure in figures)
-    return Course(instrument, figures, tuple(chart for chart in charts if chart is not None), tuple(rows))
+    return InstrumentHistory(instrument, figures, tuple(chart for chart in charts if chart is not None), tuple(rows))
 
 
 def _chart(figure: Figure, rows: Sequence[HistoryRow]) -> TimeChart | None:

@@ -23,8 +23,8 @@ from service.store.records import RunRow
 from service.web.page.rendering import render
 from service.web.page.run_frame import driven_frames, robot_banner
 from service.web.page.run_words import stopped_words
-from service.web.security.guards import Signed, requires
-from service.web.site import Here, Site
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["home"])
 _PAGE = 12
@@ -67,8 +67,8 @@ class Startable:
 @router.get("/", name="home", dependencies=[Depends(requires("read"))])
 def home(
     request: Request,
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     page: Annotated[int, Query(ge=1, le=100_000)] = 1,
     q: Sought = "",
     since: Sought = "",
@@ -108,7 +108,7 @@ def home(
 
 
 @router.get("/robots", name="robots", dependencies=[Depends(requires("read"))])
-def robots(request: Request, site: Here, but: Annotated[str, Query(max_length=64)] = "") -> HTMLResponse:
+def robots(request: Request, site: CurrentSite, but: Annotated[str, Query(max_length=64)] = "") -> HTMLResponse:
     """How the robots stand that are driven now, for the script that keeps every page up to date."""
     return render(request, "page/robots.html.j2", others=driven_frames(site, but=but))
 
@@ -120,7 +120,7 @@ def robots(request: Request, site: Here, but: Annotated[str, Query(max_length=64
     response_class=RedirectResponse,
 )
 def theme(
-    site: Here,
+    site: CurrentSite,
     theme: Annotated[Literal["light", "dark", "auto"], Form()],
     back: Annotated[str, Form(max_length=400)] = "/",
 ) -> RedirectResponse:

@@ -12,8 +12,8 @@ from service.core.errors import ConfigurationError
 from service.core.records.entered import LINE_CHARACTERS, TEXT_CHARACTERS, RunAbout
 from service.web.home.pages import startable_of
 from service.web.page.rendering import render
-from service.web.security.guards import Signed, requires
-from service.web.site import Here
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite
 
 router = APIRouter(tags=["start"])
 _KNOWN = 20  # entries of earlier runs that a field offers
@@ -21,7 +21,7 @@ _KNOWN = 20  # entries of earlier runs that a field offers
 
 @router.get("/start", name="start_form", dependencies=[Depends(requires("read"))])
 def start_form(
-    request: Request, site: Here, person: Signed, protocol: Annotated[str, Query(max_length=200)]
+    request: Request, site: CurrentSite, person: SignedInPerson, protocol: Annotated[str, Query(max_length=200)]
 ) -> HTMLResponse:
     """Fields of a new run of one protocol file; the site is filled in as in the run before."""
     if protocol not in {path.name for path in site.protocol_files()}:

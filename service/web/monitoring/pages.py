@@ -18,7 +18,7 @@ from service.store.files.space_used import forecast_of
 from service.web.monitoring.metrics import DataFolderMetrics
 from service.web.monitoring.request_counts import RequestCounts
 from service.web.security.guards import Guard
-from service.web.site import Here, Site
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["health"])
 _FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
@@ -30,7 +30,7 @@ class ReaderOrThisMachine(Guard):
     A program that scrapes cannot sign in. Who is on this machine could read the data folder as well.
     """
 
-    async def __call__(self, request: Request, site: Here) -> None:
+    async def __call__(self, request: Request, site: CurrentSite) -> None:
         """See Guard."""
         if not _is_this_machine(request):
             await super().__call__(request, site)
@@ -75,7 +75,7 @@ def _driven(site: Site) -> list[str]:
 
 
 @router.get("/health", name="health")
-def health(site: Here) -> JSONResponse:
+def health(site: CurrentSite) -> JSONResponse:
     """Whether database, data folder, worker and runners live. Status 200 when they do, 503 when one does not."""
     found = read_health(site.store, site.data, _driven(site))
     parts = {

@@ -69,7 +69,7 @@ class VectorField:
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class ChartPoint:
     """The value of one series for one name."""
 
     x: float
@@ -83,7 +83,7 @@ class Dots:
 
     title: str
     height: float
-    marks: tuple[Mark, ...]
+    marks: tuple[ChartPoint, ...]
     series: tuple[str, ...]
     x_ticks: tuple[Tick, ...]
     y_ticks: tuple[Tick, ...]
@@ -189,7 +189,7 @@ def dots(
         return round(_TOP + inner * (1 - value / top), 1)
 
     marks = [
-        Mark(round(_LEFT + (i + 0.5) * step, 1), y(value), s)
+        ChartPoint(round(_LEFT + (i + 0.5) * step, 1), y(value), s)
         for s, (_, values) in enumerate(series)
         for i, value in enumerate(values)
         if value is not None

@@ -13,9 +13,9 @@ from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render
 from service.web.people import administration
 from service.web.people.administration import utc_of
-from service.web.security.guards import Signed, clear_cookie, requires, set_cookie, token_of
+from service.web.security.guards import SignedInPerson, clear_cookie, requires, set_cookie, token_of
 from service.web.security.shield import Limiter
-from service.web.site import Here
+from service.web.site import CurrentSite
 
 router = APIRouter(tags=["people"])
 router.include_router(administration.router)
@@ -51,7 +51,7 @@ def _address(request: Request) -> str:
 @router.get("/sign-in", name="sign_in_page", response_class=HTMLResponse)
 def sign_in_page(
     request: Request,
-    site: Here,
+    site: CurrentSite,
     next_page: Annotated[str, Query(alias="next", max_length=500)] = "/",
     done: Annotated[str, Query(max_length=20)] = "",
 ) -> HTMLResponse:
@@ -70,7 +70,7 @@ def sign_in_page(
 @router.post("/sign-in", name="sign_in", response_class=RedirectResponse, status_code=303)
 def sign_in(
     request: Request,
-    site: Here,
+    site: CurrentSite,
     account: Name,
     password: Secret,
     next_page: Annotated[str, Form(alias="next", max_length=500)] = "/",
@@ -108,7 +108,7 @@ def sign_in(
     response_class=RedirectResponse,
     status_code=303,
 )
-def sign_out(site: Here, person: Signed) -> Response:
+def sign_out(site: CurrentSite, person: SignedInPerson) -> Response:
     """End this sign-in."""
     site.people.sign_out(person)
     response = _go("/sign-in?done=signed-out")
@@ -120,7 +120,7 @@ def sign_out(site: Here, person: Signed) -> Response:
 
 
 @router.get("/set-up/{token}", name="set_up_page", response_class=HTMLResponse)
-def set_up_page(request: Request, site: Here, token: Token) -> HTMLResponse:
+def set_up_page(request: Request, site: CurrentSite, token: Token) -> HTMLResponse:
     """The form behind a one-time link. Looking at it does not use it up."""
     return _set_up_form(request, site, token, None)
 
@@ -128,7 +128,7 @@ def set_up_page(request: Request, site: Here, token: Token) -> HTMLResponse:
 @router.post("/set-up/{token}", name="set_up", response_class=RedirectResponse, status_code=303)
 def set_up(
     request: Request,
-    site: Here,
+    site: CurrentSite,
     token: Token,
     password: Secret,
     repeated: Secret,
@@ -152,7 +152,12 @@ def set_up(
 
 
 def _set_up_form(
-    request: Request, site: Here, token: str, problem: AccountError | None, account: str = "", full_name: str = ""
+    request: Request,
+    site: CurrentSite,
+    token: str,
+    problem: AccountError | None,
+    account: str = "",
+    full_name: str = "",
 ) -> HTMLResponse:
     invitation = site.people.accounts.invitation(token)
     return render(
@@ -182,7 +187,7 @@ def _require_same(password: str, repeated: str) -> None:
     response_class=RedirectResponse,
     status_code=303,
 )
-def lock(site: Here, person: Signed, back: Back = "/") -> Response:
+def lock(site: CurrentSite, person: SignedInPerson, back: Back = "/") -> Response:
     """Lock this screen: it goes on showing, and acts no more until the PIN is given."""
     site.people.lock(person)
     return _go(own_page(back))
@@ -201,7 +206,7 @@ def unlock_page(request: Request, back: Annotated[str, Query(max_length=500)] = 
     response_class=RedirectResponse,
     status_code=303,
 )
-def unlock(request: Request, site: Here, person: Signed, pin: Pin, back: Back = "/") -> Response:
+def unlock(request: Request, site: CurrentSite, person: SignedInPerson, pin: Pin, back: Back = "/") -> Response:
     """Open this screen with the PIN."""
     try:
         site.people.unlock(person, pin)
@@ -217,7 +222,7 @@ def unlock(request: Request, site: Here, person: Signed, pin: Pin, back: Back = 
 
 @router.get("/account", name="own_account", dependencies=[Depends(requires("read"))], response_class=HTMLResponse)
 def own_account(
-    request: Request, site: Here, person: Signed, done: Annotated[str, Query(max_length=20)] = ""
+    request: Request, site: CurrentSite, person: SignedInPerson, done: Annotated[str, Query(max_length=20)] = ""
 ) -> HTMLResponse:
     """Password, PIN and screens of the person who looks."""
     return _own_account(request, site, person, done=done)
@@ -231,7 +236,12 @@ def own_account(
     status_code=303,
 )
 def change_password(
-    request: Request, site: Here, person: Signed, password: Secret, new_password: Secret, repeated: Secret
+    request: Request,
+    site: CurrentSite,
+    person: SignedInPerson,
+    password: Secret,
+    new_password: Secret,
+    repeated: Secret,
 ) -> Response:
     """Set a new password; the person's other screens are signed out."""
     try:
@@ -252,7 +262,7 @@ def change_password(
     response_class=RedirectResponse,
     status_code=303,
 )
-def change_pin(request: Request, site: Here, person: Signed, password: Secret, pin: Pin) -> Response:
+def change_pin(request: Request, site: CurrentSite, person: SignedInPerson, password: Secret, pin: Pin) -> Response:
     """Set a new PIN."""
     try:
         site.people.check_password(person.account, password)
@@ -271,7 +281,7 @@ def change_pin(request: Request, site: Here, person: Signed, password: Secret, p
     response_class=RedirectResponse,
     status_code=303,
 )
-def end_screen(site: Here, person: Signed, screen: Annotated[str, Path(max_length=20)]) -> Response:
+def end_screen(site: CurrentSite, person: SignedInPerson, screen: Annotated[str, Path(max_length=20)]) -> Response:
     """Sign out another screen of one's own."""
     site.people.end_screen(person, screen)
     return _go("/account?done=screen")
@@ -279,8 +289,8 @@ def end_screen(site: Here, person: Signed, screen: Annotated[str, Path(max_lengt
 
 def _own_account(
     request: Request,
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     *,
     done: str = "",
     problem: OrthocaptureError | None = None,

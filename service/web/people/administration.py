@@ -17,8 +17,8 @@ from service.people.roles import ROLES, Role
 from service.store.durable_effects import utc_text
 from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render
-from service.web.security.guards import Signed, requires
-from service.web.site import Here, Site
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["administration"])
 
@@ -29,14 +29,19 @@ _ADMINISTER = [Depends(requires("administer"))]
 
 
 @router.get("/accounts", name="accounts", dependencies=_ADMINISTER, response_class=HTMLResponse)
-def accounts(request: Request, site: Here) -> HTMLResponse:
+def accounts(request: Request, site: CurrentSite) -> HTMLResponse:
     """All accounts, and the form to invite somebody."""
     return _list(request, site)
 
 
 @router.post("/accounts", name="invite", dependencies=_ADMINISTER, response_class=HTMLResponse)
 def invite(
-    request: Request, site: Here, person: Signed, account: Name, full_name: Name, role: Annotated[Role, Form()]
+    request: Request,
+    site: CurrentSite,
+    person: SignedInPerson,
+    account: Name,
+    full_name: Name,
+    role: Annotated[Role, Form()],
 ) -> Response:
     """Make an account; the page with its one-time link is shown once."""
     try:
@@ -49,7 +54,7 @@ def invite(
 
 
 @router.get("/accounts/{account}", name="account", dependencies=_ADMINISTER, response_class=HTMLResponse)
-def account_page(request: Request, site: Here, account: AccountName) -> HTMLResponse:
+def account_page(request: Request, site: CurrentSite, account: AccountName) -> HTMLResponse:
     """One account and what can be changed of it."""
     return _one(request, site, account)
 
@@ -63,8 +68,8 @@ def account_page(request: Request, site: Here, account: AccountName) -> HTMLResp
 )
 def change_role(
     request: Request,
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     account: AccountName,
     role: Annotated[Role, Form()],
     reason: Reason,
@@ -84,7 +89,9 @@ def change_role(
     response_class=RedirectResponse,
     status_code=303,
 )
-def disable(request: Request, site: Here, person: Signed, account: AccountName, reason: Reason) -> Response:
+def disable(
+    request: Request, site: CurrentSite, person: SignedInPerson, account: AccountName, reason: Reason
+) -> Response:
     """Shut an account out."""
     try:
         site.people.accounts.disable(person, account, reason)
@@ -100,7 +107,9 @@ def disable(request: Request, site: Here, person: Signed, account: AccountName, 
     response_class=RedirectResponse,
     status_code=303,
 )
-def enable(request: Request, site: Here, person: Signed, account: AccountName, reason: Reason) -> Response:
+def enable(
+    request: Request, site: CurrentSite, person: SignedInPerson, account: AccountName, reason: Reason
+) -> Response:
     """Let a disabled account in again."""
     try:
         site.people.accounts.enable(person, account, reason)
@@ -116,14 +125,16 @@ def enable(request: Request, site: Here, person: Signed, account: AccountName, r
     response_class=RedirectResponse,
     status_code=303,
 )
-def end_wait(site: Here, person: Signed, account: AccountName) -> Response:
+def end_wait(site: CurrentSite, person: SignedInPerson, account: AccountName) -> Response:
     """End an account's wait after wrong passwords."""
     site.people.accounts.end_wait(person, account)
     return _back(account)
 
 
 @router.post("/accounts/{account}/reset", name="reset_account", dependencies=_ADMINISTER, response_class=HTMLResponse)
-def reset(request: Request, site: Here, person: Signed, account: AccountName, reason: Reason) -> Response:
+def reset(
+    request: Request, site: CurrentSite, person: SignedInPerson, account: AccountName, reason: Reason
+) -> Response:
     """Take away password and PIN; the page with the new one-time link is shown once."""
     try:
         token = site.people.accounts.reset(person, account, reason)

@@ -11,8 +11,8 @@ from service.core.errors import OrthocaptureError
 from service.people.errors import AccountError, SignInRefusedError
 from service.web.page.errors import status_of, wants_json
 from service.web.page.rendering import render
-from service.web.security.guards import Signed, requires
-from service.web.site import Here, Site
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["people"])
 
@@ -23,14 +23,14 @@ _ENROL = [Depends(requires("enrol"))]
 
 
 @router.get("/badges", name="badges", dependencies=_ENROL, response_class=HTMLResponse)
-def badges(request: Request, site: Here) -> HTMLResponse:
+def badges(request: Request, site: CurrentSite) -> HTMLResponse:
     """Who has a badge."""
     return _page(request, site)
 
 
 @router.post("/badges/{account}", name="enrol_badge", dependencies=_ENROL, response_class=RedirectResponse)
 def enrol(
-    request: Request, site: Here, person: Signed, account: AccountName, password: Secret, badge: Secret
+    request: Request, site: CurrentSite, person: SignedInPerson, account: AccountName, password: Secret, badge: Secret
 ) -> Response:
     """Give an account a badge; its owner stands there and types the account's password."""
     try:
@@ -41,7 +41,9 @@ def enrol(
 
 
 @router.post("/badges/{account}/revoke", name="revoke_badge", dependencies=_ENROL, response_class=RedirectResponse)
-def revoke(request: Request, site: Here, person: Signed, account: AccountName, reason: Reason) -> Response:
+def revoke(
+    request: Request, site: CurrentSite, person: SignedInPerson, account: AccountName, reason: Reason
+) -> Response:
     """Take a badge away."""
     try:
         site.people.badges.revoke(person, account, reason)
@@ -56,7 +58,7 @@ def revoke(request: Request, site: Here, person: Signed, account: AccountName, r
     dependencies=[Depends(requires("read"))],
     response_class=RedirectResponse,
 )
-def report_lost(site: Here, person: Signed) -> Response:
+def report_lost(site: CurrentSite, person: SignedInPerson) -> Response:
     """One's own badge is lost: it signs nothing from now on."""
     site.people.badges.revoke(person, person.account, "reported lost by its owner")
     return RedirectResponse("/account?done=badge", status_code=303)

@@ -30,7 +30,7 @@ class Sphere:
 
 
 @dataclass(frozen=True, slots=True)
-class Registered:
+class ShownRegistration:
     """The registration that pages show: the run's own, or before that the best one by its own prediction."""
 
     name: str
@@ -47,7 +47,7 @@ def result_of_kind(log: RunRecord, kind: str) -> tuple[str, Mapping[str, Any]]:
     return "", {}
 
 
-def best_registration(log: RunRecord) -> Registered | None:
+def best_registration(log: RunRecord) -> ShownRegistration | None:
     """None before there is one."""
     step, _ = result_of_kind(log, "registration")
     records = registrations(log.protocol, log.state)
@@ -57,10 +57,10 @@ def best_registration(log: RunRecord) -> Registered | None:
     own = own_registration(log.protocol, log.state)
     predicted = sorted(full, key=lambda n: float(np.trace(np.array(full[n]["covariance"])[:3, :3])))
     name = own if own in full else predicted[0]
-    return Registered(name, full[name], step)
+    return ShownRegistration(name, full[name], step)
 
 
-def scan_spheres(log: RunRecord, registered: Registered) -> tuple[Sphere, ...]:
+def scan_spheres(log: RunRecord, registered: ShownRegistration) -> tuple[Sphere, ...]:
     """Spheres of the registered scan, and the control spheres, in its frame."""
     params = log.protocol.step(registered.step).params.model_dump()
     scan = log.state.steps[params["scan"]].result if params["scan"] in log.state.steps else {}

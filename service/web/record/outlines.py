@@ -20,11 +20,11 @@ from service.core.geometry import Transform, apply, inverse
 from service.run_record import RunRecord
 from service.web.record.images import Capture
 from service.web.record.known_spheres import Sphere, best_registration, ct_spheres, scan_spheres
-from service.web.record.pictures import Mark
+from service.web.record.pictures import DrawnOutline
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class OutlineSource:
     """Where outlines of an image come from.
 
     Attributes:
@@ -41,14 +41,14 @@ class Found:
     live: bool
 
 
-def outlines_of(log: RunRecord, capture: Capture) -> Found | None:
+def outlines_of(log: RunRecord, capture: Capture) -> OutlineSource | None:
     """The registration's outlines of a valid image, else what the live numbers found, else None."""
     registered = best_registration(log)
     if registered is not None and capture.replaced is None:
         T = registered.record["T_scan_camera"].get(capture.payload.viewpoint)
         artefact = str(registered.record["outlines"])
         if T is not None and capture.payload.artefacts[0].kind in ("image", "control_image"):
-            return Found(
+            return OutlineSource(
                 f"{artefact[:16]}-{registered.name}",
                 artefact,
                 scan_spheres(log, registered),
@@ -60,10 +60,12 @@ def outlines_of(log: RunRecord, capture: Capture) -> Found | None:
     if job is None or job.status != "finished" or not job.artefacts:
         return None
     camera = CameraModel.from_record(job.arguments["camera"])
-    return Found(f"live-{job.artefacts[0].sha256[:16]}", job.artefacts[0].sha256, ct_spheres(log), camera, None, True)
+    return OutlineSource(
+        f"live-{job.artefacts[0].sha256[:16]}", job.artefacts[0].sha256, ct_spheres(log), camera, None, True
+    )
 
 
-def marks_of(log: RunRecord, capture: Capture) -> tuple[Mark, ...]:
+def marks_of(log: RunRecord, capture: Capture) -> tuple[DrawnOutline, ...]:
     """Outlines with numbers: registration spheres 0, 1, 2 …, control spheres C0, C1 …, and what is neither."""
     found = outlines_of(log, capture)
     if found is None:
@@ -74,7 +76,7 @@ def marks_of(log: RunRecord, capture: Capture) -> tuple[Mark, ...]:
     placed = _provisional(data) if found.live else found.T_camera_scan
     named = _named(outlines, found, placed, log.protocol.spheres.radius_mm / 1000)
     return tuple(
-        Mark(
+        DrawnOutline(
             named[i].kind if i in named else "unassigned",
             named[i].label if i in named else "?",
             outline.captured_px(found.camera),
@@ -90,7 +92,7 @@ def _provisional(data: Mapping[str, Any]) -> Transform | None:
 
 
 def _named(
-    outlines: Sequence[SphereOutline], found: Found, T_camera_scan: Transform | None, radius_m: float
+    outlines: Sequence[SphereOutline], found: OutlineSource, T_camera_scan: Transform | None, radius_m: float
 ) -> Mapping[int, Sphere]:
     if T_camera_scan is None or not outlines or not found.spheres:
         return {}

@@ -43,7 +43,7 @@ _DASHES: dict[MarkKind, tuple[int, int] | None] = {  # drawn, left out: segments
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class DrawnOutline:
     """The outline of one sphere in one image.
 
     Attributes:
@@ -78,7 +78,7 @@ def cached(folder: Path, key: str, suffix: str, make: Callable[[], bytes]) -> Pa
     return path
 
 
-def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = (), *, upright: bool = False) -> bytes:
+def reduced_jpeg(path: Path, width: int, marks: Sequence[DrawnOutline] = (), *, upright: bool = False) -> bytes:
     """A JPEG of this width, or of the picture's own where that is smaller, with outlines drawn over it.
 
     `upright`: turned as its orientation tag says, for people to look at; without it as stored, for measuring.
@@ -131,7 +131,7 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[Mark] = (), *, upright:
     return encoded.tobytes()
 
 
-def draw_marks(picture: NDArray[np.uint8], marks: Sequence[Mark], scale: float) -> None:
+def draw_marks(picture: NDArray[np.uint8], marks: Sequence[DrawnOutline], scale: float) -> None:
     """Draw outlines into a picture (H, W, 3): solid, dashed or dotted by kind, each with its label in its middle."""
     import cv2  # noqa: PLC0415 - a web process starts without it
     import numpy as np  # noqa: PLC0415

@@ -25,7 +25,7 @@ _lock = Lock()
 
 
 @dataclass(frozen=True, slots=True)
-class Planned:
+class PlannedPose:
     """A camera pose in the base frame of its station: where it is and where it looks."""
 
     name: str
@@ -59,19 +59,19 @@ def planned_poses(log: RunRecord, step: Step) -> tuple[Viewpoint, ...]:
     return _planned(log, step)[0]
 
 
-def planned_viewpoints(log: RunRecord, step: Step) -> tuple[Planned, ...]:
+def planned_viewpoints(log: RunRecord, step: Step) -> tuple[PlannedPose, ...]:
     """The same as places and directions."""
     return _planned(log, step)[1]
 
 
-_known: OrderedDict[tuple[str, str, tuple[int, ...]], tuple[tuple[Viewpoint, ...], tuple[Planned, ...]]] = (
+_known: OrderedDict[tuple[str, str, tuple[int, ...]], tuple[tuple[Viewpoint, ...], tuple[PlannedPose, ...]]] = (
     OrderedDict()
 )
 _KNOWN = 32  # plans that are kept: pages of a run under way ask for the same one again and again
 _OF_PLANS = ("board_poses", "suggested_viewpoints")
 
 
-def _planned(log: RunRecord, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[Planned, ...]]:
+def _planned(log: RunRecord, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[PlannedPose, ...]]:
     """They follow from the root of the chain (protocol, rig) and the step's notes: computed once for each."""
     notes = tuple(note.seq for note in log.state.steps[step.id].notes if note.note in _OF_PLANS)
     key = (log.events[0].sha256, step.id, notes)
@@ -80,7 +80,7 @@ def _planned(log: RunRecord, step: Step) -> tuple[tuple[Viewpoint, ...], tuple[P
             _known.move_to_end(key)
             return _known[key]
     poses = _computed_poses(log, step)
-    computed = poses, tuple(Planned(v.name, v.station, *place(v.T_base_camera)) for v in poses)
+    computed = poses, tuple(PlannedPose(v.name, v.station, *place(v.T_base_camera)) for v in poses)
     with _lock:
         _known[key] = computed
         while len(_known) > _KNOWN:

@@ -37,8 +37,8 @@ from service.rig import load_rig
 from service.run_record import RunRecord
 from service.run_start import record_refusal, require_rig_free, start_run
 from service.steps import params_models
-from service.web.security.guards import Signed, requires
-from service.web.site import Here, Site
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["acting"])
 
@@ -66,8 +66,8 @@ _HARMLESS = (
 
 @router.post("/runs", name="start_run", dependencies=[Depends(requires("operate"))])
 def start(
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     protocol: Short,
     reason: Words = "",
     password: Secret = "",
@@ -105,7 +105,7 @@ def start(
 
 
 @router.post("/runs/{run_id}/go-on", name="go_on", dependencies=[Depends(requires("operate"))])
-def go_on(site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
+def go_on(site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
     """Start the process that drives the run again, after it ended."""
     log = site.run(run_id)
     if log.state.terminal:
@@ -117,8 +117,8 @@ def go_on(site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
 
 @router.post("/runs/{run_id}/ticks", name="tick", dependencies=[Depends(requires("operate"))])
 def tick(
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     run_id: RunId,
     step: Short,
     attempt: Number,
@@ -145,8 +145,8 @@ def tick(
     "/runs/{run_id}/actions", name="act", dependencies=[Depends(requires("operate", while_locked=("pause",)))]
 )
 def act(
-    site: Here,
-    person: Signed,
+    site: CurrentSite,
+    person: SignedInPerson,
     run_id: RunId,
     verb: Annotated[OperatorVerb, Form()],
     step: Short = "",
@@ -235,7 +235,7 @@ def _out_of_date(state: RunState) -> IllegalTransitionError:
 
 
 @router.post("/runs/{run_id}/control/take", name="take_control", dependencies=[Depends(requires("operate"))])
-def take_control(site: Here, person: Signed, run_id: RunId, reason: Words = "") -> RedirectResponse:
+def take_control(site: CurrentSite, person: SignedInPerson, run_id: RunId, reason: Words = "") -> RedirectResponse:
     """Take control of a run that nobody controls; a supervisor takes it from somebody with a reason."""
     _require_open(site, run_id)
     control = Control(site.store)
@@ -247,7 +247,7 @@ def take_control(site: Here, person: Signed, run_id: RunId, reason: Words = "") 
 
 
 @router.post("/runs/{run_id}/control/ask", name="ask_for_control", dependencies=[Depends(requires("operate"))])
-def ask_for_control(site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
+def ask_for_control(site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
     """Ask whoever has control to hand it over."""
     _require_open(site, run_id)
     Control(site.store).ask(run_id, person)
@@ -255,14 +255,16 @@ def ask_for_control(site: Here, person: Signed, run_id: RunId) -> RedirectRespon
 
 
 @router.post("/runs/{run_id}/control/answer", name="answer_for_control", dependencies=[Depends(requires("operate"))])
-def answer_for_control(site: Here, person: Signed, run_id: RunId, grant: Annotated[bool, Form()]) -> RedirectResponse:
+def answer_for_control(
+    site: CurrentSite, person: SignedInPerson, run_id: RunId, grant: Annotated[bool, Form()]
+) -> RedirectResponse:
     """Hand control over to the screen that asked for it, or keep it."""
     Control(site.store).answer(run_id, person, grant=grant)
     return _back(run_id)
 
 
 @router.post("/runs/{run_id}/control/release", name="release_control", dependencies=[Depends(requires("operate"))])
-def release_control(site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
+def release_control(site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
     """Give control up; the run goes on and waits at its next question."""
     Control(site.store).release(run_id, person)
     return _back(run_id)

@@ -14,8 +14,8 @@ from starlette.concurrency import run_in_threadpool
 
 from service.monitor.snapshot import STALE_S, read_snapshot
 from service.people.person import Person
-from service.web.security.guards import Signed, requires, token_of
-from service.web.site import Here, Site
+from service.web.security.guards import SignedInPerson, requires, token_of
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["stream"])
 
@@ -26,7 +26,7 @@ RunId = Annotated[str, Path(max_length=64)]
 
 
 @router.get("/runs/{run_id}/stream", name="stream", dependencies=[Depends(requires("read"))])
-async def stream(request: Request, site: Here, person: Signed, run_id: RunId) -> StreamingResponse:
+async def stream(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> StreamingResponse:
     """`changed` with {"seq", "monitor", "locked"} whenever one of them is another than before.
 
     `replaced` is the end: the sign-in has opened more streams than it may have, and this is the oldest.

@@ -15,8 +15,8 @@ from service.core.errors import DataError
 from service.core.records.entered import NoteTaken
 from service.core.records.events import ArtefactRef, Event
 from service.notes import Photograph, require_size, take_note
-from service.web.security.guards import Signed, requires
-from service.web.site import Here
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite
 
 router = APIRouter(tags=["notes"])
 RunId = Annotated[str, Path(max_length=64)]
@@ -44,7 +44,7 @@ def notes_of(events: Iterable[Event], step: str = "") -> tuple[Note, ...]:
 
 
 @router.post("/runs/{run_id}/notes", name="take_note", dependencies=[Depends(requires("operate"))])
-async def take(request: Request, site: Here, person: Signed, run_id: RunId) -> RedirectResponse:
+async def take(request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId) -> RedirectResponse:
     """Record a note. It needs no control of the run: whoever works at it may write something down.
 
     The form is read here, after the guard, and not as parameters of the route, which would be read before it: nobody

@@ -23,9 +23,9 @@ from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.run.notes import notes_of
-from service.web.run.view import Looker, run_view
-from service.web.security.guards import Signed, requires
-from service.web.site import Here, Site
+from service.web.run.view import Viewer, run_view
+from service.web.security.guards import SignedInPerson, requires
+from service.web.site import CurrentSite, Site
 
 router = APIRouter(tags=["run"])
 
@@ -37,7 +37,7 @@ _DRAWINGS = files("service.web.run") / "drawings"
 
 @router.get("/runs/{run_id}", name="run", dependencies=[Depends(requires("read"))])
 def run(
-    request: Request, site: Here, person: Signed, run_id: RunId, step: Name = "", dialog: Name = ""
+    request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, step: Name = "", dialog: Name = ""
 ) -> HTMLResponse:
     """The current step, or another one to look at."""
     return render(
@@ -47,7 +47,7 @@ def run(
 
 @router.get("/runs/{run_id}/parts/{names}", name="run_parts", dependencies=[Depends(requires("read"))])
 def run_parts(
-    request: Request, site: Here, person: Signed, run_id: RunId, names: Parts, step: Name = ""
+    request: Request, site: CurrentSite, person: SignedInPerson, run_id: RunId, names: Parts, step: Name = ""
 ) -> HTMLResponse:
     """Parts of the page, all of one moment, for the script that keeps it up to date."""
     asked = names.split(",")
@@ -61,7 +61,7 @@ def _shown(site: Site, person: Person, run_id: str, step: str, dialog: str = "")
     view = run_view(
         log,
         read_snapshot(site.data, run_id),
-        _looker(site, person, run_id),
+        _viewer(site, person, run_id),
         driven=site.launcher.driven(run_id),
         show=step,
         to_come=[left.text for left in results_to_come(log)],
@@ -103,10 +103,10 @@ def _board_plan(log: RunRecord, step: str) -> int:
     return 1 + sum(note.note == "board_poses" for note in log.state.steps[step].notes)
 
 
-def _looker(site: Site, person: Person, run_id: str) -> Looker:
+def _viewer(site: Site, person: Person, run_id: str) -> Viewer:
     holder = Control(site.store).holder(run_id)
     mine = holder.screen == person.screen and bool(holder.screen)
-    return Looker(
+    return Viewer(
         may_operate=person.may("operate"),
         may_take_over=person.role == "supervisor",
         in_control=mine and person.may("operate"),

@@ -36,7 +36,7 @@ from service.web.record.board_images import unused_count
 from service.web.run.figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
 
 
-class Recorded(Interface):
+class RecordOfRun(Interface):
     """A run's record: service.run_record.RunRecord."""
 
     @property
@@ -56,7 +56,7 @@ class Recorded(Interface):
 
 
 @dataclass(frozen=True, slots=True)
-class Looker:
+class Viewer:
     """Who looks, and how they stand to the control of this run."""
 
     may_operate: bool = False
@@ -83,7 +83,7 @@ class StepLine:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class ChecklistItem:
     """An item of the checklist."""
 
     text: str
@@ -91,7 +91,7 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class StepView:
     """The step on the screen."""
 
     id: str
@@ -106,7 +106,7 @@ class Shown:
     station: str
     status: str
     current: bool
-    checklist: tuple[Check, ...]
+    checklist: tuple[ChecklistItem, ...]
     open_items: int
     gates: tuple[GateLine, ...]
     warning: str  # of an irreversible step that has not been done
@@ -123,7 +123,7 @@ class Shown:
 
 
 @dataclass(frozen=True, slots=True)
-class Main:
+class MainAction:
     """The one large target."""
 
     verb: str  # an operator's verb, or go-on
@@ -178,7 +178,7 @@ class Trouble:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class Choice:
     """A choice of what to do now."""
 
     verb: OperatorVerb
@@ -204,15 +204,15 @@ class RunView:
     attempt: int
     steps: tuple[StepLine, ...]
     passed: int
-    shown: Shown
-    main: Main | None
+    shown: StepView
+    main: MainAction | None
     options: tuple[OperatorVerb, ...]  # besides the main one
     can_pause: bool
     asked_anew: bool  # the program that drove the robot ended: nothing moves before a fresh confirmation
     standing: bool  # paused, and the robot stands still
-    looker: Looker
+    viewer: Viewer
     trouble: Trouble | None
-    ways: tuple[Way, ...]  # where it is stopped, the recommended one first
+    ways: tuple[Choice, ...]  # where it is stopped, the recommended one first
     signature: Signature | None
     acceptance: Acceptance | None
     redos: tuple[Redo, ...]
@@ -230,9 +230,9 @@ class RunView:
 
 
 def run_view(
-    log: Recorded,
+    log: RecordOfRun,
     snapshot: Snapshot,
-    looker: Looker,
+    viewer: Viewer,
     *,
     driven: bool,
     show: str = "",
@@ -271,10 +271,10 @@ def run_view(
         ),
         main=_main(protocol, state, decision, mode, stopped=snapshot.robot in STOPS),
         options=_options(decision, state),
-        can_pause=mode not in ("ended", "died", "paused") and looker.may_operate,
+        can_pause=mode not in ("ended", "died", "paused") and viewer.may_operate,
         asked_anew=needs_leave(protocol, state) and mode in ("ask", "recover"),
         standing=snapshot.doing == "paused" and snapshot.robot != "moving",
-        looker=looker,
+        viewer=viewer,
         trouble=_trouble(protocol, state, decision),
         ways=tuple(map(_way, decision.ways)) if isinstance(decision, AskOperator) else (),
         signature=_signature(protocol, state),
@@ -329,11 +329,11 @@ def _line(protocol: Protocol, state: RunState, step: Step, shown: str, *, stoppe
     return StepLine(step.id, step.title, word, tone, icon, step.id == shown, there.phase != "pending")
 
 
-def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, unused: int) -> Shown:
+def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, unused: int) -> StepView:
     now = state.steps[step.id]
-    checks = tuple(Check(item, item in now.ticked) for item in step.checklist)
+    checks = tuple(ChecklistItem(item, item in now.ticked) for item in step.checklist)
     undone = step.irreversible and now.phase != "passed"
-    return Shown(
+    return StepView(
         id=step.id,
         title=step.title,
         number=protocol.index(step.id) + 1,
@@ -363,36 +363,36 @@ def _shown(protocol: Protocol, state: RunState, step: Step, *, stopped: bool, un
     )
 
 
-def _main(protocol: Protocol, state: RunState, decision: object, mode: str, *, stopped: bool) -> Main | None:
+def _main(protocol: Protocol, state: RunState, decision: object, mode: str, *, stopped: bool) -> MainAction | None:
     main = _wanted(protocol, state, decision, mode)
     if main is not None and main.hold and stopped:
         return replace(main, enabled=False, why_not="The robot is stopped. Clear the stop at the robot first.")
     return main
 
 
-def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) -> Main | None:
+def _wanted(protocol: Protocol, state: RunState, decision: object, mode: str) -> MainAction | None:
     step, now = protocol.step(state.current), state.step
     moves = step.moves_robot
     if mode == "died":
         asks = " You are asked again before the robot moves." if moves else " Nothing moves."
-        return Main("go-on", "Go on", "The run goes on where it stopped." + asks)
+        return MainAction("go-on", "Go on", "The run goes on where it stopped." + asks)
     if mode == "paused":
         under_way = now.phase == "running"
         note = "The robot goes on with its viewpoints." if moves and under_way else "The run goes on where it paused."
-        return Main("resume", "Resume", note, hold=moves)
+        return MainAction("resume", "Resume", note, hold=moves)
     if mode == "ask":
         text, note = will_happen(step, now)
         left = sum(item not in now.ticked for item in step.checklist)
         why_not = f"{count(left, 'item is', 'items are')} not ticked yet." if left else ""
-        return Main("confirm", text, note, hold=moves, enabled=not left, why_not=why_not)
+        return MainAction("confirm", text, note, hold=moves, enabled=not left, why_not=why_not)
     if mode == "sign":
-        return Main("sign", f"Sign: {step.title[:1].lower()}{step.title[1:]}", "Your signature is asked for.")
+        return MainAction("sign", f"Sign: {step.title[:1].lower()}{step.title[1:]}", "Your signature is asked for.")
     if mode == "recover" and isinstance(decision, AskOperator) and "confirm" in decision.options:
         note = "What was captured is kept; only what is missing is done."
         first = next((way for way in decision.ways if way.available), None)
         mends = first is not None and first.verb == "confirm" and state.step.mend
         text = f"Try again: {way_words(state, first)}" if mends and first is not None else "Try again"
-        return Main("confirm", text, note + (" The robot moves." if moves else ""), hold=moves)
+        return MainAction("confirm", text, note + (" The robot moves." if moves else ""), hold=moves)
     return None
 
 
@@ -430,9 +430,9 @@ _BUTTONS: Mapping[OperatorVerb, str] = {
 }
 
 
-def _way(way: WayOn) -> Way:
+def _way(way: WayOn) -> Choice:
     takes = takes_words(way.minutes)
-    return Way(way.verb, way.step, sentence(way.words), takes, way.loses, way.why_not, _BUTTONS.get(way.verb, ""))
+    return Choice(way.verb, way.step, sentence(way.words), takes, way.loses, way.why_not, _BUTTONS.get(way.verb, ""))
 
 
 def _signature(protocol: Protocol, state: RunState) -> Signature | None:

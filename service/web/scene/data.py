@@ -21,7 +21,7 @@ from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSpher
 from service.run_record import RunRecord
 from service.web.record.images import captures_of
 from service.web.record.known_spheres import (
-    Registered,
+    ShownRegistration,
     Sphere,
     best_registration,
     ct_spheres,
@@ -35,7 +35,7 @@ _WITH_STATIONS = ("hybrid", "robot_corrected", "robot")  # sources that tell whe
 
 
 @dataclass(frozen=True, slots=True)
-class SceneNow:
+class KnownScene:
     """A scene and what pages say of it.
 
     Attributes:
@@ -52,7 +52,7 @@ class SceneNow:
     how: str
     missing: tuple[str, ...] = ()
     mesh: ArtefactRef | None = None
-    registered: Registered | None = None
+    registered: ShownRegistration | None = None
     sphere_images: Mapping[str, int] = field(default_factory=dict[str, int])
 
 
@@ -66,7 +66,7 @@ class MeshFacts:
     size_mm: tuple[float, float, float]
 
 
-def scene_of(log: RunRecord) -> SceneNow:
+def scene_of(log: RunRecord) -> KnownScene:
     """The best that the record has."""
     registered = best_registration(log)
     if registered is not None:
@@ -78,7 +78,7 @@ def scene_of(log: RunRecord) -> SceneNow:
 # --- after the registration -------------------------------------------------------------------------------------
 
 
-def _registered(log: RunRecord, registered: Registered) -> SceneNow:
+def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
     record = registered.record
     cameras = {name: np.array(T, dtype=np.float64) for name, T in record["T_scan_camera"].items()}
     spheres = scan_spheres(log, registered)
@@ -96,7 +96,7 @@ def _registered(log: RunRecord, registered: Registered) -> SceneNow:
         bases=bases,
     )
     words = registered.name.replace("_", " ")
-    return SceneNow(
+    return KnownScene(
         scene,
         spheres,
         "of the scan",
@@ -122,7 +122,7 @@ def _bases(log: RunRecord, record: Mapping[str, Any]) -> tuple[dict[str, Transfo
 # --- while images are being taken ---------------------------------------------------------------------------------
 
 
-def _live(log: RunRecord) -> SceneNow | None:
+def _live(log: RunRecord) -> KnownScene | None:
     """In the frame of the CT, by the newest provisional registration of each station; None while there is none."""
     records: dict[str, dict[str, Any]] = {}
     for step in log.protocol.steps:
@@ -152,7 +152,7 @@ def _live(log: RunRecord) -> SceneNow | None:
     )
     step, _ = result_of_kind(log, "ct_import")
     meshes = [ref for ref in log.state.steps[step].artefacts if ref.kind == "ct_mesh"] if step else []
-    return SceneNow(
+    return KnownScene(
         scene,
         spheres,
         "of the CT",
@@ -175,7 +175,7 @@ def _to_come(log: RunRecord) -> list[tuple[str, str, Transform]]:
 # --- before anything has been placed ----------------------------------------------------------------------------
 
 
-def _planned(log: RunRecord) -> SceneNow:
+def _planned(log: RunRecord) -> KnownScene:
     """One station in its base frame: where the camera was, by the drawing of its mount, and where it will be."""
     captured = _all_captures(log)
     to_come = _to_come(log)
@@ -196,7 +196,7 @@ def _planned(log: RunRecord) -> SceneNow:
     scene = Scene(cameras, dict.fromkeys((*cameras, *planned), station), planned=planned, bases=base, up=(0, 0, 1))
     if centre is not None:
         scene = replace(scene, mesh=_table(centre))
-    return SceneNow(
+    return KnownScene(
         scene,
         (),
         f"of the robot base at {station}" if station else "",
@@ -219,7 +219,7 @@ def _all_captures(log: RunRecord) -> list[Any]:
 # --- the surface --------------------------------------------------------------------------------------------------
 
 
-def with_mesh(now: SceneNow, log: RunRecord, data: Path) -> Scene:
+def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
     """The scene with its surface, decimated once and then kept in DIR/cache; coloured by the predicted error."""
     if now.mesh is None:
         return now.scene
@@ -228,13 +228,13 @@ def with_mesh(now: SceneNow, log: RunRecord, data: Path) -> Scene:
     return replace(now.scene, mesh=SceneMesh(points, triangles, error_mm))
 
 
-def predicted_error_mm(registered: Registered, points_m: Array) -> Array:
+def predicted_error_mm(registered: ShownRegistration, points_m: Array) -> Array:
     """Standard deviation (N,) of the place of points (N, 3) of the scan in the images, 3D."""
     placed = Alignment(np.array(registered.record["T_world_scan"]), np.array(registered.record["covariance"])[:6, :6])
     return np.asarray(1e3 * np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2)), dtype=np.float64)
 
 
-def mesh_facts(now: SceneNow, log: RunRecord, data: Path) -> MeshFacts | None:
+def mesh_facts(now: KnownScene, log: RunRecord, data: Path) -> MeshFacts | None:
     """None without a surface."""
     return None if now.mesh is None else _surface(log, now.mesh, data)[2]
 

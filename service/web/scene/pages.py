@@ -11,7 +11,7 @@ from service.core.gates.dependence import accepted_gates
 from service.web.page.rendering import render
 from service.web.page.run_frame import run_frame
 from service.web.security.guards import requires
-from service.web.site import Here
+from service.web.site import CurrentSite
 
 router = APIRouter(tags=["scene"])
 
@@ -35,7 +35,7 @@ FRAME_HEADERS = {
 
 
 @router.get("/runs/{run_id}/scene", name="scene", dependencies=[Depends(requires("read"))])
-def scene(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
+def scene(request: Request, site: CurrentSite, run_id: RunId) -> HTMLResponse:
     """The 3D view in its frame, and everything in it as tables."""
     from service.web.scene.tables import scene_tables  # noqa: PLC0415 - mesh and matching, not needed to start
 
@@ -53,7 +53,7 @@ def scene(request: Request, site: Here, run_id: RunId) -> HTMLResponse:
 
 
 @router.get("/runs/{run_id}/scene/frame", name="scene_frame", dependencies=[Depends(requires("read"))])
-def scene_frame(request: Request, site: Here, run_id: RunId, theme: Theme = "auto") -> HTMLResponse:
+def scene_frame(request: Request, site: CurrentSite, run_id: RunId, theme: Theme = "auto") -> HTMLResponse:
     """The 3D view alone, for the sandboxed frame."""
     from service.dataset.scene_view import figure_json, scene_figure  # noqa: PLC0415 - as above
     from service.web.scene.data import scene_of, with_mesh  # noqa: PLC0415

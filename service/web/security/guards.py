@@ -14,7 +14,7 @@ from service.people.errors import NotAllowedError, NotSignedInError, ScreenLocke
 from service.people.person import Person
 from service.people.roles import Permission
 from service.web.server.connections import Connection
-from service.web.site import Here, Site
+from service.web.site import CurrentSite, Site
 
 SAFE_METHODS = frozenset({"GET", "HEAD"})
 THEFT_REMEDY = "Load the page again and repeat; nothing was done"
@@ -53,7 +53,7 @@ class Guard:
         self.permission: Permission = permission
         self._while_locked = while_locked
 
-    async def __call__(self, request: Request, site: Here) -> None:
+    async def __call__(self, request: Request, site: CurrentSite) -> None:
         """Raises NotSignedInError, NotAllowedError, ScreenLockedError; else `request.state.person` is set."""
         person = await run_in_threadpool(
             site.people.person,
@@ -105,10 +105,10 @@ def _signed(request: Request) -> Person:
     return person
 
 
-Signed = Annotated[Person, Depends(_signed)]
+SignedInPerson = Annotated[Person, Depends(_signed)]
 
 
-def controls(run_id: str, person: Signed, site: Here) -> None:
+def controls(run_id: str, person: SignedInPerson, site: CurrentSite) -> None:
     """For routes that act on a run, beside their guard: this screen has control of it. Raises ControlError."""
     Control(site.store).require(run_id, person)
 

@@ -14,13 +14,13 @@ from service.store.errors import UnknownRunError
 from service.store.records import SITE
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.signing import checkpoint
-from service.web.site import Here, Site
+from service.web.site import CurrentSite, Site
 
 _log = logging.getLogger("orthocapture.web")
 _SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 
 
-async def sealed(request: Request, site: Here) -> AsyncGenerator[None]:
+async def sealed(request: Request, site: CurrentSite) -> AsyncGenerator[None]:
     """For the whole application, `scope="function"`: signed before the answer leaves, refused requests included.
 
     Accounts, invitations, sign-ins and their refusals, wrong passwords of a signature: all of it comes with a POST.

@@ -24,7 +24,7 @@ from service.core.text.counts import counted
 
 
 @dataclass(frozen=True, slots=True)
-class Departure:
+class NotableEvent:
     """Something that an outsider must know of, with its event."""
 
     seq: int
@@ -34,26 +34,26 @@ class Departure:
     who: str
 
 
-def deviations(run: RecordedRun) -> list[Departure]:
+def deviations(run: RecordedRun) -> list[NotableEvent]:
     """Accepted gates first; then deviations, failed gates, troubles of devices and corrections, by their events."""
     titles = {step.id: step.title for step in run.protocol.steps}
     found = [
-        Departure(d.seq, words(d.kind), titles.get(d.step or "", ""), d.text, d.actor)
+        NotableEvent(d.seq, words(d.kind), titles.get(d.step or "", ""), d.text, d.actor)
         for d in run.state.deviations
         if not d.is_note
     ]
     for event in run.events:
         found += [
-            Departure(event.seq, kind, titles.get(step, ""), text, event.actor)
+            NotableEvent(event.seq, kind, titles.get(step, ""), text, event.actor)
             for kind, step, text in _of_event(event.payload)
         ]
     last = run.events[-1].seq
     for step in run.protocol.steps:
         state = run.state.steps[step.id]
         if step.sign and state.phase == "passed" and not state.skipped and not state.signed:
-            found.append(Departure(last, "unsigned", step.title, "nobody has signed this step", ""))
+            found.append(NotableEvent(last, "unsigned", step.title, "nobody has signed this step", ""))
         elif state.phase != "passed":
-            found.append(Departure(last, "not done", step.title, f"the step is {words(state.phase)}", ""))
+            found.append(NotableEvent(last, "not done", step.title, f"the step is {words(state.phase)}", ""))
     return sorted(found, key=lambda departure: (departure.kind != words("gate_accepted"), departure.seq))
 
 
@@ -77,7 +77,7 @@ def _of_event(payload: object) -> Iterator[tuple[str, str, str]]:
             return
 
 
-def deviations_section(run: RecordedRun, listed: Sequence[Departure]) -> Section:
+def deviations_section(run: RecordedRun, listed: Sequence[NotableEvent]) -> Section:
     """First of all."""
     blocks: list[Block] = []
     if listed:

@@ -1,0 +1,121 @@
+"""The auditor's first page of a run, and all its deviations."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+
+from fastapi import APIRouter, Depends, FastAPI, Request
+from fastapi.responses import HTMLResponse, Response
+
+from service.audit.background.incremental import Progress
+from service.audit.overview import findings, first_page
+from service.audit.overview.devices import bodies_of_run
+from service.audit.overview.digest import Digest
+from service.audit.overview.first_page import GROUPS
+from service.audit.overview.shots import failed_exposures_of, shots_of, together
+from service.audit.record import queries
+from service.run_record import results_to_come
+from service.steps.time_left import Left
+from service.web.audit.frame import AuditState, CurrentAudit, audit_frame, close_audit, link
+from service.web.audit.gates import accuracy_of
+from service.web.audit.protocol_identity import protocol_identity
+from service.web.page.rendering import TEMPLATES, render
+from service.web.security.guards import requires
+
+
+@asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncGenerator[None]:
+    """Templates are read before anybody asks: the first page of a run answers at once too."""
+    for name in TEMPLATES.list_templates(filter_func=lambda name: name.startswith(("audit/", "evidence/"))):
+        TEMPLATES.get_template(name)
+    yield
+    close_audit(app)
+
+
+router = APIRouter(tags=["audit"], lifespan=_lifespan)
+_FIRST = 25  # of a list on the first page
+_READ = [Depends(requires("read"))]
+
+
+@router.get("/audit/runs/{run_id}", name="audit_run", dependencies=_READ, response_class=HTMLResponse)
+def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
+    """The first page of a run: deviations first."""
+    frame = audit_frame(audit, run_id, "")
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    with audit.site.store.database.reading() as connection:
+        root = queries.read_rows(connection, run_id, [1], whole=True)
+        corrected = queries.count_of_kind(connection, run_id, "record_corrected")
+        devices = findings.events_of(connection, run_id, "device_opened", newest=True)
+        sessions = findings.events_of(connection, run_id, "session_started", newest=True)
+        exports = findings.events_of(connection, run_id, "evidence_exported", newest=True)
+        signatures = findings.signatures(connection, run_id, known)
+        failures = failed_exposures_of(connection, run_id)
+        bodies = bodies_of_run(connection, run_id, devices)
+    listed = first_page.findings(known) if known else []
+    run = frame.run
+    return render(
+        request,
+        "audit/run.html.j2",
+        identity=protocol_identity(audit.site.store, run_id, run.protocol, run.version),
+        audit=frame,
+        digest=known,
+        progress=digest if isinstance(digest, Progress) else None,
+        counts=first_page.counts(known) if known else {},
+        groups=GROUPS,
+        group_name=first_page.group_name,
+        listed=listed[:_FIRST],
+        more=len(listed) - _FIRST,
+        accuracy=accuracy_of(known),
+        dataset_exported=any(row.payload.get("what") == "dataset" for row in exports),
+        root=root[0] if root else None,
+        corrected=corrected,
+        shots=shots_of(known, failures),
+        together=together,
+        bodies=bodies,
+        devices={row.payload.get("device"): row for row in devices},
+        session=sessions[-1] if sessions else None,
+        sessions=len(sessions),
+        exports=exports,
+        releases=[s for s in signatures if not s.step],
+        signatures=signatures,
+        late=known.late if known else [],
+        to_come=[left.text for left in _to_come(audit, run_id, known)],
+    )
+
+
+def _to_come(audit: AuditState, run_id: str, digest: Digest | None) -> list[Left]:
+    """Results that are still being computed, or will never come. Read whole only where there may be any."""
+    failed = digest is not None and digest.facets.kinds.get("job_failed", 0) > 0
+    if digest is None or digest.problem or not (failed or audit.site.store.open_jobs(run_id)):
+        return []
+    return results_to_come(audit.site.run(run_id))
+
+
+@router.get(
+    "/audit/runs/{run_id}/deviations", name="audit_deviations", dependencies=_READ, response_class=HTMLResponse
+)
+def deviations_page(request: Request, audit: CurrentAudit, run_id: str, group: str = "", page: int = 1) -> Response:
+    """All deviations, or those of one group."""
+    frame = audit_frame(audit, run_id, "")
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    group = group if group in GROUPS else ""
+    listed = first_page.findings(known, group) if known else []
+    pages = max(1, -(-len(listed) // queries.PAGE))
+    page = min(max(page, 1), pages)
+    return render(
+        request,
+        "audit/deviations.html.j2",
+        audit=frame,
+        progress=digest if isinstance(digest, Progress) else None,
+        groups=GROUPS,
+        counts=first_page.counts(known) if known else {},
+        group=group,
+        listed=listed[(page - 1) * queries.PAGE : page * queries.PAGE],
+        count=len(listed),
+        page=page,
+        pages=pages,
+        href=lambda number: link(f"{frame.base}/deviations", {"group": group, "page": number}),
+    )

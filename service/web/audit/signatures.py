@@ -1,0 +1,51 @@
+"""The auditor's pages of who signed what, and of whether the evidence verifies."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Depends, Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+
+from service.audit.background.incremental import Progress
+from service.audit.overview import findings, first_page
+from service.web.audit.frame import CurrentAudit, audit_frame
+from service.web.page.rendering import render
+from service.web.security.guards import SignedInPerson, requires
+
+router = APIRouter(tags=["audit"])
+_READ = [Depends(requires("read"))]
+
+
+@router.get(
+    "/audit/runs/{run_id}/signatures", name="audit_signatures", dependencies=_READ, response_class=HTMLResponse
+)
+def signatures_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
+    """Who signed what, and whether it still stands."""
+    frame = audit_frame(audit, run_id, "/signatures")
+    digest = audit.digests.get(run_id)
+    known = first_page.known(digest)
+    with audit.site.store.database.reading() as connection:
+        found = findings.signatures(connection, run_id, known)
+    return render(
+        request,
+        "audit/signatures.html.j2",
+        audit=frame,
+        signatures=found,
+        digest=known,
+        progress=digest if isinstance(digest, Progress) else None,
+    )
+
+
+@router.get(
+    "/audit/runs/{run_id}/verification", name="audit_verification", dependencies=_READ, response_class=HTMLResponse
+)
+def verification_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
+    """What the last verification found, or how far the present one is."""
+    return render(request, "audit/verification.html.j2", audit=audit_frame(audit, run_id, "/verification"))
+
+
+@router.post("/audit/runs/{run_id}/verification", name="verify", dependencies=_READ)
+def verify_now(audit: CurrentAudit, person: SignedInPerson, run_id: str) -> Response:
+    """Verify the run; it only reads, so whoever may read may ask for it."""
+    audit_frame(audit, run_id, "/verification")
+    audit.verifications.start(run_id, person.account)
+    return RedirectResponse(f"/audit/runs/{run_id}/verification", status_code=303)
