@@ -16,6 +16,7 @@ from service.core.records.import_list import ImportList
 from service.core.text.checked_yaml import checked, decoded, problem_of, refuse
 from service.core.text.json_text import parse_json
 from service.core.text.yaml_tree import NO_LINES, FieldPath, Plain, Problem, YamlTree, field_name, parse_yaml
+from service.core.units import metres
 
 _REMEDY = "Compare it with the example in docs/howto/your_hardware.md"
 
@@ -77,7 +78,7 @@ class LensSection(Record):
 
     def focal_px(self, width_px: int) -> float:
         """Focal length in pixels of images of this width: the lens extends when it is focused near."""
-        f_m = self.focal_length_mm / 1e3
+        f_m = metres(self.focal_length_mm)
         extended = 1.0 if self.focus_distance_m is None else self.focus_distance_m / (self.focus_distance_m - f_m)
         return self.focal_length_mm * extended / self.sensor_width_mm * width_px
 

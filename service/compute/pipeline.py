@@ -19,6 +19,7 @@ from service.compute.registration.identity import Assignment, identify
 from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, apply, inverse
+from service.core.units import mm
 
 __all__ = ["Detection", "ImageDetections", "PipelineResult", "detect_all", "locate_outlines", "register_images"]
 
@@ -72,7 +73,7 @@ class PipelineResult:
             "mean_reprojection_error_px": None
             if self.evaluation is None
             else self.evaluation.mean_reprojection_error_px,
-            "predicted_error_mm": 1e3 * r.sigma_at_m(self.centre_scan_m),
+            "predicted_error_mm": mm(r.sigma_at_m(self.centre_scan_m)),
             "n_images": r.n_images,
             "markers": [
                 {

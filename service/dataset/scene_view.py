@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.core.geometry import Array, Transform, apply, inverse, transform
+from service.core.units import metres, mm
 
 FACES_SHOWN = 60_000
 _FRUSTUM_MM = 50.0
@@ -109,19 +110,19 @@ def scene_figure(scene: Scene) -> dict[str, Any]:
     to_view = viewing_frame(scene)
     extent = _Extent()
 
-    def mm(points_m: Array) -> Array:
-        points = 1e3 * apply(to_view, np.asarray(points_m, dtype=np.float64).reshape(-1, 3))
+    def in_view_mm(points_m: Array) -> Array:
+        points = mm(apply(to_view, np.asarray(points_m, dtype=np.float64).reshape(-1, 3)))
         extent.add(points)
         return points
 
     data: list[dict[str, Any]] = []
     if scene.mesh is not None:
-        data.append(_mesh(mm(scene.mesh.points_m), scene.mesh))
+        data.append(_mesh(in_view_mm(scene.mesh.points_m), scene.mesh))
     for kind in KIND_NAMES:
         mine = [s for s in scene.spheres if s.kind == kind]
         if mine:
-            data += _spheres(mm(np.array([s.centre_m for s in mine])), mine, 1e3 * scene.radius_m)
-    data.append(_scale_bar(mm(_centre(scene))))
+            data += _spheres(in_view_mm(np.array([s.centre_m for s in mine])), mine, mm(scene.radius_m))
+    data.append(_scale_bar(in_view_mm(_centre(scene))))
     names = sorted({*scene.stations.values(), *scene.bases})
     for i, station in enumerate(names):
         colour, symbol = STYLES[i % len(STYLES)]
@@ -129,9 +130,9 @@ def scene_figure(scene: Scene) -> dict[str, Any]:
         mine = [
             T for name, T in (*scene.cameras.items(), *scene.planned.items()) if scene.stations.get(name) == station
         ]
-        mm(np.array([T[:3, 3] for T in mine]))
+        in_view_mm(np.array([T[:3, 3] for T in mine]))
         if station in scene.bases:
-            data.append(_base(mm(scene.bases[station][None, :3, 3]), station, colour))
+            data.append(_base(in_view_mm(scene.bases[station][None, :3, 3]), station, colour))
     return {"data": data, "layout": _layout(extent)}
 
 
@@ -225,7 +226,7 @@ def _cameras(scene: Scene, station: str, to_view: Transform, colour: str, symbol
         line = {"color": colour, "width": 3}
         frusta = {"mode": "lines", "name": title, "line": line, "hoverinfo": "skip", "opacity": opacity}
         out.append({"type": "scatter3d", **frusta, **_xyz(frustum_lines(list(mine.values())))})
-        eyes = 1e3 * np.array([T[:3, 3] for T in mine.values()])
+        eyes = mm(np.array([T[:3, 3] for T in mine.values()]))
         marker = {"size": 5, "color": colour, "symbol": filled}
         points = {"mode": "markers", "text": list(mine), "hoverinfo": "text", "marker": marker, "showlegend": False}
         out.append({"type": "scatter3d", **points, **_xyz(eyes)})
@@ -266,7 +267,7 @@ def _layout(extent: _Extent) -> dict[str, Any]:
     return {
         "scene": {
             "aspectmode": "manual",
-            "aspectratio": {a: 1e-3 * (high - low) for a, (low, high) in ranges.items()},
+            "aspectratio": {a: metres(high - low) for a, (low, high) in ranges.items()},
             "dragmode": "turntable",
             "camera": {"eye": _in_box(ranges, EYE_MM), "center": _in_box(ranges, TOWARDS_MM)},
             **axes,
@@ -278,16 +279,16 @@ def _layout(extent: _Extent) -> dict[str, Any]:
 
 def _in_box(ranges: Mapping[str, Sequence[float]], point_mm: Sequence[float]) -> dict[str, float]:
     """Where a point of the viewing frame is for plotly's camera."""
-    return {a: 1e-3 * (p - sum(ends) / 2) for (a, ends), p in zip(ranges.items(), point_mm, strict=True)}
+    return {a: metres(p - sum(ends) / 2) for (a, ends), p in zip(ranges.items(), point_mm, strict=True)}
 
 
 def frustum_lines(cameras: Sequence[Transform]) -> Array:
     """Line segments (N, 3) in mm, broken by NaN rows, of a small pyramid for each camera."""
     w, h, z = 0.36 * _FRUSTUM_MM, 0.24 * _FRUSTUM_MM, _FRUSTUM_MM
     o, a, b, c, d = [0, 0, 0], [-w, -h, z], [w, -h, z], [w, h, z], [-w, h, z]
-    path = 1e-3 * np.array([o, a, b, c, d, a, o, b, o, c, o, d], dtype=np.float64)
+    path = metres(np.array([o, a, b, c, d, a, o, b, o, c, o, d], dtype=np.float64))
     gap = np.full((1, 3), np.nan)
-    return np.vstack([np.vstack([1e3 * apply(T, path), gap]) for T in cameras]) if cameras else gap
+    return np.vstack([np.vstack([mm(apply(T, path)), gap]) for T in cameras]) if cameras else gap
 
 
 def unit_ball() -> tuple[Array, NDArray[np.int64]]:

@@ -12,6 +12,7 @@ import numpy as np
 from service.compute.evaluation.accuracy import true_error_m
 from service.core.geometry import apply
 from service.core.run.state import JobState
+from service.core.units import mm
 from service.dataset.summary import RunSummary
 from service.worker.job import JobAnswer
 
@@ -116,8 +117,8 @@ def drifts(summary: RunSummary, recomputed: Recomputed) -> Iterator[Drift]:
         in_world: float | None = None
         if before["poses"] in ("robot", "robot_corrected"):  # the world is the base of the first station
             places = [apply(np.array(each["T_world_scan"]), centre_m) for each in (before, after)]
-            in_world = 1e3 * float(np.linalg.norm(places[1] - places[0]))
-        yield Drift(str(before["poses"]), in_world, 1e3 * true_error_m(moved, given, centre_m))
+            in_world = mm(float(np.linalg.norm(places[1] - places[0])))
+        yield Drift(str(before["poses"]), in_world, mm(true_error_m(moved, given, centre_m)))
 
 
 def _key(value: Any) -> str:

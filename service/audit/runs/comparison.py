@@ -17,6 +17,7 @@ from service.core.records.entered import ABOUT, RunAbout
 from service.core.records.events import Event, GateVerdict, RunStarted
 from service.core.results.registrations import evaluated
 from service.core.run.state import RunState, StepState
+from service.core.units import mm
 from service.people.approvals import difference
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "°", "_min": "min"}  # by the end of a measure's name
@@ -203,10 +204,10 @@ def _calibration(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
             yield _row(name, *texts, change=_change(values, unit))
     here, there = (T for _, T, _ in found)
     if here is not None and there is not None:
-        moved_mm = 1e3 * float(np.linalg.norm(there[:3, 3] - here[:3, 3]))
+        moved_mm = mm(float(np.linalg.norm(there[:3, 3] - here[:3, 3])))
         turned = here[:3, :3].T @ there[:3, :3]
         turned_deg = math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(turned)) - 1) / 2))))
-        where = [f"{1e3 * T[0, 3]:.2f}, {1e3 * T[1, 3]:.2f}, {1e3 * T[2, 3]:.2f} mm" for T in (here, there)]
+        where = [f"{mm(T[0, 3]):.2f}, {mm(T[1, 3]):.2f}, {mm(T[2, 3]):.2f} mm" for T in (here, there)]
         change = f"{moved_mm:.3f} mm, {turned_deg:.4f}°" if not np.array_equal(here, there) else ""
         yield _row("Camera on the flange", *where, change=change)
 

@@ -11,6 +11,7 @@ import typer
 from service.compute.calibration.board.board import Board, Pattern
 from service.compute.calibration.board.images import probe_board
 from service.core.errors import ComputeError, ConfigurationError
+from service.core.units import metres, mm
 
 _SQUARE_MM = (0.5, 1000.0)  # what is printed on boards; a square in metres or micrometres is a slip of the unit
 
@@ -52,14 +53,14 @@ def described_board(
         raise typer.BadParameter(f"--board takes COLSxROWS such as 16x23, not {board!r}")
     low, high = _SQUARE_MM
     if not low <= square_mm <= high:
-        likely = f"; {1e3 * square_mm:g} for a square of {square_mm:g} m" if 0 < square_mm < low else ""
+        likely = f"; {mm(square_mm):g} for a square of {square_mm:g} m" if 0 < square_mm < low else ""
         raise ConfigurationError(
             f"squares of {square_mm:g} mm are not what boards have ({low:g} to {high:g} mm)",
             where="--square-mm",
             remedy=f"Give the side of a square in millimetres{likely}",
         )
-    marker_m = None if marker_mm is None else marker_mm * 1e-3
-    return Board(int(columns), int(rows), square_mm * 1e-3, pattern, marker_m, dictionary, legacy)
+    marker_m = None if marker_mm is None else metres(marker_mm)
+    return Board(int(columns), int(rows), metres(square_mm), pattern, marker_m, dictionary, legacy)
 
 
 def require_board(files: Sequence[Path], board: Board) -> None:

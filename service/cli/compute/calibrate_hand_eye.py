@@ -46,6 +46,7 @@ from service.compute.poses.files.pose_files import posed_images, read_camera_jso
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform
 from service.core.text.counts import counted
+from service.core.units import mm
 
 
 def hand_eye_command(
@@ -195,7 +196,7 @@ def _suggestion(pose: SuggestedPose) -> dict[str, Any]:
 
 
 def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
-    x, y, z = 1e3 * result.T_flange_camera[:3, 3]
+    x, y, z = mm(result.T_flange_camera[:3, 3])
     frame = "flange" if setup == "eye-in-hand" else "robot's base"
     console.print(
         f"{counted(len(result.held_out_mm), 'image')}: camera at {x:.2f}, {y:.2f}, {z:.2f} mm in the {frame} frame "

@@ -21,6 +21,7 @@ from service.compute.markers.detect import detect_spheres
 from service.compute.poses.files.pose_files import read_camera_json, read_spheres_json
 from service.core.errors import ComputeError
 from service.core.geometry import Array
+from service.core.units import metres, mm
 
 
 def layout_command(
@@ -61,7 +62,7 @@ def _centres(
         return np.concatenate([known.registration_m, known.control_m]), None, known.radius_m
     if radius_mm is None:
         raise typer.BadParameter("--mesh and --photo need --radius-mm")
-    radius_m = radius_mm / 1e3
+    radius_m = metres(radius_mm)
     if mesh is not None:
         found = spheres_of(mesh, radius_m, mesh_unit, None, None)
         return np.array([s.centre_m for s in found]), np.array([s.covariance for s in found]), radius_m
@@ -76,23 +77,21 @@ def _centres(
 def _show(report: LayoutReport, centres: Array, radius_m: float) -> None:
     table = Table("sphere", "x mm", "y mm", "z mm", "margin mm")
     for number, (centre, margin) in enumerate(zip(centres, report.sphere_margins_m, strict=True)):
-        shown = f"{1e3 * margin:.2f}" if np.isfinite(margin) else "more"
-        table.add_row(str(number), *(f"{1e3 * v:.1f}" for v in centre), shown)
+        shown = f"{mm(margin):.2f}" if np.isfinite(margin) else "more"
+        table.add_row(str(number), *(f"{mm(v):.1f}" for v in centre), shown)
     print_table(table)
     if report.margin.upper_m > report.margin.lower_m:
         margin = report.margin
-        console.print(
-            f"margin {1e3 * margin.value_m:.2f} mm, {1e3 * margin.lower_m:.2f} to {1e3 * margin.upper_m:.2f}"
-        )
-    seen = ", ".join(f"{k}: {1e3 * v:.1f}" for k, v in report.margin_by_count_m.items() if np.isfinite(v))
+        console.print(f"margin {mm(margin.value_m):.2f} mm, {mm(margin.lower_m):.2f} to {mm(margin.upper_m):.2f}")
+    seen = ", ".join(f"{k}: {mm(v):.1f}" for k, v in report.margin_by_count_m.items() if np.isfinite(v))
     console.print(f"least misfit in mm of a wrong assignment, by spheres seen: {seen}")
     for problem in report.problems:
         console.print(f"[bold red]to do:[/] {problem}")
     for move in _moves(centres, radius_m) if report.problems else ():
-        x, y, z = 1e3 * move.by_m
+        x, y, z = mm(move.by_m)
         console.print(
             f"  move sphere {move.sphere} by about ({x:.0f}, {y:.0f}, {z:.0f}) mm: "
-            f"the margin is then {1e3 * move.margin_m:.2f} mm"
+            f"the margin is then {mm(move.margin_m):.2f} mm"
         )
     if report.passed:
         console.print("[bold green]The spheres can be told apart.[/]")

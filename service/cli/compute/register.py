@@ -37,6 +37,7 @@ from service.compute.pipeline import register_images
 from service.compute.poses.files.pose_files import posed_images, read_camera_json, read_spheres_json
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array
+from service.core.units import metres, mm
 
 DetectorName = Literal["classical", "paper"]
 
@@ -141,8 +142,8 @@ def register_command(
         )
         record = result.as_json(model)
         record["spheres_mm"] = {
-            "registration": (registration_m * 1e3).tolist(),
-            "control": (control_m * 1e3).tolist(),
+            "registration": mm(registration_m).tolist(),
+            "control": mm(control_m).tolist(),
         }
         record["left_out"] = folder.left_out
         record["search"] = _search(located, [file.name for file in files])
@@ -200,11 +201,11 @@ def _spheres(
         raise typer.BadParameter("give either --mesh or --spheres")
     if spheres is not None:
         known = read_spheres_json(spheres)
-        return known.registration_m, known.control_m, known.radius_m if radius_mm is None else radius_mm / 1e3
+        return known.registration_m, known.control_m, known.radius_m if radius_mm is None else metres(radius_mm)
     if radius_mm is None:
         raise typer.BadParameter("--mesh needs --radius-mm")
     assert mesh is not None
-    found = spheres_of(mesh, radius_mm / 1e3, mesh_unit, None, seeds)
+    found = spheres_of(mesh, metres(radius_mm), mesh_unit, None, seeds)
     centres = np.array([sphere.centre_m for sphere in found])
     try:
         chosen = sorted({int(word) for word in control.split(",") if word.strip()})
@@ -217,4 +218,4 @@ def _spheres(
             remedy="Run without --control once: result.json lists the spheres in their order",
         )
     rest = [i for i in range(len(centres)) if i not in chosen]
-    return centres[rest], centres[chosen], radius_mm / 1e3
+    return centres[rest], centres[chosen], metres(radius_mm)

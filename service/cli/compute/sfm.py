@@ -45,6 +45,7 @@ from service.compute.poses.sfm.options import Effort, Refine, SfmOptions, option
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, align_points, apply
+from service.core.units import deg, metres, mm
 
 _FAR = 0.1  # of the cameras' spread: robot poses that miss the reconstruction by more are in another frame
 
@@ -150,13 +151,13 @@ def _spheres(
     """Centres (M, 3) and radius, metres."""
     if spheres is not None:
         known = read_spheres_json(spheres)
-        return known.registration_m, known.radius_m if radius_mm is None else radius_mm / 1e3
+        return known.registration_m, known.radius_m if radius_mm is None else metres(radius_mm)
     if radius_mm is None:
         raise typer.BadParameter("--mesh needs --radius-mm")
     assert mesh is not None
     scan = read_mesh_file(mesh, mesh_unit).mesh
-    found = locate_spheres(scan.vertices_m, scan.faces, radius_mm / 1e3)
-    return np.array([sphere.centre_m for sphere in found]), radius_mm / 1e3
+    found = locate_spheres(scan.vertices_m, scan.faces, metres(radius_mm))
+    return np.array([sphere.centre_m for sphere in found]), metres(radius_mm)
 
 
 @contextmanager
@@ -196,7 +197,7 @@ def _reconstruct(
         return solved, off_m
     if off_m > _FAR * spread_m:
         error_console.print(
-            f"The robot's poses miss the model by {1e3 * off_m:.0f} mm: several stations without --stations, "
+            f"The robot's poses miss the model by {mm(off_m):.0f} mm: several stations without --stations, "
             "or poses of other images. All pairs of images are matched instead."
         )
     again = reconstruct(files, camera, folder, mapper, options=options, progress=progress)
@@ -280,7 +281,7 @@ def _record(solved: SfmModel, off_m: float | None) -> dict[str, Any]:
         "mean_reprojection_error_px": solved.mean_reprojection_error_px,
         "mean_track_length": solved.mean_track_length,
         "camera": solved.camera.record(),
-        "robot_poses_off_mm": None if off_m is None else 1e3 * off_m,
+        "robot_poses_off_mm": None if off_m is None else mm(off_m),
         "seconds": solved.seconds,
     }
 
@@ -290,11 +291,11 @@ def _hybrid_record(metric: HybridPoses) -> dict[str, Any]:
         "T_world_scan": metric.T_world_scan.tolist(),
         "T_world_group": {str(g): T.tolist() for g, T in metric.T_world_group.items()},
         "covariance": metric.scan_covariance.tolist(),
-        "predicted_error_mm": 1e3 * metric.sigma_at_m(metric.centre_scan_m),
+        "predicted_error_mm": mm(metric.sigma_at_m(metric.centre_scan_m)),
         "sigma_track_px": metric.sigma_track_px,
         "sphere_factor": metric.sphere_factor,
-        "sigma_robot_mm": None if metric.sigma_robot_m is None else 1e3 * metric.sigma_robot_m,
-        "sigma_robot_deg": None if metric.sigma_robot_rad is None else float(np.degrees(metric.sigma_robot_rad)),
+        "sigma_robot_mm": None if metric.sigma_robot_m is None else mm(metric.sigma_robot_m),
+        "sigma_robot_deg": None if metric.sigma_robot_rad is None else deg(metric.sigma_robot_rad),
         "chi2": metric.chi2,
     }
 

@@ -21,6 +21,7 @@ from service.compute.surfaces.sphere_records import spheres_document
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
 from service.core.text.counts import counted
+from service.core.units import metres, mm
 
 _NAMED = 3  # spheres that a refusal names
 
@@ -64,13 +65,13 @@ def spheres_command(
     """Find every sphere of a radius in a mesh or point cloud, with its covariance and what it was measured on."""
     with reporting_errors(json):
         require_writable(out)
-        radius_m = _positive(radius_mm) / 1e3
+        radius_m = metres(_positive(radius_mm))
         limits = _limits(radius_m, max_rms_mm, max_radius_off_mm, max_form_mm, min_cap_deg)
         try:
             found = spheres_of(mesh, radius_m, mesh_unit, expect, seeds, limits)
         except ComputeError as error:
             raise _with_limits(error, limits, radius_mm) from error
-        document = spheres_document(found, radius_mm / 1e3)
+        document = spheres_document(found, metres(radius_mm))
         out.write_text(json_module.dumps(document, indent=1), encoding="utf-8")
         if json:
             print_json(document)
@@ -79,10 +80,10 @@ def spheres_command(
         for number, sphere in enumerate(found):
             table.add_row(
                 str(number),
-                *(f"{value * 1e3:.3f}" for value in sphere.centre_m),
-                f"{1e3 * float(np.sqrt(np.trace(sphere.covariance))):.4f}",
-                f"{1e3 * sphere.rms_m:.3f}",
-                f"{1e3 * sphere.radius_residual_m:+.3f} ± {1e3 * sphere.radius_sigma_m:.3f}",
+                *(f"{mm(value):.3f}" for value in sphere.centre_m),
+                f"{mm(float(np.sqrt(np.trace(sphere.covariance)))):.4f}",
+                f"{mm(sphere.rms_m):.3f}",
+                f"{mm(sphere.radius_residual_m):+.3f} ± {mm(sphere.radius_sigma_m):.3f}",
                 f"{sphere.coverage:.2f}",
             )
         print_table(table)
@@ -104,7 +105,7 @@ def _limits(
 ) -> SphereLimits:
     """The default limits with what was given instead, as parts of the radius."""
     given = {"max_rms": max_rms_mm, "max_radius_residual": max_radius_off_mm, "max_form": max_form_mm}
-    changed = {name: value / 1e3 / radius_m for name, value in given.items() if value is not None}
+    changed = {name: metres(value) / radius_m for name, value in given.items() if value is not None}
     if min_cap_deg is not None:
         half = np.radians(min_cap_deg / 2)
         changed |= {"min_cap_deg": min_cap_deg, "min_coverage": min(0.05, 0.7 * (1 - float(np.cos(half))) / 2)}
@@ -157,13 +158,13 @@ def spheres_of(
 def _of_another_radius(error: ComputeError, seen: SeenRadius, radius_m: float) -> ComputeError:
     """The refusal with the radius that the mesh's spheres have."""
     count = len(seen.spheres)
-    where = ", ".join("({:.1f}, {:.1f}, {:.1f})".format(*(1e3 * s.centre_m)) for s in seen.spheres[:_NAMED])
+    where = ", ".join("({:.1f}, {:.1f}, {:.1f})".format(*mm(s.centre_m)) for s in seen.spheres[:_NAMED])
     more = ", …" if count > _NAMED else ""
     return ComputeError(
         f"{error.what}. There {'is 1 sphere' if count == 1 else f'are {count} spheres'} of radius "
-        f"{1e3 * seen.radius_m:.2f} mm, at {where}{more} mm; the radius given may be off by 4 % at most",
+        f"{mm(seen.radius_m):.2f} mm, at {where}{more} mm; the radius given may be off by 4 % at most",
         where=error.where,
-        remedy=f"Measure a sphere: if these are the ones, give --radius-mm {1e3 * seen.radius_m:.2f}"
+        remedy=f"Measure a sphere: if these are the ones, give --radius-mm {mm(seen.radius_m):.2f}"
         + (", half of what was given: the radius, not the diameter" if seen.radius_m < 0.55 * radius_m else ""),
     )
 
@@ -187,4 +188,4 @@ def read_seeds(text: str | None) -> Array | None:
         raise DataError(f"the seeds cannot be read ({error})", where=text, remedy="give x,y,z;x,y,z in mm") from error
     if seeds.ndim != 2 or seeds.shape[1] != 3 or len(seeds) == 0:
         raise DataError("the seeds are not points x,y,z", where=text, remedy="give x,y,z;x,y,z in mm, or a JSON file")
-    return seeds / 1e3
+    return metres(seeds)

@@ -38,6 +38,7 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import inverse
 from service.core.protocol.models import load_protocol
 from service.core.results.registrations import shared_adjustment_note
+from service.core.units import mm
 from service.dataset.export import export_dataset
 from service.dataset.summary import RunSummary, summarise
 from service.rig import load_rig
@@ -124,7 +125,7 @@ def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
         cameras: Mapping[str, Any] = registration["T_scan_camera"]
         estimated = np.array([cameras[name] for name in cameras])
         true = np.array([T_scan_world @ T_world_camera[photographs[name]] for name in cameras])
-        errors[source] = 1e3 * true_error_m(estimated, true, centre_scan_m)
+        errors[source] = mm(true_error_m(estimated, true, centre_scan_m))
     return errors
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from service.compute.arm.kinematics import ArmModel, arm_model, chain, dh_jacobian, pose_gap
 from service.core.errors import DataError
 from service.core.geometry import Array
+from service.core.units import mm
 
 HARMONICS = np.arange(1, 11)  # periods a revolution; faster ones cannot be told from noise with tens of poses
 # What arms of this kind are built to (a, d, α, θ of a joint); only the ratios matter, the scale is estimated.
@@ -124,7 +125,7 @@ def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
     distance_m, angle_rad = pose_gap(arm, joints_rad, T_base_flange)
     if distance_m > _MODEL_GAP_M or angle_rad > _MODEL_GAP_RAD:
         raise DataError(
-            f"the poses are {1e3 * distance_m:.0f} mm and {np.degrees(angle_rad):.1f}° off what the joints of a "
+            f"the poses are {mm(distance_m):.0f} mm and {np.degrees(angle_rad):.1f}° off what the joints of a "
             f"{arm.name} give",
             remedy="check the arm's model, that the poses are the flange's (tool centre point zero), and radians",
         )

@@ -22,6 +22,7 @@ from service.compute.registration.prediction import Foreign, Prediction, foreign
 from service.compute.registration.result import RegistrationResult, Solution
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse
+from service.core.units import mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,8 +190,8 @@ def _error(
     lifted = np.column_stack([points, np.ones(len(points))])
     distance = np.abs(residuals(lifted, np.broadcast_to(centre, lifted.shape), radius_m, "sampson"))
     return ControlError(
-        image, outline, sphere, float(radial.mean()) * 1e3, float(distance.mean()) * 0.5 * (camera.fx + camera.fy),
-        None if stated is None else 1e3 * stated.sigma_rad * float(np.linalg.norm(centre)),
+        image, outline, sphere, mm(float(radial.mean())), float(distance.mean()) * 0.5 * (camera.fx + camera.fy),
+        None if stated is None else mm(stated.sigma_rad * float(np.linalg.norm(centre))),
         None if stated is None else stated.normalised,
     )  # fmt: skip
 

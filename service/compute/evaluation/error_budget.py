@@ -9,6 +9,7 @@ import numpy as np
 
 from service.compute.evaluation.closure import Alignment, Closure, SeenSphere, compare_in_frame, compare_shapes
 from service.core.geometry import Array
+from service.core.units import mm
 
 CONTROL_SPHERES = "control spheres"
 HONEST = (0.5, 2.0)  # normalised chi square between these: the covariances say what is observed
@@ -86,15 +87,15 @@ class ErrorBudget:
         """For a file: millimetres."""
         return {
             "contributions": [
-                {"name": c.name, "sigma_mm": 1e3 * c.sigma_m, "how": c.how, "counted": c.counted}
+                {"name": c.name, "sigma_mm": mm(c.sigma_m), "how": c.how, "counted": c.counted}
                 for c in self.contributions
             ],
-            "total_mm": 1e3 * self.total_m,
+            "total_mm": mm(self.total_m),
             "observations": [
                 {
                     "name": o.name,
-                    "observed_mm": 1e3 * o.observed_m,
-                    "predicted_mm": 1e3 * o.predicted_m,
+                    "observed_mm": mm(o.observed_m),
+                    "predicted_mm": mm(o.predicted_m),
                     "normalised_chi2": o.normalised_chi2,
                     "n": o.n,
                     "how": o.how,

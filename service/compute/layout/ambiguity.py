@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from service.compute.layout.misfits import bounded_misfits, misfits, rigid_motions
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
+from service.core.units import deg, mm
 
 IntArray = NDArray[np.int64]
 
@@ -60,7 +61,7 @@ class Bounded:
 
     def record_mm(self) -> dict[str, float]:
         """Plain data in millimetres, as gates take it."""
-        return {"sigma": 1e3 * self.sigma_m, "lower": 1e3 * self.lower_m, "upper": 1e3 * self.upper_m}
+        return {"sigma": mm(self.sigma_m), "lower": mm(self.lower_m), "upper": mm(self.upper_m)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,17 +174,17 @@ def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]
         first = report.worst[0]
         problems.append(
             f"spheres {_names(first.spheres)} can be taken for {_names(first.taken_for)}: "
-            f"{report.margin_m * 1e3:.2f} mm apart, {required_margin_m * 1e3:.1f} mm are needed"
+            f"{mm(report.margin_m):.2f} mm apart, {mm(required_margin_m):.1f} mm are needed"
         )
     if report.margin_of_five.value_m < REQUIRED_MARGIN_OF_FIVE_M:
         problems.append(
-            f"five spheres can be taken for others that are {report.margin_of_five.value_m * 1e3:.2f} mm different, "
-            f"{REQUIRED_MARGIN_OF_FIVE_M * 1e3:.0f} mm are needed"
+            f"five spheres can be taken for others that are {mm(report.margin_of_five.value_m):.2f} mm different, "
+            f"{mm(REQUIRED_MARGIN_OF_FIVE_M):.0f} mm are needed"
         )
     if report.depth.value_m < REQUIRED_DEPTH_M:
         problems.append(
-            f"the spheres lie within {report.depth.value_m * 1e3:.1f} mm of a plane, "
-            f"{REQUIRED_DEPTH_M * 1e3:.0f} mm are needed: set some of them higher"
+            f"the spheres lie within {mm(report.depth.value_m):.1f} mm of a plane, "
+            f"{mm(REQUIRED_DEPTH_M):.0f} mm are needed: set some of them higher"
         )
     if report.largest_gap_rad > LARGEST_GAP_RAD:
         problems.append(f"no sphere over {np.rad2deg(report.largest_gap_rad):.0f}° of the way around: spread them")
@@ -195,17 +196,17 @@ def layout_record(report: LayoutReport) -> dict[str, Any]:
     return {
         "passed": report.passed,
         "problems": list(report.problems),
-        "margin_mm": 1e3 * report.margin_m,
-        "margin_sigma_mm": 1e3 * report.margin.sigma_m,
+        "margin_mm": mm(report.margin_m),
+        "margin_sigma_mm": mm(report.margin.sigma_m),
         "bounds": {name: bounded.record_mm() for name, (bounded, _) in layout_bounds(report).items()},
-        "margin_by_count_mm": {str(k): 1e3 * v for k, v in report.margin_by_count_m.items() if np.isfinite(v)},
+        "margin_by_count_mm": {str(k): mm(v) for k, v in report.margin_by_count_m.items() if np.isfinite(v)},
         "worst": [
-            {"spheres": list(c.spheres), "taken_for": list(c.taken_for), "misfit_mm": 1e3 * c.misfit_m}
+            {"spheres": list(c.spheres), "taken_for": list(c.taken_for), "misfit_mm": mm(c.misfit_m)}
             for c in report.worst
         ],
-        "depth_mm": 1e3 * report.depth.value_m,
-        "extent_mm": 1e3 * report.extent_m,
-        "largest_gap_deg": float(np.rad2deg(report.largest_gap_rad)),
+        "depth_mm": mm(report.depth.value_m),
+        "extent_mm": mm(report.extent_m),
+        "largest_gap_deg": deg(report.largest_gap_rad),
     }
 
 
@@ -222,9 +223,9 @@ def layout_bounds(report: LayoutReport) -> dict[str, tuple[Bounded, float]]:
 def layout_measures(report: LayoutReport) -> dict[str, float]:
     """The numbers of a layout, lengths in mm, by the names of their measures: alike in every step."""
     return {
-        **{name: 1e3 * bounded.value_m for name, (bounded, _) in layout_bounds(report).items()},
-        "layout_margin_sigma_mm": 1e3 * report.margin.sigma_m,
-        "layout_gap_deg": float(np.rad2deg(report.largest_gap_rad)),
+        **{name: mm(bounded.value_m) for name, (bounded, _) in layout_bounds(report).items()},
+        "layout_margin_sigma_mm": mm(report.margin.sigma_m),
+        "layout_gap_deg": deg(report.largest_gap_rad),
         "layout_problems": float(len(report.problems)),
     }
 

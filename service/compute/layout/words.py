@@ -9,6 +9,7 @@ import numpy as np
 from service.compute.camera_model import CameraModel
 from service.compute.layout.sphere_moves import Move
 from service.core.geometry import Array, Transform, apply
+from service.core.units import mm
 
 _EDGES = ("right edge", "lower right corner", "lower edge", "lower left corner", "left edge", "upper left corner",
           "upper edge", "upper right corner")  # fmt: skip
@@ -63,6 +64,6 @@ def show_move(
     where = "in the middle" if column == row == "middle" else f"at the {row} {column}".replace(" middle", "")
     words = (
         f"Move sphere {move.sphere}, {where} of the photograph, {' and '.join(parts)}; the margin is then predicted "
-        f"to be {1e3 * move.margin_m:.1f} mm ({1e3 * limit_m:.1f} mm are needed)"
+        f"to be {mm(move.margin_m):.1f} mm ({mm(limit_m):.1f} mm are needed)"
     )
     return ShownMove(words, start, end, higher)

@@ -14,6 +14,7 @@ import numpy as np
 from service.compute.arm.kinematics import ArmModel, chain
 from service.compute.planning.capsules import segment_box_distance_m, segment_distance_m
 from service.core.geometry import Array, Transform, apply, inverse
+from service.core.units import mm
 
 LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3", "camera")
 # Neighbours touch by construction; the mount holds the camera beside the last two joints. The shoulder and the base
@@ -74,7 +75,7 @@ class Contact:
         if self.clearance_m < 0:
             return f"the {_words(self.first)} would touch the {_words(self.second)}"
         return (
-            f"the {_words(self.first)} would come within {1e3 * self.clearance_m:.0f} mm of the {_words(self.second)}"
+            f"the {_words(self.first)} would come within {mm(self.clearance_m):.0f} mm of the {_words(self.second)}"
         )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from service.core.geometry import Array, Transform, inverse, transform
+from service.core.units import deg
 
 _FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # C0: columns are x, y, z of the camera
 _COARSE_FROM_M = 0.10  # from here on distances are told to five centimetres, below to one
@@ -118,7 +119,7 @@ def _distance(metres: float, positive: str, negative: str) -> str:
 
 
 def _angle(radians: float, verb: str, positive: str, negative: str) -> str:
-    degrees = float(np.rad2deg((radians + np.pi) % (2 * np.pi) - np.pi))
+    degrees = deg((radians + np.pi) % (2 * np.pi) - np.pi)
     told = int(_ANGLE_STEP_DEG * round(abs(degrees) / _ANGLE_STEP_DEG))
     return f"{verb} {told}° {positive if degrees > 0 else negative}" if told else ""
 

@@ -9,6 +9,7 @@ from scipy.optimize import linear_sum_assignment
 
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply
+from service.core.units import mm
 
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 
@@ -58,7 +59,7 @@ def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> Const
         )
     if count < 4:
         raise ComputeError(
-            f"only {count} of {len(a)} and {len(b)} spheres agree within {tolerance_m * 1e3:.1f} mm, 4 are needed",
+            f"only {count} of {len(a)} and {len(b)} spheres agree within {mm(tolerance_m):.1f} mm, 4 are needed",
             remedy="check the units of both meshes, and that the spheres did not move between the scans",
         )
     best, rival = proper[0], proper[1:]

@@ -16,6 +16,7 @@ from service.compute.surfaces.sphere_noise import CentreUncertainty, centre_unce
 from service.compute.surfaces.surfels import CHUNK, IntArray, Surfels, surfels
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
+from service.core.units import deg, mm
 
 _SURFEL = 0.2  # surface cell over which normals are averaged, in radii
 _HOOD = 1.3  # radii around a centre in which its sphere's surface lies
@@ -224,11 +225,11 @@ def _shape_reasons(fit: SphereFit, radius: float, limits: SphereLimits) -> list[
     elif (cap_deg := _cap_deg(fit)) < limits.min_cap_deg:
         reasons.append(f"its cap is {cap_deg:.0f}° wide, {limits.min_cap_deg:.0f}° are needed")
     if fit.rms > limits.max_rms * radius:
-        reasons.append(f"rms {fit.rms * 1e3:.2f} mm, at most {limits.max_rms * radius * 1e3:.2f}")
+        reasons.append(f"rms {mm(fit.rms):.2f} mm, at most {mm(limits.max_rms * radius):.2f}")
     if fit.flank > limits.max_flank:
         reasons.append("the surface goes on smoothly beyond it: not a sphere of this radius")
     if fit.form > limits.max_form * radius:
-        reasons.append(f"departs from a sphere's form by {fit.form * 1e3:.2f} mm")
+        reasons.append(f"departs from a sphere's form by {mm(fit.form):.2f} mm")
     return reasons
 
 
@@ -240,7 +241,7 @@ def _cap_deg(fit: SphereFit) -> float:
     # In the plane across the middle direction: half the sine of the half angle is the deviation of an even cap.
     plane = np.linalg.svd(middle[None])[2][1:]
     across = float(np.sqrt(max(float(np.linalg.eigvalsh(plane @ (off.T @ (off * weight[:, None])) @ plane.T)[0]), 0)))
-    return 2 * float(np.degrees(np.arcsin(min(1.0, 2 * across))))
+    return 2 * deg(np.arcsin(min(1.0, 2 * across)))
 
 
 def _radius_reasons(fit: SphereFit, sigma: float, radius: float, limits: SphereLimits) -> list[str]:
@@ -248,7 +249,7 @@ def _radius_reasons(fit: SphereFit, sigma: float, radius: float, limits: SphereL
         return ["too small a cap for its noise to tell the radius"]
     most = max(limits.max_radius_residual, limits.most_radius_residual)
     if abs(fit.radius_residual) > max(limits.max_radius_residual * radius, min(3 * sigma, most * radius)):
-        return [f"radius {fit.radius_residual * 1e3:+.2f} ± {sigma * 1e3:.2f} mm off"]
+        return [f"radius {mm(fit.radius_residual):+.2f} ± {mm(sigma):.2f} mm off"]
     return []
 
 
@@ -268,7 +269,7 @@ def _judge(
     if len(good) >= 4:
         usual = _ROUGHER * float(np.median([f.rms for f in good[: (len(good) + 1) // 2]])) + 3e-3 * radius
         refused += [
-            _Candidate(f, (f"rms {f.rms * 1e3:.2f} mm, much rougher than the best covered spheres",))
+            _Candidate(f, (f"rms {mm(f.rms):.2f} mm, much rougher than the best covered spheres",))
             for f in good
             if f.rms > usual
         ]
@@ -324,8 +325,8 @@ def _sphere(fit: SphereFit, worth: CentreUncertainty) -> MeshSphere:
 
 
 def _describe(fit: SphereFit) -> str:
-    x, y, z = fit.centre * 1e3
-    return f"({x:.1f}, {y:.1f}, {z:.1f}) mm coverage {fit.coverage:.2f} rms {fit.rms * 1e3:.2f} mm"
+    x, y, z = mm(fit.centre)
+    return f"({x:.1f}, {y:.1f}, {z:.1f}) mm coverage {fit.coverage:.2f} rms {mm(fit.rms):.2f} mm"
 
 
 def _wrong_count(
@@ -335,7 +336,7 @@ def _wrong_count(
     listing = "; ".join(_describe(f) for f in found) or "none"
     almost = "; ".join(f"{_describe(c.fit)} ({', '.join(c.reasons)})" for c in refused[:_NEAR_MISSES])
     return ComputeError(
-        f"found {len(found)} spheres of radius {radius * 1e3:.2f} mm in the mesh, expected {wanted}: {listing}"
+        f"found {len(found)} spheres of radius {mm(radius):.2f} mm in the mesh, expected {wanted}: {listing}"
         + (f". Refused candidates: {almost}" if almost else ""),
         remedy="check the mesh's unit and the radius, and that every sphere was scanned over a cap of 60° at least; "
         "scan again what was refused, or give seeds",
@@ -374,9 +375,9 @@ def _at_seeds(
         accepted, refused, _ = _judge(fits, radius, limits, None)
         if not accepted:
             why = f"; {_describe(refused[0].fit)}: {', '.join(refused[0].reasons)}" if refused else ""
-            x, y, z = seed * 1e3
+            x, y, z = mm(seed)
             raise ComputeError(
-                f"no sphere of radius {radius * 1e3:.2f} mm at seed {number} ({x:.1f}, {y:.1f}, {z:.1f}) mm{why}",
+                f"no sphere of radius {mm(radius):.2f} mm at seed {number} ({x:.1f}, {y:.1f}, {z:.1f}) mm{why}",
                 remedy="give a point on the sphere or near its centre, in the mesh's frame",
             )
         best = min(accepted, key=lambda f: abs(float(np.linalg.norm(f.centre - seed)) - 0.5 * radius))

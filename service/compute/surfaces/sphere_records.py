@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from service.compute.surfaces.mesh_spheres import MeshSphere
+from service.core.units import mm
 
 
 def sphere_record(sphere: MeshSphere) -> dict[str, Any]:
@@ -14,10 +15,10 @@ def sphere_record(sphere: MeshSphere) -> dict[str, Any]:
     return {
         "centre_m": sphere.centre_m.tolist(),
         "covariance_m2": sphere.covariance.tolist(),
-        "sigma_mm": 1e3 * float(np.sqrt(np.trace(sphere.covariance))),
-        "rms_mm": 1e3 * sphere.rms_m,
-        "radius_residual_mm": 1e3 * sphere.radius_residual_m,
-        "radius_sigma_mm": 1e3 * sphere.radius_sigma_m,
+        "sigma_mm": mm(float(np.sqrt(np.trace(sphere.covariance)))),
+        "rms_mm": mm(sphere.rms_m),
+        "radius_residual_mm": mm(sphere.radius_residual_m),
+        "radius_sigma_mm": mm(sphere.radius_sigma_m),
         "coverage": sphere.coverage,
         "n_points": sphere.n,
     }
@@ -27,8 +28,8 @@ def spheres_document(spheres: tuple[MeshSphere, ...], radius_m: float) -> dict[s
     """The content of spheres.json: centres as `read_spheres_json` reads them, and under `details`, in the same order,
     what each is worth."""
     return {
-        "radius_mm": radius_m * 1e3,
-        "registration_mm": [(sphere.centre_m * 1e3).tolist() for sphere in spheres],
+        "radius_mm": mm(radius_m),
+        "registration_mm": [mm(sphere.centre_m).tolist() for sphere in spheres],
         "control_mm": [],
         "details": [sphere_record(sphere) for sphere in spheres],
     }

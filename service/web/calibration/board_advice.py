@@ -21,6 +21,7 @@ from service.core.errors import OrthocaptureError
 from service.core.geometry import Transform, inverse
 from service.core.protocol.models import Board as BoardSection
 from service.core.records.events import ViewpointCaptured
+from service.core.units import deg, metres, mm
 from service.steps.planning import known_arm
 from service.web.record.pictures import cached
 
@@ -111,7 +112,7 @@ def _advise(
         near = joints[int(np.argmin(np.linalg.norm(T_base_flange[:, :3, 3] - target[:3, 3], axis=1)))]
         return model is None or nearest_posture(model, target, near) is not None
 
-    points = Board(board.columns, board.rows, board.square_mm / 1000).points()
+    points = Board(board.columns, board.rows, metres(board.square_mm)).points()
     suggested = suggest_board_poses(
         _answer(best), T_base_flange, points, camera, corner_sigma_px=sigma_px, count=POSES, reachable=reachable
     )
@@ -122,11 +123,11 @@ def _advise(
         T_board_camera = T_board_base @ pose.T_base_camera
         away = T_board_camera[:3, 3] - middle
         axis, top = T_board_camera[:3, 2], -T_board_camera[:3, 1]
-        x, y, z = (1e3 * float(v) for v in pose.T_base_flange[:3, 3])
+        x, y, z = (mm(float(v)) for v in pose.T_base_flange[:3, 3])
         out.append(
             PoseAdvice(
-                tilt_deg=float(np.degrees(np.arccos(min(1.0, abs(float(axis[2])))))),
-                azimuth_deg=float(np.degrees(np.arctan2(away[1], away[0]))),
+                tilt_deg=deg(np.arccos(min(1.0, abs(float(axis[2]))))),
+                azimuth_deg=deg(np.arctan2(away[1], away[0])),
                 roll_deg=float(round(np.degrees(np.arctan2(top[0], -top[1])), 1)) % 360,
                 distance_m=float(np.linalg.norm(away)),
                 sigma_mm=pose.sigma_mm,

@@ -15,6 +15,7 @@ from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorAction, ViewpointCaptured
 from service.core.run.actions import refuse
 from service.core.run.state import StepState
+from service.core.units import mm, mrad
 from service.run_record import RunRecord
 from service.web.record.board_images import board_use, board_uses
 from service.web.record.images import Capture, captures_of, last_failures
@@ -242,10 +243,10 @@ def _taken(protocol: Protocol, capture: Capture) -> list[Verdict]:
         still = payload.verdicts.get("still")
         words = {None: "not judged", True: "Still", False: "Moved"}
         figures = (
-            f"σ {_small(1e3 * payload.pose_sigma_m)} mm, {_small(1e3 * payload.pose_sigma_rad)} mrad "
+            f"σ {_small(mm(payload.pose_sigma_m))} mm, {_small(mrad(payload.pose_sigma_rad))} mrad "
             f"over {payload.pose_samples} poses"
         )
-        limit = f"limit {1e3 * protocol.settle.position_peak_to_peak_m:.3g} mm peak to peak"
+        limit = f"limit {mm(protocol.settle.position_peak_to_peak_m):.3g} mm peak to peak"
         out.append(Verdict("Pose", still, words[still], figures, limit))
 
     settings = payload.verdicts.get("settings")

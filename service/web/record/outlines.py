@@ -17,6 +17,7 @@ from service.compute.markers.records import SphereOutline
 from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE
 from service.compute.registration.hypotheses import match, sightings
 from service.core.geometry import Transform, apply, inverse
+from service.core.units import metres
 from service.run_record import RunRecord
 from service.web.record.images import Capture
 from service.web.record.known_spheres import Sphere, best_registration, ct_spheres, scan_spheres
@@ -74,7 +75,7 @@ def marks_of(log: RunRecord, capture: Capture) -> tuple[DrawnOutline, ...]:
     records: Sequence[dict[str, Any]] = data["outlines"] if found.live else data.get(capture.payload.viewpoint, [])
     outlines = [outline_from_record(record, found.camera) for record in records]
     placed = _provisional(data) if found.live else found.T_camera_scan
-    named = _named(outlines, found, placed, log.protocol.spheres.radius_mm / 1000)
+    named = _named(outlines, found, placed, metres(log.protocol.spheres.radius_mm))
     return tuple(
         DrawnOutline(
             named[i].kind if i in named else "unassigned",

@@ -17,6 +17,7 @@ from service.compute.evaluation.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import ArtefactRef, ViewpointCaptured
 from service.core.results.registrations import registrations
+from service.core.units import metres, mm
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
 from service.run_record import RunRecord
 from service.web.record.images import captures_of
@@ -92,7 +93,7 @@ def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
         stations=dict.fromkeys(cameras, "")
         | {c.viewpoint: c.station for c in _all_captures(log) if c.viewpoint in cameras},
         spheres=[SceneSphere(s.label, s.kind, s.centre_m) for s in spheres],
-        radius_m=log.protocol.spheres.radius_mm / 1000,
+        radius_m=metres(log.protocol.spheres.radius_mm),
         bases=bases,
     )
     words = registered.name.replace("_", " ")
@@ -146,7 +147,7 @@ def _live(log: RunRecord) -> KnownScene | None:
         cameras={n: T_ct_base[r["station"]] @ np.array(r["T_base_camera"]) for n, r in mine.items()},
         stations=stations,
         spheres=[SceneSphere(s.label, s.kind, s.centre_m) for s in spheres],
-        radius_m=log.protocol.spheres.radius_mm / 1000,
+        radius_m=metres(log.protocol.spheres.radius_mm),
         planned=planned,
         bases=T_ct_base,
     )
@@ -231,7 +232,7 @@ def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
 def predicted_error_mm(registered: ShownRegistration, points_m: Array) -> Array:
     """Standard deviation (N,) of the place of points (N, 3) of the scan in the images, 3D."""
     placed = Alignment(np.array(registered.record["T_world_scan"]), np.array(registered.record["covariance"])[:6, :6])
-    return np.asarray(1e3 * np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2)), dtype=np.float64)
+    return np.asarray(mm(np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2))), dtype=np.float64)
 
 
 def mesh_facts(now: KnownScene, log: RunRecord, data: Path) -> MeshFacts | None:
@@ -244,7 +245,7 @@ def _surface(log: RunRecord, ref: ArtefactRef, data: Path) -> tuple[Array, NDArr
         with np.load(log.store.artefact_path(ref.sha256, verify=True), allow_pickle=False) as mesh:
             vertices, faces = mesh["vertices_m"], mesh["faces"]
         points, triangles = decimated(vertices, faces)
-        size = 1e3 * (vertices.max(axis=0) - vertices.min(axis=0))
+        size = mm(vertices.max(axis=0) - vertices.min(axis=0))
         buffer = io.BytesIO()
         facts = np.array([len(vertices), len(faces), len(triangles), *size], dtype=np.float64)
         np.savez(buffer, points=points.astype(np.float32), triangles=triangles.astype(np.int32), facts=facts)

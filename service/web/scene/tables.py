@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from service.core.geometry import Array
+from service.core.units import deg, mm
 from service.dataset.scene_view import viewing_frame
 from service.run_record import RunRecord
 from service.web.scene.data import MeshFacts, mesh_facts, predicted_error_mm, scene_of
@@ -71,14 +72,14 @@ def scene_tables(log: RunRecord, data: Path) -> SceneTables:
     rows: list[CameraRow] = []
     for poses, planned in ((now.scene.cameras, False), (now.scene.planned, True)):
         for name, T in poses.items():
-            tilt = float(np.degrees(np.arccos(np.clip(T[:3, 2] @ down, -1, 1))))
-            away = 1e3 * float(np.linalg.norm(T[:3, 3] - centre))
+            tilt = deg(np.arccos(np.clip(T[:3, 2] @ down, -1, 1)))
+            away = mm(float(np.linalg.norm(T[:3, 3] - centre)))
             rows.append(CameraRow(name, now.scene.stations.get(name, ""), _mm(T[:3, 3]), tilt, away, planned))
     stations = [
         StationRow(
             name,
             _mm(T[:3, 3]),
-            1e3 * float(np.linalg.norm(T[:3, 3] - centre)),
+            mm(float(np.linalg.norm(T[:3, 3] - centre))),
             sum(now.scene.stations.get(camera) == name for camera in now.scene.cameras),
         )
         for name, T in sorted(now.scene.bases.items())
@@ -98,5 +99,5 @@ def scene_tables(log: RunRecord, data: Path) -> SceneTables:
 
 
 def _mm(point_m: Array) -> Vector:
-    x, y, z = (1e3 * float(v) for v in point_m)
+    x, y, z = (mm(float(v)) for v in point_m)
     return x, y, z

@@ -10,6 +10,7 @@ import numpy as np
 
 from service.audit.report.blocks import Box, Drawing, Label, Line, Shape
 from service.core.geometry import Array
+from service.core.units import mm
 
 _WIDTH = 480.0
 _LEGEND = 26.0
@@ -37,7 +38,7 @@ def uncertainty_drawing(record: Mapping[str, Any], size: tuple[int, int]) -> Dra
     """Standard deviation of a projected point over the image, in micrometres at the board's distance."""
     known = record["uncertainty"]
     field = np.array(known["sigma_mm"], dtype=np.float64)
-    coarse = field[:: max(1, len(field) // 8), :: max(1, len(field[0]) // 12)] * 1e3
+    coarse = mm(field[:: max(1, len(field) // 8), :: max(1, len(field[0]) // 12)])
     shapes, height = _cells(np.log(coarse), size, lambda value: f"{math.exp(value):.2g}")
     return Drawing(
         f"Uncertainty of a projected point at {known['distance_m']:.2f} m, in µm",

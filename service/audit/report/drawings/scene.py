@@ -19,6 +19,7 @@ from service.compute.evaluation.closure import Alignment
 from service.core.errors import IntegrityError
 from service.core.geometry import Array, apply
 from service.core.text.counts import counted
+from service.core.units import metres, mm
 from service.dataset import scene_view
 from service.dataset.summary import RunSummary
 
@@ -67,14 +68,14 @@ def report_scene(summary: RunSummary, *, turning: bool) -> Scene | None:
     registered = registrations[best]
     points_m, triangles = scene_view.decimated(*summary.scan_mesh(), most=_FACES)
     placed = Alignment(np.array(registered["T_world_scan"]), np.array(registered["covariance"])[:6, :6])
-    error_mm = 1e3 * np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2))
+    error_mm = mm(np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2)))
     cameras = {name: np.array(T) for name, T in registered["T_scan_camera"].items()}
     stations = {c.viewpoint: c.station for c in summary.captures() if c.viewpoint in cameras}
     scene = scene_view.Scene(
         cameras=cameras,
         stations={name: stations.get(name, "") for name in cameras},
         spheres=[scene_view.SceneSphere(str(i), "registration", centre) for i, centre in enumerate(spheres)],
-        radius_m=summary.protocol.spheres.radius_mm / 1000,
+        radius_m=metres(summary.protocol.spheres.radius_mm),
         mesh=scene_view.SceneMesh(points_m, triangles, error_mm),
     )
     geometry = _geometry(scene)
@@ -90,8 +91,8 @@ def report_scene(summary: RunSummary, *, turning: bool) -> Scene | None:
 def _geometry(scene: scene_view.Scene) -> _Geometry:
     to_view = scene_view.viewing_frame(scene)
 
-    def mm(points_m: Array) -> NDArray[np.float32]:
-        return (1e3 * apply(to_view, np.asarray(points_m, dtype=np.float64).reshape(-1, 3))).astype(np.float32)
+    def in_view_mm(points_m: Array) -> NDArray[np.float32]:
+        return mm(apply(to_view, np.asarray(points_m, dtype=np.float64).reshape(-1, 3))).astype(np.float32)
 
     points: list[NDArray[np.float32]] = []
     triangles: list[NDArray[np.uint32]] = []
@@ -109,11 +110,11 @@ def _geometry(scene: scene_view.Scene) -> _Geometry:
         error = scene.mesh.error_mm
         error_mm = float(error.min()), float(error.max())
         share = (error - error_mm[0]) / max(error_mm[1] - error_mm[0], 1e-12)
-        add(mm(scene.mesh.points_m), scene.mesh.triangles, _viridis(share))
+        add(in_view_mm(scene.mesh.points_m), scene.mesh.triangles, _viridis(share))
     ball, faces = scene_view.unit_ball()
-    radius_mm = 1e3 * scene.radius_m
+    radius_mm = mm(scene.radius_m)
     for sphere in scene.spheres:
-        centre = mm(np.array(sphere.centre_m))[0]
+        centre = in_view_mm(np.array(sphere.centre_m))[0]
         vertices = (centre + scene_view.PROUD * radius_mm * ball).astype(np.float32)
         add(vertices, faces, _rgb(scene_view.KINDS[sphere.kind]))
         labels.append((sphere.label, centre + np.array([0, 0, 1.6 * radius_mm], np.float32)))
@@ -254,9 +255,9 @@ def _rows(scene: scene_view.Scene) -> tuple[tuple[str, ...], ...]:
     head = ("what", "name", "station", "x_mm", "y_mm", "z_mm", "axis_x", "axis_y", "axis_z")
     rows: list[tuple[str, ...]] = [head]
     for name, T in sorted(scene.cameras.items()):
-        rows.append(("camera", name, scene.stations[name], *_numbers(1e3 * T[:3, 3], 4), *_numbers(T[:3, 2], 6)))
+        rows.append(("camera", name, scene.stations[name], *_numbers(mm(T[:3, 3]), 4), *_numbers(T[:3, 2], 6)))
     for sphere in scene.spheres:
-        rows.append(("sphere", sphere.label, "", *_numbers(1e3 * np.array(sphere.centre_m), 4), "", "", ""))
+        rows.append(("sphere", sphere.label, "", *_numbers(mm(np.array(sphere.centre_m)), 4), "", "", ""))
     return tuple(rows)
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, transform
+from service.core.units import mm
 
 Pattern = Literal["checkerboard", "charuco", "circles"]
 Grey = NDArray[np.uint8]
@@ -52,7 +53,7 @@ class Board:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or not 0 < self.square_m < 10:
             raise DataError(
-                f"a board of {self.columns} × {self.rows} points {self.square_m * 1e3:g} mm apart cannot be used",
+                f"a board of {self.columns} × {self.rows} points {mm(self.square_m):g} mm apart cannot be used",
                 remedy="give its inner corners (3 × 3 at least) and the side of a square",
             )
         if self.pattern == "charuco" and not 0 < self._marker_m() < self.square_m:

@@ -27,6 +27,7 @@ from service.compute.calibration.board_poses.information import (
 from service.compute.calibration.board_poses.knowledge import BoardKnowledge
 from service.compute.calibration.intrinsics.estimate import COVERAGE_GRID, coverage_map_of
 from service.core.geometry import Array, Transform, inverse
+from service.core.units import deg, mm
 
 _CELLS = COVERAGE_GRID[0] * COVERAGE_GRID[1]
 _CELL_SHARE = 0.8  # of a cell's sides: a corner nearer to its edge may turn out to lie in the next one
@@ -165,8 +166,8 @@ def predict(taken: Taken, known: BoardKnowledge, board: Board, aims: Aims) -> Pr
     if len(boards) >= 3:
         information = hand_eye_information(taken.T_base_camera, known, board, aims.corner_sigma_px).sum(axis=0)
         covariance = inverse_of(information[None])[0]
-        sigma_mm = 1e3 * float(np.sqrt(np.trace(covariance[:3, :3])))
-        sigma_deg = float(np.degrees(np.sqrt(np.trace(covariance[3:6, 3:6]))))
+        sigma_mm = mm(float(np.sqrt(np.trace(covariance[:3, :3]))))
+        sigma_deg = deg(np.sqrt(np.trace(covariance[3:6, 3:6])))
     tilts = np.degrees(np.arccos(np.clip(np.abs(boards[:, 2, 2]), 0, 1)))
     return Prediction(
         images=len(boards),
@@ -255,4 +256,4 @@ def _spread_deg(boards: Array) -> float:
     if len(boards) < 2:
         return 0.0
     turns = Rotation.from_matrix(boards[:, :3, :3])
-    return float(np.degrees(max(float((turns[i].inv() * turns).magnitude().max()) for i in range(len(boards)))))
+    return deg(max(float((turns[i].inv() * turns).magnitude().max()) for i in range(len(boards))))

@@ -14,6 +14,7 @@ from service.compute.calibration.hand_eye.weighted import linearise
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse, look_at, transform
+from service.core.units import deg, metres, mm
 
 _TILTS_DEG = (0.0, 12.0, 25.0, 38.0, 48.0)
 _AZIMUTHS = 12
@@ -76,7 +77,7 @@ def suggest_board_poses(
     X, B = answer.T_flange_camera, answer.T_base_board
     candidates = _candidates(B, T_base_flange @ X, points_m, camera)
     noise = np.diag(
-        [max((answer.robot_noise_mm or 0.0) * 1e-3, _FLOOR_M) ** 2] * 3
+        [max(metres(answer.robot_noise_mm or 0.0), _FLOOR_M) ** 2] * 3
         + [max(np.radians(answer.robot_noise_deg or 0.0), _FLOOR_RAD) ** 2] * 3
     )
     flanges = candidates @ inverse(X)
@@ -105,7 +106,7 @@ def suggest_board_poses(
         sigma_m, sigma_rad = (
             float(np.sqrt(np.trace(part))) for part in (covariance[best, :3, :3], covariance[best, 3:, 3:])
         )
-        chosen.append(SuggestedPose(flanges[pick], candidates[pick], 1e3 * sigma_m, float(np.degrees(sigma_rad))))
+        chosen.append(SuggestedPose(flanges[pick], candidates[pick], mm(sigma_m), deg(sigma_rad)))
     return tuple(chosen)
 
 

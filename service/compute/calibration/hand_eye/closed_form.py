@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse, rotation_angle_rad, transform
+from service.core.units import deg, mm
 
 ClosedForm = Literal["park", "daniilidis", "tsai", "horaud", "andreff"]
 
@@ -78,7 +79,7 @@ def observability(hands: Array) -> tuple[float, float, float]:
     i, j = np.triu_indices(n, 1)
     relative = np.swapaxes(hands[i, :3, :3], 1, 2) @ hands[j, :3, :3]
     vectors = Rotation.from_matrix(relative).as_rotvec()
-    spread = float(np.degrees(np.linalg.norm(vectors, axis=1).max()))
+    spread = deg(np.linalg.norm(vectors, axis=1).max())
     axes = np.degrees(np.sqrt(np.maximum(np.linalg.eigvalsh(vectors.T @ vectors / len(vectors)), 0)))
     second = float(axes[1])
     if spread < _MIN_ROTATION_DEG:
@@ -153,13 +154,13 @@ def deviation(poses: Array, mean: Transform, point_m: Array | None = None) -> tu
     angle = Rotation.from_matrix(offset[:, :3, :3]).magnitude()
     point = np.zeros(3) if point_m is None else point_m
     moved = offset[:, :3, :3] @ point + offset[:, :3, 3] - point
-    return np.linalg.norm(moved, axis=1) * 1e3, np.degrees(angle)
+    return mm(np.linalg.norm(moved, axis=1)), np.degrees(angle)
 
 
 def distance(a: Transform, b: Transform) -> tuple[float, float]:
     """Between two poses, in mm and degrees."""
     offset = inverse(a) @ b
-    return float(np.linalg.norm(offset[:3, 3]) * 1e3), float(np.degrees(rotation_angle_rad(offset)))
+    return mm(float(np.linalg.norm(offset[:3, 3]))), deg(rotation_angle_rad(offset))
 
 
 def _angles(rotations: Array) -> Array:

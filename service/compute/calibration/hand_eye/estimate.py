@@ -41,6 +41,7 @@ from service.compute.calibration.hand_eye.weighted import Noise
 from service.compute.camera_covariance import CameraCovariance
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
+from service.core.units import deg, mm
 
 __all__ = [
     "BoardCorners",
@@ -257,7 +258,7 @@ def calibrate_hand_eye(
         **_quality(straight, good, method, plain, outcomes["none"][1:], point, share, bootstrap, seed),
         method=method,
         methods=methods,
-        spread_mm=max(mm for mm, _ in distances),
+        spread_mm=max(distance_mm for distance_mm, _ in distances),
         spread_deg=max(deg for _, deg in distances),
         corner_sigma_px=sigma_px,
         rotation_spread_deg=spread,
@@ -290,13 +291,13 @@ def _quality(
     return {
         "T_flange_camera": answer.T_flange_camera,
         "T_base_board": answer.T_base_board,
-        "sigma_mm": 1e3 * float(np.sqrt(np.trace(covariance[:3, :3]))),
-        "sigma_deg": float(np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))),
+        "sigma_mm": mm(float(np.sqrt(np.trace(covariance[:3, :3])))),
+        "sigma_deg": deg(np.sqrt(np.trace(covariance[3:, 3:]))),
         "covariance": covariance,
         "camera_share": share,
         "formal_covariance": None if answer.fit is None else answer.fit.covariance[:6, :6],
-        "robot_noise_mm": None if answer.noise is None else 1e3 * answer.noise.robot_m,
-        "robot_noise_deg": None if answer.noise is None else float(np.degrees(answer.noise.robot_rad)),
+        "robot_noise_mm": None if answer.noise is None else mm(answer.noise.robot_m),
+        "robot_noise_deg": None if answer.noise is None else deg(answer.noise.robot_rad),
         "residual_mm": residual[0],
         "residual_deg": residual[1],
         "held_out_mm": errors[0],

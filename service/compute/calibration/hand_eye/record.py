@@ -16,6 +16,7 @@ from service.compute.calibration.hand_eye.setup import Setup
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform
+from service.core.units import deg, mm
 
 _BESIDE = {"T_flange_camera": "T_base_camera", "T_base_board": "T_flange_board"}
 
@@ -76,8 +77,8 @@ def _answer(answer: HandEyeAnswer, images: Sequence[str]) -> dict[str, Any]:
             "mm": answer.sigma_mm,
             "deg": answer.sigma_deg,
             "covariance": answer.covariance.tolist(),
-            "camera_mm": 1e3 * float(np.sqrt(np.trace(answer.camera_share[:3, :3]))),
-            "camera_deg": float(np.degrees(np.sqrt(np.trace(answer.camera_share[3:, 3:])))),
+            "camera_mm": mm(float(np.sqrt(np.trace(answer.camera_share[:3, :3])))),
+            "camera_deg": deg(np.sqrt(np.trace(answer.camera_share[3:, 3:]))),
             "formal_covariance": None if formal is None else formal.tolist(),
         },
         "robot_noise": {"mm": answer.robot_noise_mm, "deg": answer.robot_noise_deg},

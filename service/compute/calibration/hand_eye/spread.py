@@ -15,6 +15,7 @@ from service.compute.calibration.intrinsics.adjustment import fit_pose, pose_mat
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform
+from service.core.units import metres
 
 _MIN_DISTINCT = 4  # views in a bootstrap replicate
 
@@ -87,7 +88,7 @@ def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Arra
         held_out_deg: (N,).
     """
     root = np.sqrt(len(held_out_mm))
-    least = np.array([1e-3 * np.median(held_out_mm), np.radians(np.median(held_out_deg))]) / root
+    least = np.array([metres(float(np.median(held_out_mm))), np.radians(np.median(held_out_deg))]) / root
     stated = np.sqrt([np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])])
     factor = np.repeat(np.maximum(1.0, least / np.maximum(stated, 1e-12)), 3)
     return covariance * np.outer(factor, factor)

@@ -24,6 +24,7 @@ from service.compute.calibration.intrinsics.adjustment import (
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform
+from service.core.units import deg
 
 COVERAGE_GRID = (12, 8)
 _MIN_VIEWS = 3
@@ -315,7 +316,7 @@ def _check_tilt(views: Sequence[BoardView], points: Array, size: tuple[int, int]
 
 
 def _largest_angle_deg(directions: Array) -> float:
-    return float(np.degrees(np.arccos(np.clip((directions @ directions.T).min(), -1, 1))))
+    return deg(np.arccos(np.clip((directions @ directions.T).min(), -1, 1)))
 
 
 def coverage_map_of(corners: Sequence[Array], size: tuple[int, int]) -> NDArray[np.int64]:

@@ -11,6 +11,7 @@ from service.compute.calibration.intrinsics.estimate import COVERAGE_GRID, Intri
 from service.compute.calibration.intrinsics.uncertainty import ProjectionUncertainty
 from service.compute.calibration.intrinsics.validation import CrossValidation, residual_field
 from service.core.geometry import Array
+from service.core.units import mm
 
 
 def intrinsics_record(
@@ -35,7 +36,7 @@ def intrinsics_record(
             "pattern": board.pattern,
             "columns": board.columns,
             "rows": board.rows,
-            "square_mm": board.square_m * 1e3,
+            "square_mm": mm(board.square_m),
         },
         "n_views": len(result.views),
         "images": list(names),

@@ -13,6 +13,7 @@ from service.compute.calibration.intrinsics.estimate import IntrinsicsResult
 from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Array
+from service.core.units import mm
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +129,7 @@ def uncertainty_of(
     by_point = by_pose[:, 3:].reshape(-1, 2, 3)[:, :, :2]
     inverse = np.linalg.inv(by_point)
     sigma_m = np.sqrt(np.linalg.eigvalsh(inverse @ covariance @ inverse.swapaxes(1, 2))[:, -1])
-    field_px, field_mm = sigma_px[:-1].reshape(rows, columns), sigma_m[:-1].reshape(rows, columns) * 1e3
+    field_px, field_mm = sigma_px[:-1].reshape(rows, columns), mm(sigma_m[:-1].reshape(rows, columns))
     return ProjectionUncertainty(
         distance_m=distance_m,
         pixels=grid,
@@ -137,7 +138,7 @@ def uncertainty_of(
         centre_px=float(sigma_px[-1]),
         worst_px=float(field_px.max()),
         rms_px=float(np.sqrt(np.mean(field_px**2))),
-        centre_mm=float(sigma_m[-1] * 1e3),
+        centre_mm=mm(float(sigma_m[-1])),
         worst_mm=float(field_mm.max()),
         rms_mm=float(np.sqrt(np.mean(field_mm**2))),
     )

@@ -20,6 +20,7 @@ from service.core.errors import DataError
 from service.core.geometry import Array, Transform, from_quaternion, transform
 from service.core.text.file_text import csv_rows, file_text
 from service.core.text.json_text import parse_json
+from service.core.units import metres
 
 _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UNIT = 1e-3  # how far a quaternion's length may be from 1: files with four decimals pass
@@ -361,10 +362,10 @@ def read_spheres_json(path: Path) -> SphereFile:
             rows = np.empty((0, 3))
         if rows.ndim != 2 or rows.shape[1] != 3:
             raise DataError(f"{key} is not a list of [x, y, z]", where=str(path), remedy=f"correct {key}")
-        centres.append(rows * 1e-3)
+        centres.append(metres(rows))
     if len(centres[0]) == 0:
         raise DataError("registration_mm is empty", where=str(path), remedy="give at least three spheres")
-    return SphereFile(float(radius) * 1e-3, centres[0], centres[1])
+    return SphereFile(metres(float(radius)), centres[0], centres[1])
 
 
 def _check_keys(document: Mapping[str, Any], needed: set[str], optional: set[str], path: Path) -> None:
