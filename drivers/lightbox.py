@@ -50,7 +50,7 @@ class LightboxConfig(DriverConfig):
     """The light box's section in rig.yaml."""
 
     port: str = Field(min_length=1, description="serial device, link to one, or socket://HOST:PORT")
-    baudrate: int = Field(default=115200, gt=0)
+    baudrate: int = Field(default=115200, gt=0)  # of the serial line
     timeout_s: float = Field(default=1.0, gt=0, description="longest wait for a reply; three attempts")
 
 

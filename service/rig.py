@@ -29,8 +29,8 @@ Vector3 = tuple[float, float, float]
 class StationSection(Record):
     """A place where a robot base stands; the scene as a technician measured it, in that base frame."""
 
-    robot: str
-    scene_centre_m: Vector3
+    robot: str  # name of the device that stands there
+    scene_centre_m: Vector3  # centre of the scene in this station's base frame, to a centimetre
     scene_up: Vector3 = (0.0, 0.0, 1.0)  # the only one: an arm at a wall or ceiling is not planned for
     approach_azimuth_deg: float  # direction from the scene to the base, about the base's z axis
 
@@ -38,8 +38,8 @@ class StationSection(Record):
 class PayloadSection(Record):
     """What hangs on the flange."""
 
-    mass_kg: Annotated[float, Field(gt=0, lt=50)]
-    centre_of_gravity_m: Vector3
+    mass_kg: Annotated[float, Field(gt=0, lt=50)]  # camera, lens and mount together
+    centre_of_gravity_m: Vector3  # in the flange frame
 
 
 class CollisionSection(Record):
@@ -53,25 +53,25 @@ class CollisionSection(Record):
         0.17,
     )  # along the approach, across it, up; with spheres
     camera_from_m: Vector3 = (0.0, 0.0, -0.09)  # axis of a capsule around body and lens, in the camera's frame
-    camera_to_m: Vector3 = (0.0, 0.0, 0.05)
-    camera_radius_m: Annotated[float, Field(gt=0, lt=0.3)] = 0.06
+    camera_to_m: Vector3 = (0.0, 0.0, 0.05)  # the other end of that axis
+    camera_radius_m: Annotated[float, Field(gt=0, lt=0.3)] = 0.06  # of that capsule
     margin_m: Annotated[float, Field(ge=0, lt=0.2)] = 0.01  # clearance that must stay
 
 
 class OpticsSection(Record):
     """The lens, for the depth of field."""
 
-    focal_length_mm: Annotated[float, Field(gt=0)]
-    aperture_f: Annotated[float, Field(gt=0)]
-    focus_distance_m: Annotated[float, Field(gt=0)]
+    focal_length_mm: Annotated[float, Field(gt=0)]  # as it is taped
+    aperture_f: Annotated[float, Field(gt=0)]  # as it is set
+    focus_distance_m: Annotated[float, Field(gt=0)]  # from the camera
     blur_um: Annotated[float, Field(gt=0)] = 45.0  # circle of confusion on the sensor, 12 px of 3.76 µm
 
 
 class LensSection(Record):
     """What is engraved on the lens and stated of the sensor: from this the first board images are planned."""
 
-    focal_length_mm: Annotated[float, Field(gt=0)]
-    sensor_width_mm: Annotated[float, Field(gt=0)]
+    focal_length_mm: Annotated[float, Field(gt=0)]  # engraved on the lens
+    sensor_width_mm: Annotated[float, Field(gt=0)]  # width of the sensor
     image_px: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]  # width and height of the photographs
     focus_distance_m: Annotated[float, Field(gt=0.05)] | None = None  # from the camera; None: the lens hardly extends
     tolerance: Annotated[float, Field(gt=0, lt=0.5)] = 0.025  # of the focal length, relative
@@ -86,15 +86,15 @@ class LensSection(Record):
 class TimestampSection(Record):
     """A time-stamp authority (RFC 3161) asked at the end of every run; without its answer the run ends too."""
 
-    url: Annotated[str, Field(pattern=r"^https?://")]
+    url: Annotated[str, Field(pattern=r"^https?://")]  # where the authority answers
     certificates: str  # PEM file beside the rig file: the authority's root, and those between
-    timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0
+    timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0  # for its answer
 
 
 class WebhookSection(Record):
     """An address that gets each alert as JSON. The rig file is evidence: a secret address is named, not written."""
 
-    url: Annotated[str, Field(pattern=r"^https?://")] | None = None
+    url: Annotated[str, Field(pattern=r"^https?://")] | None = None  # the address itself
     url_env: str | None = None  # environment variable that holds it
 
     @model_validator(mode="after")
@@ -107,42 +107,43 @@ class WebhookSection(Record):
 class EmailSection(Record):
     """A mail server and whom it is to tell."""
 
-    to: Annotated[tuple[str, ...], Field(min_length=1)]
-    sender: str
-    host: str
-    port: Annotated[int, Field(gt=0, lt=65536)] = 587
-    starttls: bool = True
-    user: str = ""
+    to: Annotated[tuple[str, ...], Field(min_length=1)]  # addresses
+    sender: str  # address that the mail comes from
+    host: str  # the mail server
+    port: Annotated[int, Field(gt=0, lt=65536)] = 587  # of the mail server
+    starttls: bool = True  # whether the connection is encrypted
+    user: str = ""  # name at the mail server; empty: no sign-in
     password_env: str = ""  # environment variable that holds the password
 
 
 class AlertsSection(Record):
     """Whom to tell, away from the screen, that a run has stopped, waits or has ended."""
 
-    webhook: WebhookSection | None = None
-    email: EmailSection | None = None
-    on: tuple[Literal["stopped", "waits", "ended"], ...] = ("stopped", "waits", "ended")
+    webhook: WebhookSection | None = None  # a web address to tell
+    email: EmailSection | None = None  # people to write to
+    on: tuple[Literal["stopped", "waits", "ended"], ...] = ("stopped", "waits", "ended")  # what is told
     waits_after_s: Annotated[float, Field(ge=0, le=86400)] = 30.0  # for a person, until that is told
 
 
 class SigningSection(Record):
     """What may stand for the password where a step is signed or figures are accepted; the password always may."""
 
-    pin: bool = False
+    pin: bool = False  # a PIN may
     badge: bool = False  # of a reader that types what it reads, and Enter
 
 
 class RigSection(Record):
     """The rig file."""
 
-    name: str
-    simulated: bool = False
+    name: str  # of the site or the room, as people know it
+    simulated: bool = False  # devices are simulators: everything recorded is marked so
     hands: str | None = None  # address of a simulated technician (simulated rigs only)
-    devices: dict[str, dict[str, Any]]
-    stations: dict[str, StationSection] = Field(default_factory=dict)
+    devices: dict[str, dict[str, Any]]  # by a name of your choice: robot, camera, scanner and so on; see Devices
+    stations: dict[str, StationSection] = Field(default_factory=dict)  # by the name that protocols use
+    # The camera mount's drawing: a rigid 4×4 matrix, metres; the calibration replaces it.
     T_flange_camera_nominal: tuple[tuple[float, float, float, float], ...] | None = None
-    payload: PayloadSection | None = None
-    collision: CollisionSection = CollisionSection()
+    payload: PayloadSection | None = None  # what the arm is told that it carries
+    collision: CollisionSection = CollisionSection()  # what the plan of motions keeps clear of
     optics: OpticsSection | None = None  # None: depth of field is not judged
     lens: LensSection | None = None  # needed where the software plans the board poses
     timestamp: TimestampSection | None = None  # None: nobody outside is asked
@@ -150,7 +151,7 @@ class RigSection(Record):
         None  # a file elsewhere, on a share say, that gets each line of the log of signatures
     )
     alerts: AlertsSection | None = None  # None: nobody elsewhere is told
-    signing: SigningSection = SigningSection()
+    signing: SigningSection = SigningSection()  # what may stand for a password
     imported: ImportList | None = None  # of a run that captures nothing: what was captured earlier
 
 

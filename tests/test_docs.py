@@ -6,6 +6,7 @@ import ast
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import time
@@ -19,7 +20,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from docs.generate.pages import REFERENCE, pages
+from docs.generate.measure_words import MEANINGS
+from docs.generate.pages import REFERENCE, pages, shipped_protocols
+from docs.generate.steps import all_measures
 from service.compute.poses.files.pose_files import write_camera_json, write_poses_csv
 from service.core.records.events import JobFailed
 from service.store.records import NewJob
@@ -28,10 +31,12 @@ from tests.support.bench_run import record_runs
 from tests.support.sphere_images import RADIUS_M, REGISTRATION_M, render, scene
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+HELP_TEXTS = "commands.md"  # the help of the commands, put together
 SCRIPTS = Path(sys.executable).parent
 SHELLS = ("sh", "bash", "shell", "console")
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_PATH = re.compile(r"`((?:service|drivers|simulators|protocols|bench|tests)/[\w/]*(?:\w|\.(?:py|yaml)|/))`")
 _SPAN = re.compile(r"`((?:orthocapture|make|python3?|pip|\.venv/bin/\S+) [^`]+)`")
 
 
@@ -62,12 +67,18 @@ class Site:
         )
 
 
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A data folder with a completed run and one that waits, and the name of the latter."""
+    folder = tmp_path_factory.mktemp("recorded")
+    _, begun = record_runs(folder)
+    return folder / "data", begun
+
+
 @pytest.fixture
-def site(tmp_path: Path) -> Site:
-    recorded = tmp_path / "recorded"
-    recorded.mkdir()
-    _, begun = record_runs(recorded)
-    (tmp_path / "runs").symlink_to(recorded / "data")
+def site(tmp_path: Path, recorded: tuple[Path, str]) -> Site:
+    data, begun = recorded
+    shutil.copytree(data, tmp_path / "runs")
     (tmp_path / "protocols").symlink_to(ROOT / "protocols")
     (tmp_path / "scans").mkdir()
     rig = "name: a small site\ndevices:\n  scanner: {driver: scan_folder, folder: scans}\n"
@@ -210,6 +221,7 @@ RUN_ELSEWHERE = {
         "tests/test_mesh_spheres_hard.py::test_command_reads_clouds_and_writes_spheres"
     ),
     "orthocapture layout --spheres spheres.json": "tests/test_layout.py::test_command",
+    "orthocapture demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     "make demo": "tests/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
     'python -m pip install ".[fuzz]"': (
         "tests/test_torture_fuzz.py::test_every_parser_refuses_bad_input_as_people_can_understand"
@@ -224,7 +236,11 @@ RUN_ELSEWHERE = {
     **dict.fromkeys(
         (
             "make test",
+            "make test-all",
             "make lint",
+            "make docs",
+            "make reference",
+            "make lock",
             "make test-versions",
             "make torture-audit",
             "make torture-faults",
@@ -265,6 +281,21 @@ RUN_ELSEWHERE = {
     "orthocapture audit verify --signatures FILE": (
         "tests/test_signature_log.py::test_a_run_keeps_the_copy_that_its_rig_file_names"
     ),
+    "orthocapture serve --rig rig/rig.yaml --data runs": (
+        "tests/test_browser_run.py::test_a_technician_is_led_through_a_run_and_a_second_person_releases_it"
+    ),
+    "orthocapture register --images DIR --camera camera.json --poses MODEL_DIR --estimate-scale --mesh scan.ply "
+    "--radius-mm 15 --out result.json": ("tests/test_register_command.py::test_scale_of_poses_that_are_not_metric"),
+    ".venv/bin/python -m pip wheel --no-deps --no-build-isolation --wheel-dir dist .": (
+        "tests/test_package.py::test_wheel_and_sdist_hold_every_file_of_the_packages"
+    ),
+    **dict.fromkeys(
+        (
+            ".venv/bin/pytest tests/test_gate_words.py -n 0",
+            '.venv/bin/pytest -m "not slow" -k gate',
+        ),
+        "tests/test_docs.py::test_test_files_and_the_marker_are_there",
+    ),
     "orthocapture act release": "tests/test_web_held.py::test_the_buttons_ask_the_step",
     "orthocapture simulate rig --scene 7 --dir rig": (
         "tests/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
@@ -272,13 +303,15 @@ RUN_ELSEWHERE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", RUN_HERE)
 def test_the_command_works_as_it_is_written(site: Site, command: str) -> None:
     RUN_HERE[command](site, command)
 
 
 def test_every_command_of_the_documents_is_run_and_none_is_listed_in_vain() -> None:
-    written = {command for document in DOCUMENTS for command in commands_of(document.read_text(encoding="utf-8"))}
+    texts = [document.read_text(encoding="utf-8") for document in DOCUMENTS if document.name != HELP_TEXTS]
+    written = {command for text in texts for command in commands_of(text)}
     listed = {*RUN_HERE, *RUN_ELSEWHERE}
     assert written - listed == set(), "in the documents, but run by no test"
     assert listed - written == set(), "listed here, but in no document"
@@ -298,6 +331,9 @@ def test_make_targets_do_what_the_documents_say() -> None:
         ("test-all", ".venv/bin/pytest"),
         ("demo", ".venv/bin/orthocapture demo"),
         ("lint", ".venv/bin/lint-imports"),
+        ("lock", "sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt"),
+        ("docs", ".venv/bin/sphinx-build --quiet --fail-on-warning --keep-going docs build/docs"),
+        ("reference", ".venv/bin/python -m docs.generate"),
         ("test-versions", ".ci/versions"),
         ("torture-audit", ".venv/bin/python -m bench.torture.audit"),
         ("torture-crash", ".venv/bin/python -m bench.torture.crash"),
@@ -322,6 +358,45 @@ def test_commands_are_found_in_blocks_tables_and_text() -> None:
     assert commands_of(text) == ["ls -l", "find .    -name x", "make it so", "orthocapture status latest"]
 
 
+def test_test_files_and_the_marker_are_there() -> None:
+    """What the commands for a part of the tests name; they cannot be run within the tests themselves."""
+    assert (ROOT / "tests" / "test_gate_words.py").is_file()
+    assert '"slow: ' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+def test_snippets_of_python_run(site: Site) -> None:
+    snippets = [
+        block
+        for document in DOCUMENTS
+        for language, block in _FENCE.findall(document.read_text(encoding="utf-8"))
+        if language == "python"
+    ]
+    assert snippets
+    for snippet in snippets:
+        done = subprocess.run(
+            [sys.executable, "-c", snippet], cwd=site.folder, capture_output=True, text=True, timeout=60, check=False
+        )
+        assert done.returncode == 0, done.stderr
+    assert "viewpoint,sha256" in (site.folder / "captures.csv").read_text()
+
+
+def test_files_that_the_documents_name_exist() -> None:
+    for document in DOCUMENTS:
+        for path in _PATH.findall(document.read_text(encoding="utf-8")):
+            assert (ROOT / path).exists(), f"{document.name}: {path}"
+
+
+def test_every_page_is_reached_from_the_first() -> None:
+    """Sphinx says so too, but only where it is installed."""
+    listed = set(re.findall(r"^(\w+/\w+)$", (ROOT / "docs" / "index.md").read_text(encoding="utf-8"), re.MULTILINE))
+    pages_there = {
+        path.relative_to(ROOT / "docs").with_suffix("").as_posix()
+        for part in ("tutorial", "howto", "reference", "explanation")
+        for path in (ROOT / "docs" / part).glob("*.md")
+    }
+    assert pages_there == {page for page in listed if not page.startswith("decisions/")}
+
+
 # --- what is generated ------------------------------------------------------------------------------------------
 
 
@@ -329,6 +404,16 @@ def test_the_generated_documents_are_up_to_date() -> None:
     """`make reference` regenerates them."""
     for name, text in pages().items():
         assert (REFERENCE / name).read_text(encoding="utf-8") == text, f"{name}: run `make reference`"
+
+
+def test_every_key_of_a_file_and_every_measure_is_explained() -> None:
+    for name in ("protocol.md", "rig.md"):
+        keys = [
+            line for line in (REFERENCE / name).read_text(encoding="utf-8").splitlines() if line.startswith("| `")
+        ]
+        assert keys
+        assert not [line for line in keys if line.endswith("|  |")], name
+    assert all_measures(shipped_protocols()) == set(MEANINGS)
 
 
 def test_links_of_the_documents_lead_somewhere() -> None:

@@ -38,10 +38,11 @@ _NAME = re.compile(r"(?:capt_)?(?P<stem>[A-Za-z_]*?(?P<counter>\d+))(?P<suffix>\
 class GphotoConfig(DriverConfig):
     """A camera in rig.yaml: `port` is ptpip:HOST:PORT:PORT, usb:BUS,DEVICE, or empty for the only camera on USB."""
 
-    port: str = ""
+    port: str = ""  # as libgphoto2 names it; usb: is the only camera on USB
     model: str = ""  # part of the model name, to choose among several cameras on USB
+    # What the camera keeps the image on until it is fetched.
     capture_target: Literal["computer", "card", "both"] = "computer"
-    capture_timeout_s: float = 40.0
+    capture_timeout_s: float = 40.0  # from the release to the file
 
     @property
     def longest_call_s(self) -> float:

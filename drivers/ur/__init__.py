@@ -25,7 +25,7 @@ class UrConfig(DriverConfig):
     stale_after_s: float = Field(
         default=1.0, gt=0, description="age of the newest sample above which the link counts as dead"
     )
-    stop_deceleration_rad_s2: float = Field(default=2.0, gt=0)
+    stop_deceleration_rad_s2: float = Field(default=2.0, gt=0)  # with which a motion is stopped
     watchdog_s: float = Field(
         default=0.2,
         ge=0.1,

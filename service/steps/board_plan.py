@@ -39,16 +39,18 @@ _UNKNOWN_FOCAL = 0.25
 class BoardPoses(Record):
     """Board images that the software plans: how many, from where, and what they shall reach."""
 
-    station: str
-    prefix: str
-    count: Annotated[int, Field(ge=4, le=300)]
+    station: str  # where the images are taken
+    prefix: str  # of the names of the views
+    count: Annotated[int, Field(ge=4, le=300)]  # how many images
+    # Of the camera from the vertical.
     tilts_deg: tuple[Annotated[float, Field(ge=0, le=60)], ...] = PoseWishes().tilts_deg
-    rolls_deg: tuple[float, ...] = PoseWishes().rolls_deg
+    rolls_deg: tuple[float, ...] = PoseWishes().rolls_deg  # of the camera about its axis
+    # From the camera to the board.
     distances_m: tuple[Annotated[float, Field(ge=0.2, le=2)], ...] = PoseWishes().distances_m
     above_scene_m: float = 0.09  # height of the board over the scene's centre, roughly
     long_side: Literal["across", "along"] = "across"  # how the board lies, seen from the robot
     place_tolerance_mm: Annotated[float, Field(gt=0, le=100)] = 30.0  # of the board's middle
-    turn_tolerance_deg: Annotated[float, Field(gt=0, le=30)] = 10.0
+    turn_tolerance_deg: Annotated[float, Field(gt=0, le=30)] = 10.0  # of the board's turn about the vertical
     coverage: Annotated[float, Field(gt=0, le=1)] = 0.97  # of the image, as planned
     replacements: Annotated[int, Field(ge=0, le=100)] = 12  # in one attempt, for images without a board
 

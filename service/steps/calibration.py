@@ -27,7 +27,7 @@ _FEWEST_KNOWN = 3  # whole boards, before a part of one may count
 class Params(MovingParams):
     """Which board images, and what is computed from them."""
 
-    solve: tuple[Literal["intrinsics", "hand_eye"], ...]
+    solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # what is computed
     board_poses: BoardPoses | None = None  # planned by the software
     viewpoints: tuple[ViewpointSet, ...] = ()  # or: as listed here
     images_of: str | None = None  # use the images of this earlier calibration step instead of new ones

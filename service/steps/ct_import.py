@@ -17,7 +17,7 @@ class Params(Record):
     source: Literal["dicom", "mesh"] = "dicom"  # mesh: segmented elsewhere (Mimics STL)
     threshold_hu: float = -450.0  # half way between air and soft tissue or plastic: neither grows nor shrinks
     spheres: int  # registration and control spheres in the volume
-    wait_s: float = 600.0
+    wait_s: float = 600.0  # for the series to appear and be complete
 
 
 class Result(Record):

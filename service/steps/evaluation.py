@@ -16,7 +16,7 @@ from service.steps.sources import registration_ways
 class Params(Record):
     """Where the control spheres were seen and measured."""
 
-    registration: str
+    registration: str  # step whose registrations are judged
     images_of: tuple[str, ...]  # control captures
     scan: str  # the registered scan
     control_scan: str | None = None  # scan or CT that still holds the control spheres; None: spheres left out in turn

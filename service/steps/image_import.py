@@ -19,7 +19,7 @@ _KINDS = {"calibration": "board_image", "image": "image", "control_image": "cont
 class Params(Record):
     """Which of the photographs that were brought."""
 
-    photographs: PhotographRole
+    photographs: PhotographRole  # of which part of the import
 
 
 class Result(Record):

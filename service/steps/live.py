@@ -27,9 +27,10 @@ SUGGESTION = "suggested_viewpoints"  # name of the note that a retry of the step
 class CoverageRule(Record):
     """When a view counts for a point of the specimen's surface."""
 
-    min_views: Annotated[int, Field(ge=1)] = 2
+    min_views: Annotated[int, Field(ge=1)] = 2  # that must see the point
+    # Between the viewing ray and the normal of the surface.
     max_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 65.0
-    max_distance_m: Annotated[float, Field(gt=0)] = 1.0
+    max_distance_m: Annotated[float, Field(gt=0)] = 1.0  # from the camera
 
 
 class Live(Record):
@@ -43,8 +44,8 @@ class Live(Record):
     # Scatter of the camera's poses before any image tells; without them what the hand-eye calibration's held-out
     # views show.
     arm_sigma_mm: Annotated[float, Field(gt=0)] | None = None
-    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None
-    coverage: CoverageRule = CoverageRule()
+    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # of the camera's rotation
+    coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
     wait_s: Annotated[float, Field(ge=0)] = 60.0  # at the end of the step, for images still being looked at
 
 

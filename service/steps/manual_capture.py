@@ -30,11 +30,11 @@ class Ring(Record):
     Azimuth 0 is the person's side at the first image, positive to the right; a range of 360° is a whole ring.
     """
 
-    tilt_deg: Annotated[float, Field(ge=0, le=60)]
-    azimuth_from_deg: float = -180.0
-    azimuth_to_deg: float = 180.0
-    count: Annotated[int, Field(ge=1, le=60)]
-    distance_m: Annotated[float, Field(ge=0.2, le=2)]
+    tilt_deg: Annotated[float, Field(ge=0, le=60)]  # from the vertical
+    azimuth_from_deg: float = -180.0  # start of the range
+    azimuth_to_deg: float = 180.0  # end of the range
+    count: Annotated[int, Field(ge=1, le=60)]  # places on the ring
+    distance_m: Annotated[float, Field(ge=0.2, le=2)]  # from the middle of the scene
     aim_spread_m: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # to all sides of the middle, for images of the board
 
     def azimuths_deg(self) -> list[float]:
@@ -51,17 +51,17 @@ class Ring(Record):
 class Params(Record):
     """What the images are for, and from where they should be taken."""
 
-    purpose: Literal["dataset", "control", "calibration"]
-    hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]
-    prefix: str = "h_"
-    min_images: Annotated[int, Field(ge=3)] = 12
+    purpose: Literal["dataset", "control", "calibration"]  # what the images are for
+    hemisphere: Annotated[tuple[Ring, ...], Field(min_length=1)]  # from where images are to be taken
+    prefix: str = "h_"  # of the names of the views
+    min_images: Annotated[int, Field(ge=3)] = 12  # that must be usable
     max_images: Annotated[int, Field(ge=3)] = 200  # those that cannot be used included
     calibration: str | None = None  # step with the intrinsics; none for images of the board
     spheres_of: tuple[str, ...] = ()  # steps that may know the spheres, the best first: ct_import, layout_check
     sensor_width_mm: float = 35.7  # for images of the board, with the focal length of the file
-    coverage: CoverageRule = CoverageRule()
+    coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
     pose_sigma_mm: Annotated[float, Field(gt=0)] = 0.05  # what structure from motion will leave of a camera's pose
-    pose_sigma_mrad: Annotated[float, Field(gt=0)] = 0.1
+    pose_sigma_mrad: Annotated[float, Field(gt=0)] = 0.1  # of the camera's rotation
     wait_s: Annotated[float, Field(gt=0)] = 600.0  # for the next image, before the step asks what is wrong
 
 

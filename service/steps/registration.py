@@ -23,24 +23,24 @@ from service.steps.sources import DEFAULT_SOURCES, PLANNED, Source, Wanted, Ways
 class StructureFromMotion(Record):
     """How much effort structure from motion makes."""
 
-    max_image_size: int = 3200
-    max_features: int = 8000
+    max_image_size: int = 3200  # longer side that features are looked for at, px
+    max_features: int = 8000  # features of an image
     neighbours: int = 12  # pairs an image, chosen by the robot's poses
 
 
 class Params(Record):
     """Which images, which scan, which camera poses."""
 
-    images_of: tuple[str, ...]
+    images_of: tuple[str, ...]  # capture steps with the images
     control_images_of: tuple[str, ...] = ()  # these see the control spheres and are kept for the evaluation too
     calibration: str  # step with the intrinsics
     hand_eye: str | None = None  # step with T_flange_camera; None: no robot carried the camera
-    scan: str
-    poses: tuple[Source, ...] = DEFAULT_SOURCES
-    structure_from_motion: StructureFromMotion = StructureFromMotion()
+    scan: str  # step that imported the scan
+    poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
+    structure_from_motion: StructureFromMotion = StructureFromMotion()  # sizes and numbers of features
     detector: Literal["classical", "paper"] = "classical"  # "paper" searches every image whole, for comparison
     reduced: tuple[str, ...] = ()  # "1920x1080": lower resolutions, for the comparison that the paper makes
-    reduced_poses: tuple[Literal["colmap", "glomap"], ...] = ("colmap",)
+    reduced_poses: tuple[Literal["colmap", "glomap"], ...] = ("colmap",)  # sources of poses for the reduced images
 
     @field_validator("reduced")
     @classmethod

@@ -15,8 +15,8 @@ from service.steps.layouts import layout_uncertainties
 class Params(Record):
     """What the scan must hold."""
 
-    spheres: int
-    wait_s: float = 1800.0
+    spheres: int  # that the scan must hold
+    wait_s: float = 1800.0  # for the export to appear and be complete
     device: str | None = None  # name of the scanner in rig.yaml; None: the only one
     application: str | None = None  # the step whose coat is still on the specimen
     compare_with: str | None = None  # an earlier ct_import or scan_import: did the spheres move since?

@@ -9,9 +9,9 @@ from service.steps.context import StepContext, StepKind, StepOutcome
 class Params(Record):
     """What is applied and how long it lasts."""
 
-    product: str
-    sublimates_after_s: float
-    scan_within_s: float
+    product: str  # what is applied
+    sublimates_after_s: float  # when it is gone
+    scan_within_s: float  # latest time for the scan, counted from the application
     settle_s: float = 0.0  # wait this long before the next step
 
 

@@ -22,10 +22,10 @@ from service.steps.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints,
 class Params(MovingParams):
     """Which viewpoints, what the images are for, and what is to be known of them while they are taken."""
 
-    purpose: Literal["dataset", "control"]
-    viewpoints: tuple[ViewpointSet, ...]
-    order: Order = "as_listed"
-    live: Live | None = None
+    purpose: Literal["dataset", "control"]  # what the images are for
+    viewpoints: tuple[ViewpointSet, ...]  # from where
+    order: Order = "as_listed"  # as listed, or the shortest way
+    live: Live | None = None  # what is computed of each image while the capture goes on; without it nothing
 
 
 class Result(Record):

@@ -24,11 +24,11 @@ class Arc(Record):
     Azimuth 0 looks from the robot's side; tilt 0 looks straight down.
     """
 
-    tilt_deg: float
-    azimuth_from_deg: float
-    azimuth_to_deg: float
-    count: int
-    distance_m: float
+    tilt_deg: float  # from the vertical, 0 to 80
+    azimuth_from_deg: float  # from the side of the robot
+    azimuth_to_deg: float  # end of the range
+    count: int  # viewpoints on the arc
+    distance_m: float  # from the point that is aimed at, 0.2 to 2
 
     @model_validator(mode="after")
     def _plausible(self) -> Self:
@@ -40,9 +40,9 @@ class Arc(Record):
 class ViewpointSet(Record):
     """Arcs seen from one station, and how the camera is turned and aimed."""
 
-    station: str
-    prefix: str
-    arcs: tuple[Arc, ...]
+    station: str  # name in the rig file
+    prefix: str  # of the names of the viewpoints
+    arcs: tuple[Arc, ...]  # where the viewpoints lie
     rolls_deg: tuple[float, ...] = (0.0,)  # cycled over the viewpoints
     aim_spread_m: float = 0.0  # spread of the aim point around the scene centre (for board images)
     aim_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the aim point, in the base frame

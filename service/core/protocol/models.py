@@ -69,9 +69,9 @@ Exposure = Annotated[
 class Spheres(Record):
     """The reference spheres on and around the specimen."""
 
-    radius_mm: Positive
+    radius_mm: Positive  # of each sphere
     registration: Annotated[int, Field(ge=4)]  # how many
-    control: Annotated[int, Field(ge=0)] = 0
+    control: Annotated[int, Field(ge=0)] = 0  # how many control spheres; they take no part in the registration
     # Where it is not told, the detector learns it from the clearest spheres of each image.
     colour: Annotated[str, Field(pattern=r"^(white|grey|green|orange|#[0-9a-fA-F]{6})$")] | None = None
 
@@ -79,38 +79,38 @@ class Spheres(Record):
 class Board(Record):
     """The calibration checkerboard, counted in inner corners."""
 
-    columns: Annotated[int, Field(ge=3)]
-    rows: Annotated[int, Field(ge=3)]
-    square_mm: Positive
+    columns: Annotated[int, Field(ge=3)]  # inner corners in a row
+    rows: Annotated[int, Field(ge=3)]  # inner corners in a column
+    square_mm: Positive  # side of a square
 
 
 class CameraSection(Record):
     """The camera settings that stay fixed through the run."""
 
-    aperture_f: Positive
-    exposure_s: Exposure
-    iso: Annotated[int, Field(gt=0)]
-    focus_mode: Text = "Manual"
-    image_quality: Literal["JPEG", "RAW", "RAW+JPEG"] = "JPEG"
+    aperture_f: Positive  # f-number
+    exposure_s: Exposure  # seconds, or a fraction such as 1/15
+    iso: Annotated[int, Field(gt=0)]  # sensitivity
+    focus_mode: Text = "Manual"  # as the camera names it
+    image_quality: Literal["JPEG", "RAW", "RAW+JPEG"] = "JPEG"  # what the camera writes
 
 
 class Motion(Record):
     """How the arm moves between viewpoints."""
 
-    speed_rad_s: Positive = 0.5
-    acceleration_rad_s2: Positive = 0.5
+    speed_rad_s: Positive = 0.5  # of the fastest joint
+    acceleration_rad_s2: Positive = 0.5  # of the fastest joint
     dwell_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5  # after standing still, before the exposure
 
 
 class Settle(Record):
     """When the arm counts as standing still, and how long to wait for it."""
 
-    window_s: Positive = 0.5
-    joint_speed_rad_s: Positive = 0.001
-    tcp_speed_m_s: Positive = 0.0002
-    position_peak_to_peak_m: Positive = 0.00002
-    rotation_peak_to_peak_rad: Positive = 0.0000873
-    timeout_s: Positive = 20.0
+    window_s: Positive = 0.5  # over which all limits must hold
+    joint_speed_rad_s: Positive = 0.001  # most of any joint
+    tcp_speed_m_s: Positive = 0.0002  # most of the flange
+    position_peak_to_peak_m: Positive = 0.00002  # range of the flange's position within the window
+    rotation_peak_to_peak_rad: Positive = 0.0000873  # range of the flange's rotation within the window
+    timeout_s: Positive = 20.0  # then the viewpoint fails
 
 
 # Who may accept a gate outside its limits; `another_supervisor`: who neither began the run nor confirmed the step.
@@ -120,11 +120,11 @@ AcceptedBy = Literal["supervisor", "another_supervisor"]
 class Gate(Record):
     """A measured number and its limits; a step passes only within all of them, or as somebody accepts it."""
 
-    measure: Text
-    min: Finite | None = None
-    max: Finite | None = None
-    unit: str = ""
-    why: str = ""
+    measure: Text  # name of a number that the step measures
+    min: Finite | None = None  # least value that passes
+    max: Finite | None = None  # greatest value that passes
+    unit: str = ""  # of the limits; checked against the unit of the measure
+    why: str = ""  # the reason for the limit, for people
     unless_skipped: str | None = None  # the earlier step without which there is no such number; skipped: no such gate
     accept_by: AcceptedBy | None = None  # None: nobody may; see service.core.gates.acceptance
 
@@ -134,33 +134,33 @@ class Recovery(Record):
 
     retries: Annotated[int, Field(ge=0, le=20)] = 2  # of passing troubles of a device, without progress in between
     wait_s: Annotated[float, Field(ge=0, le=600)] = 1.0  # before a retry
-    on_failure: Literal["ask", "abort"] = "ask"
+    on_failure: Literal["ask", "abort"] = "ask"  # when no retry is left: ask a person, or end the run
 
 
 class HandAction(Record):
     """What the technician's hands do when confirming this step; a simulated rig does it by itself."""
 
-    action: Text
-    station: str | None = None
+    action: Text  # what the simulator is asked to do
+    station: str | None = None  # where
 
 
 class StepFields(Record):
     """Everything of a step but its params."""
 
-    id: StepId
-    kind: Text
-    title: Text
-    why: str = ""
-    instructions: str = ""
+    id: StepId  # name in the record, unique in the protocol
+    kind: Text  # what the step does: one of the step kinds
+    title: Text  # what people read
+    why: str = ""  # the reason, for the technician
+    instructions: str = ""  # what the technician is to do
     drawing: str = ""  # of service/web/run/drawings, beside the instructions; "": as the kind of step suggests
-    checklist: tuple[Text, ...] = ()
-    gates: tuple[Gate, ...] = ()
-    sign: bool = False
-    confirm: bool = True
-    skippable: bool = False
-    irreversible: bool = False
-    requires: tuple[str, ...] = ()
-    recovery: Recovery = Recovery()
+    checklist: tuple[Text, ...] = ()  # items to tick before the step can be confirmed
+    gates: tuple[Gate, ...] = ()  # measured numbers with their limits
+    sign: bool = False  # whether a person signs before the step passes
+    confirm: bool = True  # whether a person starts it; a step that moves the robot always waits for one
+    skippable: bool = False  # whether a person may skip it, with a reason
+    irreversible: bool = False  # whether nothing before it can be done again afterwards
+    requires: tuple[str, ...] = ()  # earlier steps that must not have been skipped
+    recovery: Recovery = Recovery()  # what happens when the work fails
     simulated_hands: tuple[HandAction, ...] = ()  # without effect on a real rig
 
 
@@ -198,15 +198,15 @@ class Step(StepFields):
 class ProtocolFields(Record):
     """Everything of a protocol but its steps."""
 
-    id: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
-    version: Text
-    title: Text
-    source: str = ""
-    spheres: Spheres
-    board: Board | None = None
+    id: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]  # name in the record and on the pages
+    version: Text  # changes with the content
+    title: Text  # what people read
+    source: str = ""  # where the procedure comes from
+    spheres: Spheres  # radius and number of the spheres
+    board: Board | None = None  # the calibration board; needed by a step that calibrates
     camera: CameraSection | None = None  # None: no settings are demanded, and no step of the protocol sets a camera
-    motion: Motion = Motion()
-    settle: Settle = Settle()
+    motion: Motion = Motion()  # speed and acceleration of the arm
+    settle: Settle = Settle()  # when the arm counts as standing still
     # Whether a person who took no part in the run must release it before anything of it is exported.
     release: Literal["none", "second_person"] = "none"
     reasons: Reasons = Reasons()  # offered where a redo, a skip or an acceptance asks for one

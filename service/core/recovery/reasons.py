@@ -14,6 +14,7 @@ _Text = Annotated[str, Field(min_length=3, max_length=200)]
 class Reasons(Record):
     """Of a protocol, by what is done; free words beside them are always possible. What is recorded is the text."""
 
+    # Offered for a redo.
     redo: tuple[_Text, ...] = (
         "Images are blurred or badly lit",
         "The specimen, the board or a sphere has moved",
@@ -21,12 +22,14 @@ class Reasons(Record):
         "A device gave a wrong or incomplete result",
         "Confirmed by mistake, or before everything was ready",
     )
+    # Offered for a skip.
     skip: tuple[_Text, ...] = (
         "Not part of this acquisition",
         "A device is out of order",
         "Done already, outside of this run",
         "No time is left for it",
     )
+    # Offered where figures outside their limits are accepted.
     accept: tuple[_Text, ...] = (
         "Only just outside; enough for the purpose of this run",
         "Another figure shows that the result can be used",

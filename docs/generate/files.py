@@ -1,0 +1,71 @@
+"""The pages of the two files that people write: a protocol and a rig."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+
+from pydantic import BaseModel
+
+from docs.generate.fields import docstring, field_table, records_below
+from drivers.plugin import DriverSpec
+from service.core.protocol.models import ProtocolFields, StepFields
+from service.rig import RigSection
+
+_MADE = "Made from the code by `make reference`."
+_NOT_WRITTEN = ("imported",)  # by the program alone, in the record of an import
+
+
+def protocol_text() -> str:
+    """Every key of a protocol file but the `params` of its steps, which are as their kind says."""
+    return _page(
+        "The protocol file",
+        "A lab procedure in YAML: how the scene is made up, how the arm moves, and the steps in their order. "
+        "`orthocapture protocol check protocols/exvivo_spine.yaml` says all that is wrong with one, by line and "
+        "field; editors check it with `protocol.schema.json` beside this page. What stands under `params` of a step, "
+        "and what its gates can measure, depends on its kind: [Step kinds](steps.md).",
+        {"The file": ProtocolFields, "A step": StepFields},
+        {"The file": ["Besides, `steps`: a list of at least one step, as below.", ""]},
+    )
+
+
+def rig_text() -> str:
+    """Every key of a rig file; the keys of a device are its driver's."""
+    return (
+        _page(
+            "The rig file",
+            "Devices and stations of one site in YAML. `orthocapture doctor --rig rig.yaml` says what is wrong with "
+            "it and with the devices. How one is written: [Your own hardware](../howto/your_hardware.md).",
+            {"The file": RigSection},
+            {},
+        )
+        + _devices()
+    )
+
+
+def _devices() -> str:
+    """A table for each driver that is installed."""
+    lines = [
+        "## Devices",
+        "",
+        "Under `devices` each device has a name, and beneath it `driver` and the keys of that driver. A driver of "
+        "your own: [A new driver](../howto/new_driver.md).",
+        "",
+    ]
+    for point in sorted(entry_points(group="orthocapture.drivers"), key=lambda point: point.name):
+        spec: DriverSpec = point.load()
+        if point.value.startswith("drivers."):
+            lines += [f"### {point.name}", "", f"A device of kind {spec.kind}. {docstring(spec.config)}", ""]
+            lines += [*field_table(spec.config), ""]
+    return "\n".join(lines)
+
+
+def _page(title: str, about: str, models: dict[str, type[BaseModel]], more: dict[str, list[str]]) -> str:
+    lines = [f"# {title}", "", _MADE, "", about, ""]
+    below: dict[str, type[BaseModel]] = {}
+    for heading, model in models.items():
+        lines += [f"## {heading}", "", docstring(model), "", *field_table(model, without=_NOT_WRITTEN), ""]
+        lines += more.get(heading, [])
+        records_below(model, below, without=_NOT_WRITTEN)
+    for name, model in below.items():
+        lines += [f"## {name}", "", docstring(model), "", *field_table(model), ""]
+    return "\n".join(lines)
