@@ -189,7 +189,7 @@ def test_a_secret_comes_from_the_environment(
     with pytest.raises(ConfigurationError, match="no LAB_HOOK"):
         Alarm(alerts, "run", "bench")
     monkeypatch.setenv("LAB_HOOK", "ftp://elsewhere")
-    with pytest.raises(ConfigurationError, match="no address of a webhook"):
+    with pytest.raises(ConfigurationError, match="no webhook address"):
         Alarm(alerts, "run", "bench")
     monkeypatch.setenv("LAB_HOOK", url)
     alarm = Alarm(alerts, "run", "bench")

@@ -178,9 +178,9 @@ def test_on_the_last_gigabyte_the_log_stops_with_one_line_and_the_run_goes_on(tm
         bench.must_verify()
         assert len(bench.captured()) == 4
     said = lines(data)
-    stops = [number for number, line in enumerate(said) if "no more is written here" in line["event"]]
+    stops = [number for number, line in enumerate(said) if "logging stops until" in line["event"]]
     assert len(stops) == 1
-    assert [line["event"] for line in said[stops[0] + 1 :]] == ["the log goes on: there is space again", "this again"]
+    assert [line["event"] for line in said[stops[0] + 1 :]] == ["logging resumes: there is space again", "this again"]
     assert sum(line["event"] == "viewpoint_captured" for line in said) < 4
 
 

@@ -1,1 +1,1 @@
-"""What leaves the house: the report and the registered data set, made from what was recorded."""
+"""What leaves the site: the report and the registered data set, made from the recorded evidence."""

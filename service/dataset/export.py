@@ -1,4 +1,4 @@
-"""The registered data set as files: images, camera, poses and mesh in one frame, and where each came from."""
+"""The registered data set as files: images, camera, poses and mesh in one frame, with their provenance."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from service.dataset.summary import RunSummary
 def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] = ()) -> None:
     """Write images/, camera.json, poses.csv, transforms.json, mesh.ply and dataset.json into a new folder.
 
-    The common frame is that of the scan (metres): the scan is the ground truth and is not resampled.
+    The common frame is the scan's (metres): the scan is the ground truth and is not resampled.
 
     Args:
-        summary: of the run.
-        folder: to be made.
-        not_in_yet: results that had not arrived, in words.
+        summary: the run.
+        folder: created here.
+        not_in_yet: results that have not arrived yet, in words.
 
     Raises:
-        DataError: nothing was evaluated, or the folder exists.
+        DataError: the run has no evaluated registration, or the folder exists.
     """
     best = summary.best()
     if best is None:
@@ -90,7 +90,7 @@ def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] 
 
 
 def _gates(summary: RunSummary) -> dict[str, list[str]]:
-    """Every gate of every step that was judged, in words, with how it came out."""
+    """Each judged step's gates in words, with their verdicts."""
     steps = {step.id: summary.state.steps[step.id] for step in summary.protocol.steps}
     return {
         name: [

@@ -17,19 +17,19 @@ from service.core.units import metres, mm
 
 FACES_SHOWN = 60_000
 _FRUSTUM_MM = 50.0
-STYLES = (("#2f86d6", "circle"), ("#d9772b", "diamond"), ("#9a58d1", "square"))  # of cameras, by station
+STYLES = (("#2f86d6", "circle"), ("#d9772b", "diamond"), ("#9a58d1", "square"))  # camera marks, by station
 KINDS = {"registration": "#2f9e57", "sphere": "#2f9e57", "control": "#d05fa0"}
 KIND_NAMES = {"registration": "registration spheres", "control": "control spheres", "sphere": "spheres"}
-PROUD = 1.07  # times its radius: a sphere is drawn over the scanned one
+PROUD = 1.07  # times the radius, so that a drawn sphere covers the scanned one
 BAR_MM = 100.0
 _ROOM_MM = 60.0
-EYE_MM, TOWARDS_MM = (280.0, -1150.0, 850.0), (0.0, 0.0, 210.0)  # of the first view
+EYE_MM, TOWARDS_MM = (280.0, -1150.0, 850.0), (0.0, 0.0, 210.0)  # the initial view
 _ROUND, _FLAT = 10, 6  # meridians and parallels of a sphere
 
 
 @dataclass(frozen=True, slots=True)
 class SceneSphere:
-    """A sphere with the label that it has on every page."""
+    """A sphere with the label used on every page."""
 
     label: str
     kind: Literal["registration", "control", "sphere"]
@@ -38,12 +38,12 @@ class SceneSphere:
 
 @dataclass(frozen=True, slots=True)
 class SceneMesh:
-    """A surface light enough for a screen.
+    """A surface decimated for display.
 
     Attributes:
         points_m: (V, 3).
         triangles: (F, 3).
-        error_mm: (V,) predicted target registration error; None: not known.
+        error_mm: (V,) predicted target registration error; None if unknown.
     """
 
     points_m: Array = field(repr=False)
@@ -57,9 +57,9 @@ class Scene:
 
     Attributes:
         cameras: T_frame_camera by viewpoint.
-        planned: the same of viewpoints still to be taken.
-        stations: station of every viewpoint.
-        bases: T_frame_base by station, where it is known.
+        planned: T_frame_camera of the viewpoints still to be taken.
+        stations: station of each viewpoint.
+        bases: T_frame_base by station, where known.
         up: unit vector (3,).
     """
 
@@ -74,7 +74,7 @@ class Scene:
 
 
 def decimated(vertices_m: Array, faces: Any, most: int = FACES_SHOWN) -> tuple[Array, NDArray[np.int64]]:
-    """Points (V, 3) and triangles (F, 3) of at most about `most` faces."""
+    """Points (V, 3) in metres and triangles (F, 3), reduced to about `most` triangles."""
     share = 1.0 - min(1.0, most / max(len(faces), 1))
     points, triangles = np.asarray(vertices_m, dtype=np.float64), np.asarray(faces).astype(np.int64)
     if share > 0:
@@ -85,9 +85,9 @@ def decimated(vertices_m: Array, faces: Any, most: int = FACES_SHOWN) -> tuple[A
 
 
 def viewing_frame(scene: Scene) -> Transform:
-    """T_view_frame: origin amid the spheres, z up, −y towards the first station.
+    """T_view_frame: origin at the spheres' centre, z up, −y towards the first station.
 
-    A scan's frame is arbitrary: the cameras tell where up is, unless the scene says so.
+    The scan's frame is arbitrary, so the cameras define up unless the scene does.
     """
     centre = _centre(scene)
     eyes = np.array([T[:3, 3] for T in (*scene.cameras.values(), *scene.planned.values())]).reshape(-1, 3)
@@ -98,14 +98,14 @@ def viewing_frame(scene: Scene) -> Transform:
     front = near - centre
     front = _unit(front - up * float(front @ up), np.eye(3)[int(np.argmin(np.abs(up)))])
     front = _unit(front - up * float(front @ up), front)
-    rotation = np.column_stack([np.cross(front, up) * -1.0, -front, up])  # axes of the view in the frame
+    rotation = np.column_stack([np.cross(front, up) * -1.0, -front, up])  # axes of the view in the scene's frame
     return inverse(transform(rotation, centre))
 
 
 def scene_figure(scene: Scene) -> dict[str, Any]:
     """The figure as plotly's plain data, in millimetres of the viewing frame.
 
-    plotly's camera moves in a box that its axes fill: the box is made to have one unit for a metre.
+    plotly places its camera relative to the box of the axes: the box is scaled to one unit per metre.
     """
     to_view = viewing_frame(scene)
     extent = _Extent()
@@ -137,13 +137,13 @@ def scene_figure(scene: Scene) -> dict[str, Any]:
 
 
 def figure_json(figure: Mapping[str, Any]) -> str:
-    """A figure for a script element of type application/json: nothing in it can end that element."""
+    """The figure for a script element of type application/json; escaped so that it cannot close that element."""
     text = json.dumps(figure, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 class _Extent:
-    """The box around everything, mm."""
+    """The bounding box of everything drawn, mm."""
 
     def __init__(self) -> None:
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -156,7 +156,7 @@ class _Extent:
             )
 
     def ranges(self) -> list[list[float]]:
-        """Low and high end of each axis, with room for what is drawn around a point."""
+        """Low and high end of each axis, mm, with a margin for markers."""
         if not np.all(np.isfinite(self._low)):
             return [[-500.0, 500.0]] * 3
         return [[float(a) - _ROOM_MM, float(b) + _ROOM_MM] for a, b in zip(self._low, self._high, strict=True)]
@@ -188,7 +188,7 @@ def _spheres(centres: Array, spheres: Sequence[SceneSphere], radius: float) -> l
     points = (centres[:, None] + PROUD * radius * ball[None]).reshape(-1, 3)
     triangles = (np.arange(len(centres))[:, None, None] * len(ball) + faces[None]).reshape(-1, 3)
     kind = spheres[0].kind
-    # A control sphere is told by its label, C0, C1 …, not by its colour alone.
+    # Control spheres are marked by their labels (C0, C1, …) too, not by colour alone.
     return [
         {
             "type": "mesh3d",
@@ -278,12 +278,12 @@ def _layout(extent: _Extent) -> dict[str, Any]:
 
 
 def _in_box(ranges: Mapping[str, Sequence[float]], point_mm: Sequence[float]) -> dict[str, float]:
-    """Where a point of the viewing frame is for plotly's camera."""
+    """A point of the viewing frame in the coordinates of plotly's camera."""
     return {a: metres(p - sum(ends) / 2) for (a, ends), p in zip(ranges.items(), point_mm, strict=True)}
 
 
 def frustum_lines(cameras: Sequence[Transform]) -> Array:
-    """Line segments (N, 3) in mm, broken by NaN rows, of a small pyramid for each camera."""
+    """Line segments (N, 3) in mm that draw each camera as a small pyramid, separated by NaN rows."""
     w, h, z = 0.36 * _FRUSTUM_MM, 0.24 * _FRUSTUM_MM, _FRUSTUM_MM
     o, a, b, c, d = [0, 0, 0], [-w, -h, z], [w, -h, z], [w, h, z], [-w, h, z]
     path = metres(np.array([o, a, b, c, d, a, o, b, o, c, o, d], dtype=np.float64))
@@ -313,7 +313,7 @@ def _xyz(points: Array) -> dict[str, Any]:
 
 
 def _packed(values: NDArray[Any]) -> dict[str, str]:
-    """A typed array in base64, as plotly reads it."""
+    """A typed array in base64, in plotly's format."""
     kind = "f4" if values.dtype.kind == "f" else "u4"
     little = values.astype(np.dtype(f"<{kind}"))
     return {"dtype": kind, "bdata": base64.b64encode(little.tobytes()).decode()}
@@ -325,7 +325,7 @@ def _centre(scene: Scene) -> Array:
     if scene.mesh is not None:
         return scene.mesh.points_m.mean(axis=0)
     poses = [*scene.cameras.values(), *scene.planned.values()]
-    # Nothing but cameras: what they look at, about.
+    # Only cameras: the point they look at, roughly.
     return _mean(np.array([T[:3, 3] + 0.6 * T[:3, 2] for T in poses]).reshape(-1, 3))
 
 

@@ -1,4 +1,4 @@
-"""A finished (or stopped) run as the report and the data set need it, read from the evidence alone."""
+"""A finished or stopped run, as the report and the data set need it, read from the evidence alone."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from service.store.store import Store
 
 
 class ArtefactReader(Interface):
-    """Where the files of the evidence are."""
+    """Finds the files of the evidence."""
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """The read-only file of an artefact. Raises IntegrityError when missing or, with `verify`, altered."""
+        """Path of an artefact's read-only file. Raises IntegrityError if missing or, with `verify`, if altered."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """What is recorded of a run."""
+    """The record of one run."""
 
     run_id: str
     protocol: Protocol
@@ -50,50 +50,50 @@ class RunSummary:
         return last_result(self.protocol, self.state, kind)
 
     def registrations(self) -> Mapping[str, Mapping[str, Any]]:
-        """Every registration by its name, those that arrived after the step's decision included."""
+        """Registrations by name, including those that arrived after the step's decision."""
         return registrations(self.protocol, self.state)
 
     def table(self) -> Sequence[Mapping[str, Any]]:
-        """The paper's table: errors on the control spheres for each source of poses, whenever it arrived."""
+        """The paper's table: control sphere errors for each source of poses, including late arrivals."""
         return evaluated(self.protocol, self.state)
 
     def budgets(self) -> Mapping[str, Mapping[str, Any]]:
-        """The error budget of each registration that was evaluated."""
+        """The error budget of each evaluated registration."""
         return budgets(self.protocol, self.state)
 
     def best(self) -> str | None:
-        """The run's own registration: the best of those that the evaluation step judged; see core/registered.py."""
+        """Name of the run's own registration: the best that the evaluation step judged (core/registered.py)."""
         return own_registration(self.protocol, self.state)
 
     def better_later(self) -> Mapping[str, Any] | None:
-        """The row of a registration that arrived after the evaluation and is better than the run's own."""
+        """The row of a registration that arrived after the evaluation and beats the run's own, if any."""
         return better_later(self.protocol, self.state)
 
     def captures(self) -> Iterable[View]:
-        """Every valid capture, in order, calibration included."""
+        """Every valid capture in order, including those for calibration."""
         seqs = sorted(seq for step in self.state.steps.values() for seq in step.captured.values())
         payloads = (self.events[seq - 1].payload for seq in seqs)
         return (payload for payload in payloads if isinstance(payload, View))
 
     def artefacts(self, kind: str) -> tuple[ArtefactRef, ...]:
-        """Artefacts of a kind among the results of the run's valid steps."""
+        """Artefacts of a kind in the results of the run's valid steps."""
         refs = (ref for s in self.protocol.steps for ref in self.state.steps[s.id].artefacts)
         return tuple(ref for ref in refs if ref.kind == kind)
 
     def jobs(self) -> Sequence[JobFinished]:
-        """Everything that workers computed."""
+        """All finished jobs."""
         return [event.payload for event in self.events if isinstance(event.payload, JobFinished)]
 
     def scan_mesh(self) -> tuple[Array, Any]:
-        """Vertices (V, 3) in metres and faces (F, 3) of the registered scan; the last one imported."""
+        """Vertices (V, 3) in metres and faces (F, 3) of the registered scan that was imported last."""
         ref = self.artefacts("scan_mesh")[-1]
         with np.load(self.store.artefact_path(ref.sha256), allow_pickle=False) as mesh:
             return mesh["vertices_m"], mesh["faces"]
 
 
 def summarise(store: Store, run_id: str, protocol: Protocol) -> RunSummary:
-    """Read a run."""
+    """Read a run and fold its events."""
     events = store.events(run_id)
     root = events[0].payload
-    assert isinstance(root, RunStarted)  # service.run_start has read it the same way
+    assert isinstance(root, RunStarted)  # service.run_start has checked it
     return RunSummary(run_id, protocol, root, fold(protocol, events), events, store)

@@ -1,1 +1,1 @@
-"""Logs of runner, worker, web and drivers as lines of JSON: for whoever looks for a cause; no evidence."""
+"""Logs of the runner, worker, web server and drivers as JSON lines, for finding causes; they are not evidence."""

@@ -1,4 +1,4 @@
-"""A log file that several processes write: rotated by size, bounded in all, silent where the disk is nearly full."""
+"""A log file written by several processes: rotated by size, bounded in total, silent when the disk is nearly full."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from service.core.equipment.disk_space import LEAST_FREE_BYTES
 
 NAME = "orthocapture.jsonl"
 FILE_BYTES = 10_000_000
-FILES = 10  # the one that is written and those before it: 100 MB in all
-_STOPPED = "less than {:.1f} GB are free: no more is written here until there is more; the evidence goes on"
-_GOES_ON = "the log goes on: there is space again"
+FILES = 10  # the current file and the older ones: 100 MB in total
+_STOPPED = "less than {:.1f} GB are free: logging stops until there is more; the evidence is still recorded"
+_GOES_ON = "logging resumes: there is space again"
 
 
 class BoundedFile(logging.Handler):
-    """Writes lines to DATA/logs/orthocapture.jsonl; older ones are in orthocapture.1.jsonl, .2 … and then gone.
+    """Writes lines to DATA/logs/orthocapture.jsonl; older ones move to orthocapture.1.jsonl, .2 …, then go.
 
-    Nothing that goes wrong here disturbs what is logged: a line that cannot be written is lost.
+    A failure here never disturbs the process that logs: a line that cannot be written is lost.
     """
 
     def __init__(
@@ -42,9 +42,9 @@ class BoundedFile(logging.Handler):
         self._stopped = False
 
     def emit(self, record: logging.LogRecord) -> None:
-        """See logging.Handler, which holds this process' lock meanwhile."""
+        """Write one record as a line; rotate the files first if it does not fit. `logging.Handler` holds its lock."""
         if not self._data.is_dir():
-            return  # there is no data folder yet, and a log does not make one
+            return  # no data folder yet, and a log must not create one
         with contextlib.suppress(OSError):
             full = self._free_bytes(self._data) < LEAST_FREE_BYTES
             if full and self._stopped:
@@ -56,7 +56,7 @@ class BoundedFile(logging.Handler):
                 self._write(self._line(record))
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         if self._stream is not None:
             self._stream.close()
             self._stream = None
@@ -77,7 +77,7 @@ class BoundedFile(logging.Handler):
                 self._stream = None
             if self._stream is None:
                 self._stream = path.open("ab", buffering=0)
-            size = os.fstat(self._stream.fileno()).st_size  # not this process' own place in it
+            size = os.fstat(self._stream.fileno()).st_size  # other processes append too
             if size and size + len(line) > self._file_bytes:
                 self._stream.close()
                 self._rotate(path)

@@ -1,4 +1,4 @@
-"""Sends what a process logs to the data folder too, as JSON; what the terminal shows stays as it is."""
+"""Writes a process's log records to the data folder as JSON too; the terminal's output stays as it is."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from service.logs.bounded_file import BoundedFile
 from service.logs.secrets import without_secrets
 from service.logs.where import at, where_now
 
-_LONGEST = 20_000  # characters of one text: a traceback of a deep recursion must not turn the file over
-_OURS = ("service", "drivers", "orthocapture")  # other libraries speak of every move they make
-_CHILDREN = "drivers.host."  # loggers under which drivers.host passes on what a driver's own process writes
+_LONGEST = 20_000  # characters of one text: the traceback of a deep recursion must not rotate the whole log away
+_OURS = ("service", "drivers", "orthocapture")  # other libraries log too much below warnings
+_CHILDREN = "drivers.host."  # loggers with which drivers.host passes on what a driver's process logs
 
 
 @contextmanager
@@ -29,14 +29,14 @@ def file_log(
     handler: BoundedFile | None = None,
     admits: Callable[[logging.LogRecord], bool] | None = None,
 ) -> Generator[None]:
-    """Within this block what the process logs goes to `data`/logs as well: our own from INFO on, others' warnings.
+    """Within this block, also write log records to `data`/logs: ours from INFO up, other libraries' from WARNING up.
 
     Args:
-        data: the data folder; nothing is written before it is there.
-        process: runner, worker, web …, in every line.
-        run: in every line too.
-        handler: where the lines go, if not to the file of the data folder.
-        admits: what says of each message whether it goes there; all do without it.
+        data: the data folder; nothing is written until it exists.
+        process: name written in every line: runner, worker, web …
+        run: run id, also written in every line.
+        handler: replaces the data folder's file.
+        admits: decides for each record whether it is written; None: all are.
     """
     handler = handler or BoundedFile(data)
     handler.setFormatter(_formatter(process))
@@ -44,7 +44,7 @@ def file_log(
         handler.addFilter(admits)
     root = logging.getLogger()
     before = root.level
-    # What the terminal shows was chosen by this level; from now on it is theirs alone.
+    # The root level chose what the terminal shows; keep that choice on its handlers, since ours needs INFO.
     shown = [other for other in root.handlers if other.level < before]
     levels = [other.level for other in shown]
     for other in shown:
@@ -84,7 +84,7 @@ def _formatter(process: str) -> logging.Formatter:
         ],
         processors=[
             structlog.stdlib.ProcessorFormatter.remove_processors_meta,
-            structlog.processors.format_exc_info,  # without the values of variables
+            structlog.processors.format_exc_info,  # leaves out the values of variables
             _shortened,
             _scrubbed,
             structlog.processors.JSONRenderer(ensure_ascii=False),

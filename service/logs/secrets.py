@@ -1,4 +1,4 @@
-"""Takes out of a line what nobody may read in a log: passwords, PINs, tokens, set-up links, keys."""
+"""Removes secrets from log lines: passwords, PINs, tokens, set-up links and keys."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PATTERNS = (
 
 
 def without_secrets(value: Any, name: str = "") -> Any:
-    """A copy of plain data in which secrets are replaced by `[secret]`, by the names of fields and within text."""
+    """A copy of plain data with secrets replaced by `[secret]`, found by field name and by pattern within text."""
     if name and _NAME.fullmatch(name) and value not in (None, "", False, True):
         return OUT
     if isinstance(value, str):

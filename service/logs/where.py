@@ -1,7 +1,7 @@
-"""What this process works on now (run, step, viewpoint): every line of its log says it, whichever thread writes it.
+"""What this process works on now (run, step, viewpoint), added to every log line whichever thread writes it.
 
-One process drives one run or computes one job, and its drivers answer in threads of their own, which is why this
-belongs to the process and not to a thread.
+It belongs to the process, not to a thread: one process drives one run or computes one job, and its drivers answer in
+threads of their own.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ _now: Mapping[str, str] = {}
 
 
 def at(**names: str) -> None:
-    """From here on: `at(step="capture", viewpoint="v1_003")`; "" takes a name away."""
-    global _now  # noqa: PLW0603 - see above; replaced as a whole, so that no thread sees half of it
+    """Set names for all later lines, as in `at(step="capture", viewpoint="v1_003")`; "" removes a name."""
+    global _now  # noqa: PLW0603 - one per process (see above); replaced as a whole, so no thread sees half of it
     _now = {name: value for name, value in {**_now, **names}.items() if value}
 
 
 def where_now() -> Mapping[str, str]:
-    """What was said last."""
+    """The names that are set now."""
     return _now

@@ -1,1 +1,1 @@
-"""What a runner tells the screens while it works; never evidence."""
+"""What a runner shows on the screens while it works, the alerts it sends, and health checks; none of it evidence."""

@@ -1,4 +1,4 @@
-"""Tells people who are elsewhere that a run has stopped, waits or has ended: by webhook and by e-mail."""
+"""Alerts people elsewhere when a run has stopped, waits for them or has ended: by webhook and by e-mail."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from service.monitor.snapshot import Standing
 from service.rig import AlertsSection, EmailSection, Rig, WebhookSection
 
 _TIMEOUT_S = 10.0
-_TRIES_S = (0.0, 2.0, 10.0)  # pauses before each try
+_TRIES_S = (0.0, 2.0, 10.0)  # pause before each attempt
 _CLOSE_S = 15.0
 _log = logging.getLogger(__name__)
 _SUBJECT = {"waits": "waits for you", "stopped": "has stopped", "ended": "has ended"}
@@ -29,7 +29,7 @@ _SUBJECT = {"waits": "waits for you", "stopped": "has stopped", "ended": "has en
 
 @dataclass(frozen=True, slots=True)
 class Alert:
-    """What is sent. Names no person."""
+    """One alert. It names no person."""
 
     standing: Standing
     run_id: str
@@ -39,22 +39,22 @@ class Alert:
 
     @property
     def subject(self) -> str:
-        """One line."""
+        """The subject line."""
         return f"Run {self.run_id} {_SUBJECT[self.standing]}"
 
     @property
     def text(self) -> str:
-        """The whole message."""
+        """The full message."""
         return f"{self.subject}: {self.words} (rig {self.rig})"
 
 
 class Alarm:
-    """Follows how a run stands, and sends what is due in a thread of its own: no capture waits for a mail server."""
+    """Follows the state of a run and sends alerts in a thread of its own: no capture waits for a mail server."""
 
     def __init__(
         self, section: AlertsSection, run_id: str, rig: str, *, monotonic_s: Callable[[], float] = time.monotonic
     ) -> None:
-        """Raises ConfigurationError where a secret that the rig file names is not in the environment."""
+        """Raises ConfigurationError if a secret named in the rig file is missing from the environment."""
         self._section, self._run_id, self._rig, self._monotonic_s = section, run_id, rig, monotonic_s
         self._senders = _senders(section)
         self._since: tuple[tuple[str, str], float] = (("", ""), 0.0)
@@ -64,12 +64,12 @@ class Alarm:
         self._thread.start()
 
     def follow(self, standing: Standing, words: str) -> None:
-        """How the run stands now; called again and again. Waiting is told when it has lasted, the rest at once."""
+        """Report the run's current state; called repeatedly. Waiting is reported after a delay, the rest at once."""
         now = (standing, words)
         if now != self._since[0]:
             self._since = (now, self._monotonic_s())
         if standing == "works":
-            self._told = ("", "")  # the same stop once more is news
+            self._told = ("", "")  # after work has resumed, the same stop is reported again
         lasted_s = self._monotonic_s() - self._since[1]
         due_s = self._section.waits_after_s if standing == "waits" else 0.0
         if standing not in self._section.on or now == self._told or lasted_s < due_s:
@@ -78,7 +78,7 @@ class Alarm:
         self._queue.put(Alert(standing, self._run_id, self._rig, words, time.time()))
 
     def close(self) -> None:
-        """Send what is still to be sent, for some seconds at most."""
+        """Send pending alerts, for some seconds at most."""
         self._queue.put(None)
         self._thread.join(_CLOSE_S)
 
@@ -89,7 +89,7 @@ class Alarm:
 
 
 def alarm_of(rig: Rig, run_id: str) -> Alarm | None:
-    """As the rig file configures it; None: nobody elsewhere is told."""
+    """The alarm configured in the rig file; None if it has no `alerts`."""
     section = rig.section.alerts
     return None if section is None else Alarm(section, run_id, rig.section.name)
 
@@ -100,7 +100,7 @@ def _try(name: str, send: Callable[[Alert], None], alert: Alert) -> None:
         try:
             send(alert)
         except (OSError, http.client.HTTPException, smtplib.SMTPException) as error:
-            _log.warning("the alert was not taken by the %s: %s", name, error)
+            _log.warning("the %s did not accept the alert: %s", name, error)
         else:
             return
 
@@ -118,14 +118,14 @@ def _webhook(section: WebhookSection) -> Callable[[Alert], None]:
     url = section.url or _secret(section.url_env or "")
     if not url.startswith(("http://", "https://")):
         raise ConfigurationError(
-            f"{section.url_env} holds no address of a webhook",
+            f"{section.url_env} holds no webhook address",
             where="rig.yaml: alerts",
             remedy="It begins with http:// or https://",
         )
 
     def send(alert: Alert) -> None:
         body = {
-            "text": alert.text,  # what chat services show
+            "text": alert.text,  # the field that chat services show
             "run": alert.run_id, "rig": alert.rig, "standing": alert.standing, "words": alert.words,
             "at_utc_s": round(alert.at_utc_s, 3),
         }  # fmt: skip
@@ -160,8 +160,8 @@ def _secret(name: str) -> str:
     value = os.environ.get(name, "")
     if not value:
         raise ConfigurationError(
-            f"the environment has no {name}, which the rig file names for alerts",
+            f"{name}, which the rig file names for alerts, is not set in the environment",
             where="rig.yaml: alerts",
-            remedy=f"Set {name} where the server and the runs are started, or take it out of the rig file",
+            remedy=f"Set {name} where the server and the runs are started, or remove it from the rig file",
         )
     return value

@@ -1,4 +1,4 @@
-"""The figures of a data folder that whoever operates it watches, read from the record and from what processes say."""
+"""The operating figures of a data folder, read from the record and from what processes report."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from service.store.records import SITE
 from service.store.store import Store, read_open_runs
 
 CAPTURED = ("viewpoint_captured", "view_held", "view_imported")
-_LAST_CAPTURES = 21  # of which the seconds a viewpoint are the median
+_LAST_CAPTURES = 21  # used for the median time per viewpoint
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceFigures:
-    """What a run last recorded of a device."""
+    """What a run last recorded about a device."""
 
     run_id: str
     device: str  # name in rig.yaml
     kind: str  # robot, camera, …
-    answers: bool  # it was opened, and no trouble was recorded since
-    problems: int  # that its report named
+    answers: bool  # it was opened, and no fault was recorded since
+    problems: int  # named in its report
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,21 +42,21 @@ class DrivenRun:
     run_id: str
     doing: Doing
     robot: RobotPhase
-    silent_s: float  # since its runner last said anything; inf: never
-    viewpoint_s: float | None  # between the last exposures of one step, median; None: too few yet
+    silent_s: float  # since its runner last reported; inf: never
+    viewpoint_s: float | None  # median time between the last exposures of one step; None: too few yet
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """All of them, at one moment."""
+    """All figures at one moment."""
 
     runs: Mapping[str, int]  # completed, aborted, open
     driven: Sequence[DrivenRun]
-    shown: Sequence[str]  # the runs whose devices are meant: those that are driven, else the newest
-    captures: int  # photographs recorded, of all runs
+    shown: Sequence[str]  # runs whose devices are listed: the driven ones, else the newest
+    captures: int  # photographs recorded in all runs
     jobs: Mapping[tuple[str, str], int]  # kind and state
-    job_seconds: Mapping[str, tuple[int, float]]  # kind → how many were computed, and how long in all
-    queue: Mapping[str, int]  # jobs that nobody computes yet: waited (a step waits for them), background
+    job_seconds: Mapping[str, tuple[int, float]]  # kind → number of finished jobs, and their total time
+    queue: Mapping[str, int]  # open jobs that no worker has claimed: waited (a step waits for them), background
     devices: Sequence[DeviceFigures]
     workers: int
     database_bytes: int
@@ -64,7 +64,7 @@ class Figures:
 
 
 def read_figures(store: Store, data: Path, driven: Sequence[str]) -> Figures:
-    """Read them. `driven`: the runs that a process drives. Raises StoreError; OSError of the data folder's disk."""
+    """Read all figures; `driven` are the runs driven now. Raises StoreError; OSError if the disk fails."""
     with store.database.reading() as connection:
         latest = select(runs.c.run_id).where(runs.c.run_id != SITE).order_by(runs.c.created_utc.desc()).limit(1)
         shown = list(driven) or list(connection.execute(latest).scalars())
@@ -152,12 +152,12 @@ def _devices(connection: Connection, run_id: str) -> list[DeviceFigures]:
             kind = str(dict(report.get("identity") or {}).get("kind", ""))
             problems = len(report.get("problems") or ())
             devices[name] = DeviceFigures(run_id, name, kind, True, problems)
-        elif known is not None:  # the trouble of what is no device of the rig file names a step
+        elif known is not None:  # faults of anything that is not a device of the rig file name a step
             devices[name] = DeviceFigures(run_id, name, known.kind, False, known.problems)
     return list(devices.values())
 
 
 def _database_bytes(path: Path) -> int:
-    """With its write-ahead log."""
+    """Size including the write-ahead log."""
     parts = (path, path.with_name(path.name + "-wal"))
     return sum(part.stat().st_size for part in parts if part.exists())

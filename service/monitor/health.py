@@ -1,4 +1,4 @@
-"""Whether a data folder's database, disk, workers and runners live, in words."""
+"""Health of a data folder, in words: database, disk, workers and runners."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from service.monitor.snapshot import read_snapshot
 from service.monitor.worker_sign import living_workers
 from service.store.store import Store
 
-_SILENT_S = 60.0  # for which a runner does not look up from what it does; fetching one photograph takes less
+_SILENT_S = 60.0  # a runner's longest call, fetching one photograph, is shorter
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What is wrong with each part; "" for nothing."""
+    """What is wrong with each part; "" if nothing is."""
 
     database: str
     data_folder: str
@@ -30,12 +30,12 @@ class Health:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is."""
+        """Whether nothing is wrong."""
         return not (self.database or self.data_folder or self.worker or self.runners)
 
 
 def read_health(store: Store, data: Path, driven: Sequence[str]) -> Health:
-    """Look. The words name neither runs nor people nor paths: whoever asks may not be known."""
+    """Check every part. The words name no runs, people or paths, because anyone may ask."""
     try:
         with store.database.reading() as connection:
             connection.execute(text("SELECT 1 FROM heads LIMIT 1")).all()
@@ -59,10 +59,10 @@ def _data_folder(data: Path) -> str:
 def _worker(data: Path, queued: int) -> str:
     if not queued or living_workers(data):
         return ""
-    return f"{queued} jobs wait, and no worker lives"
+    return f"{queued} jobs wait, and no worker is running"
 
 
 def _runners(data: Path, driven: Sequence[str]) -> str:
     snapshots = [read_snapshot(data, run_id) for run_id in driven]
     silent = [snapshot for snapshot in snapshots if snapshot.at_utc_s and snapshot.unattended_s() > _SILENT_S]
-    return f"{len(silent)} of {len(driven)} runners have said nothing for {_SILENT_S:.0f} s" if silent else ""
+    return f"{len(silent)} of {len(driven)} runners have not reported for {_SILENT_S:.0f} s" if silent else ""

@@ -1,4 +1,4 @@
-"""Threads of the runner's process that go on telling how things stand while its main loop is in a long call."""
+"""Threads in the runner's process that keep reporting while its main loop is in a long call."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 class Heartbeat:
-    """Each work is called again and again in a thread of its own: one that waits does not hold up the others."""
+    """Calls each function repeatedly in a thread of its own, so that one that blocks does not hold up the others."""
 
     def __init__(self, *works: Callable[[], None], every_s: float = 0.5) -> None:
         self._every_s = every_s
@@ -17,12 +17,12 @@ class Heartbeat:
         ]
 
     def begin(self) -> None:
-        """From now on."""
+        """Start the threads."""
         for thread in self._threads:
             thread.start()
 
     def end(self, within_s: float = 2.0) -> None:
-        """No further call. One that waits for a device is left behind: it ends with the process."""
+        """Make no further calls. A thread blocked by a device is left behind and ends with the process."""
         self._stop.set()
         for thread in self._threads:
             if thread.ident is not None:

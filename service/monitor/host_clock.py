@@ -1,4 +1,4 @@
-"""How well this machine's clock is set: asked of chrony where it runs, else of the kernel that it would steer."""
+"""How well this machine's clock is synchronised: from chrony if it runs, otherwise from the kernel."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _SYSTEM_TIME = re.compile(r"^System time\s*:\s*([0-9.]+) seconds (fast|slow) of 
 _LEAP = re.compile(r"^Leap status\s*:\s*(.+?)\s*$", re.MULTILINE)
 _TIMEOUT_S = 3.0
 _STA_UNSYNC = 0x40
-_NOT_SET_S = 16.0  # the kernel's word for an error that nobody bounds
+_NOT_SET_S = 16.0  # the kernel's value for an unknown error
 
 
 def host_clock() -> HostClock:
-    """As it is now; what cannot be told is None. Never raises."""
+    """The clock's state now; unknown values are None. Never raises."""
     return _of_chrony() or _of_kernel()
 
 
@@ -47,7 +47,7 @@ def _of_chrony() -> HostClock | None:
 
 
 class _Timex(ctypes.Structure):
-    """The beginning of struct timex of adjtimex(2); the rest is room."""
+    """The beginning of struct timex of adjtimex(2), with padding for the rest."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -61,7 +61,7 @@ class _Timex(ctypes.Structure):
 
 
 def _of_kernel() -> HostClock:
-    """Whether something sets the clock, and the error that it states at most; not by how much it is off."""
+    """Whether the clock is synchronised, and the kernel's bound of its error; the kernel knows no offset."""
     nothing = HostClock(source="", synchronised=None, offset_s=None)
     if not sys.platform.startswith("linux"):
         return nothing

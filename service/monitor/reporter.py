@@ -1,4 +1,4 @@
-"""Gathers what the screens show of a run's devices and machine, and writes it down twice a second, come what may."""
+"""Gathers what the screens show of a run's devices and machine, and writes it to a file twice a second."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ _log = logging.getLogger(__name__)
 _EVERY_S = 0.4
 _FRAME_S = 0.3
 _LIGHT_S = 3.0
-_CAMERA_S = 30.0  # asking a camera for its battery takes time that exposures want
+_CAMERA_S = 30.0  # reading the battery takes time that exposures need
 _MESSAGES = 12
-_QUIET_S = 1.0  # of the main loop, after which the robot is watched from beside it
-_WATCHED_S = 0.3  # of the arm's stream, by which it is said to move or to stand
+_QUIET_S = 1.0  # silence of the main loop, after which the heartbeat watches the robot
+_WATCHED_S = 0.3  # length of the pose stream that shows whether the arm moves
 _STOPS: Mapping[SafetyState, RobotPhase] = {
     SafetyState.PROTECTIVE_STOP: "protective_stop",
     SafetyState.SAFEGUARD_STOP: "safeguard_stop",
@@ -59,7 +59,7 @@ _TOWER: Mapping[Standing, TowerLight] = {
 
 @dataclass(frozen=True, slots=True)
 class OpenDevices:
-    """What is open at this moment, by role and name in rig.yaml; nothing is opened for a banner's sake."""
+    """The devices open at this moment, by role and name in rig.yaml; none is opened just to be shown."""
 
     robots: Mapping[str, RobotArm] = field(default_factory=dict[str, RobotArm])
     cameras: Mapping[str, Camera] = field(default_factory=dict[str, Camera])
@@ -68,20 +68,19 @@ class OpenDevices:
 
 @dataclass
 class Reporter:
-    """Told by the runner's own thread what goes on; a heartbeat beside it keeps on saying so.
+    """Told by the runner's thread what goes on; heartbeat threads keep writing it while that thread is busy.
 
-    Devices are spoken to by the runner's thread alone, so that nothing happens behind its back, but for one question:
-    while that thread is in a call that takes its time, the pose stream is read, which keeps no watchdog happy
-    (`RobotArm.samples`). A device that does not answer becomes "unknown" on the screens; a disk that refuses the file
-    is logged. Neither disturbs the capture.
+    Only the runner's thread talks to devices, with one exception: while it is in a long call, a heartbeat thread
+    reads the pose stream, which satisfies no watchdog (`RobotArm.samples`). A device that does not answer is shown as
+    "unknown"; a failure to write the file is logged. Neither disturbs the capture.
     """
 
     data: Path
     run_id: str
     devices: Callable[[], OpenDevices]
-    camera: Callable[[], Camera]  # opens it: for the live view, which somebody asked for
+    camera: Callable[[], Camera]  # opens it, for the live view that somebody asked for
     alarm: Alarm | None = None
-    outcome: str = "its program has ended before the run has"  # what people elsewhere are told in the end
+    outcome: str = "its program ended before the run did"  # the final alert's text
     monotonic_s: Callable[[], float] = time.monotonic
     _news: tuple[Message, ...] = ()
     _progress: tuple[str, int, int] = ("", 0, 0)
@@ -90,7 +89,7 @@ class Reporter:
     _watched: tuple[float, dict[str, Any]] = (
         0.0,
         {},
-    )  # when, and how the robot stood
+    )  # time, and the robot's state then
     _writing: threading.Lock = field(default_factory=threading.Lock)
     _heartbeat: Heartbeat = field(init=False)
     _known: dict[str, Any] = field(default_factory=dict[str, Any])
@@ -100,21 +99,21 @@ class Reporter:
         self._heartbeat = Heartbeat(self.beat, self.watch)
 
     def begin(self) -> None:
-        """Tell from now on, twice a second, until `end`."""
+        """Write twice a second from now on, until `end`."""
         self._newest = self._newest.model_copy(update={"attended_utc_s": time.time()})
         self.busy("starting")
         self._heartbeat.begin()
 
     def show(self, what: str, done: int, total: int) -> None:
-        """Progress of the work under way."""
+        """Set the progress of the work under way."""
         self._progress = (what, done, total)
 
     def busy(self, what: str) -> None:
-        """The main loop is about to do this, and will not look up before it is done."""
+        """Announce a call of the main loop that may take long."""
         self._activity = (what, time.time())
 
     def tell(self, message: str) -> None:
-        """One line of news."""
+        """Add one message."""
         news = Message(at_utc=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"), text=message)
         self._news = (*self._news, news)[-_MESSAGES:]
         self._due_s.pop("snapshot", None)
@@ -122,11 +121,11 @@ class Reporter:
     def attend(
         self, doing: Doing, step: str, attempt: int, *, pedal_armed: bool = False, asks: Asks = "", words: str = ""
     ) -> None:
-        """The main loop looks up: write how things stand, if it is time again.
+        """Called by the main loop between calls: read the devices and write the snapshot if it is due.
 
         Args:
-            asks: what is asked of people now; "" for nothing.
-            words: the question, or what goes on, for people who are elsewhere.
+            asks: what people are asked for now; "" for nothing.
+            words: the question, or what goes on, for alerts.
         """
         self._activity = ("", 0.0)
         changed = (doing, step, attempt, pedal_armed, asks) != self._known.get("at")
@@ -164,7 +163,7 @@ class Reporter:
             self._frame()
 
     def beat(self) -> None:
-        """Write what is known, with the time of now."""
+        """Write the last known state with the current time."""
         (what, done, total), (activity, since_s) = self._progress, self._activity
         with self._writing:
             newest, (watched_s, robot) = self._newest, self._watched
@@ -180,7 +179,7 @@ class Reporter:
             self._write(lambda: write_snapshot(self.data, self.run_id, snapshot))
 
     def watch(self) -> None:
-        """Look at the robot from beside the main loop, while that does not look up. May wait for the robot."""
+        """Read the robot's pose stream while the main loop is in a long call. May block on the robot."""
         newest = self._newest
         if time.time() - newest.attended_utc_s < _QUIET_S or newest.doing == "ended":
             return
@@ -201,14 +200,14 @@ class Reporter:
         self._watched = (asked_s, {"robot": "not_connected"})
 
     def _elsewhere(self) -> str:
-        """How things stand, in few words, for people who are elsewhere."""
+        """The run's state in a few words, for alerts."""
         newest = self._newest
         if newest.robot in STOPS:
             return f"the robot reports: {newest.robot.replace('_', ' ')}"
         return newest.question or ("paused" if newest.doing == "paused" else newest.step)
 
     def end(self) -> None:
-        """The runner ends, whatever the reason: what is shown from now on does not come from it."""
+        """Write the final state and stop; called when the runner ends, for whatever reason."""
         step, attempt = self._known.get("at", ("", "", 0, False, ""))[1:3]
         self._tower(self.devices(), "ended")
         with self._writing:
@@ -236,7 +235,7 @@ class Reporter:
         return {"robot": "not_connected"}
 
     def _tower(self, devices: OpenDevices, standing: Standing) -> None:
-        """What is seen across the room; a box without a tower, or one that does not answer, is left alone."""
+        """Set the signal tower; a light box without one, or one that does not answer, is ignored."""
         light = _TOWER[standing]
         for box in devices.lightboxes.values():
             if light == self._known.get("tower") or self.monotonic_s() < self._due_s.get("tower", 0.0):
@@ -275,7 +274,7 @@ class Reporter:
         return self._known.get("camera", {})
 
     def _frame(self) -> None:
-        """A frame of the live view while somebody looks; only between works, when the camera is idle."""
+        """Write a frame of the live view while somebody looks; only when the camera is idle."""
         if not frames_wanted(self.data, self.run_id) or not self._due("frame", _FRAME_S):
             return
         try:
@@ -297,13 +296,13 @@ class Reporter:
         try:
             write()
         except OSError as error:
-            _log.warning("the screens cannot be told: %s", error)
+            _log.warning("the state for the screens cannot be written: %s", error)
 
 
 def _moves(robot: RobotArm) -> bool:
     try:
         return robot.is_moving()
-    except (SafetyStopError, LeaveNeededError):  # its motion was cut short, and whoever began it is told the same
+    except (SafetyStopError, LeaveNeededError):  # its motion was cut short; whoever started it gets the same error
         return False
 
 

@@ -1,4 +1,4 @@
-"""The newest word of a runner: one small file a run, replaced as a whole, read by the web process."""
+"""The latest state reported by a runner: one small file per run, replaced atomically, read by the web process."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pydantic import ValidationError
 from service.core.records.events import Record
 
 STALE_S = 5.0
-STARTING_S = 120.0  # in which a runner that was started has loaded what it needs, on a busy machine too
-LASTING_S = 1.5  # what has gone on for so long is told: shorter, a page would be redrawn for every motion
+STARTING_S = 120.0  # time to load everything when started, also on a busy machine
+LASTING_S = 1.5  # an activity is shown once it has lasted this long; otherwise every motion would redraw the page
 _QUIET_STEP_S = 5.0
 Doing = Literal["starting", "asking", "working", "pausing", "paused", "ended", "unknown"]
 Asks = Literal["", "confirm", "sign", "recovery"]
-Standing = Literal["works", "waits", "stopped", "ended"]  # for people who are elsewhere
+Standing = Literal["works", "waits", "stopped", "ended"]  # for the tower and for alerts
 RobotPhase = Literal[
     "not_connected", "standing", "moving", "protective_stop", "safeguard_stop", "emergency_stop", "fault", "unknown"
 ]
@@ -28,29 +28,29 @@ STOPS = frozenset({"protective_stop", "safeguard_stop", "emergency_stop", "fault
 
 
 class Message(Record):
-    """One line of news."""
+    """One message with its time."""
 
     at_utc: str
     text: str
 
 
 class Snapshot(Record):
-    """What a runner says of itself, its devices and its machine. What cannot be told is None, or "unknown".
+    """What a runner reports about itself, its devices and its machine. Unknown values are None or "unknown".
 
-    It comes from a thread of its own (`at_utc_s`), which also tells since when the main loop has not looked up from
-    what it does (`attended_utc_s`), what that is, and when the robot was last heard of.
+    A heartbeat thread writes it (`at_utc_s`) and states since when the main loop has been in a long call
+    (`attended_utc_s`), which call that is, and when the robot was last heard from.
     """
 
     at_utc_s: float = 0.0
-    attended_utc_s: float = 0.0  # 0: as at_utc_s
-    robot_utc_s: float = 0.0  # 0: as attended_utc_s
-    activity: str = ""  # a call of the main loop that takes its time, in words
+    attended_utc_s: float = 0.0  # 0: same as at_utc_s
+    robot_utc_s: float = 0.0  # 0: same as attended_utc_s
+    activity: str = ""  # the long call of the main loop, in words
     activity_utc_s: float = 0.0  # when it began
     pid: int = 0
     doing: Doing = "unknown"
     step: str = ""
     attempt: int = 0
-    what: str = ""  # of the work under way
+    what: str = ""  # the work that `done` and `total` count
     done: int = 0
     total: int = 0
     messages: tuple[Message, ...] = ()  # newest last
@@ -62,16 +62,16 @@ class Snapshot(Record):
     light_lux: float | None = None
     temperature_c: float | None = None
     disk_free_bytes: int | None = None
-    asks: Asks = ""  # of people, now
+    asks: Asks = ""  # what people are asked for now
     question: str = ""
-    pedal_armed: bool = False  # one press given; a second one lets the robot move
+    pedal_armed: bool = False  # pressed once; a second press lets the robot move
 
     def age_s(self) -> float:
-        """Seconds since it was written."""
+        """Seconds since it was written, by now."""
         return time.time() - self.at_utc_s
 
     def shown(self) -> tuple[object, ...]:
-        """What a screen would show differently, in steps that people see: without this, noise redraws every page."""
+        """What a screen shows, rounded to visible steps: without rounding, noise would redraw every page."""
         steps = {"light_lux": 0.05, "temperature_c": 0.2, "disk_free_bytes": 1e9, "camera_free_bytes": 1e9}
         seen: dict[str, Any] = dict(self) | {"at_utc_s": 0.0, "activity_utc_s": 0.0, "activity": self.lasting}
         seen |= {"attended_utc_s": self.quiet_s // _QUIET_STEP_S, "robot_utc_s": self.robot_silent_s > STALE_S}
@@ -81,12 +81,12 @@ class Snapshot(Record):
 
     @property
     def stale(self) -> bool:
-        """Whether it no longer tells how things stand."""
+        """Whether it is too old to tell the current state."""
         return self.age_s() > (STARTING_S if self.doing == "starting" else STALE_S)
 
     @property
     def standing(self) -> Standing:
-        """Whether the run works, waits for a person, or is stopped, as far as the runner knows."""
+        """The run's state as far as the runner knows: works, waits for a person, stopped or ended."""
         if self.doing == "ended":
             return "ended"
         if self.asks == "recovery" or self.robot in STOPS:
@@ -95,26 +95,26 @@ class Snapshot(Record):
 
     @property
     def quiet_s(self) -> float:
-        """Seconds for which the main loop had not looked up from what it does when this was written."""
+        """Seconds since the main loop's last report, when this was written."""
         return max(0.0, self.at_utc_s - self.attended_utc_s) if self.attended_utc_s else 0.0
 
     def unattended_s(self) -> float:
-        """Seconds since the main loop last looked up, by now."""
+        """Seconds since the main loop's last report, by now."""
         return time.time() - (self.attended_utc_s or self.at_utc_s)
 
     @property
     def robot_silent_s(self) -> float:
-        """Seconds for which the robot had not been heard of when this was written."""
+        """Seconds since the robot was last heard from, when this was written."""
         return max(0.0, self.at_utc_s - self.robot_utc_s) if self.robot_utc_s else self.quiet_s
 
     @property
     def lasting(self) -> str:
-        """The activity, once it has lasted long enough to be told."""
+        """The activity, once it has lasted long enough to be shown; otherwise ""."""
         return self.activity if self.activity_s >= LASTING_S else ""
 
     @property
     def activity_s(self) -> float:
-        """Seconds that the activity had taken when this was written."""
+        """Seconds that the activity had lasted when this was written."""
         return max(0.0, self.at_utc_s - self.activity_utc_s) if self.activity else 0.0
 
 
@@ -123,17 +123,17 @@ def _path(data: Path, run_id: str, suffix: str) -> Path:
 
 
 def log_path(data: Path, run_id: str) -> Path:
-    """Where the output of a run's runner goes."""
+    """Path of the file that takes the output of a run's runner."""
     return _path(data, run_id, "log")
 
 
 def write_snapshot(data: Path, run_id: str, snapshot: Snapshot) -> None:
-    """Replace the file. Not durable: after a crash it says nothing. Raises OSError."""
+    """Replace the file; not durable, since it means nothing after a crash. Raises OSError."""
     _replace(_path(data, run_id, "json"), snapshot.model_dump_json().encode())
 
 
 def read_snapshot(data: Path, run_id: str) -> Snapshot:
-    """The newest; an unknown one when there is none, or when its runner has fallen silent."""
+    """The latest snapshot; an unknown one if there is none, or if its runner has fallen silent."""
     try:
         snapshot = Snapshot.model_validate_json(_path(data, run_id, "json").read_bytes())
     except (OSError, ValidationError):
@@ -143,18 +143,18 @@ def read_snapshot(data: Path, run_id: str) -> Snapshot:
     return snapshot
 
 
-# --- live view: a frame for whoever looks, taken only while somebody does ---------------------------------------
+# --- live view: frames are taken only while somebody looks --------------------------------------------------------
 
 
 def ask_for_frames(data: Path, run_id: str) -> None:
-    """Somebody looks at the live view now. Raises OSError."""
+    """Note that somebody is looking at the live view now. Raises OSError."""
     path = _path(data, run_id, "wanted")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch()
 
 
 def frames_wanted(data: Path, run_id: str, *, within_s: float = 3.0) -> bool:
-    """Whether somebody has looked lately."""
+    """Whether somebody has looked within this time."""
     try:
         return time.time() - _path(data, run_id, "wanted").stat().st_mtime < within_s
     except OSError:
@@ -162,12 +162,12 @@ def frames_wanted(data: Path, run_id: str, *, within_s: float = 3.0) -> bool:
 
 
 def write_frame(data: Path, run_id: str, jpeg: bytes) -> None:
-    """Replace the newest frame. Raises OSError."""
+    """Replace the latest frame. Raises OSError."""
     _replace(_path(data, run_id, "jpg"), jpeg)
 
 
 def frame_path(data: Path, run_id: str) -> Path:
-    """Where the newest frame lies, if any; its time of change says how old it is."""
+    """Path of the latest frame, which may not exist; its modification time tells its age."""
     return _path(data, run_id, "jpg")
 
 

@@ -1,4 +1,4 @@
-"""That a worker lives: one small file a worker, written again every two seconds, taken away when it ends."""
+"""Signs of life of the workers: one small file each, rewritten every two seconds and removed when it ends."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 class WorkerSign(Record):
-    """What a worker says of itself."""
+    """What a worker reports about itself."""
 
     host: str
     pid: int
@@ -29,21 +29,21 @@ class WorkerSign(Record):
 
     @property
     def lives(self) -> bool:
-        """Whether it has written lately, and is not known to be dead."""
+        """Whether it reported lately and is not known to be dead."""
         if self.host == socket.gethostname() and not psutil.pid_exists(self.pid):
             return False
         return abs(time.time() - self.at_utc_s) <= _STALE_S
 
 
 class SignOfLife:
-    """The file of this process. What cannot be written is logged: it disturbs no computation."""
+    """This process's file. A failure to write is logged and disturbs no computation."""
 
     def __init__(self, data: Path) -> None:
         self._path = _folder(data) / f"{socket.gethostname()}-{os.getpid()}.json"
         self._due_s = 0.0
 
     def give(self, jobs_done: int) -> None:
-        """Write it, when it is time again."""
+        """Write it, if it is due."""
         now_s = time.monotonic()
         if now_s < self._due_s:
             return
@@ -55,16 +55,16 @@ class SignOfLife:
             part.write_text(sign.model_dump_json())
             part.replace(self._path)
         except OSError as error:
-            _log.warning("the worker cannot say that it lives: %s", error)
+            _log.warning("the worker's sign of life cannot be written: %s", error)
 
     def close(self) -> None:
-        """Take it away."""
+        """Remove it."""
         with contextlib.suppress(OSError):
             self._path.unlink(missing_ok=True)
 
 
 def living_workers(data: Path) -> list[WorkerSign]:
-    """The workers of a data folder that live, as far as is known; files of dead ones are taken away."""
+    """The workers of a data folder that are alive, as far as is known; removes the files of dead ones."""
     found: list[WorkerSign] = []
     for path in sorted(_folder(data).glob("*.json")):
         try:
