@@ -1,1 +1,1 @@
-"""Pure numerics on arrays and frozen dataclasses: detection, calibration, registration, evaluation."""
+"""Numerics on arrays and frozen dataclasses: detection, calibration, registration, evaluation."""

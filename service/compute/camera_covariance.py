@@ -1,4 +1,4 @@
-"""How well a calibrated camera is known, for what is computed with it: its error is common to all images."""
+"""The covariance of a calibrated camera, whose error is common to all images."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from service.core.text.json_text import parse_json
 
 @dataclass(frozen=True, slots=True)
 class CameraCovariance:
-    """Covariance (P, P) of parameters of a CameraModel, by name, in their units (px and 1)."""
+    """Covariance (P, P) of named parameters of a CameraModel, in their units (px and 1)."""
 
     parameters: tuple[str, ...]
     matrix: Array
 
     def deviations(self, camera: CameraModel) -> Iterator[CameraModel]:
-        """Cameras one standard deviation off along each principal axis of what is not known.
+        """Cameras displaced by one standard deviation along each principal axis of the covariance.
 
-        What they change in a result, squared and summed, is the camera's share of that result's covariance.
+        The outer products of the changes that they cause in a result add up to the camera's share of its covariance.
         """
         scale = np.sqrt(np.maximum(np.diag(self.matrix), 1e-300))
         values, axes = np.linalg.eigh(self.matrix / np.outer(scale, scale))
@@ -39,10 +39,10 @@ class CameraCovariance:
 
 
 def read_camera_covariance(path: Path) -> CameraCovariance | None:
-    """What `calibrate intrinsics` wrote of it into camera.json; None where the file says nothing.
+    """The covariance that `calibrate intrinsics` wrote into camera.json; None if the file has none.
 
     Raises:
-        DataError: the file holds no JSON, or no covariance where it says that it does.
+        DataError: the file is not JSON, or its `covariance` is malformed.
     """
     document = parse_json(file_text(path), name=str(path))
     stated: Any = cast("dict[str, Any]", document).get("covariance") if isinstance(document, dict) else None
@@ -51,7 +51,7 @@ def read_camera_covariance(path: Path) -> CameraCovariance | None:
     wrong = DataError(
         "the covariance of the camera is no square matrix of its parameters",
         where=f"{path}: covariance",
-        remedy="Calibrate again, or take the key out: the camera then counts as exactly known",
+        remedy="Calibrate again, or remove the key: the camera then counts as exactly known",
     )
     try:
         parameters = tuple(str(name) for name in stated["parameters"])

@@ -1,4 +1,4 @@
-"""The pinhole camera with OpenCV's distortion: k1, k2, p1, p2, and k3 … k6 where a calibration asks for them."""
+"""The pinhole camera with OpenCV's distortion: k1, k2, p1, p2, and k3 … k6 if a calibration estimates them."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class CameraModel:
 
     @classmethod
     def from_record(cls, record: Mapping[str, float]) -> CameraModel:
-        """The camera of a recorded result: its fields by name, the image size perhaps as floats."""
+        """The camera of a recorded result: its fields by name; the image size may be floats."""
         rest = {name: value for name, value in record.items() if name not in ("width", "height")}
         return cls(int(record["width"]), int(record["height"]), **rest)
 
     def record(self) -> dict[str, float]:
-        """The camera as `from_record` reads it; k3 … k6 only where one is not zero."""
+        """The camera as `from_record` reads it; k3 … k6 only if one of them is not zero."""
         fields = dataclasses.asdict(self)
         return {name: value for name, value in fields.items() if name not in _OPTIONAL or value != 0}
 
@@ -54,7 +54,7 @@ class CameraModel:
 
     @property
     def distortion(self) -> Array:
-        """(4,) k1, k2, p1, p2; (5,) with k3, (8,) with k3 … k6, where these are not zero."""
+        """(4,) k1, k2, p1, p2; (5,) with k3 or (8,) with k3 … k6 if these are not zero."""
         terms = np.array([self.k1, self.k2, self.p1, self.p2, self.k3, self.k4, self.k5, self.k6])
         return terms if terms[5:].any() else terms[:5] if self.k3 else terms[:4]
 
@@ -70,14 +70,14 @@ class CameraModel:
         return np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=1)
 
     def normalise(self, pixels: Array) -> Array:
-        """Undistorted normalised coordinates (N, 2), z = 1, of distorted pixels (N, 2)."""
+        """Undistorted normalised coordinates (N, 2), at z = 1, of distorted pixels (N, 2)."""
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-12)
         points = np.ascontiguousarray(pixels, dtype=np.float64).reshape(-1, 1, 2)
         out = cv2.undistortPointsIter(points, self.matrix, self.distortion, np.eye(3), np.eye(3), criteria)
         return np.asarray(out, dtype=np.float64).reshape(-1, 2)
 
     def scaled(self, width: int, height: int) -> CameraModel:
-        """The same camera at another image size; centres stay at integers, so c' = (c + ½) s − ½."""
+        """The camera at another image size; pixel centres stay at integers, so c' = (c + ½) s − ½."""
         sx, sy = width / self.width, height / self.height
         return dataclasses.replace(
             self,

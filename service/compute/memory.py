@@ -1,4 +1,4 @@
-"""How this process deals with memory that it no longer needs: it keeps it for the next array."""
+"""Makes this process keep freed memory for its next arrays."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import ctypes
 from contextlib import suppress
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of malloc.h
-_LARGEST_KEPT = 32 << 20  # the most that glibc accepts
+_LARGEST_KEPT = 32 << 20  # the largest value that glibc accepts
 _MOST_KEPT = 1 << 30
 
 
 def keep_freed_memory() -> None:
-    """Work on images makes and frees arrays of megabytes by the thousand.
+    """Keep freed memory instead of returning it to the system.
 
-    By default glibc gives each back to the system, which has to clear it anew for the next one: up to half of the
-    time. Without effect where the C library has no such setting.
+    Image processing allocates and frees thousands of arrays of several megabytes. By default glibc returns each to
+    the system, which must clear it again for the next one; that takes up to half of the time. No effect with other C
+    libraries.
     """
     with suppress(OSError, AttributeError):
         libc = ctypes.CDLL("libc.so.6")

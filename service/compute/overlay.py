@@ -1,4 +1,4 @@
-"""Pictures for the report: what was detected in an image, and what the registration predicts there."""
+"""Pictures for the report: the detected outlines in an image, and those that the registration predicts."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def draw_overlay(
     radius_m: float = 0.015,
 ) -> NDArray[np.uint8]:
     """A copy (H, W, 3) with detected outlines (green: registration, blue: control, grey: unused, red: excluded),
-    their marker numbers, and dashed in yellow the outlines that the registration predicts.
+    their sphere numbers, and the outlines that the registration predicts, dashed in yellow.
     """
     picture = image_bgr.copy()
     width = max(1, round(camera.width / 900))

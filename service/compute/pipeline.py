@@ -1,4 +1,4 @@
-"""The whole way from image files and poses to a registration and its evaluation, without a run or a store."""
+"""The whole pipeline from outlines and poses to a registration and its evaluation, without a run or a store."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from service.core.units import mm
 
 __all__ = ["Detection", "ImageDetections", "PipelineResult", "detect_all", "locate_outlines", "register_images"]
 
-CONTROL_GATE = 0.5  # of the radius: a control sphere is where the registration says, or the registration is wrong
+CONTROL_GATE = 0.5  # of the radius: if a control sphere is farther from its prediction, the registration is wrong
 CONTROL_SIZE_GATE = 0.15
 
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """One outline of one image, with what became of it."""
+    """One outline of an image and what it was used for."""
 
     outline: SphereOutline
     marker: int | None  # registration sphere, index into the list given
     control: int | None  # control sphere, index into the list given
-    rms_px: float | None  # against the prediction of the registration
-    excluded: str = ""  # the reason, when the registration left it out
+    rms_px: float | None  # distance from the outline that the registration predicts
+    excluded: str = ""  # the reason, if the registration excluded it
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class ImageDetections:
 
 @dataclass(frozen=True, slots=True)
 class PipelineResult:
-    """Everything that result.json and the report need. Errors of control spheres are None where there are none."""
+    """The results for result.json and the report. `evaluation` is None if there are no control spheres."""
 
     registration: RegistrationResult
     evaluation: Evaluation | None
@@ -57,10 +57,10 @@ class PipelineResult:
     markers: tuple[int, ...]  # registration spheres used
     assignments: tuple[Assignment, ...] = field(repr=False)
     control_assignments: tuple[Assignment, ...] = field(repr=False)
-    centre_scan_m: Array = field(repr=False)  # (3,) of the registration spheres: the scene's centre
+    centre_scan_m: Array = field(repr=False)  # (3,) mean of the registration spheres: the scene's centre
 
     def as_json(self, camera: CameraModel) -> dict[str, object]:
-        """Plain data of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
+        """The content of result.json: metres, row-major 4×4 matrices, pixels of the images as captured."""
         r = self.registration
         return {
             "T_world_scan": r.T_world_scan.tolist(),
@@ -135,28 +135,28 @@ def register_images(
     sphere_covariance_m2: Array | None = None,
     intrinsics_covariance: Array | None = None,
 ) -> PipelineResult:
-    """Identity, registration and evaluation of detected outlines.
+    """Identify, register and evaluate detected outlines.
 
     Args:
         outlines: per image, from `locate_outlines` or `detect_all`.
-        poses: (N, 4, 4) T_world_camera, or T_base_camera of each image's group.
+        poses: (N, 4, 4) T_world_camera, or T_base_camera in the base frame of each image's group.
         camera: intrinsics.
         registration_centres_m: (M, 3) in the scan frame.
-        radius_m: of all spheres.
-        control_centres_m: (C, 3) spheres that only serve the evaluation, or None.
-        groups: (N,) station of each image; None: all one.
-        estimate_scale: the poses are not metric.
-        cost: of the registration.
-        names: of the images.
-        assignments: per image, which outlines are which registration spheres, where `locate_outlines` knows it;
-            None: found here.
-        pose_covariance: of the poses, see `register`.
+        radius_m: radius of all spheres.
+        control_centres_m: (C, 3) spheres used only for the evaluation, or None.
+        groups: (N,) station of each image; None: all the same.
+        estimate_scale: whether to estimate a scale, for poses that are not metric.
+        cost: residual of the registration.
+        names: image names, for messages and results.
+        assignments: per image, which outlines are which registration spheres, if `locate_outlines` knows it; None:
+            identified here.
+        pose_covariance: of the poses, as for `register`.
         sphere_covariance_m2: (M, 3, 3) of the registration spheres; None takes them as exact.
-        intrinsics_covariance: of fx, fy, cx, cy, k1, k2, p1, p2, see `register`.
+        intrinsics_covariance: of fx, fy, cx, cy, k1, k2, p1, p2, as for `register`.
 
     Raises:
-        DataError: lengths do not agree.
-        ComputeError: too few spheres, ambiguous, or contradictory.
+        DataError: the lengths do not agree, or a pose is not finite.
+        ComputeError: too few spheres, or an ambiguous or contradictory assignment.
     """
     n = len(outlines)
     stations = np.zeros(n, dtype=np.int64) if groups is None else np.asarray(groups, dtype=np.int64)
@@ -212,7 +212,7 @@ def _find_controls(
     radius_m: float,
     camera: CameraModel,
 ) -> tuple[Assignment, ...]:
-    """Control spheres by their predicted places; outlines that serve the registration are not asked."""
+    """Match outlines not used by the registration to the control spheres' predicted positions."""
     out: list[Assignment] = []
     for i, found in enumerate(outlines):
         T = registration.T_scan_camera[i]

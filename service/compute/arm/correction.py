@@ -1,4 +1,4 @@
-"""The systematic part of an arm's error: small DH deltas and periodic gear errors, and poses corrected by them."""
+"""An arm's systematic error: small DH deltas and periodic gear errors, and the correction of poses by them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from service.core.errors import DataError
 from service.core.geometry import Array
 from service.core.units import mm
 
-HARMONICS = np.arange(1, 11)  # periods a revolution; faster ones cannot be told from noise with tens of poses
-# What arms of this kind are built to (a, d, α, θ of a joint); only the ratios matter, the scale is estimated.
+HARMONICS = np.arange(1, 11)  # periods per revolution; tens of poses cannot tell faster ones from noise
+# Usual manufacturing tolerances of a joint's a, d, α, θ; only the ratios matter, the scale is estimated.
 DH_TOLERANCE = np.array([0.2e-3, 0.2e-3, np.radians(0.015), np.radians(0.04)])
-GEAR_TOLERANCE_RAD = np.radians(0.01)  # of one harmonic
+GEAR_TOLERANCE_RAD = np.radians(0.01)  # per harmonic
 N_DH = 24
 N_GEAR = 6 * 2 * len(HARMONICS)
 _MODEL_GAP_M, _MODEL_GAP_RAD = 0.02, np.radians(3.0)
@@ -28,15 +28,15 @@ _REMEDY = "Calibrate hand and eye again"
 
 @dataclass(frozen=True, slots=True)
 class ArmCorrection:
-    """Where the flange is, beside where the controller says it is, as a function of the joints.
+    """The difference between the flange's true pose and the controller's, as a function of the joints.
 
     Attributes:
-        arm: name of the model whose nominal parameters these are added to.
+        arm: name of the arm model to whose nominal parameters these are added.
         dh_deltas: (6, 4) added to a, d (metres), α, θ (radians) of each joint.
         gear_cos_rad: (6, H) amplitudes of cos(k q), k = 1 … H, added to each joint's angle.
-        gear_sin_rad: (6, H) of sin(k q).
-        observed: (6,) share of each joint's error that the images determine, 0 … 1 (1 - posterior / prior variance,
-            over the terms in use).
+        gear_sin_rad: (6, H) amplitudes of sin(k q).
+        observed: (6,) share of each joint's error that the images determine, 0 … 1: 1 - posterior / prior variance,
+            over the terms in use.
     """
 
     arm: str
@@ -58,7 +58,7 @@ class ArmCorrection:
 
     @classmethod
     def from_json(cls, record: Mapping[str, Any]) -> ArmCorrection:
-        """What `as_json` wrote.
+        """Read a record written by `as_json`.
 
         Raises:
             DataError: a field is missing or has another shape.
@@ -79,23 +79,23 @@ class ArmCorrection:
             or found.gear_cos_rad.shape[0] != 6
             or found.gear_cos_rad.shape != found.gear_sin_rad.shape
         ):
-            raise DataError("not an arm correction: shapes do not belong together", where=_PLACE, remedy=_REMEDY)
+            raise DataError("not an arm correction: the shapes are inconsistent", where=_PLACE, remedy=_REMEDY)
         return found
 
 
 def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction: ArmCorrection) -> Array:
-    """Poses as the arm really took them: the reported ones times what the corrected model differs from the nominal.
+    """The arm's true poses: reported poses times the difference between corrected and nominal kinematics.
 
     Args:
-        joints_rad: (6,) or (N, 6), as the controller read them.
-        T_base_flange: (4, 4) or (N, 4, 4), as the controller reported them.
+        joints_rad: (6,) or (N, 6) as reported by the controller.
+        T_base_flange: (4, 4) or (N, 4, 4) as reported by the controller.
         correction: from a hand-eye calibration of the same arm.
 
     Returns:
-        poses of the shape of `T_base_flange`.
+        Corrected poses in the shape of `T_base_flange`.
 
     Raises:
-        DataError: joints and poses do not belong together, or not to this arm.
+        DataError: the numbers of joints and poses differ, or they are another arm's.
     """
     joints, poses = np.asarray(joints_rad, dtype=np.float64), np.asarray(T_base_flange, dtype=np.float64)
     if poses.ndim == 2:
@@ -117,24 +117,24 @@ def corrected_T_base_flange(joints_rad: Array, T_base_flange: Array, correction:
 
 
 def check_arm(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
-    """Refuse joints that are another arm's, or poses of a tool instead of the flange.
+    """Refuse joints of another arm, or poses of a tool instead of the flange.
 
     Raises:
-        DataError: forward kinematics and reported poses are far apart.
+        DataError: forward kinematics and reported poses are too far apart.
     """
     distance_m, angle_rad = pose_gap(arm, joints_rad, T_base_flange)
     if distance_m > _MODEL_GAP_M or angle_rad > _MODEL_GAP_RAD:
         raise DataError(
-            f"the poses are {mm(distance_m):.0f} mm and {np.degrees(angle_rad):.1f}° off what the joints of a "
-            f"{arm.name} give",
+            f"the poses are {mm(distance_m):.0f} mm and {np.degrees(angle_rad):.1f}° off the forward kinematics "
+            f"of a {arm.name}",
             remedy="check the arm's model, that the poses are the flange's (tool centre point zero), and radians",
         )
 
 
 def correction_design(arm: ArmModel, joints_rad: Array) -> Array:
-    """(N, 6, 24 + 120) derivative of the flange's pose with respect to all parameters, each over its tolerance.
+    """(N, 6, 24 + 120) derivative of the flange's pose by all parameters, each in units of its tolerance.
 
-    Columns: DH deltas joint after joint (a, d, α, θ), then for each joint cos(k q), sin(k q), k = 1 … 10.
+    Columns: DH deltas joint by joint (a, d, α, θ), then for each joint cos(k q), sin(k q), k = 1 … 10.
     """
     J = dh_jacobian(chain(arm.joint_values(joints_rad)))
     phase = joints_rad[:, :, None] * HARMONICS
@@ -145,7 +145,7 @@ def correction_design(arm: ArmModel, joints_rad: Array) -> Array:
 
 
 def correction_of(arm: ArmModel, scaled: Array, observed: Array) -> ArmCorrection:
-    """The correction of scaled parameters (24 + 120,) as `correction_design` orders them."""
+    """The correction from scaled parameters (24 + 120,) in the order of `correction_design`."""
     gears = scaled[N_DH:].reshape(6, 2, len(HARMONICS)) * GEAR_TOLERANCE_RAD
     return ArmCorrection(
         arm.name, scaled[:N_DH].reshape(6, 4) * DH_TOLERANCE, gears[:, 0].copy(), gears[:, 1].copy(), observed

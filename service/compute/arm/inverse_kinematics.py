@@ -1,4 +1,4 @@
-"""Inverse kinematics of the Universal Robots arms in closed form: all postures that reach a pose."""
+"""Closed-form inverse kinematics of the Universal Robots arms: all postures that reach a pose."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _REACH_TOLERANCE = 1e-9
 
 
 def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
-    """Joints (K, 6), K ≤ 8, within ±180°, that reach a pose; none is an empty array.
+    """Joints (K, 6), K ≤ 8, within ±180°, that reach a pose; an empty array if there are none.
 
-    Shoulder left or right, wrist up or down, elbow up or down. Where the last axis is parallel to the second, its
-    angle is free, and 0 is taken.
+    The eight are shoulder left or right, wrist up or down, elbow up or down. Where the last axis is parallel to the
+    second, its angle is free and taken as 0.
 
     Source: K. P. Hawkins, "Analytic Inverse Kinematics for the Universal Robots UR-5/UR-10 Arms", Georgia Institute
     of Technology, 2013, for the DH parameters of `ArmModel`.
@@ -53,7 +53,7 @@ def postures(arm: ArmModel, T_base_flange: Transform) -> Array:
 
 
 def nearest_posture(arm: ArmModel, T_base_flange: Transform, near_rad: Array) -> Array | None:
-    """The joints (6,) nearest to `near_rad` (6,) that reach a pose, within ±360°; None out of reach."""
+    """The joints (6,) that reach a pose and are nearest to `near_rad` (6,), within ±360°; None if out of reach."""
     found = postures(arm, T_base_flange)
     if not len(found):
         return None

@@ -12,11 +12,11 @@ from service.core.geometry import Array
 from service.core.text.file_text import csv_rows
 
 _HEADER = ("image", "q1", "q2", "q3", "q4", "q5", "q6")
-_LARGEST_RAD = 4 * np.pi  # no arm turns further; degrees do
+_LARGEST_RAD = 4 * np.pi  # beyond any arm's range: the file is in degrees
 
 
 def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
-    """Joints (6,) in radians of each of these images.
+    """Joints (6,) in radians by image name.
 
     Raises:
         DataError: the file is missing or malformed (with file:line), in degrees, or lacks an image.

@@ -1,4 +1,4 @@
-"""Kinematics of the arms by their published Denavit–Hartenberg parameters: forward, derivatives, numeric inverse."""
+"""Kinematics of arms from their published Denavit–Hartenberg parameters: forward, derivatives, numeric inverse."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ JOINT_LIMIT_RAD = 2 * np.pi
 
 @dataclass(frozen=True, slots=True)
 class ArmModel:
-    """An arm's nominal DH parameters, classic convention: T_(i-1)_i = Rz(θ_i) Tz(d_i) Tx(a_i) Rx(α_i).
+    """An arm's nominal DH parameters in the classic convention: T_(i-1)_i = Rz(θ_i) Tz(d_i) Tx(a_i) Rx(α_i).
 
     Attributes:
-        name: as the maker calls it.
+        name: the manufacturer's.
         a_m: (6,) link lengths.
         d_m: (6,) link offsets.
         alpha_rad: (6,) link twists.
@@ -31,7 +31,7 @@ class ArmModel:
     alpha_rad: Array
 
     def joint_values(self, joints_rad: Array) -> Array:
-        """(N, 6, 4) nominal a, d, α, θ at the joints (N, 6)."""
+        """(N, 6, 4) nominal a, d, α, θ for joints (N, 6)."""
         rest = np.stack([self.a_m, self.d_m, self.alpha_rad], axis=1)
         return np.concatenate([np.broadcast_to(rest, (len(joints_rad), 6, 3)), joints_rad[:, :, None]], axis=2)
 
@@ -63,15 +63,15 @@ _ARMS = {
 }
 
 
-#: Names of the arms whose kinematics are known.
+#: Names of the arms with known kinematics.
 ARM_MODELS = tuple(arm.name for arm in _ARMS.values())
 
 
 def arm_model(name: str) -> ArmModel:
-    """The arm of this name, upper or lower case.
+    """The arm of this name, in upper or lower case.
 
     Raises:
-        ConfigurationError: not in the table.
+        ConfigurationError: the name is unknown.
     """
     try:
         return _ARMS[name.lower()]
@@ -83,12 +83,12 @@ def arm_model(name: str) -> ArmModel:
 
 
 def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0.02) -> ArmModel | None:
-    """The arm of the table whose forward kinematics give the reported poses best; None if none is within `within_m`.
+    """The arm whose forward kinematics fit the reported poses best; None if none is within `within_m`.
 
     Args:
         joints_rad: (N, 6).
-        T_base_flange: (N, 4, 4) as the controller reported them, tool point at the flange.
-        within_m: largest median distance of the positions.
+        T_base_flange: (N, 4, 4) as reported by the controller with the tool centre point at the flange.
+        within_m: largest accepted median distance of the positions.
     """
     best, best_m = None, within_m
     for arm in _ARMS.values():
@@ -100,7 +100,7 @@ def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0
 
 
 def chain(values: Array) -> Array:
-    """(N, 7, 4, 4) T_base_0 … T_base_6 of DH values (N, 6, 4) in the order a, d, α, θ."""
+    """(N, 7, 4, 4) T_base_0 … T_base_6 from DH values (N, 6, 4) in the order a, d, α, θ."""
     frames = np.zeros((len(values), 7, 4, 4))
     frames[:, 0] = np.eye(4)
     for i in range(6):
@@ -120,14 +120,14 @@ def chain(values: Array) -> Array:
 
 
 def forward(arm: ArmModel, joints_rad: Array) -> Array:
-    """(N, 4, 4) T_base_flange at joints (N, 6) by the nominal parameters."""
+    """(N, 4, 4) T_base_flange at joints (N, 6) with the nominal parameters."""
     return chain(arm.joint_values(_joints(joints_rad)))[:, 6]
 
 
 def dh_jacobian(frames: Array) -> Array:
-    """(N, 6, 24) derivative of the flange's pose with respect to a, d, α, θ of joint 1, of joint 2, …
+    """(N, 6, 24) derivative of the flange's pose by a, d, α, θ of joint 1, of joint 2, …
 
-    The pose's increment is (d in metres, w in radians) in the axes of the flange, at its origin.
+    The pose increment is (d in metres, w in radians) in the flange's axes, about its origin.
 
     Args:
         frames: (N, 7, 4, 4) as from `chain`.
@@ -151,9 +151,9 @@ def dh_jacobian(frames: Array) -> Array:
 
 
 def solve_joints(arm: ArmModel, T_base_flange: Transform, starts_rad: Array) -> Array | None:
-    """Joints (6,) that reach a pose, by damped Newton steps from each start (S, 6) in turn; None if none arrives.
+    """Joints (6,) that reach a pose, by damped Newton steps from each start (S, 6) in turn; None if none converges.
 
-    Within ±360°. A planner's question, "can the arm get there in a posture like the ones it had": it is no motion.
+    The result is within ±360°. For planning only: whether the arm reaches the pose in a posture near the starts.
     """
     for start in np.atleast_2d(starts_rad):
         q = np.array(start, dtype=np.float64)
@@ -170,10 +170,10 @@ def solve_joints(arm: ArmModel, T_base_flange: Transform, starts_rad: Array) -> 
 
 
 def pose_gap(arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> tuple[float, float]:
-    """Median distance (m) and angle (rad) between an arm's forward kinematics and the poses it reported (N, 4, 4).
+    """Median distance (m) and angle (rad) between forward kinematics and the reported poses (N, 4, 4).
 
     Raises:
-        DataError: arrays that do not belong together.
+        DataError: the numbers of joints and poses differ.
     """
     joints = _joints(joints_rad)
     if len(joints) != len(T_base_flange):
@@ -191,5 +191,5 @@ def _joints(joints_rad: Array) -> Array:
 
 
 def increment(T: Transform, d: Array, w: Array) -> Transform:
-    """exp(w) R, t + d: the project's perturbation of a pose in the axes of its outer frame."""
+    """exp(w) R, t + d: the project's pose perturbation, in the axes of the outer frame."""
     return transform(Rotation.from_rotvec(w).as_matrix() @ T[:3, :3], T[:3, 3] + d)

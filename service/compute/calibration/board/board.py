@@ -18,9 +18,9 @@ Pattern = Literal["checkerboard", "charuco", "circles"]
 Grey = NDArray[np.uint8]
 
 _SEARCH_WIDTHS = (1200, 2400)  # px; the board is searched for at these sizes, then measured at full size
-_CHARUCO_WIDTHS = (1600, 3200)  # its markers are smaller than squares
-_REACH = 0.4  # of the shortest distance between two corners: the window must not see the next corner's edges
-_MAX_HALF = 30  # px; beyond this a window gains nothing and lens distortion bends the edges in it
+_CHARUCO_WIDTHS = (1600, 3200)  # larger, because markers are smaller than squares
+_REACH = 0.4  # of the shortest distance between corners: the window must not include the next corner's edges
+_MAX_HALF = 30  # px; a larger window gains nothing, and lens distortion bends the edges in it
 _SMOOTHING = 0.15  # sigma of the smoothing, in half windows
 _MAX_SMOOTHING_PX = 1.5
 _MIN_CHARUCO_CORNERS = 8
@@ -31,15 +31,16 @@ class Board:
     """A flat board of columns × rows points.
 
     Attributes:
-        columns: of inner corners (where four squares meet) of a checkerboard or ChArUco board, one less than its
-            squares; of circles in a row of an asymmetric grid.
-        rows: the same along the other side.
-        square_m: side of a square; of an asymmetric circle grid the distance between two rows, which is half the
+        columns: number of inner corners (where four squares meet) in a row of a checkerboard or ChArUco board, one
+            less than its squares; number of circles in a row of an asymmetric grid.
+        rows: number of rows of inner corners or circles.
+        square_m: side of a square; for an asymmetric circle grid the distance between two rows, which is half the
             distance between two circles of a row (OpenCV's convention).
-        pattern: what is printed.
+        pattern: kind of board.
         marker_m: side of a ChArUco board's markers; None: three quarters of a square.
-        dictionary: of a ChArUco board's markers, one of OpenCV's names.
-        legacy: a ChArUco board as OpenCV printed it before 4.6 (differs where the squares in a column are even).
+        dictionary: OpenCV's name for the dictionary of a ChArUco board's markers.
+        legacy: a ChArUco board as OpenCV printed it before 4.6 (differs if the number of squares in a column is
+            even).
     """
 
     columns: int
@@ -60,7 +61,7 @@ class Board:
             raise DataError("a ChArUco marker is smaller than its square", remedy="give the marker's side")
 
     def points(self) -> Array:
-        """(columns · rows, 3) in the board frame, row after row: x along the columns, y along the rows."""
+        """(columns · rows, 3) in the board frame, metres, row by row: x along the columns, y along the rows."""
         if self.pattern != "circles":
             return board_points(self.columns, self.rows, self.square_m)
         row, column = np.mgrid[: self.rows, : self.columns]
@@ -68,7 +69,7 @@ class Board:
         return np.stack([x, row.ravel() * self.square_m, np.zeros(x.size)], axis=1)
 
     def half_turn(self) -> Transform | None:
-        """T_board_turned if the board looks the same after half a turn; None if it shows which end is up."""
+        """T_board_turned if the board looks the same after half a turn; None if its ends can be told apart."""
         if self.pattern == "charuco" or (self.pattern == "circles" and self.rows % 2):
             return None
         if self.pattern == "circles":
@@ -79,10 +80,10 @@ class Board:
         return 0.75 * self.square_m if self.marker_m is None else self.marker_m
 
     def charuco(self) -> cv2.aruco.CharucoBoard:
-        """OpenCV's description of a ChArUco board.
+        """The board as an OpenCV object.
 
         Raises:
-            DataError: an unknown dictionary, or one with too few markers.
+            DataError: the dictionary is unknown or has too few markers.
         """
         identifier = getattr(cv2.aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(identifier, int):
@@ -99,7 +100,7 @@ class Board:
         return board
 
     def reach(self) -> float:
-        """How far from a corner, in squares, nothing but this corner's own edges is printed."""
+        """Radius around a corner, in squares, within which only this corner's own edges are printed."""
         if self.pattern == "charuco":
             return min(_REACH, 0.9 * (1 - self._marker_m() / self.square_m) / 2)
         return _REACH
@@ -107,7 +108,7 @@ class Board:
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """The points of a board that one image shows.
+    """The points of a board found in one image.
 
     Attributes:
         indices: (M,) into `Board.points()`.
@@ -119,15 +120,15 @@ class BoardView:
 
 
 def board_points(columns: int, rows: int, square_m: float) -> Array:
-    """(columns · rows, 3) inner corners in the board frame, row after row."""
+    """(columns · rows, 3) inner corners in the board frame, row by row, in the unit of `square_m`."""
     y, x = np.mgrid[:rows, :columns]
     return np.stack([x.ravel() * square_m, y.ravel() * square_m, np.zeros(x.size)], axis=1)
 
 
 def half_turn(columns: int, rows: int, square_m: float) -> Transform | None:
-    """T_board_turned of a board that looks the same after half a turn; None if its colours tell which end is up.
+    """T_board_turned of a checkerboard that looks the same after half a turn; None if colours tell its ends apart.
 
-    A board with one even and one odd number of inner corners has opposite colours at opposite corners.
+    With one even and one odd number of inner corners, opposite corners have opposite colours.
     """
     if (columns + rows) % 2:
         return None
@@ -136,13 +137,13 @@ def half_turn(columns: int, rows: int, square_m: float) -> Transform | None:
 
 
 def find_board(image_grey: Grey, board: Board) -> BoardView:
-    """Every point of the board that the image shows, measured at full size.
+    """Find the board's points in an image and measure them at full size.
 
-    A checkerboard or circle grid must be seen whole; a ChArUco board may be cut or covered in part.
+    A checkerboard or circle grid must be fully visible; a ChArUco board may be cropped or partly covered.
 
     Raises:
-        DataError: not a grey 8-bit image, or a board that cannot be.
-        ComputeError: the board is not visible.
+        DataError: the image is not grey with 8 bits, or the board's description is invalid.
+        ComputeError: the board was not found.
     """
     _check(image_grey)
     if board.pattern == "checkerboard":
@@ -154,8 +155,8 @@ def find_board(image_grey: Grey, board: Board) -> BoardView:
 def _find_checkerboard(image: Grey, columns: int, rows: int) -> tuple[Array, NDArray[np.bool_]]:
     """All corners of a checkerboard, and which of them can be trusted.
 
-    A board with one even and one odd corner count is always numbered from the same physical corner: the square
-    between the first corners of the first two rows is dark.
+    A board with one even and one odd corner count is always numbered from the same physical corner, the one that
+    makes the square between the first corners of the first two rows dark.
     """
     found = _search_checkerboard(image, columns, rows)
     corners, good = refine_corners(image, found, half_window(_grid_spacing(found.reshape(rows, columns, 2)), _REACH))
@@ -172,7 +173,7 @@ def _check(image: Grey) -> None:
 
 
 def _reduced(image: Grey, target: int) -> tuple[Grey, Array]:
-    """A copy at most `target` wide or high, and the factors from its pixels to the image's."""
+    """A copy whose longer side is at most `target` px, and the factors (2,) from its pixels to the image's."""
     height, width = image.shape
     factor = min(1.0, target / max(width, height))
     if factor == 1.0:
@@ -186,7 +187,7 @@ def _search_checkerboard(image: Grey, columns: int, rows: int) -> Array:
     tried: list[tuple[int, int]] = []
     near, far = _SEARCH_WIDTHS
     stretched = cv2.CALIB_CB_NORMALIZE_IMAGE
-    # Reduced first; as it is, for dark rooms, whose noise a stretched histogram raises to texture; then larger, for
+    # First reduced; then unstretched, for dark rooms, where stretching turns noise into texture; then larger, for
     # small boards; then with local contrast, for shadows and glare.
     attempts = ((near, stretched, False), (near, 0, False), (far, stretched, False), (near, stretched, True))
     for target, flags, even in attempts:
@@ -214,16 +215,16 @@ def _grid_spacing(grid: Array) -> float:
 
 
 def refine_corners(image: Grey, found: Array, half: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Corners (N, 2) at full size, and which of them stayed near and have their whole window in the image.
+    """Refined corners (N, 2), and which of them stayed near their start with their whole window in the image.
 
-    A corner is the point whose directions to all pixels of the window are normal to their gradients.
-    Four squares meet point-symmetrically, so neither gamma nor blur moves this point. Smoothing first halves its
-    error: differences of neighbouring pixels amplify noise, and a sharp lens is sampled too coarsely for them.
-    Source: Förstner and Gülch 1987, as OpenCV's cornerSubPix has it; the smoothing from bench/corner_accuracy.py.
+    A corner is the point whose directions to all pixels of the window are normal to the gradients there. Four squares
+    meet with point symmetry, so neither gamma nor blur moves this point. Smoothing first halves the error:
+    differences of neighbouring pixels amplify noise, and a sharp lens is undersampled.
+    Source: Förstner and Gülch 1987, as in OpenCV's cornerSubPix; the smoothing from bench/corner_accuracy.py.
     """
     sigma = float(np.clip(_SMOOTHING * half, 0.5, _MAX_SMOOTHING_PX))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
-    margin = 2 * half + 6  # the window may move by its own half
+    margin = 2 * half + 6  # the window may move by half its size
     corners = np.empty_like(found)
     for k, (x, y) in enumerate(found.round().astype(int)):
         left, top = max(x - margin, 0), max(y - margin, 0)
@@ -239,12 +240,12 @@ def refine_corners(image: Grey, found: Array, half: int) -> tuple[Array, NDArray
 
 
 def half_window(spacing_px: float, reach: float) -> int:
-    """Half the side of the window in which a corner is refined, px; `reach` as of the board."""
+    """Half the side of the window in which a corner is refined, px; `reach` is `Board.reach`."""
     return int(np.clip(reach * spacing_px, 2, _MAX_HALF))
 
 
 def _first_square_is_dark(image: Grey, grid: Array) -> bool:
-    """Compare the mean brightness at the centres of the squares of either colour."""
+    """Compare the mean brightness at the centres of the two colours' squares."""
     centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     x = np.clip(centres[..., 0].round().astype(int), 0, image.shape[1] - 1)
     y = np.clip(centres[..., 1].round().astype(int), 0, image.shape[0] - 1)
@@ -255,11 +256,11 @@ def _first_square_is_dark(image: Grey, grid: Array) -> bool:
 
 
 def _find_charuco(image: Grey, board: Board) -> BoardView:
-    """Identify corners by their markers on a reduced copy, then refine them at full size."""
+    """Identify corners by their markers in a reduced copy, then refine them at full size."""
     for target in _CHARUCO_WIDTHS:
         small, scale = _reduced(image, target)
         found, identifiers, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(small)
-        # Annotated as always there; None when no marker is seen.
+        # OpenCV's annotation says that it is never None, but it is when no marker is found.
         if identifiers is not None and len(identifiers) >= _MIN_CHARUCO_CORNERS:  # pyright: ignore[reportUnnecessaryComparison]
             indices = np.asarray(identifiers, dtype=np.int64).ravel()
             corners = (np.asarray(found, dtype=np.float64).reshape(-1, 2) + 0.5) * scale - 0.5
@@ -286,14 +287,15 @@ def _charuco_view(image: Grey, board: Board, indices: NDArray[np.int64], corners
 
 
 def _scatter(corners: Array) -> float:
-    """A length that grows with the spacing of the corners, px."""
+    """A length that scales with the spacing of the corners, px."""
     return float(np.sqrt(np.prod(np.ptp(corners, axis=0)) / len(corners)))
 
 
 def _find_circles(image: Grey, board: Board) -> BoardView:
-    """Find an asymmetric grid of dark circles on a reduced copy, then the centroid of each at full size.
+    """Find an asymmetric grid of dark circles in a reduced copy, then the centroid of each at full size.
 
-    The centroid of a tilted circle's image is not the image of its centre: by 0.1 px at 45° and 20 px across.
+    The centroid of a tilted circle's image is not the image of its centre: the difference is 0.1 px at 45° and 20 px
+    diameter.
     """
     for target in _SEARCH_WIDTHS:
         small, scale = _reduced(image, target)
@@ -318,7 +320,7 @@ def _find_circles(image: Grey, board: Board) -> BoardView:
 
 
 def _centroids(image: Grey, start: Array) -> Array:
-    """Centroid (N, 2) of each dark circle's share of every pixel."""
+    """Centroids (N, 2) of the dark circles, each pixel weighted by how much of it is dark."""
     distance = np.linalg.norm(start[:, None] - start[None], axis=2) + np.diag(np.full(len(start), np.inf))
     half = int(0.5 * distance.min())
     out = start.copy()
@@ -326,7 +328,7 @@ def _centroids(image: Grey, start: Array) -> Array:
         patch = image[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1].astype(np.float64)
         dark, bright = np.percentile(patch, (2, 95))
         share = np.clip((bright - patch) / max(bright - dark, 1.0), 0, 1)
-        share[share < 0.2] = 0  # paper's texture and noise, which would pull to the patch's centre
+        share[share < 0.2] = 0  # paper texture and noise, which would pull towards the patch's centre
         rows, columns = np.indices(share.shape)
         out[k] = np.array([np.sum(columns * share), np.sum(rows * share)]) / share.sum()
         out[k] += [max(x - half, 0), max(y - half, 0)]

@@ -1,4 +1,4 @@
-"""Why a board is not found: found out by trying what people confuse, counts, printing, dictionary, frame."""
+"""Diagnoses why a board is not found, by trying the usual mistakes: counts, printing, dictionary, cropping."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from service.compute.calibration.board.board import Board, Grey
 from service.core.geometry import Array
 
-_WIDTH = 1200  # px, of the copies on which it is tried
+_WIDTH = 1200  # px, of the reduced copies
 _CHARUCO_WIDTH = 1600
-_LEAST = 3  # corners a side that a board must show to be one
+_LEAST = 3  # corners per side for a grid to count as a board
 _FEWEST_MARKERS = 4
-_BORDER = 1.6  # distances of corners between the last one seen and the frame: the next one would be outside
+_BORDER = 1.6  # corner spacings between the last visible corner and the frame: the next one would be outside
 _FEWEST_CORNERS = 8
 _DICTIONARIES = tuple(
     sorted(
@@ -28,12 +28,13 @@ _DICTIONARIES = tuple(
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What an image shows instead of the board that was described.
+    """What an image shows instead of the described board.
 
     Attributes:
         words: for people, without a full stop.
         remedy: what to do.
-        of_board: the description is wrong, for every image; else it is this image alone.
+        of_board: whether the description is wrong, and so fails for every image; otherwise only this image is at
+            fault.
     """
 
     words: str
@@ -42,9 +43,9 @@ class Diagnosis:
 
 
 def diagnose(image: Grey, board: Board) -> Diagnosis | None:
-    """What may be wrong where `find_board` finds nothing; None where nothing that was tried explains it.
+    """Why `find_board` may have found nothing; None if none of the usual mistakes explains it.
 
-    Takes a fraction of a second for a checkerboard, and some seconds for a ChArUco board.
+    Takes a fraction of a second for a checkerboard and some seconds for a ChArUco board.
     """
     if board.pattern == "checkerboard":
         return _checkerboard(image, board)
@@ -52,9 +53,9 @@ def diagnose(image: Grey, board: Board) -> Diagnosis | None:
 
 
 def wrong_board(images: Sequence[Grey], board: Board) -> Diagnosis | None:
-    """The mistake in the board's description on which two of these images agree; None when any shows the board.
+    """The mistake in the board's description that explains two of these images; None if any image shows the board.
 
-    One image alone may show a board that is covered in part, unless there is no other.
+    A single image may just show a partly covered board, so one is enough only if there is no other.
     """
     said: list[Diagnosis] = []
     for image in images:
@@ -90,7 +91,7 @@ def _small(image: Grey, width: int) -> Grey:
 
 
 def _seen(image: Grey) -> tuple[tuple[int, int], Array] | None:
-    """Columns and rows of the largest grid of corners that is seen, and the corners (rows, columns, 2)."""
+    """Columns and rows of the largest corner grid in the image, and the corners (rows, columns, 2)."""
     flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (_LEAST, _LEAST), flags)
     if not found:
@@ -110,14 +111,14 @@ def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
     (columns, rows), corners = seen
     found = sorted((columns, rows))
     if found == wanted:
-        return None  # it is there; find_board's own reason stands
+        return None  # the board is there; find_board's own reason holds
     if _at_frame(corners, small.shape) and all(a <= b for a, b in zip(found, wanted, strict=True)):
         return Diagnosis(
             f"the board is cut by the frame: {columns} × {rows} of its {given} inner corners are seen",
             "The whole board must be in the image",
             False,
         )
-    # The board has the order that the description has.
+    # Report the counts in the order in which the description gives them.
     first, second = found if board.columns <= board.rows else found[::-1]
     words = f"the board has {first} × {second} inner corners, not {given}"
     if found == [wanted[0] - 1, wanted[1] - 1]:
@@ -126,7 +127,7 @@ def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
 
 
 def _at_frame(corners: Array, shape: tuple[int, ...]) -> bool:
-    """Whether the next row or column of corners would lie outside of the image."""
+    """Whether the next row or column of corners would lie outside the image."""
     spacing = max(
         float(np.median(np.linalg.norm(np.diff(corners, axis=0), axis=2))),
         float(np.median(np.linalg.norm(np.diff(corners, axis=1), axis=2))),
@@ -162,7 +163,7 @@ def _charuco(image: Grey, board: Board) -> Diagnosis | None:
 
 
 def _variants(board: Board) -> list[tuple[Board, str, str]]:
-    """Boards that are taken for one another, with words and what to give."""
+    """Boards that are often confused, each with the mistake in words and the option that corrects it."""
     c, r = board.columns, board.rows
     counts = (
         ((c, r), ""),
@@ -196,7 +197,7 @@ _LEGACY_WORDS = {
 
 
 def _corners(image: Grey, board: Board) -> int:
-    """Corners that lie on one plane as this board has them."""
+    """Number of corners that lie on one plane in this board's arrangement."""
     try:
         found, identifiers, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(image)
     except cv2.error:
@@ -218,7 +219,7 @@ def _markers(image: Grey, dictionary: str) -> int:
 
 
 def _best_dictionary(image: Grey) -> tuple[str, int]:
-    """The dictionary of most markers in the image; of those with as many, the smallest."""
+    """The dictionary with the most markers in the image (the smallest one in a tie), and their number."""
     best = ("", 0)
     for name in _DICTIONARIES:
         if (count := _markers(image, name)) > best[1]:

@@ -1,4 +1,4 @@
-"""The board in many image files at once: who shows it, who does not and why, in parallel processes."""
+"""Finds the board in many image files at once, in parallel processes, with a reason for each failure."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from service.core.errors import ComputeError, DataError
 
 _MANY_FILES = 24
 _MANY_BYTES = 30e6
-_PROBED = 4  # images, before all are searched
+_PROBED = 4  # images tried before all are searched
 
 
 @dataclass(frozen=True, slots=True)
 class BoardImage:
-    """What one image file shows: `view` is None, and `reason` says why, where it cannot be used."""
+    """What one image file shows; if it cannot be used, `view` is None and `reason` says why."""
 
     size: tuple[int, int]
     view: BoardView | None
@@ -33,11 +33,11 @@ class BoardImage:
 
 @dataclass(frozen=True, slots=True)
 class UsableViews:
-    """The views that belong together, and every other image with its reason.
+    """The views with one common image size, and the reasons for all others.
 
     Attributes:
-        size: width and height of all of them, px.
-        indices: (N) of the images.
+        size: common width and height, px.
+        indices: (N) indices of the images.
         views: (N).
         excluded: reason by image index.
     """
@@ -55,16 +55,16 @@ def find_boards(
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[BoardImage, ...]:
-    """Read every image file and measure the board in it. A file that cannot be read is a reason, not an error.
+    """Find the board in every image file. A file that cannot be read gets a reason and raises no error.
 
     Args:
         files: images.
-        board: what to look for.
-        workers: processes, at most.
-        progress: called with images done and in all.
+        board: the board to find.
+        workers: largest number of processes.
+        progress: called with the number of images done and the total.
 
     Raises:
-        DataError: a board that cannot be (a ChArUco dictionary too small, say).
+        DataError: the board's description is invalid (for example, its ChArUco dictionary is too small).
     """
     if board.pattern == "charuco":
         board.charuco()
@@ -85,22 +85,22 @@ def find_boards(
 
 
 def probe_board(files: Sequence[Path], board: Board) -> Diagnosis | None:
-    """What is wrong with the board's description, by a few of the images; None where it is seen, or nobody knows."""
+    """A mistake in the board's description, from a few of the images; None if it is found or nothing explains it."""
     some = [files[k] for k in sorted({round(k * (len(files) - 1) / (_PROBED - 1)) for k in range(_PROBED)})]
     greys: list[Grey] = []
     for file in some:
         try:
             greys.append(read_grey(file))
-        except DataError:  # told with the other reasons
+        except DataError:  # reported later with the other reasons
             continue
     return wrong_board(greys, board)
 
 
 def usable_views(found: Sequence[BoardImage]) -> UsableViews:
-    """Views of the size that most images have; the others are excluded with their reasons.
+    """Views in the most common image size; the others are excluded with reasons.
 
     Raises:
-        ComputeError: no image shows the board.
+        ComputeError: the board is in no image.
     """
     sizes = Counter(image.size for image in found if image.view is not None)
     if not sizes:
@@ -126,7 +126,7 @@ def usable_views(found: Sequence[BoardImage]) -> UsableViews:
 
 
 def _worth_processes(files: Sequence[Path]) -> bool:
-    """Whether there is more to do than to start processes."""
+    """Whether the work outweighs the start of processes."""
     return len(files) >= _MANY_FILES or sum(file.stat().st_size for file in files if file.is_file()) > _MANY_BYTES
 
 
@@ -140,6 +140,6 @@ def _find(file: Path, board: Board) -> BoardImage:
     try:
         return BoardImage(size, find_board(grey, board))
     except ComputeError as error:
-        # Of a ChArUco board a part is enough, and trying its markers takes seconds.
+        # A ChArUco board needs only a part in view, and trying its markers takes seconds.
         why = diagnose(grey, board) if board.pattern == "checkerboard" else None
         return BoardImage(size, None, error.what if why is None else why.words)

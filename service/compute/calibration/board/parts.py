@@ -1,7 +1,7 @@
-"""A board that the image shows in part: its corners are looked for where the arm's pose says that they are.
+"""Finds a partly visible checkerboard: its corners are searched where the arm's pose predicts them.
 
-A checkerboard that is cut by the frame, or covered in part, cannot be counted. Where camera, mount and board are
-known well enough to say where each corner lies to a fraction of a square, it need not be.
+The corners of a cropped or partly covered checkerboard cannot be numbered by counting. If camera, mount and board are
+known well enough to predict each corner to a fraction of a square, counting is not needed.
 """
 
 from __future__ import annotations
@@ -21,27 +21,28 @@ from service.core.geometry import Array, Transform, apply, inverse
 
 _FEWEST = 24  # corners
 _FEWEST_LINES = 3  # rows, and columns
-_NEAR = 0.25  # of a square: by so much the board may lie elsewhere; from half a square on a corner has another name
+_NEAR = 0.25  # of a square: largest accepted shift of the board; from half a square on, corners are confused
 _DOUBT, _DRAWS = 0.5, 32
-_CONTRAST = 0.25  # least difference of dark and bright squares at a corner, over that of the whole board
+_CONTRAST = 0.25  # least contrast of dark and bright squares at a corner, over that of the whole board
 _OUTLIER = 4.0  # times the median distance from the fit
 _OUTLIER_FLOOR_PX = 0.3
 
 
 def find_part(image: Grey, board: Board, known: BoardKnowledge, T_base_camera: Transform) -> BoardView:
-    """The corners of a checkerboard that the image shows, told apart by where they must lie.
+    """The visible corners of a checkerboard, numbered by their predicted positions.
 
-    Each is refined from where it is expected and stays only if it is a crossing of four squares of the right colours
-    and fits one pose of the board with the others; all of them together may be off by a quarter of a square.
+    Each is refined from its predicted position. It is kept only if it is a crossing of four squares of the right
+    colours and fits one board pose together with the others. All of them may be shifted by up to a quarter of a
+    square.
 
     Args:
         image: grey, 8 bits.
         board: a checkerboard.
         known: camera, mount and board, from other images.
-        T_base_camera: of this image, by the arm's pose and the mount.
+        T_base_camera: of this image, from the arm's pose and the mount.
 
     Raises:
-        ComputeError: too little of the board, or not where it must be.
+        ComputeError: too little of the board is visible, or it is not where it was predicted.
     """
     T_camera_board = inverse(T_base_camera) @ known.T_base_board
     points = apply(T_camera_board, board.points())
@@ -81,11 +82,11 @@ def with_parts(
     known: BoardKnowledge,
     T_base_flange: Array,
 ) -> tuple[BoardImage, ...]:
-    """The images, those without a whole board searched again for a part of it; reasons say what became of that.
+    """The images, with parts of the board in those without a whole one; where that failed, the reason says why.
 
     Args:
-        images: (N) as from `find_boards`.
-        greys: (N) of those without a view; None for the others.
+        images: (N) from `find_boards`.
+        greys: (N) pixels of the images without a view; None for the others.
         board: a checkerboard.
         known: from the images with a view.
         T_base_flange: (N, 4, 4).
@@ -108,7 +109,7 @@ def _too_little(count: int) -> ComputeError:
 
 
 def _doubt_px(board: Board, known: BoardKnowledge, T_base_camera: Transform) -> float:
-    """How far the corners may lie from where they are expected, px: the largest of some draws of what is possible."""
+    """Largest possible distance of the corners from their predicted positions, px, from random draws."""
     hands, boards, _, _ = known.draws(_DRAWS)
     flange = T_base_camera @ inverse(known.T_flange_camera)
     ends = board.points()[[0, board.columns - 1, -board.columns, -1]]
@@ -123,10 +124,10 @@ def _doubt_px(board: Board, known: BoardKnowledge, T_base_camera: Transform) -> 
 def _crossings(
     image: Grey, grid: Array, which: NDArray[np.int64], found: Array, *, dark_first: bool
 ) -> NDArray[np.bool_]:
-    """(M,) corners where two dark squares meet two bright ones, as everywhere on the board.
+    """(M,) whether two dark and two bright squares meet at each corner, as on the board.
 
-    With `dark_first` the board is of the kind whose first square is dark (`find_board` numbers it so): a grid that is
-    off by one square has the wrong colours.
+    With `dark_first`, the board's first square is dark (the order in which `find_board` numbers it), so a grid that
+    is off by one square has the wrong colours.
     """
     columns = grid.shape[1]
     step_x, step_y = np.gradient(grid, axis=1).reshape(-1, 2)[which], np.gradient(grid, axis=0).reshape(-1, 2)[which]
@@ -147,7 +148,7 @@ def _crossings(
 
 
 def _one_plane(view: BoardView, board: Board, known: BoardKnowledge) -> BoardView:
-    """Without the corners that do not fit the board's pose with the others."""
+    """The view without corners that do not fit one common board pose."""
     points = board.points()
     for _ in range(3):
         pose, _ = fit_pose(view, points, known.camera, start_pose(view, points, known.camera))

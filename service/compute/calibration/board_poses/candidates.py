@@ -1,4 +1,4 @@
-"""Camera poses from which the whole board is in the frame, pushed to every part of it, whatever is not yet known."""
+"""Candidate camera poses for which the whole board stays in the frame despite everything not yet known."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from service.compute.calibration.board_poses.knowledge import BoardKnowledge
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 
-_ANCHORS = tuple(product((0, -1, 1), (0, -1, 1)))  # where in the frame: its middle, its edges, its corners
+_ANCHORS = tuple(product((0, -1, 1), (0, -1, 1)))  # places in the frame: its middle, edges and corners
 _ROUNDS = 4
-_MARGIN = 0.006  # of the image's width, beyond all that is not known
+_MARGIN = 0.006  # of the image's width, on top of all uncertainty
 _DRAWS, _CHECKED = 16, 64
 _MOST = 800
 
 
 @dataclass(frozen=True, slots=True)
 class PoseWishes:
-    """From where the board is to be seen."""
+    """The wanted range of views of the board."""
 
     tilts_deg: tuple[float, ...] = (4.0, 14.0, 24.0, 32.0, 38.0)  # of the optical axis from the board's normal
     rolls_deg: tuple[float, ...] = (0.0, 12.0, -12.0, 180.0, 168.0, 192.0)  # of the image about the optical axis
@@ -32,30 +32,31 @@ class PoseWishes:
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Camera poses T_base_camera (C, 4, 4), and the corners' pixels (C, P, 2) as they are expected."""
+    """Camera poses T_base_camera (C, 4, 4), and the board points' expected pixels (C, P, 2)."""
 
     T_base_camera: Array
     pixels: Array
 
     def take(self, which: NDArray[np.int64]) -> Candidates:
-        """These only."""
+        """Only the candidates with these indices."""
         return Candidates(self.T_base_camera[which], self.pixels[which])
 
 
 def board_candidates(
     known: BoardKnowledge, board: Board, wishes: PoseWishes, approach: Array, *, most: int = _MOST, seed: int = 0
 ) -> Candidates:
-    """Poses that hold the whole printed board within the frame, whatever the truth within what is known.
+    """Poses that keep the whole printed board in the frame for every truth within the tolerances.
 
     Args:
-        known: nominal values or estimates, and how far each may be off.
-        board: what lies there.
+        known: nominal values or estimates, with their tolerances.
+        board: the board.
         wishes: tilts, rolls and distances.
-        approach: (3,) horizontal unit vector from the scene towards the base; images are upright seen from there.
-        most: poses tried, drawn from all combinations.
+        approach: (3,) horizontal unit vector from the scene towards the base; images are upright for a viewer there.
+        most: number of poses tried, drawn at random from all combinations.
         seed: of the draw.
 
     Returns:
+        Candidates, possibly none.
         Candidates, perhaps none.
     """
     grid = _grid(known, board, wishes, approach)
@@ -72,14 +73,14 @@ def board_candidates(
 
 
 def expected_pixels(known: BoardKnowledge, board: Board, T_base_camera: Array) -> Array:
-    """(C, P, 2) pixels of the board's points at the estimate."""
+    """(C, P, 2) pixels of the board's points for the estimated camera, mount and board."""
     boards = np.array([inverse(T) @ known.T_base_board for T in T_base_camera]).reshape(-1, 4, 4)
     points = np.einsum("nij,pj->npi", boards[:, :3, :3], board.points()) + boards[:, None, :3, 3]
     return known.camera.project(points.reshape(-1, 3)).reshape(len(boards), len(board.points()), 2)
 
 
 def _outline(board: Board) -> Array:
-    """(8, 3) the edge of the printed squares, which reaches one square beyond the inner corners; board frame."""
+    """(8, 3) edge of the printed squares in the board frame; it lies one square beyond the inner corners."""
     points = board.points()[:, :2]
     low, high = points.min(axis=0) - board.square_m, points.max(axis=0) + board.square_m
     share = [(0, 0), (0.5, 0), (1, 0), (1, 0.5), (1, 1), (0.5, 1), (0, 1), (0, 0.5)]
@@ -87,7 +88,7 @@ def _outline(board: Board) -> Array:
 
 
 class _Possible:
-    """Draws of what may be true: where a camera sent to a pose really is, and where the board's outline is."""
+    """Draws within the tolerances: the true pose of a camera sent to a pose, and the true place of the board."""
 
     def __init__(self, known: BoardKnowledge, outline: Array, count: int, seed: int = 0) -> None:
         hands, boards, self.zoom, self.shift_px = known.draws(count, seed)
@@ -127,15 +128,15 @@ def _grid(known: BoardKnowledge, board: Board, wishes: PoseWishes, approach: Arr
 
 
 def _pushed(poses: Array, anchors: Array, camera: CameraModel, truth: _Possible) -> Array:
-    """Each pose shifted in its image plane until the board touches its side of the frame, or is in its middle."""
+    """Each pose shifted in its image plane until the board touches the wanted side of the frame, or is centred."""
     size, margin = np.array([camera.width, camera.height]), _MARGIN * camera.width
     poses = poses.copy()
     for _ in range(_ROUNDS):
         pixels, depth = truth.pixels(poses)
         low, high = pixels.min(axis=(1, 2)), pixels.max(axis=(1, 2))
-        left, right = margin - low, size - 1 - margin - high  # what it may move by
+        left, right = margin - low, size - 1 - margin - high  # the range of shifts
         wanted = np.where(anchors < 0, left, np.where(anchors > 0, right, (left + right) / 2))
-        # To the right in the image by moving the camera to the left.
+        # Moving the camera to the left moves the image to the right.
         shift = -wanted * depth.mean(axis=(1, 2))[:, None] / [camera.fx, camera.fy]
         poses[:, :3, 3] += np.einsum("cij,cj->ci", poses[:, :3, :2], shift)
     return poses

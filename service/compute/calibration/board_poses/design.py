@@ -1,8 +1,8 @@
-"""The choice of board poses: the image covered, and the camera and its mount determined as well as they can be.
+"""Chooses board poses that cover the image and determine the camera and its mount as well as possible.
 
-Greedy on the linearised problems, as optimal designs are found: first the poses that reach new cells of the image,
-then those that lower the predicted variances most. Each later pick looks at a random part of what is open
-("stochastic greedy", Mirzasoleiman et al., "Lazier than lazy greedy", AAAI 2015), which also keeps the poses apart.
+Greedy optimal design on the linearised problems: first the poses that reach new cells of the image, then those that
+lower the predicted variances most. Each later pick looks only at a random sample of the remaining candidates
+("stochastic greedy", Mirzasoleiman et al., "Lazier than lazy greedy", AAAI 2015), which also spreads the poses.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from service.core.geometry import Array, Transform, inverse
 from service.core.units import deg, mm
 
 _CELLS = COVERAGE_GRID[0] * COVERAGE_GRID[1]
-_CELL_SHARE = 0.8  # of a cell's sides: a corner nearer to its edge may turn out to lie in the next one
+_CELL_SHARE = 0.8  # of a cell's sides: a corner nearer to its edge may end up in the next cell
 _LEVER_M = 0.7  # from the camera to what it looks at
-_OPEN = 50  # candidates that a later pick looks at
-_TRIED = 40  # of the best ones, for one that the arm can take
+_OPEN = 50  # random candidates considered in a later pick
+_TRIED = 40  # of the best ones, until the arm can take one
 
 
 @dataclass(frozen=True, slots=True)
 class Aims:
-    """What the images are for, and what is wanted of them."""
+    """Which calibrations the images are for, and their targets."""
 
     intrinsics: bool = True
     hand_eye: bool = True
@@ -48,13 +48,13 @@ class Aims:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """What a set of images will come to.
+    """The predicted result of a set of images.
 
     Attributes:
-        images: how many.
+        images: number of images.
         coverage: share of the image's cells with a corner.
         coverage_map: (8, 12) corners in each cell.
-        uncertainty_mm: of a projected point at the board's distance, worst in the image; NaN where the images do not
+        uncertainty_mm: of a projected point at the board's distance, worst in the image; NaN if the images do not
             determine the camera.
         tilt_deg: largest tilt of the board.
         rotation_spread_deg: largest rotation between two images.
@@ -73,13 +73,13 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """Images that are there, or decided: T_base_camera (N, 4, 4) and the pixels of their corners (N) (M, 2)."""
+    """Images taken or already chosen: T_base_camera (N, 4, 4) and the pixels of their corners, N arrays (M, 2)."""
 
     T_base_camera: Array
     pixels: tuple[Array, ...] = ()
 
     def plus(self, poses: Array, pixels: Sequence[Array]) -> Taken:
-        """With further ones."""
+        """These with further ones."""
         return Taken(np.concatenate([self.T_base_camera, poses.reshape(-1, 4, 4)]), (*self.pixels, *pixels))
 
 
@@ -98,18 +98,18 @@ def choose_poses(
     enough: Callable[[Prediction], bool] | None = None,
     seed: int = 0,
 ) -> Array:
-    """Up to `count` of the candidates' poses (K, 4, 4), in the order of what they bring.
+    """Up to `count` of the candidates' poses (K, 4, 4), in the order of their gain.
 
     Args:
         candidates: to choose from.
-        count: at most.
-        known: where board and camera are.
-        board: what is seen.
-        aims: for what.
+        count: largest number of poses.
+        known: estimates of camera, mount and board.
+        board: the board.
+        aims: calibrations and targets.
         taken: images that count already.
-        feasible: whether the arm can go there; asked for the best only.
-        enough: judged after each pose; no more are chosen once it says so.
-        seed: of the random part of later picks.
+        feasible: whether the arm can go there; asked only for the best candidates.
+        enough: asked after each pose; once it returns True, no more are chosen.
+        seed: of the random samples of later picks.
     """
     rng = np.random.default_rng([seed, 0x9A5E])
     worth = _Worth(known, board, aims)
@@ -152,13 +152,13 @@ def _of_chosen(
 
 
 def as_taken(known: BoardKnowledge, board: Board, T_base_camera: Array) -> Taken:
-    """Poses as if their images were there, the board seen where it is expected."""
+    """Poses as if their images were taken, with the board's points at their expected pixels."""
     poses = T_base_camera.reshape(-1, 4, 4)
     return Taken(poses, tuple(expected_pixels(known, board, poses)))
 
 
 def predict(taken: Taken, known: BoardKnowledge, board: Board, aims: Aims) -> Prediction:
-    """What images of these poses will come to."""
+    """Predict what calibrations from images at these poses will achieve."""
     counts = _counts(taken.pixels, known)
     boards = np.array([inverse(T) @ known.T_base_board for T in taken.T_base_camera]).reshape(-1, 4, 4)
     worst_mm = uncertainty_mm(boards, known.camera, board, aims.corner_sigma_px) if len(boards) >= 3 else np.nan
@@ -182,7 +182,7 @@ def predict(taken: Taken, known: BoardKnowledge, board: Board, aims: Aims) -> Pr
 
 
 class _Worth:
-    """Information of poses, and the variance that a set of them leaves."""
+    """Information gained by poses, and the variance left by a set of them."""
 
     def __init__(self, known: BoardKnowledge, board: Board, aims: Aims) -> None:
         self.known, self.board, self.aims = known, board, aims
@@ -204,17 +204,17 @@ class _Worth:
         return lens, mount
 
     def start(self, T_base_camera: Array) -> tuple[Array, Array]:
-        """What is known from images that count already, on top of the nominal values."""
+        """Information (8, 8) and (12, 12) from images that count already, plus the prior from the nominal values."""
         lens, mount = self.gains(T_base_camera)
         weak = np.diag(1 / np.array([*[0.01] * 3, *[0.05] * 3, *[0.05] * 3, *[0.2] * 3]) ** 2)
         return self.prior + lens.sum(axis=0), weak + mount.sum(axis=0)
 
     def plus(self, so_far: tuple[Array, Array], gains: tuple[Array, Array], k: int) -> tuple[Array, Array]:
-        """With one more."""
+        """With candidate `k` added."""
         return so_far[0] + gains[0][k], so_far[1] + gains[1][k]
 
     def cost(self, so_far: tuple[Array, Array], gains: tuple[Array, Array], pool: NDArray[np.int64]) -> Array:
-        """(K,) logarithm of the variance that is left with one more of the pool."""
+        """(K,) logarithm of the variance left after adding each candidate of the pool."""
         cost = np.zeros(len(pool))
         if self.aims.intrinsics:
             covariance = inverse_of(so_far[0] + gains[0][pool])
@@ -228,7 +228,7 @@ class _Worth:
 
 
 def _cells(pixels: Array, known: BoardKnowledge, share: float) -> NDArray[np.bool_]:
-    """(C, 96) cells that hold a corner (C, P, 2) within the inner share of their sides."""
+    """(C, 96) whether each cell holds a corner of (C, P, 2) within the inner share of its sides."""
     if not len(pixels):
         return np.zeros((0, COVERAGE_GRID[0] * COVERAGE_GRID[1]), dtype=bool)
     place = (pixels + 0.5) / [known.camera.width, known.camera.height] * COVERAGE_GRID
@@ -240,7 +240,7 @@ def _cells(pixels: Array, known: BoardKnowledge, share: float) -> NDArray[np.boo
 
 
 def _covered(pixels: Sequence[Array], known: BoardKnowledge) -> NDArray[np.bool_]:
-    """(96,) cells that hold a corner of images that count already."""
+    """(96,) whether each cell holds a corner of images that count already."""
     return _counts(pixels, known).ravel() > 0
 
 
@@ -252,7 +252,7 @@ def _counts(pixels: Sequence[Array], known: BoardKnowledge) -> NDArray[np.int64]
 
 
 def _spread_deg(boards: Array) -> float:
-    """Largest rotation between two views."""
+    """Largest rotation between two views, degrees."""
     if len(boards) < 2:
         return 0.0
     turns = Rotation.from_matrix(boards[:, :3, :3])

@@ -1,4 +1,4 @@
-"""What board images of given poses will tell of the camera and of its mount, before they are taken."""
+"""Predicts the information that board images at given poses hold about the camera and its mount."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, inverse
 
 _PARAMETERS = 8  # fx … p2
-# Before any image: focal lengths relative, principal point over the width, distortion.
+# Prior before any image: focal lengths (relative), principal point (over the width), distortion.
 _PRIOR_SIGMA = (0.05, 0.05, 0.02, 0.02, 0.2, 0.4, 2e-3, 2e-3)
-_ARM_M, _ARM_RAD = 0.5e-3, 0.5e-3  # scatter of an arm's poses, for each axis
-_DISTANCE_M = 0.7  # where projections are judged in the choice
+_ARM_M, _ARM_RAD = 0.5e-3, 0.5e-3  # scatter of an arm's poses, per axis
+_DISTANCE_M = 0.7  # at which projections are judged in the choice
 _GRID = (12, 8)
-_EVERY = 2  # corner of a row and of a column; the others add nothing but noise averaging
+_EVERY = 2  # use every second corner of rows and columns; more would only average noise
 
 
 def lens_prior(camera: CameraModel) -> Array:
-    """(8, 8) information that the nominal values are worth."""
+    """(8, 8) prior information from the nominal values."""
     scale = np.array([camera.fx, camera.fy, camera.width, camera.width, 1, 1, 1, 1])
     return np.diag(1 / (np.array(_PRIOR_SIGMA) * scale) ** 2)
 
 
 def lens_information(boards: Array, camera: CameraModel, board: Board, corner_sigma_px: float) -> Array:
-    """(C, 8, 8) of images of boards T_camera_board (C, 4, 4), each board's own pose being unknown."""
+    """(C, 8, 8) information about fx … p2 from images of boards T_camera_board (C, 4, 4) whose poses are unknown."""
     some = (
         np.arange(board.columns * board.rows, dtype=np.int64)
         .reshape(board.rows, board.columns)[::_EVERY, ::_EVERY]
@@ -41,9 +41,9 @@ def lens_information(boards: Array, camera: CameraModel, board: Board, corner_si
 
 
 def lens_field(camera: CameraModel) -> Array:
-    """(8, 8) matrix F: trace(F C) is the mean variance, px², of projected points, a moved camera left out.
+    """(8, 8) matrix F such that trace(F C) is the mean variance, px², of projected points, less a camera motion.
 
-    C is the covariance of fx … p2. What a rigid motion of the camera can make good is no error of a calibration.
+    C is the covariance of fx … p2. Whatever a rigid motion of the camera can absorb is not a calibration error.
     """
     x, y = np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1])
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -56,7 +56,7 @@ def lens_field(camera: CameraModel) -> Array:
 
 
 def hand_eye_information(T_base_camera: Array, known: BoardKnowledge, board: Board, corner_sigma_px: float) -> Array:
-    """(C, 12, 12) what each pose would tell of T_flange_camera and T_base_board."""
+    """(C, 12, 12) information of each pose about T_flange_camera and T_base_board."""
     points = board.points()
     corners = points.reshape(board.rows, board.columns, 3)[:: board.rows - 1, :: board.columns - 1].reshape(-1, 3)
     share = len(points) / len(corners)
@@ -75,7 +75,7 @@ def hand_eye_information(T_base_camera: Array, known: BoardKnowledge, board: Boa
 def uncertainty_mm(boards: Array, camera: CameraModel, board: Board, corner_sigma_px: float) -> float:
     """Predicted `projection_uncertainty` of a calibration from boards T_camera_board (N, 4, 4), worst in the image.
 
-    At the boards' median distance; NaN where they do not determine the camera.
+    At the boards' median distance; NaN if they do not determine the camera.
     """
     everything = np.arange(board.columns * board.rows, dtype=np.int64)
     solution = _equations(boards, camera, board, everything)
@@ -92,7 +92,7 @@ def uncertainty_mm(boards: Array, camera: CameraModel, board: Board, corner_sigm
 
 
 def inverse_of(information: Array) -> Array:
-    """(N, K, K) inverses of positive matrices of very different units."""
+    """(N, K, K) inverses of positive definite matrices, scaled first because their units differ widely."""
     scale = 1 / np.sqrt(np.einsum("nii->ni", information))
     both = scale[:, :, None] * scale[:, None, :]
     return np.linalg.inv(information * both) * both

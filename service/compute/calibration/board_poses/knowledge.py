@@ -1,4 +1,4 @@
-"""Where the calibration board lies and how the camera is mounted, as far as is known, and how far each may be off."""
+"""What is known of the board's place and the camera's mount before and during calibration, with tolerances."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, inverse, transform
 
-_ARM_M, _ARM_RAD = 0.7e-3, 1e-3  # for each axis: what the poses of an uncalibrated arm err by
+_ARM_M, _ARM_RAD = 0.7e-3, 1e-3  # per axis: pose error of an uncalibrated arm
 _ROUNDS = 6
 _SAFETY = 1.3 * np.sqrt(3.0)  # bound over standard deviation; a uniform error within ± b has b / √3
-_LENS_VIEWS = 5  # from so many images the lens is known better than from its engraving
+_LENS_VIEWS = 5  # from this many images, the lens is known better than from its engraving
 _REFINED_FOCAL, _REFINED_CENTRE = 0.006, 0.003
-_ON_LENS = 0.012  # of the distance: what is left between a board's pose and a lens that is not yet known well
+_ON_LENS = 0.012  # of the distance: error of a board's pose while the lens is not well known
 
 
 @dataclass(frozen=True, slots=True)
 class Tolerances:
-    """How far things may be from where they are said to be: bounds for each axis.
+    """Tolerances as bounds, for each axis.
 
     Attributes:
-        mount_m, mount_rad: of the camera on the flange, against its drawing.
-        place_m: of the board's middle, horizontally, the scene centre's tape measure included.
-        height_m: the same vertically.
+        mount_m, mount_rad: of the camera on the flange, from its drawing.
+        place_m: of the board's middle, horizontally, including how well the scene's centre was measured.
+        height_m: of the board's middle, vertically.
         turn_rad: of the board about the vertical.
-        tilt_rad: of the board against the horizontal.
+        tilt_rad: of the board from the horizontal.
         focal: of the focal length, relative.
         centre: of the principal point, over the image's width.
     """
@@ -52,16 +52,16 @@ class Tolerances:
 
 @dataclass(frozen=True, slots=True)
 class BoardKnowledge:
-    """What board poses are planned from.
+    """The estimates from which board poses are planned, with their tolerances.
 
     Attributes:
         camera: nominal, or calibrated.
-        T_flange_camera, T_base_board: nominal, or from the images' own poses.
-        spread: (12, 12) increments (d, w) of the former and of the latter that are possible are spread @ u for
-            every u within ± 1.
-        focal: the focal length may be off by this share.
-        centre: the principal point by this share of the image's width.
-        measured: from how many images; 0: nominal.
+        T_flange_camera, T_base_board: nominal, or estimated from the images.
+        spread: (12, 12); the possible increments (d, w) of T_flange_camera and T_base_board are spread @ u for every
+            u within ± 1.
+        focal: relative tolerance of the focal length.
+        centre: tolerance of the principal point, over the image's width.
+        measured: number of images used; 0: nominal.
     """
 
     camera: CameraModel
@@ -86,7 +86,7 @@ class BoardKnowledge:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> BoardKnowledge:
-        """Of `record`."""
+        """Read a record written by `record`."""
         return cls(
             CameraModel.from_record(record["camera"]),
             np.array(record["T_flange_camera"]),
@@ -98,11 +98,11 @@ class BoardKnowledge:
         )
 
     def draws(self, count: int, seed: int = 0) -> tuple[Array, Array, Array, Array]:
-        """What may be true: `count` draws within what is possible.
+        """Draw `count` possible truths within the tolerances.
 
         Returns:
-            T_flange_camera (count, 4, 4), T_base_board (count, 4, 4), focal length over the estimate's (count,) and
-            shift of the principal point (count, 2), px.
+            T_flange_camera (count, 4, 4), T_base_board (count, 4, 4), ratio of the focal length to the estimate
+            (count,) and shift of the principal point (count, 2), px.
         """
         rng = np.random.default_rng([seed, 0xD4A3])
         steps = rng.uniform(-1, 1, (count, 12)) @ self.spread.T
@@ -122,15 +122,15 @@ def nominal_knowledge(
     long_side_across: bool = True,
     tolerances: Tolerances = Tolerances(),
 ) -> BoardKnowledge:
-    """What is known before any image.
+    """The knowledge before any image.
 
     Args:
-        camera: nominal, of the images' shape.
-        T_flange_camera: the mount's drawing.
-        middle_m: (3,) where the board's middle should lie, base frame.
+        camera: nominal, for the images' size.
+        T_flange_camera: from the mount's drawing.
+        middle_m: (3,) intended place of the board's middle, base frame.
         approach: (3,) horizontal unit vector from the scene towards the base.
         board: lies face up and level.
-        long_side_across: its long side runs across the approach, not along it.
+        long_side_across: whether the board's long side runs across the approach; otherwise along it.
         tolerances: bounds.
     """
     middle = board.points().mean(axis=0)
@@ -144,7 +144,7 @@ def nominal_knowledge(
     spread[:3, :3], spread[3:6, 3:6] = t.mount_m * np.eye(3), t.mount_rad * np.eye(3)
     turns = np.diag([t.tilt_rad, t.tilt_rad, t.turn_rad])
     spread[6:9, 6:9] = np.diag([t.place_m, t.place_m, t.height_m])
-    spread[6:9, 9:] = cross((R @ middle)[None])[0] @ turns  # turned about its middle, not about its first corner
+    spread[6:9, 9:] = cross((R @ middle)[None])[0] @ turns  # rotated about its middle, not about its first corner
     spread[9:, 9:] = turns
     return BoardKnowledge(camera, T_flange_camera, T_base_board, spread, t.focal, t.centre)
 
@@ -152,23 +152,23 @@ def nominal_knowledge(
 def refined_knowledge(
     known: BoardKnowledge, views: Sequence[BoardView], T_base_flange: Array, board: Board, *, lens_known: bool = False
 ) -> tuple[BoardKnowledge, Array]:
-    """What the first images tell: the lens (from five images on), the mount and the board, weighted with the nominal.
+    """Update lens (from five images on), mount and board with the first images.
 
-    Bayes' rule on the linearised equations of the hand-eye problem (`linearise`): the nominal values with their
-    tolerances are the prior, an arm errs by about a millimetre.
+    Bayes' rule on the linearised hand-eye equations (`linearise`): the nominal values with their tolerances are the
+    prior; the arm's error is taken as about a millimetre.
 
     Args:
-        known: nominal, or from calibrations so far.
-        views: (N) of the board, N > 0.
-        T_base_flange: (N, 4, 4).
-        board: what they show.
-        lens_known: the camera is calibrated and stays as it is.
+            known: nominal, or from calibrations so far.
+            views: (N) of the board, N > 0.
+            T_base_flange: (N, 4, 4).
+            board: the board in the views.
+            lens_known: whether the camera is calibrated and stays as it is.
 
-    Returns:
-        the knowledge, and T_camera_board (N, 4, 4) of the views.
+        Returns:
+            The knowledge, and T_camera_board (N, 4, 4) of the views.
 
     Raises:
-        DataError: no view.
+        DataError: there is no view.
         ComputeError: a view has no pose.
     """
     if not views:
@@ -194,7 +194,7 @@ def refined_knowledge(
 def _posterior(
     known: BoardKnowledge, prior_board: Transform, hands: Array, boards: Array, C: Array
 ) -> tuple[Transform, Transform, Array]:
-    """T_flange_camera, T_base_board and their covariance (12, 12)."""
+    """Posterior T_flange_camera and T_base_board, and their covariance (12, 12)."""
     precision = np.linalg.inv(known.spread @ known.spread.T / 3 + 1e-16 * np.eye(12))
     mount0, board0 = known.T_flange_camera, prior_board
     mount, board = mount0, hands[0] @ mount0 @ boards[0]
@@ -214,13 +214,13 @@ def _posterior(
 
 
 def _from(start: Transform, end: Transform) -> Array:
-    """(6,) increment (d, w) from one transform to the other."""
+    """(6,) increment (d, w) that takes `start` to `end`."""
     w = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
     return np.concatenate([end[:3, 3] - start[:3, 3], w])
 
 
 def _lens(known: BoardKnowledge, views: Sequence[BoardView], board: Board) -> tuple[CameraModel, float, float]:
-    """A lens from the first images, where it is plausible: near the nominal one, and with a moderate distortion."""
+    """A lens from the first images if it is plausible: near the nominal one, and with moderate distortion."""
     size = (known.camera.width, known.camera.height)
     try:
         found = calibrate_intrinsics(views, board, size, model="radial2").camera
@@ -234,7 +234,7 @@ def _lens(known: BoardKnowledge, views: Sequence[BoardView], board: Board) -> tu
 
 
 def _nearer_end(T_base_board: Transform, seen: Transform, board: Board) -> Transform:
-    """The nominal pose, or that of the board laid the other way round, whichever is nearer to how it is seen."""
+    """The nominal pose, or that of the board rotated by half a turn, whichever is nearer to the observed one."""
     middle = board.points().mean(axis=0)
     other = T_base_board @ transform(Rotation.from_euler("z", np.pi), 2 * middle * [1, 1, 0])
     return min((T_base_board, other), key=lambda T: float(np.linalg.norm(T[:3, :3] - seen[:3, :3])))
@@ -243,7 +243,7 @@ def _nearer_end(T_base_board: Transform, seen: Transform, board: Board) -> Trans
 def _same_way(
     T_camera_board: Transform, T_base_camera: Transform, T_base_board: Transform, turned: Transform
 ) -> Array:
-    """Of a board that looks the same after half a turn: the way that agrees with the others."""
+    """For a board that looks the same after half a turn: the orientation that agrees with the other views."""
     expected = (inverse(T_base_camera) @ T_base_board)[:3, :3]
     ways = (T_camera_board, T_camera_board @ turned)
     return min(ways, key=lambda T: float(np.linalg.norm(T[:3, :3] - expected)))

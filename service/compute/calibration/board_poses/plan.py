@@ -1,4 +1,4 @@
-"""Which board poses to take next: those that shrink the covariance of T_flange_camera most."""
+"""Suggests the next board poses for a hand-eye calibration: those that shrink T_flange_camera's covariance most."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ _AZIMUTHS = 12
 _ROLLS_DEG = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
 _DISTANCES = (0.8, 1.0)  # times the median distance so far
 _MARGIN = 0.02  # of the image's width, free of corners
-_MOST_TRIED = 60  # of the best candidates, for one that is reachable
+_MOST_TRIED = 60  # of the best candidates, until one is reachable
 _FLOOR_M, _FLOOR_RAD = 1e-5, 1e-5
 
 
 @dataclass(frozen=True, slots=True)
 class SuggestedPose:
-    """A board pose worth taking.
+    """A suggested board pose.
 
     Attributes:
-        T_base_flange: where to send the flange.
-        T_base_camera: where the camera then is.
-        sigma_mm: predicted standard deviation of T_flange_camera's translation once this and all before are taken.
-        sigma_deg: of its rotation.
+        T_base_flange: target pose of the flange.
+        T_base_camera: the camera's pose there.
+        sigma_mm: predicted standard deviation of T_flange_camera's translation after this and all poses before it.
+        sigma_deg: the same for its rotation.
     """
 
     T_base_flange: Transform
@@ -54,23 +54,23 @@ def suggest_board_poses(
 ) -> tuple[SuggestedPose, ...]:
     """Greedy A-optimal choice among arcs and rolls around the board, on the linearised weighted problem.
 
-    The criterion is the mean square displacement, by T_flange_camera's error, of points as far away as the board.
-    Poses that hide a corner of the board are no candidates.
+    The criterion is the mean square displacement that T_flange_camera's error causes at the board's distance.
+    Candidates show the whole board.
 
     Args:
-        answer: the calibration so far; its robot noise weighs the poses.
+        answer: the calibration so far; its robot noise weights the poses.
         T_base_flange: (N, 4, 4) taken so far.
         points_m: (P, 3) of the board.
         camera: calibrated.
-        corner_sigma_px: noise of a corner.
-        count: of poses wanted.
-        reachable: whether the arm can get its flange there; asked for the best candidates only.
+        corner_sigma_px: standard deviation of a corner.
+        count: number of poses wanted.
+        reachable: whether the arm can take a flange pose; asked only for the best candidates.
 
     Returns:
-        up to `count` poses in the order of their gain; fewer when no others are reachable.
+        Up to `count` poses in the order of their gain; fewer if no others are reachable.
 
     Raises:
-        DataError: no pose was taken so far.
+        DataError: no pose has been taken yet.
     """
     if len(T_base_flange) == 0:
         raise DataError("no board pose so far")
@@ -111,7 +111,7 @@ def suggest_board_poses(
 
 
 def _candidates(T_base_board: Transform, T_base_camera: Array, points_m: Array, camera: CameraModel) -> Array:
-    """(C, 4, 4) camera poses around the board that see all of it."""
+    """(C, 4, 4) camera poses around the board with the whole board in the image."""
     centre_board = points_m.mean(axis=0)
     eyes = (T_base_camera @ np.array([0.0, 0.0, 0.0, 1.0]))[:, :3]
     centre = T_base_board[:3, :3] @ centre_board + T_base_board[:3, 3]
@@ -138,7 +138,7 @@ def _candidates(T_base_board: Transform, T_base_camera: Array, points_m: Array, 
 def _information(
     flanges: Array, X: Transform, B: Transform, points_m: Array, camera: CameraModel, sigma_px: float, noise: Array
 ) -> Array:
-    """(N, 12, 12) what each pose would tell of T_flange_camera and T_base_board."""
+    """(N, 12, 12) information of each pose about T_flange_camera and T_base_board."""
     if len(flanges) == 0:
         return np.zeros((0, 12, 12))
     boards = np.array([inverse(flange @ X) @ B for flange in flanges])
@@ -154,7 +154,7 @@ def _information(
 
 
 def _covariance_of(information: Array) -> Array:
-    """(C, 6, 6) covariance of T_flange_camera from (C, 12, 12)."""
+    """(C, 6, 6) covariance of T_flange_camera from joint information (C, 12, 12)."""
     scale = 1 / np.sqrt(np.einsum("nii->ni", information))
     both = scale[:, :, None] * scale[:, None, :]
     return (np.linalg.inv(information * both) * both)[:, :6, :6]

@@ -1,4 +1,4 @@
-"""A picture of the board poses taken and of those suggested, from above and from the side."""
+"""A picture of the taken and the suggested board poses, from above and from the side."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from service.core.geometry import Array, Transform, apply, inverse
 _PANEL = 700  # px
 _MARGIN = 50
 _TAKEN, _SUGGESTED, _BOARD, _INK = (150, 150, 150), (20, 90, 230), (60, 140, 60), (40, 40, 40)  # BGR
-_LABEL = 14  # px; labels nearer than this are joined: poses often differ by their roll only
-_DEPTH_M = 0.07  # of a camera as it is drawn
+_LABEL = 14  # px; labels nearer than this are joined: poses often differ only in their roll
+_DEPTH_M = 0.07  # of a camera's pyramid
 
 
 def draw_board_plan(
@@ -26,7 +26,7 @@ def draw_board_plan(
     points_m: Array,
     camera: CameraModel,
 ) -> bytes:
-    """PNG: cameras as pyramids around the board, taken ones grey, suggested ones in colour with their number."""
+    """PNG: cameras as pyramids around the board; taken ones grey, suggested ones in colour with their numbers."""
     middle = points_m.mean(axis=0)
     lift = T_base_board.copy()
     lift[:3, 3] = apply(T_base_board, middle)
@@ -86,7 +86,7 @@ def _panel(
 
 
 def _frustum(T: Transform, camera: CameraModel) -> Array:
-    """(5, 3) eye and the four corners of the image, the top edge first."""
+    """(5, 3) camera centre and the four image corners, the top edge first."""
     x, y = camera.width / camera.fx / 2, camera.height / camera.fy / 2
     rays = np.array([[0, 0, 0], [-x, -y, 1], [x, -y, 1], [x, y, 1], [-x, y, 1]]) * _DEPTH_M
     return apply(T, rays)
@@ -98,7 +98,7 @@ def _pyramid(canvas: NDArray[np.uint8], corners: NDArray[np.int32], colour: tupl
     for corner in frame:
         cv2.line(canvas, (int(eye[0]), int(eye[1])), (int(corner[0]), int(corner[1])), colour, width, cv2.LINE_AA)
     top = [(int(x), int(y)) for x, y in frame[:2]]
-    cv2.line(canvas, top[0], top[1], colour, width + 2, cv2.LINE_AA)  # which way the image's top is
+    cv2.line(canvas, top[0], top[1], colour, width + 2, cv2.LINE_AA)  # marks the image's top
 
 
 def _text(canvas: NDArray[np.uint8], text: str, at: tuple[int, int], colour: tuple[int, int, int] = _INK) -> None:

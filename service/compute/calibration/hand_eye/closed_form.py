@@ -1,4 +1,4 @@
-"""Hand-eye in closed form (OpenCV's five methods), what the motion determines, and half-turned boards."""
+"""Hand-eye in closed form (OpenCV's five methods), observability from the motion, and half-turned boards."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _SUBSETS, _SUBSET_SIZE = 24, 8
 
 
 def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transform:
-    """T_flange_camera of poses T_base_flange and T_camera_board, both (N, 4, 4), N ≥ 3.
+    """T_flange_camera from poses T_base_flange and T_camera_board, both (N, 4, 4), N ≥ 3.
 
     Source: Park and Martin 1994, Daniilidis 1999, Tsai and Lenz 1989, Horaud and Dornaika 1995, Andreff et al. 1999,
     as OpenCV implements them.
 
     Raises:
-        ComputeError: no finite answer.
+        ComputeError: the answer is not finite.
     """
-    # By keyword: a fifth positional argument of calibrateHandEye silently means something else.
+    # Arguments by keyword: a fifth positional argument of calibrateHandEye is silently taken as an output array.
     R, t = cv2.calibrateHandEye(
         R_gripper2base=list(hands[:, :3, :3]),
         t_gripper2base=list(hands[:, :3, 3]),
@@ -46,7 +46,7 @@ def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transf
         method=CLOSED_FORMS[method],
     )
     rotation, translation = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel()
-    # Andreff's answer is a rotation only as far as the data are exact.
+    # Andreff's answer is a rotation only for exact data.
     U, scale, Vt = np.linalg.svd(np.nan_to_num(rotation))
     if not (np.isfinite(rotation).all() and np.isfinite(translation).all()) or scale[2] < 0.1:
         raise ComputeError(f"hand-eye calibration by {method} has no answer", remedy="take views with more rotation")
@@ -54,21 +54,21 @@ def solve_closed_form(hands: Array, boards: Array, method: ClosedForm) -> Transf
 
 
 def all_closed_forms(hands: Array, boards: Array) -> dict[ClosedForm, Transform]:
-    """T_flange_camera by every method that has an answer."""
+    """T_flange_camera by every method that gives an answer."""
     answers: dict[ClosedForm, Transform] = {}
     for method in CLOSED_FORMS:
         try:
             answers[method] = solve_closed_form(hands, boards, method)
-        except (cv2.error, ComputeError):  # a comparison that fails is no reason to lose the answer
+        except (cv2.error, ComputeError):  # these are only for comparison; one may fail
             continue
     return answers
 
 
 def observability(hands: Array) -> tuple[float, float, float]:
-    """Largest relative rotation, RMS rotation about the second best axis (both degrees), and the condition number.
+    """Largest relative rotation and RMS rotation about the second best axis (degrees), and the condition number.
 
     Raises:
-        ComputeError: the translation cannot be determined from these rotations.
+        ComputeError: these rotations do not determine the translation.
     """
     n = len(hands)
     if n < MIN_VIEWS:
@@ -98,10 +98,10 @@ def observability(hands: Array) -> tuple[float, float, float]:
 
 
 def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Array, NDArray[np.bool_]]:
-    """Turn the views that were numbered from the board's other end, so that all agree with the robot.
+    """Turn back the views whose board was numbered from its other end, so that all agree with the robot.
 
-    Between two views the flange and the camera must turn by the same angle. Which choice fits each pair better
-    gives a signed graph; its leading eigenvector splits the views in two groups, and the larger one is kept.
+    Between two views, flange and camera must rotate by the same angle. Which orientation fits each pair better gives
+    a signed graph; its leading eigenvector splits the views into two groups, and the larger one is kept as it is.
     """
     n = len(hands)
     turned = boards @ T_board_turned
@@ -118,9 +118,10 @@ def untwist(hands: Array, boards: Array, T_board_turned: Transform) -> tuple[Arr
 
 
 def robust_start(hands: Array, boards: Array, rng: np.random.Generator) -> tuple[Transform, Transform]:
-    """T_flange_camera and T_base_board by Park from the subset of views that suits half of all views best.
+    """T_flange_camera and T_base_board by Park's method on the subset of views that fits half of all views best.
 
-    Least median over random subsets (Rousseeuw 1984) and all views: a few images with a wrong pose have no say.
+    Least median of squares over random subsets (Rousseeuw 1984) and all views, so that a few wrong poses have no
+    influence.
     """
     n = len(hands)
     picks = [np.arange(n)]
@@ -158,7 +159,7 @@ def deviation(poses: Array, mean: Transform, point_m: Array | None = None) -> tu
 
 
 def distance(a: Transform, b: Transform) -> tuple[float, float]:
-    """Between two poses, in mm and degrees."""
+    """Distance in mm and angle in degrees between two poses."""
     offset = inverse(a) @ b
     return mm(float(np.linalg.norm(offset[:3, 3]))), deg(rotation_angle_rad(offset))
 

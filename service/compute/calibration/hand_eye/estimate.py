@@ -1,4 +1,4 @@
-"""Hand-eye calibration: the camera in the flange frame and the board in the base frame, with honest errors."""
+"""Hand-eye calibration: the camera in the flange frame and the board in the base frame, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -55,30 +55,30 @@ __all__ = [
 ]
 
 _FOLDS = 5
-_FEW = 24  # up to so many views twice the folds: a fifth less would change the answer
-_WORTH = 0.9  # an arm's correction is used when the held-out error falls below this share
+_FEW = 24  # up to this many views, use twice the folds: leaving a fifth out would change the answer
+_WORTH = 0.9  # an arm's correction is used if it lowers the held-out error below this share
 
 
 @dataclass(frozen=True, slots=True)
 class HandEyeAnswer:
-    """T_flange_camera, T_base_board and what tells whether to trust them; arrays are over the N views.
+    """T_flange_camera, T_base_board and measures of their quality; arrays are over the N views.
 
     Attributes:
         T_flange_camera: the calibration.
-        T_base_board: where the board lay.
+        T_base_board: the board's pose.
         sigma_mm: bootstrap standard deviation of the translation (root of the summed variances), over images.
         sigma_deg: bootstrap standard deviation of the rotation.
-        covariance: (6, 6) of T_flange_camera by the bootstrap: (d in metres, w in radians) in the flange's axes; with
-            the camera's share.
-        camera_share: (6, 6) of it, from what is not known of the camera: no number of images makes it smaller.
-        formal_covariance: (6, 6) as the fit's own noise model predicts it; None unless the method is weighted.
-        robot_noise_mm: standard deviation for each axis of what is left of the robot's position error; None
-            unless the method is weighted, as the next.
-        robot_noise_deg: of its rotation.
-        residual_mm: (N,) how far the board, placed by each view, is from its place, at the board's middle.
+        covariance: (6, 6) of T_flange_camera from the bootstrap, (d in metres, w in radians) in the flange's axes,
+            including `camera_share`.
+        camera_share: (6, 6) part of it due to the camera calibration's uncertainty, which more images do not reduce.
+        formal_covariance: (6, 6) predicted by the fit's own noise model; None unless the method is weighted.
+        robot_noise_mm: standard deviation per axis of the robot's remaining position error; None unless the method is
+            weighted.
+        robot_noise_deg: the same for its rotation.
+        residual_mm: (N,) distance between the board as placed by each view and T_base_board, at the board's middle.
         residual_deg: (N,) the same for its orientation.
-        held_out_mm: (N,) as residual_mm, but each view judged by a calibration without its fold.
-        held_out_deg: (N,).
+        held_out_mm: (N,) as residual_mm, but each view is judged by a calibration without its fold.
+        held_out_deg: (N,) the same for its orientation.
     """
 
     T_flange_camera: Transform
@@ -98,7 +98,7 @@ class HandEyeAnswer:
 
 @dataclass(frozen=True, slots=True)
 class CorrectedHandEye(HandEyeAnswer):
-    """The answer that goes with poses corrected by `correction` (`corrected_T_base_flange`).
+    """The answer for poses corrected by `correction` (`corrected_T_base_flange`).
 
     Attributes:
         correction: the arm's systematic error.
@@ -111,24 +111,24 @@ class CorrectedHandEye(HandEyeAnswer):
 
 @dataclass(frozen=True, slots=True)
 class HandEyeResult(HandEyeAnswer):
-    """The answer that goes with the robot's poses as it reports them, and all that was learnt on the way.
+    """The answer for the robot's poses as reported, and the diagnostics of the calibration.
 
     Attributes:
-        method: of T_flange_camera.
+        method: method that gave T_flange_camera.
         methods: T_flange_camera by every method that gave an answer.
-        spread_mm: largest distance of another method's translation from the chosen one's (Tsai's and Andreff's
-            included, which are the weakest: a large spread warns of a weak data set).
+        spread_mm: largest distance between the chosen method's translation and another's (including Tsai's and
+            Andreff's, which are the weakest: a large spread warns of weak data).
         spread_deg: the same for the rotation.
-        corner_sigma_px: noise of the corners; None if only board poses were given.
+        corner_sigma_px: standard deviation of the corners; None if only board poses were given.
         rotation_spread_deg: largest rotation between two views.
         second_axis_deg: root mean square rotation about the second best axis.
-        condition: of the translation's linear system; one rotation axis makes it infinite.
-        turned: (N,) views whose board pose was turned by half a turn.
-        excluded: views that no fit used, with the reason.
-        corrected: the answer with the arm's systematic error estimated; None if no joints were given or it does not
-            pay on held-out views.
-        arm_held_out_mm: root mean square of held_out_mm for each model of the arm that was tried ("none" is the
-            arm as it reports itself).
+        condition: condition number of the translation's linear system; infinite for a single rotation axis.
+        turned: (N,) whether the view's board pose was rotated by half a turn.
+        excluded: reason by index of each view that no fit used.
+        corrected: the answer with the arm's systematic error estimated; None if no joints were given or if it does
+            not lower the held-out error.
+        arm_held_out_mm: root mean square of held_out_mm for each arm model that was tried ("none": the poses as
+            reported).
     """
 
     method: Method
@@ -151,8 +151,8 @@ class BoardPlacement:
 
     Attributes:
         T_base_board: mean over the views.
-        residual_mm: (N,) distance of each view's board origin from it.
-        residual_deg: (N,).
+        residual_mm: (N,) distance of each view's board origin from the mean.
+        residual_deg: (N,) angle of each view's board from the mean.
         sigma_mm: standard error of the mean position.
     """
 
@@ -178,31 +178,31 @@ def calibrate_hand_eye(
 ) -> HandEyeResult:
     """Solve T_base_flange · T_flange_camera · T_camera_board = T_base_board over the views.
 
-    `weighted`, the default, weighs robot and images by the noise that the data show in each (weighted.py); a closed
-    form weighs nothing, and `reprojection` blames the images for the robot's errors. With joints and the arm's model,
-    the weighted fit also estimates the arm's systematic error and keeps it when held-out views say that it gains.
+    `weighted`, the default, weights robot and images by the noise that the data show in each (weighted.py). A closed
+    form uses no weights, and `reprojection` attributes the robot's errors to the images. Given joints and the arm's
+    model, the weighted fit also estimates the arm's systematic error and keeps it if held-out views improve.
 
     Args:
         T_base_flange: (N, 4, 4) from the robot.
         T_camera_board: (N, 4, 4) from the images.
-        method: which one gives the answer; the others are computed for comparison.
-        corners: the boards' corners: gives the board poses' covariance; `reprojection` cannot do without.
+        method: the one that gives the answer; the others are computed for comparison.
+        corners: the boards' corners, from which the board poses' covariance follows; required by `reprojection`.
         joints_rad: (N, 6) as recorded with the poses.
-        arm: model of the arm, with `joints_rad`.
+        arm: the arm's model, with `joints_rad`.
         T_board_turned: the half turn of a board that looks the same upside down (`half_turn`); views that were
-            numbered from the other end are then turned so that they agree with the robot.
-        setup: eye-to-hand: the camera stands beside the robot and the board hangs on the flange. Then T_flange_camera
-            and T_flange_board change places with T_base_camera and T_base_board: the answer's T_flange_camera is
-            T_base_camera, its T_base_board is T_flange_board. The arm's own error is not estimated then.
-        camera_covariance: how well the camera of the corners is known; added to the answer's, with `corners`.
+            numbered from the other end are then turned to agree with the robot.
+        setup: eye-to-hand: the camera stands beside the robot and the board is on the flange. T_base_camera and
+            T_flange_board then take the places of T_flange_camera and T_base_board in the answer, and the arm's
+            systematic error is not estimated.
+        camera_covariance: of the calibrated camera; with `corners`, it is added to the answer's covariance.
         bootstrap: number of resamples.
         seed: of the resampling and of the folds.
 
     Raises:
-        DataError: arrays that do not belong together, or are not finite; joints of another arm.
+        DataError: array shapes do not match, values are not finite, or the joints are another arm's.
         ComputeError: too few views, too little rotation, rotation about one axis only, poses that do not fit the
-            images (`check_setup` says which reading of them does), or more than a third of the images in
-            disagreement with the robot.
+            images (`check_setup` names the reading that does), or more than a third of the images disagree with the
+            robot.
     """
     data = _measured(T_base_flange, T_camera_board, corners, joints_rad, arm)
     if setup == "eye-to-hand":
@@ -219,7 +219,7 @@ def calibrate_hand_eye(
     keep = ~np.isin(np.arange(len(data.hands)), list(excluded))
     plain = fit_method(straight.take(keep), method)
     if T_board_turned is not None and (again := turned_back(straight, plain, T_board_turned)).any():
-        # The vote of all pairs can err for a view; its neighbours' common answer does not.
+        # The vote of all pairs can be wrong for a view; the answer common to the others is not.
         turned = turned ^ again
         straight, sigma_px = _straightened(data, turned, T_board_turned)
         excluded = find_outliers(straight, rng)
@@ -344,7 +344,7 @@ def _straightened(
 def _arm_answer(
     data: Measured, keep: NDArray[np.bool_], plain: Answer, terms: ArmTerms, noise: Noise
 ) -> tuple[Answer, NDArray[np.bool_], Noise]:
-    """The fit with the arm's errors; views that only it shows to be wrong have no say in it."""
+    """The fit with the arm's errors (refitted without its own outliers), the views used, and the noise."""
     good = data.take(keep)
     answer = fit_with_arm(good, plain, terms, noise)
     wrong = arm_outliers(answer)
@@ -367,18 +367,19 @@ def _methods(data: Measured, method: Method, answer: Answer) -> dict[Method, Tra
         if other not in answers and (other != "reprojection" or data.corners is not None):
             try:
                 answers[other] = fit_method(data, other).T_flange_camera
-            except ComputeError:  # a comparison that fails is no reason to lose the answer
+            except ComputeError:  # these are only for comparison; one may fail
                 continue
     return answers
 
 
 def place_board(T_base_flange: Array, T_camera_board: Array, T_flange_camera: Transform) -> BoardPlacement:
-    """The board in the base frame of the station that saw it; two stations are joined through one board.
+    """Mean pose of a board in the base frame of the station that saw it.
 
-    T_base1_base2 = T_base1_board · inverse(T_base2_board), if the board has not moved in between.
+    One board joins two stations: T_base1_base2 = T_base1_board · inverse(T_base2_board), if it has not moved in
+        between.
 
     Raises:
-        DataError: no view, or arrays that do not belong together.
+        DataError: no view, or array shapes do not match.
     """
     if T_base_flange.shape != T_camera_board.shape or len(T_base_flange) == 0:
         raise DataError(

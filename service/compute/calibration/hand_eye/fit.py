@@ -1,4 +1,4 @@
-"""The fits behind a hand-eye calibration: outlying images, the weighted fit, and the arm's errors where that pays."""
+"""The fits behind a hand-eye calibration: outlier rejection, the weighted fit, and the arm's systematic error."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ from service.core.geometry import Array, Transform
 Method = Literal["weighted", "reprojection", "park", "daniilidis", "tsai", "horaud", "andreff"]
 ArmTerms = Literal["none", "geometry", "geometry+gears"]
 
-# An arm's systematic error puts views three times the others' scatter off, and they must stay: it is their due. A
+# An arm's systematic error alone displaces views by up to three times the others' scatter; these are not outliers. A
 # wrong pose, a moved board or a bad detection is farther away than this.
 _GROSS = 5.0
-_LIMIT = float(chdtri(6, 1e-4))  # where the arm's own error is part of the model
+_LIMIT = float(chdtri(6, 1e-4))  # when the arm's systematic error is part of the model
 _MEDIAN_NORM = 1.538  # median length of three standard normal numbers
 _CHI2_MEDIAN = float(chdtri(6, 0.5))
 _MAX_EXCLUDED = 1 / 3
-_ARM_FLOOR_M = 3e-6  # no arm repeats better
+_ARM_FLOOR_M = 3e-6  # no arm is more repeatable
 _MIN_ARM_VIEWS = 9
 _ROUNDS = 6
 
@@ -71,15 +71,15 @@ _GROUPS = np.concatenate([np.zeros(N_DH, dtype=np.int64), _GEAR_GROUPS.ravel()])
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """T_flange_camera and T_base_board, and for a weighted fit what it rests on.
+    """T_flange_camera and T_base_board, with the model of a weighted fit.
 
     Attributes:
         T_flange_camera: the calibration.
-        T_base_board: where the board lay.
-        views: weighted fit only: the views with the parameters in use.
+        T_base_board: the board's pose.
+        views: the views with the arm parameters in use; weighted fit only.
         noise: weighted fit only.
         fit: weighted fit only.
-        correction: of the arm, if it takes part.
+        correction: of the arm, if it was estimated.
     """
 
     T_flange_camera: Transform
@@ -92,7 +92,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """All that was measured: N views; `corners` and `joints_rad` (N, 6) where known."""
+    """All measurements of N views; `corners` and `joints_rad` (N, 6) if known."""
 
     hands: Array
     boards: Array
@@ -102,7 +102,7 @@ class Measured:
     arm: ArmModel | None
 
     def take(self, which: NDArray[np.bool_]) -> Measured:
-        """These views only."""
+        """Only these views."""
         return Measured(
             self.hands[which],
             self.boards[which],
@@ -113,7 +113,7 @@ class Measured:
         )
 
     def views(self, terms: ArmTerms) -> Views:
-        """For the weighted fit, with these parameters of the arm."""
+        """The views for a weighted fit with these parameters of the arm."""
         kind = _KIND[terms]
         if terms == "none":
             design = np.zeros((len(self.hands), 6, 0))
@@ -125,7 +125,7 @@ class Measured:
         return Views(self.hands, self.boards, self.covariance, design, kind)
 
     def placed(self, answer: Answer) -> Array:
-        """(N, 4, 4) T_base_board by each view alone."""
+        """(N, 4, 4) T_base_board from each view alone."""
         hands = self.hands
         if answer.correction is not None:
             assert self.joints_rad is not None
@@ -134,10 +134,10 @@ class Measured:
 
 
 def find_outliers(data: Measured, rng: np.random.Generator) -> dict[int, str]:
-    """Views whose robot pose and board pose disagree beyond what the others' noise explains, with reasons.
+    """Views whose robot pose and board pose disagree beyond the others' noise, with reasons by index.
 
     Raises:
-        ComputeError: more than a third of them.
+        ComputeError: more than a third of the views disagree.
     """
     views = data.views("none")
     X, B = robust_start(data.hands, data.boards, rng)
@@ -170,14 +170,14 @@ def find_outliers(data: Measured, rng: np.random.Generator) -> dict[int, str]:
 
 
 def _median_noise(e: Array) -> Noise:
-    """A robust first guess from increments (N, 6)."""
+    """A robust initial estimate of the noise from increments (N, 6)."""
     lengths = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
     robot_m, robot_rad = (max(float(v) / _MEDIAN_NORM, FLOOR_M) for v in np.median(lengths, axis=0))
     return Noise(robot_m, robot_rad)
 
 
 def turned_back(data: Measured, answer: Answer, T_board_turned: Transform) -> NDArray[np.bool_]:
-    """(N,) views that agree better with the answer when their board is turned by half a turn."""
+    """(N,) views that fit the answer better with the board turned by half a turn."""
     apart = [
         Measured(data.hands, boards, data.covariance, None, data.joints_rad, data.arm).placed(answer)
         for boards in (data.boards, data.boards @ T_board_turned)
@@ -187,15 +187,15 @@ def turned_back(data: Measured, answer: Answer, T_board_turned: Transform) -> ND
 
 
 def fit_method(data: Measured, method: Method, start: Answer | None = None) -> Answer:
-    """One method's answer from these views, the arm taken as it reports itself.
+    """One method's answer from these views, without a model of the arm's error.
 
     Args:
         data: without outliers.
-        method: which.
-        start: a nearby answer, which saves the search.
+        method: the method.
+        start: a nearby answer, which saves the search for a start.
 
     Raises:
-        ComputeError: no answer.
+        ComputeError: the method has no answer.
     """
     if method not in ("weighted", "reprojection"):
         return fit_closed_form(data, method)
@@ -216,16 +216,16 @@ def fit_method(data: Measured, method: Method, start: Answer | None = None) -> A
 
 
 def fit_closed_form(data: Measured, method: ClosedForm) -> Answer:
-    """A closed form's answer, the board at its mean place."""
+    """A closed form's answer, with the board at its mean pose."""
     X = solve_closed_form(data.hands, data.boards, method)
     return Answer(X, mean_pose(data.hands @ X @ data.boards))
 
 
 def arm_noise(data: Measured, plain: Answer, terms: ArmTerms) -> Noise:
-    """Variances of the model with these parameters of the arm, before any selection among them.
+    """Noise of the model with these arm parameters, before any selection among them.
 
     Raises:
-        DataError: the joints are not this arm's.
+        DataError: the joints are another arm's.
     """
     assert plain.noise is not None
     views = data.views(terms)
@@ -235,17 +235,17 @@ def arm_noise(data: Measured, plain: Answer, terms: ArmTerms) -> Noise:
 
 
 def fit_with_arm(data: Measured, plain: Answer, terms: ArmTerms, start: Noise) -> Answer:
-    """The weighted answer together with the arm's systematic error.
+    """The weighted answer with the arm's systematic error estimated.
 
     Args:
         data: without outliers, with joints and arm.
-        plain: the weighted answer without.
-        terms: which parameters.
-        start: from `arm_noise`, of these views or of nearly the same.
+        plain: the weighted answer without it.
+        terms: the arm parameters to estimate.
+        start: noise from `arm_noise`, of these views or nearly the same.
 
     Raises:
-        ComputeError: no answer.
-        DataError: the joints are not this arm's.
+        ComputeError: there is no answer.
+        DataError: the joints are another arm's.
     """
     assert data.arm is not None
     views, noise = data.views(terms), start
@@ -269,7 +269,7 @@ def _observed(fit: Fit, noise: Noise, kind: NDArray[np.int64]) -> Array:
 
 
 def arm_outliers(answer: Answer) -> NDArray[np.bool_]:
-    """(N,) views that a fit with the arm's errors cannot explain, though one without could."""
+    """(N,) views that a fit with the arm's errors does not explain, though a fit without them may."""
     assert answer.views is not None
     assert answer.noise is not None
     assert answer.fit is not None
@@ -278,7 +278,7 @@ def arm_outliers(answer: Answer) -> NDArray[np.bool_]:
 
 
 def arm_is_possible(data: Measured) -> bool:
-    """Whether joints are known and views are enough to think of the arm's errors."""
+    """Whether joints are known and there are enough views to estimate the arm's errors."""
     return data.arm is not None and data.joints_rad is not None and len(data.hands) >= _MIN_ARM_VIEWS
 
 
@@ -291,16 +291,16 @@ def held_out(
     folds: NDArray[np.int64],
     point_m: Array,
 ) -> tuple[Array, Array]:
-    """(N,) mm and degrees by which each view puts the board off a fit that did not know it.
+    """(N,) distance in mm and angle in degrees of each view's board from a fit without this view.
 
     Args:
-        data: all views, outliers included (which no fit ever sees).
-        keep: (N,) the others.
+        data: all views, including outliers (which no fit uses).
+        keep: (N,) whether a view is not an outlier.
         method: of the fits.
-        terms: parameters of the arm in the fits.
-        start: answer to all views without the arm, and the arm's variances, to start from.
+        terms: arm parameters in the fits.
+        start: the answer from all views without the arm's errors, and the noise with them, to start from.
         folds: (N,) fold of each view.
-        point_m: (3,) point of the board where the distance is measured.
+        point_m: (3,) point of the board at which the distance is measured.
     """
     mm, deg = np.zeros(len(folds)), np.zeros(len(folds))
     for k in range(int(folds.max()) + 1):

@@ -1,4 +1,4 @@
-"""A hand-eye calibration's board views in and plain data out: hand_eye.json and the calibration step's record."""
+"""Converts board views to a hand-eye calibration's input and its result to plain data (hand_eye.json, evidence)."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _BESIDE = {"T_flange_camera": "T_base_camera", "T_base_board": "T_flange_board"}
 
 
 def hand_eye_record(result: HandEyeResult, images: Sequence[str], setup: Setup = "eye-in-hand") -> dict[str, Any]:
-    """4×4 transforms and covariances in metres and radians, errors in mm and degrees, views by name.
+    """The result as plain data: transforms (4×4) and covariances in metres and radians, errors in mm and degrees.
 
-    Of a camera beside the robot (eye-to-hand) the record holds T_base_camera and T_flange_board instead, and nothing
-    that takes T_flange_camera reads it by mistake.
+    For a camera beside the robot (eye-to-hand) the record holds T_base_camera and T_flange_board instead, so that
+    nothing that expects T_flange_camera can read it by mistake.
 
-    `T_flange_camera` goes with poses as the robot reports them. `arm_correction`, where it is not null, holds the
-    correction of the poses and the T_flange_camera that goes with corrected ones (`read_arm_correction`).
+    `T_flange_camera` is for poses as the robot reports them. `arm_correction`, if not null, holds the correction of
+    the poses and the T_flange_camera for corrected poses (`read_arm_correction`).
     """
     chosen = result.T_flange_camera
     corrected = result.corrected
@@ -95,7 +95,7 @@ def _answer(answer: HandEyeAnswer, images: Sequence[str]) -> dict[str, Any]:
 
 
 def board_corners(views: Sequence[BoardView], board: Board, camera: CameraModel) -> BoardCorners:
-    """Views of a board, perhaps partial, as `calibrate_hand_eye` takes them."""
+    """Views of a board, possibly partial, in the form that `calibrate_hand_eye` takes."""
     points = board.points()
     pixels = np.full((len(views), len(points), 2), np.nan)
     for row, view in zip(pixels, views, strict=True):
@@ -105,22 +105,22 @@ def board_corners(views: Sequence[BoardView], board: Board, camera: CameraModel)
 
 @dataclass(frozen=True, slots=True)
 class ArmCorrected:
-    """What turns an arm's joints and reported poses into camera poses."""
+    """Converts an arm's joints and reported poses to camera poses."""
 
     correction: ArmCorrection
     T_flange_camera: Transform
 
     def T_base_camera(self, joints_rad: Array, T_base_flange: Array) -> Array:
-        """(N, 4, 4) of joints (N, 6) and reported poses (N, 4, 4).
+        """(N, 4, 4) camera poses from joints (N, 6) and reported poses (N, 4, 4).
 
         Raises:
-            DataError: not this arm's joints and poses.
+            DataError: joints and poses of another arm.
         """
         return corrected_T_base_flange(joints_rad, T_base_flange, self.correction) @ self.T_flange_camera
 
 
 def read_arm_correction(record: Mapping[str, Any]) -> ArmCorrected:
-    """The value of `arm_correction` in a record, which must not be null.
+    """Read the value of `arm_correction` from a record; it must not be null.
 
     Raises:
         DataError: a field is missing or has another shape.

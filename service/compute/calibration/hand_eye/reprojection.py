@@ -1,4 +1,4 @@
-"""Board poses' covariance from their corners, and the hand-eye of the least reprojection error (12 parameters)."""
+"""Covariance of board poses from their corners, and hand-eye by least reprojection error (12 parameters)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class BoardCorners:
 
     Attributes:
         points_m: (P, 3) in the board frame.
-        corners_px: (N, P, 2) detected; NaN where a corner was not seen.
+        corners_px: (N, P, 2) detected; NaN for corners that were not seen.
         camera: calibrated.
     """
 
@@ -36,19 +36,19 @@ class BoardCorners:
             raise DataError(f"{self.corners_px.shape} corners of boards with {len(self.points_m)}")
 
     def take(self, which: NDArray[np.bool_]) -> BoardCorners:
-        """These views only."""
+        """Only these views."""
         return BoardCorners(self.points_m, self.corners_px[which], self.camera)
 
 
 def projection_jacobian(points_m: Array, T_camera_board: Array, camera: CameraModel) -> tuple[Array, Array]:
-    """Pixels (N, P, 2) and their derivative (N, P, 2, 6) to the (d, w) increment of each T_camera_board (N, 4, 4)."""
+    """Pixels (N, P, 2) and their derivative (N, P, 2, 6) by the (d, w) increment of each T_camera_board (N, 4, 4)."""
     points = np.einsum("nij,pj->npi", T_camera_board[:, :3, :3], points_m) + T_camera_board[:, None, :3, 3]
     shape = points.shape[:2]
 
     def project(p: Array) -> Array:
         return camera.project(p.reshape(-1, 3)).reshape(*shape, 2)
 
-    # Central differences over a micrometre are good to nine digits, for whatever lens model the camera has.
+    # Central differences over a micrometre are accurate to nine digits and work for any lens model.
     to_point = np.stack(
         [(project(points + shift) - project(points - shift)) / (2 * _STEP_M) for shift in np.eye(3) * _STEP_M],
         axis=-1,
@@ -59,9 +59,9 @@ def projection_jacobian(points_m: Array, T_camera_board: Array, camera: CameraMo
 
 
 def board_covariance(corners: BoardCorners, T_camera_board: Array) -> tuple[Array, float]:
-    """(N, 6, 6) covariance of each located board's pose, and the corners' noise in px that it comes from.
+    """(N, 6, 6) covariance of each board pose, and the standard deviation of the corners in px that it follows from.
 
-    The noise is the median over the views of their residuals' standard deviation for each axis.
+    The latter is the median over the views of their residuals' standard deviation per axis.
     """
     pixels, J = projection_jacobian(corners.points_m, T_camera_board, corners.camera)
     residual = (corners.corners_px - pixels).reshape(len(pixels), -1)
@@ -77,7 +77,7 @@ def board_covariance(corners: BoardCorners, T_camera_board: Array) -> tuple[Arra
 
 
 def _grams(hands: Array, corners: BoardCorners, X: Transform, B: Transform) -> Array:
-    """(N, 13, 13) products of the rows [J | residual] of each view's corners."""
+    """(N, 13, 13) Gram matrices of each view's rows [J | residual]."""
     boards = np.array([inverse(hand @ X) @ B for hand in hands])
     pixels, J = projection_jacobian(corners.points_m, boards, corners.camera)
     _, to_flange, from_board = linearise(hands, boards, X, B)
@@ -102,18 +102,18 @@ def _step(gram: Array) -> Array:
 def solve_reprojection(
     hands: Array, corners: BoardCorners, X: Transform, B: Transform
 ) -> tuple[Transform, Transform]:
-    """T_flange_camera and T_base_board of the least reprojection error, the robot's poses held (Gauss-Newton).
+    """T_flange_camera and T_base_board of least reprojection error, with the robot's poses fixed (Gauss-Newton).
 
-    The paper's method. It blames the images for the robot's errors, which are many times larger.
+    The paper's method. It attributes the robot's errors, which are many times larger, to the images.
 
     Args:
         hands: (N, 4, 4) T_base_flange.
         corners: of the N views.
-        X: start of T_flange_camera.
-        B: start of T_base_board.
+        X: initial T_flange_camera.
+        B: initial T_base_board.
 
     Raises:
-        ComputeError: undetermined, or no convergence.
+        ComputeError: the views do not determine the answer, or it did not converge.
     """
     hand_eye, board, before = X, B, np.inf
     for _ in range(_ITERATIONS):
@@ -127,6 +127,6 @@ def solve_reprojection(
 
 
 def resample_reprojection(hands: Array, corners: BoardCorners, X: Transform, B: Transform, counts: Array) -> Array:
-    """(R, 12) increments of the answer when view i counts `counts[r, i]` times."""
+    """(R, 12) increments of the answer if view i counts `counts[r, i]` times."""
     flat = counts @ _grams(hands, corners, X, B).reshape(len(hands), -1)
     return np.array([_step(row.reshape(13, 13)) for row in flat])

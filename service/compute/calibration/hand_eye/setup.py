@@ -1,9 +1,9 @@
-"""Whether robot poses and board images fit together at all, and if not, which mistake explains them.
+"""Checks whether robot poses and board images fit together, and names the usual mistake if they do not.
 
-Where the camera hangs on the flange and the board lies still, T_base_flange · X · T_camera_board is one pose. A file
-that holds T_flange_base instead, or a camera that stands beside the robot and looks at a board on the flange, gives
-poses that fit only when they are inverted; a file in millimetres, only a thousand times smaller. A solver answers all
-the same: with a camera metres away and a noise of centimetres.
+If the camera is on the flange and the board lies still, T_base_flange · X · T_camera_board is constant. A file with
+T_flange_base instead, or a camera beside the robot that looks at a board on the flange, gives poses that fit only
+when inverted; a file in millimetres fits only when scaled by 1/1000. A solver would still give an answer: a camera
+metres away, with centimetres of noise.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from service.core.geometry import Array, inverse
 
 Setup = Literal["eye-in-hand", "eye-to-hand"]
 
-# Half of the views place the board by more than this beside its place: no robot's poses, whatever the robot.
+# If half of the views place the board farther than this from its place, these are not a robot's poses.
 _MOST_MM, _MOST_DEG = 25.0, 3.0
-_CLEARLY = 3.0  # times smaller, position and rotation: then the other reading is the true one
+_CLEARLY = 3.0  # the true reading's errors are this many times smaller, in position and rotation
 
 
 @dataclass(frozen=True, slots=True)
 class SetupFit:
-    """How views agree under one reading of the poses: medians over the views."""
+    """Agreement of the views under one reading of the poses: medians over the views."""
 
     mm: float
     deg: float
 
     @property
     def fits(self) -> bool:
-        """Whether a robot could be as bad."""
+        """Whether the errors are small enough for a robot."""
         return self.mm <= _MOST_MM and self.deg <= _MOST_DEG
 
     def beats(self, other: SetupFit) -> bool:
-        """Whether it fits, and so much better that the other reading is a mistake."""
+        """Whether it fits, and so much better that the other reading must be a mistake."""
         return self.fits and _CLEARLY * self.mm < other.mm and _CLEARLY * self.deg < other.deg
 
     def __str__(self) -> str:
@@ -45,18 +45,18 @@ class SetupFit:
 
 
 def inverted(poses: Array) -> Array:
-    """(N, 4, 4) the inverses of poses (N, 4, 4)."""
+    """(N, 4, 4) inverses of poses (N, 4, 4)."""
     return np.array([inverse(T) for T in poses])
 
 
 def check_setup(hands: Array, boards: Array, point_m: Array, setup: Setup) -> None:
-    """Raise ComputeError unless the robot's and the images' poses fit as they are read; name the reading that does.
+    """Raise ComputeError unless robot and image poses fit; its message names the reading that does, if any.
 
     Args:
         hands: (N, 4, 4) T_base_flange, or T_flange_base for a camera beside the robot.
         boards: (N, 4, 4) T_camera_board.
-        point_m: (3,) of the board, at which distances are measured.
-        setup: how the poses are read.
+        point_m: (3,) point of the board at which distances are measured.
+        setup: the assumed reading of the poses.
     """
     as_read = _fit(hands, boards, point_m)
     metres = hands.copy()
@@ -74,7 +74,7 @@ def check_setup(hands: Array, boards: Array, point_m: Array, setup: Setup) -> No
     )
     for poses, words, remedy in readings:
         found = _fit(poses, boards, point_m)
-        # A millimetre file fits in rotation as it is: only its positions tell.
+        # Poses in millimetres fit in rotation as they are: only their positions tell.
         better = found.fits and not as_read.fits if poses is metres else found.beats(as_read)
         if better:
             raise ComputeError(

@@ -1,4 +1,4 @@
-"""How far a hand-eye answer would scatter with other images: the bootstrap, and what held-out images say of it."""
+"""Uncertainty of a hand-eye answer: the bootstrap over images, the camera's share, and held-out images."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform
 from service.core.units import metres
 
-_MIN_DISTINCT = 4  # views in a bootstrap replicate
+_MIN_DISTINCT = 4  # distinct views in a bootstrap replicate
 
 
 def bootstrap_covariance(
     data: Measured, method: Method, answer: Answer, count: int, rng: np.random.Generator
 ) -> Array:
-    """(6, 6) covariance of T_flange_camera over resamples of whole images.
+    """(6, 6) covariance of T_flange_camera from resampling whole images.
 
-    It holds for systematic errors that differ from pose to pose too.
+    It also covers systematic errors, as far as they differ from pose to pose.
     """
     n = len(data.hands) if answer.views is None else len(answer.views.T_base_flange)
     picks = [rng.integers(0, n, n) for _ in range(count)]
@@ -48,10 +48,10 @@ def bootstrap_covariance(
 
 
 def camera_share(data: Measured, known: CameraCovariance) -> Array:
-    """(6, 6) covariance of T_flange_camera from what is not known of the camera, which is the same in every image.
+    """(6, 6) covariance of T_flange_camera due to the camera calibration's uncertainty, common to all images.
 
-    The board's place in each image and then the mount are found again with cameras one standard deviation off; by
-    Park's closed form, whose answer the camera's error moves as it moves the others'.
+    Board poses and then the mount are found again with cameras displaced by one standard deviation; by Park's closed
+    form, which reacts to the camera's error as the other methods do.
     """
     corners = data.corners
     assert corners is not None
@@ -69,7 +69,7 @@ def camera_share(data: Measured, known: CameraCovariance) -> Array:
 
 
 def _located(corners: BoardCorners, index: int, T: Transform, camera: CameraModel) -> Transform:
-    """T_camera_board of one view through another camera, starting from where it was."""
+    """T_camera_board of one view refined with another camera, starting from T."""
     seen = np.flatnonzero(np.isfinite(corners.corners_px[index]).all(axis=1))
     view = BoardView(seen, corners.corners_px[index][seen])
     start = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
@@ -77,15 +77,15 @@ def _located(corners: BoardCorners, index: int, T: Transform, camera: CameraMode
 
 
 def not_below_held_out(covariance: Array, held_out_mm: Array, held_out_deg: Array) -> Array:
-    """The covariance (6, 6), translation and rotation each scaled up to what held-out images allow.
+    """The covariance (6, 6) with translation and rotation each scaled up to what held-out images require.
 
-    A closed form has no model of the noise, and views that err alike make its resamples alike: what N views place
-    with a scatter is not known better than that scatter over the root of N.
+    A closed form has no noise model, and views with similar errors give similar resamples. But the mean of N views is
+    not known better than their held-out scatter over the root of N.
 
     Args:
         covariance: (d in metres, w in radians).
-        held_out_mm: (N,) of views that were judged by a calibration without them.
-        held_out_deg: (N,).
+        held_out_mm: (N,) errors of views judged by a calibration without them.
+        held_out_deg: (N,) the same for the rotation.
     """
     root = np.sqrt(len(held_out_mm))
     least = np.array([metres(float(np.median(held_out_mm))), np.radians(np.median(held_out_deg))]) / root

@@ -1,13 +1,14 @@
-"""Hand-eye weighted by the noise of robot and images: variances from the data, arm errors as random effects.
+"""Hand-eye weighted by the noise of robot and images; variances from the data, arm errors as random effects.
 
-For view i the flange's pose by the images is  T_base_board · inverse(T_camera_board) · inverse(T_flange_camera).  Its
-increment e from the pose that the robot reported, in the axes of the flange, is the robot's error plus the images':
+According to the images, the flange's pose in view i is  T_base_board · inverse(T_camera_board) ·
+inverse(T_flange_camera).  Its increment e from the reported pose, in the flange's axes, is the sum of the robot's and
+the images' errors:
 
     e_i(T_flange_camera, T_base_board) = G_i φ + a_i + J_i c_i,   a_i ~ N(0, diag(σ_t² 1, σ_r² 1)),  c_i ~ N(0, C_i)
 
-C_i is the covariance of the board's pose in the image; G_i φ the arm's systematic error (arm.correction), φ ~
-N(0, s²) in the scale of usual tolerances. The variances σ_t², σ_r² and s² are those of the largest restricted
-likelihood (REML; Patterson and Thompson 1971, by Henderson's mixed model equations).
+C_i is the covariance of the board's pose in the image; G_i φ is the arm's systematic error (arm.correction) with the
+prior φ ~ N(0, s²) in units of usual tolerances. The variances σ_t², σ_r² and s² maximise the restricted likelihood
+(REML; Patterson and Thompson 1971, by Henderson's mixed model equations).
 """
 
 from __future__ import annotations
@@ -28,19 +29,19 @@ FLOOR_M = 2e-7
 _ITERATIONS = 8
 _SELECTION_ROUNDS = 80
 _UNDETERMINED = "the views do not determine the hand-eye transform"
-_SINGULAR = 3e-7  # least pivot of the scaled normal matrix
+_SINGULAR = 3e-7  # smallest accepted pivot of the scaled normal matrix
 
 
 @dataclass(frozen=True, slots=True)
 class Views:
-    """What was measured: N board views.
+    """Measurements of N board views.
 
     Attributes:
         T_base_flange: (N, 4, 4) as reported.
         T_camera_board: (N, 4, 4) from the images.
-        covariance: (N, 6, 6) of T_camera_board: (d, w) in the axes of the camera.
-        design: (N, 6, K) derivative of the flange's increment to the arm's parameters, K perhaps 0.
-        kind: (K,) index of the prior scale of each parameter in `Noise.scales`.
+        covariance: (N, 6, 6) of T_camera_board: (d, w) in the camera's axes.
+        design: (N, 6, K) derivative of the flange's increment by the arm's parameters; K may be 0.
+        kind: (K,) index into `Noise.scales` of each parameter's prior scale.
     """
 
     T_base_flange: Array
@@ -50,7 +51,7 @@ class Views:
     kind: NDArray[np.int64]
 
     def take(self, which: NDArray[np.bool_]) -> Views:
-        """These views only."""
+        """Only these views."""
         return Views(
             self.T_base_flange[which],
             self.T_camera_board[which],
@@ -62,7 +63,7 @@ class Views:
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Standard deviations: the robot's for each axis (m, rad), and the scales of the arm's parameters."""
+    """Standard deviations: the robot's per axis (m, rad), and the scales of the arm's parameters."""
 
     robot_m: float
     robot_rad: float
@@ -71,7 +72,7 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """An answer: the two transforms, the arm's parameters (K,) and their part of the joint covariance."""
+    """An answer: the two transforms, the arm's parameters (K,) and their joint covariance."""
 
     T_flange_camera: Transform
     T_base_board: Transform
@@ -80,9 +81,9 @@ class Fit:
 
 
 def linearise(hands: Array, boards: Array, X: Transform, B: Transform) -> tuple[Array, Array, Array]:
-    """Increments e (N, 6) of the flange, their derivative (N, 6, 12) to X and B, and (N, 6, 6) to the board's pose.
+    """Increments e (N, 6) of the flange, their derivative (N, 6, 12) by X and B, and (N, 6, 6) by the board's pose.
 
-    All increments are (d, w) of exp(w) R, t + d in the outer axes of the transform; those of e in the flange's axes.
+    All increments are (d, w) of exp(w) R, t + d in the transform's outer axes; those of e in the flange's axes.
     """
     n = len(hands)
     Rh, Rx = np.swapaxes(hands[:, :3, :3], 1, 2), X[:3, :3]
@@ -119,7 +120,7 @@ def cross(v: Array) -> Array:
 
 
 def _grams(views: Views, noise: Noise, X: Transform, B: Transform) -> tuple[Array, Array]:
-    """(N, P + 1, P + 1) products of the whitened rows [J | e] of each view, and (N,) ½ log|V|; P = 12 + K."""
+    """(N, P + 1, P + 1) Gram matrices of each view's whitened rows [J | e], and (N,) ½ log|V|; P = 12 + K."""
     e, J, JM = linearise(views.T_base_flange, views.T_camera_board, X, B)
     L = np.linalg.cholesky(_robot(noise) + JM @ views.covariance @ np.swapaxes(JM, 1, 2))
     white = np.linalg.solve(L, np.concatenate([J, -views.design, e[:, :, None]], axis=2))
@@ -135,15 +136,15 @@ def _prior(noise: Noise, kind: NDArray[np.int64]) -> Array:
 
 
 def _minimum(gram: Array, prior: Array) -> tuple[Array, Array, float]:
-    """Step (P,), covariance (P, P) and ½ log|H| of one summed Gram matrix (P + 1, P + 1) with the arm's prior.
+    """Step (P,), covariance (P, P) and ½ log|H| from a summed Gram matrix (P + 1, P + 1) and the arm's prior.
 
     Raises:
-        ComputeError: singular.
+        ComputeError: the system is singular.
     """
     H = gram[:-1, :-1].copy()
     H[np.arange(12, len(H)), np.arange(12, len(H))] += 1 / prior
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1 / np.sqrt(np.diag(H))  # metres, radians and tolerances: to the same size
+        scale = 1 / np.sqrt(np.diag(H))  # brings metres, radians and tolerances to one size
         scaled = H * scale[:, None] * scale
     L = _factor(scaled)
     half = np.asarray(solve_triangular(L, np.diag(scale), lower=True, check_finite=False), dtype=np.float64)
@@ -153,7 +154,7 @@ def _minimum(gram: Array, prior: Array) -> tuple[Array, Array, float]:
 
 
 def _factor(scaled: Array) -> Array:
-    """Cholesky factor of a normal matrix with unit diagonal. Raises ComputeError when it is singular."""
+    """Cholesky factor of a normal matrix with unit diagonal. Raises ComputeError if it is singular."""
     try:
         L = np.asarray(np.linalg.cholesky(scaled), dtype=np.float64)
     except np.linalg.LinAlgError as error:
@@ -164,14 +165,14 @@ def _factor(scaled: Array) -> Array:
 
 
 def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations: int = _ITERATIONS) -> Fit:
-    """Least squares weighted by `noise`, in local increments scaled by their normal matrix (Gauss-Newton).
+    """Gauss-Newton least squares weighted by `noise`, in increments scaled by the normal matrix.
 
     Args:
         views: the measurements.
-        noise: standard deviations, as `estimate_noise` finds them.
-        X: start of T_flange_camera.
-        B: start of T_base_board.
-        iterations: at most.
+        noise: standard deviations from `estimate_noise`.
+        X: initial T_flange_camera.
+        B: initial T_base_board.
+        iterations: largest number.
 
     Raises:
         ComputeError: the views do not determine the answer.
@@ -194,14 +195,14 @@ def solve(views: Views, noise: Noise, X: Transform, B: Transform, *, iterations:
 
 
 def estimate_noise(views: Views, X: Transform, B: Transform, start: Noise, *, floor_m: float = FLOOR_M) -> Noise:
-    """Standard deviations of the largest restricted likelihood, at a linearisation near the answer.
+    """Standard deviations that maximise the restricted likelihood, linearised near the answer.
 
     Args:
         views: without outliers.
         X: T_flange_camera, approximately.
-        B: T_base_board.
-        start: first guess; with one scale for each kind of arm parameter.
-        floor_m: least robot noise; for the rotation the same number in radians.
+        B: T_base_board, approximately.
+        start: initial values, with one scale for each kind of arm parameter.
+        floor_m: smallest robot noise; the same number in radians for the rotation.
     """
     e, J, JM = linearise(views.T_base_flange, views.T_camera_board, X, B)
     rows = np.concatenate([J, -views.design, e[:, :, None]], axis=2)
@@ -220,7 +221,7 @@ def estimate_noise(views: Views, X: Transform, B: Transform, start: Noise, *, fl
         left = white @ u
         value = np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))) + 0.5 * np.sum(np.log(prior)) + log_H
         value += 0.5 * (np.sum(left**2) + np.sum(step[12:] ** 2 / prior))
-        # d/dV of each term, diagonal entries only: the robot's variances are diagonal.
+        # d/dV of each term, only the diagonal: the robot's variances are diagonal.
         inverse_L = np.linalg.inv(L)
         trace = np.sum(inverse_L**2, axis=1)
         solved = np.swapaxes(inverse_L, 1, 2) @ np.concatenate([white[:, :, :-1], left[:, :, None]], axis=2)
@@ -243,21 +244,21 @@ def _noise(logs: Array) -> Noise:
 
 
 def select_scales(views: Views, noise: Noise, X: Transform, B: Transform, groups: NDArray[np.int64]) -> Noise:
-    """One prior scale for each group of arm parameters: those that the data do not need go to zero.
+    """A prior scale for each group of arm parameters; those that the data do not need go to zero.
 
-    Automatic relevance determination (MacKay 1992, Tipping 2001): expectation maximisation first, which is safe,
-    then MacKay's fixed point, which is fast. A gear errs at one or two of its harmonics, not at all of them: found
-    out, they can be told from the other joints' errors, and hold beyond the angles that were visited.
+    Automatic relevance determination (MacKay 1992, Tipping 2001): expectation maximisation first, which is safe, then
+    MacKay's fixed point, which is fast. A gear errs at one or two of its harmonics, not at all of them. Once these
+    are found, they can be told from the other joints' errors, and hold beyond the joint angles that were visited.
 
     Args:
         views: as for `solve`.
-        noise: with the scales to start from, in the groups of `views.kind`.
+        noise: with the initial scales, in the groups of `views.kind`.
         X: T_flange_camera, near the answer.
-        B: T_base_board.
+        B: T_base_board, near the answer.
         groups: (K,) group of each parameter.
 
     Returns:
-        noise whose scales belong to `groups`.
+        Noise whose scales are those of `groups`.
     """
     gram = _grams(views, noise, X, B)[0].sum(axis=0)
     members = (groups == np.arange(groups.max() + 1)[:, None]).astype(np.float64)
@@ -275,7 +276,7 @@ def select_scales(views: Views, noise: Noise, X: Transform, B: Transform, groups
 
 
 def resample(views: Views, noise: Noise, fit: Fit, counts: Array) -> Array:
-    """(R, 12 + K) increments of the answer when view i counts `counts[r, i]` times: a bootstrap's replicates.
+    """(R, 12 + K) increments of the answer if view i counts `counts[r, i]` times: the replicates of a bootstrap.
 
     One Gauss-Newton step from the answer, which is exact to second order in the replicates' spread.
     """
@@ -287,10 +288,10 @@ def resample(views: Views, noise: Noise, fit: Fit, counts: Array) -> Array:
 
 
 def mahalanobis(views: Views, noise: Noise, fit: Fit, known: NDArray[np.bool_] | None = None) -> Array:
-    """(N,) squared distances of the views' increments from the model, 6 degrees of freedom each.
+    """(N,) squared Mahalanobis distances of the views' increments from the model, with 6 degrees of freedom each.
 
-    With `known`, the fit's own uncertainty counts too: it adds to the noise of views that the fit did not know, and
-    takes from that of those it did (studentised residuals).
+    With `known`, the fit's own uncertainty counts too: it is added to the noise of views not in the fit and
+    subtracted from that of views in the fit (studentised residuals).
     """
     grams, _ = _grams(views, noise, fit.T_flange_camera, fit.T_base_board)
     v = np.concatenate([np.zeros(12), fit.arm, [1.0]])

@@ -1,1 +1,1 @@
-"""The camera's intrinsics from views of a board, how good they are, and whether they still hold."""
+"""The camera's intrinsics from views of a board, their quality, and whether they still hold."""

@@ -1,4 +1,4 @@
-"""Least squares over one camera and the board's pose in every view, and the normal equations that remain."""
+"""Least squares over one camera and the board's pose in every view, with the poses eliminated."""
 
 from __future__ import annotations
 
@@ -20,24 +20,26 @@ LensModel = Literal["pinhole", "radial2", "opencv4", "opencv5", "rational"]
 PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 PARAMETER_COUNT: dict[LensModel, int] = {"pinhole": 4, "radial2": 6, "opencv4": 8, "opencv5": 9, "rational": 12}
 
-_HUBER = 3.0  # standard deviations of one coordinate beyond which a corner counts less
+_HUBER = 3.0  # standard deviations of one coordinate beyond which a corner is downweighted
 _MAX_ITERATIONS = 40
-# px over the terms' own unit: k3 … k6 are drawn to 0 ± 3 by as much as one corner of 0.03 px. Where the images
-# determine them this is nothing; where they do not, numerator and denominator would cancel without limit.
+# In px per unit of a term: pulls k3 … k6 towards 0 ± 3 with the weight of one corner of 0.03 px. If the images
+# determine these terms, the effect vanishes; if not, it stops numerator and denominator from cancelling without
+# limit.
 _PRIOR = 0.03 / 3
-_START_VIEWS = 20  # that OpenCV's solver starts from; the others join in the adjustment
+_START_VIEWS = 20  # used by OpenCV's solver for a start; the others join in the adjustment
 
 
 @dataclass(frozen=True, slots=True)
 class ViewEquations:
-    """One view at the solution, linearised; the view's own pose is eliminated from the equations.
+    """One view linearised at the solution; the view's own pose is eliminated from the equations.
 
     Attributes:
         residual: (2M,) projection minus corner, px; x and y of each corner in turn.
-        weighted: (2M,) the same times the root of its robust weight, freed of what a better pose would explain.
-        reduced: (2M, P) its derivative with respect to the parameters, freed of what the pose can compensate.
-        compensation: (6, P + 1) how the view's pose (rvec, tvec) follows a change of the parameters; the last column
-            is the pose's own correction.
+        weighted: (2M,) residual times the root of its robust weight, without the part that a better pose would
+            explain.
+        reduced: (2M, P) its derivative by the parameters, without the part that the pose can compensate.
+        compensation: (6, P + 1) change of the view's pose (rvec, tvec) with the parameters; the last column is the
+            pose's own correction.
         pose_normal: (6, 6) normal matrix of the pose alone.
     """
 
@@ -49,12 +51,12 @@ class ViewEquations:
 
     @property
     def normal(self) -> Array:
-        """(P, P) this view's share of the reduced normal matrix."""
+        """(P, P) this view's part of the reduced normal matrix."""
         return self.reduced.T @ self.reduced
 
     @property
     def gradient(self) -> Array:
-        """(P,) this view's share of the reduced gradient; the shares of all views sum to nothing at the solution."""
+        """(P,) this view's part of the reduced gradient; the parts of all views sum to zero at the solution."""
         return self.reduced.T @ self.weighted
 
     @property
@@ -65,7 +67,7 @@ class ViewEquations:
 
 @dataclass(frozen=True, slots=True)
 class Adjustment:
-    """A solution: parameters (P,), poses (N, 6) as rvec and tvec (m) of T_camera_board, and its equations."""
+    """A solution: parameters (P,), poses (N, 6) as rvec and tvec (m) of T_camera_board, and the equations there."""
 
     camera: CameraModel
     parameters: Array
@@ -74,7 +76,7 @@ class Adjustment:
     sigma_px: float  # robust standard deviation of one coordinate
 
     def T_camera_board(self) -> Array:
-        """(N, 4, 4)."""
+        """(N, 4, 4) poses of the board in the views."""
         return np.stack([pose_matrix(pose) for pose in self.poses])
 
 
@@ -84,7 +86,7 @@ def rms(residual: Array) -> float:
 
 
 def pose_matrix(pose: Array) -> Transform:
-    """Our transform of OpenCV's rvec and tvec (6,)."""
+    """The transform of OpenCV's rvec and tvec (6,)."""
     return transform(Rotation.from_rotvec(pose[:3]), pose[3:])
 
 
@@ -94,7 +96,7 @@ def camera_of(parameters: Array, size: tuple[int, int]) -> CameraModel:
 
 
 def parameters_of(camera: CameraModel, count: int) -> Array:
-    """(count,) the inverse of `camera_of`."""
+    """The first `count` PARAMETERS of a camera, the inverse of `camera_of`."""
     return np.array([getattr(camera, name) for name in PARAMETERS[:count]])
 
 
@@ -108,7 +110,7 @@ def project_with_jacobian(points: Array, pose: Array, camera: CameraModel) -> tu
 
 
 def prior_precision(count: int) -> Array:
-    """(count,) diagonal of the normal matrix that the weak prior on k3 … k6 adds; nothing for the other terms."""
+    """(count,) diagonal that the weak prior on k3 … k6 adds to the normal matrix; zero for the other terms."""
     precision = np.zeros(count)
     precision[8:] = _PRIOR**2
     return precision
@@ -117,7 +119,7 @@ def prior_precision(count: int) -> Array:
 def start(
     views: Sequence[BoardView], points: Array, size: tuple[int, int], model: LensModel
 ) -> tuple[CameraModel, Array]:
-    """A first camera from a part of the views by OpenCV's calibrateCamera, and the poses (N, 6) of all of them.
+    """An initial camera from some of the views by OpenCV's calibrateCamera, and the poses (N, 6) of all of them.
 
     Raises:
         ComputeError: no camera or no pose explains the views.
@@ -146,7 +148,7 @@ def start(
 
 
 def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
-    """(6,) rvec and tvec of one view of a known camera.
+    """(6,) rvec and tvec of one view by a known camera.
 
     Raises:
         ComputeError: no pose explains the corners.
@@ -160,7 +162,7 @@ def start_pose(view: BoardView, points: Array, camera: CameraModel) -> Array:
 
 
 def fit_pose(view: BoardView, points: Array, camera: CameraModel, pose: Array) -> tuple[Array, float]:
-    """The pose (6,) of one view of a known camera, from a near one, and its RMS error in px."""
+    """The pose (6,) of one view refined from `pose` with a known camera, and its RMS error in px."""
     object_points = points[view.indices]
     residual = np.zeros(2 * len(view.indices))
     for _ in range(10):
@@ -183,7 +185,7 @@ def adjust(
     parameters: int,
     iterations: int = _MAX_ITERATIONS,
 ) -> Adjustment:
-    """Levenberg-Marquardt over the camera's first `parameters` PARAMETERS and every pose, with Huber's weights.
+    """Levenberg-Marquardt over the camera's first `parameters` PARAMETERS and every pose, with Huber weights.
 
     Each view's pose is eliminated, so the cost of a step grows linearly with the number of views.
     Source: Zhang, "A flexible new technique for camera calibration", PAMI 2000, for the model; Triggs et al.,
@@ -193,13 +195,13 @@ def adjust(
         views: (N) corners, px.
         points: (K, 3) of the board, m.
         size: width and height, px.
-        camera: start.
-        poses: (N, 6) start, rvec and tvec (m).
-        parameters: how many are estimated; the others stay as `camera` has them (zero).
-        iterations: at most.
+        camera: initial camera.
+        poses: (N, 6) initial rvec and tvec (m).
+        parameters: number estimated; the others keep their values in `camera` (zero).
+        iterations: largest number.
 
     Raises:
-        ComputeError: the equations are singular, or do not converge to finite numbers.
+        ComputeError: the equations are singular, or the solution did not stay finite.
     """
     theta = parameters_of(camera, parameters)
     damping = 1e-4
@@ -227,7 +229,7 @@ def adjust(
         cost = trial_cost
         if small:
             break
-        if trial_scale < 0.7 * scale:  # far from the solution the corners' own scale is not yet known
+        if trial_scale < 0.7 * scale:  # far from the solution, the scale of the residuals is not yet known
             state, cost, scale = _linearise(views, points, theta, poses, size)
             cost += float(prior @ theta**2)
     state, _, scale = _linearise(views, points, theta, poses, size)
@@ -237,9 +239,9 @@ def adjust(
 
 
 def linearised(boards: Array, points: Array, camera: CameraModel, parameters: int) -> Adjustment:
-    """The equations that boards T_camera_board (N, 4, 4) would have if their points (K, 3) were seen as expected.
+    """The equations for boards T_camera_board (N, 4, 4) whose points (K, 3) are seen exactly as expected.
 
-    Residuals are nothing, corners count 1 px: what images will tell can be judged before they are taken.
+    Residuals are zero and corners have a standard deviation of 1 px: this predicts what images will determine.
     """
     poses = np.array([np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]]) for T in boards])
     theta = parameters_of(camera, parameters)
@@ -264,7 +266,7 @@ def _linearise(
     size: tuple[int, int],
     scale: float | None = None,
 ) -> tuple[tuple[ViewEquations, ...], float, float]:
-    """Equations of every view, Huber's cost at `scale` (default: the present one), and the present robust scale."""
+    """Equations of every view, Huber's cost at `scale` (default: the current one), and the current robust scale."""
     camera = camera_of(theta, size)
     parts = [
         (*project_with_jacobian(points[view.indices], pose, camera), view.corners)

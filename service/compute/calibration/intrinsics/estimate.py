@@ -1,4 +1,4 @@
-"""The camera's intrinsics from views of a board, with their covariance and the views that do not fit."""
+"""The camera's intrinsics from views of a board, with their covariance and the outlying views."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _MIN_EIGENVALUE = 1e-14  # of the normal matrix scaled to a diagonal of ones
 
 @dataclass(frozen=True, slots=True)
 class ExcludedView:
-    """A view that took no part in the calibration, by its index in the input."""
+    """A view that was not used in the calibration, by its index in the input."""
 
     index: int
     reason: str
@@ -46,24 +46,24 @@ class ExcludedView:
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicsResult:
-    """A calibrated camera and what tells whether to trust it.
+    """A calibrated camera and measures of its quality.
 
     Attributes:
         camera: the camera at the images' size.
-        model: which distortion was estimated.
-        board: what was seen.
+        model: the lens model that was estimated.
+        board: the board in the views.
         rms_px: root mean square of all corners' reprojection errors (two-dimensional).
         views: (N,) input indices of the views used.
         corners: (N) their corners.
-        per_view_rms_px: (N,).
+        per_view_rms_px: (N,) the same for each view.
         parameters: (P) names, in the order of the covariance.
-        covariance: (P, P), px and 1. From the corners' noise, as large as their residuals show it, times `inflation`.
-        inflation: how many times larger the variance is than from independent corners, 1 at least: the corners of one
-            image err together (light, flatness of the board, the model of the lens), and how much the images
-            disagree shows by how much.
+        covariance: (P, P), px and 1: from the corners' noise, estimated from the residuals, times `inflation`.
+        inflation: ratio of the variance to that from independent corners, at least 1. The corners of one image share
+            errors (light, flatness of the board, lens model); the disagreement between images shows how large these
+            are.
         sigma: standard deviation of each parameter, the roots of the covariance's diagonal.
-        sigma_independent: the same from corner noise alone, as most programs state it.
-        sigma_by_image: the same from the disagreement of the images alone; NaN of fewer than 6 views.
+        sigma_independent: the same from corner noise alone, as most programs report it.
+        sigma_by_image: the same from the disagreement of the images alone; NaN for fewer than 6 views.
         leave_one_out: (N, P) change of the parameters when one view is left out (one Newton step).
         sigma_corner_px: standard deviation of one coordinate of a corner, from the residuals.
         T_camera_board: (N, 4, 4); board frame: x along the columns, y along the rows, z away from the camera.
@@ -72,7 +72,7 @@ class IntrinsicsResult:
         tilt_deg: (N,) angle between the board's normal and the optical axis.
         tilt_spread_deg: largest angle between the normals of two views.
         excluded: views left out, with reasons.
-        adjustment: the solution's equations.
+        adjustment: the equations at the solution.
     """
 
     camera: CameraModel
@@ -105,20 +105,20 @@ def calibrate_intrinsics(
     """Calibrate a camera from views of a flat board.
 
     Source: Zhang, "A flexible new technique for camera calibration", PAMI 22(11), 2000, with OpenCV's distortion.
-    k3 … k6 have a weak prior (`prior_precision`), which shows where the images leave them open.
+    k3 … k6 have a weak prior (`prior_precision`), which takes effect only if the images do not determine them.
 
-    Views whose error stands out (more than three times the median) are left out, the worst first, and named; one that
-    fits the final camera after all comes back. Corners that stand out within a view count less (Huber).
+    Views with outlying errors (more than three times the median) are excluded with a reason, the worst first; a view
+    that fits the final camera after all is readmitted. Outlying corners within a view are downweighted (Huber).
 
     Args:
-        views: as from `find_board`.
-        board: what they show.
+        views: from `find_board`.
+        board: the board in the views.
         size: width and height of the images, px.
         model: pinhole (no distortion), radial2 (k1, k2), opencv4 (and p1, p2), opencv5 (and k3), rational (k1 … k6).
 
     Raises:
         DataError: a view's corners do not belong to this board.
-        ComputeError: too few views, or views so alike in tilt that the focal length is not determined.
+        ComputeError: too few views, or tilts so similar that the focal length is undetermined.
     """
     points = board.points()
     used: list[int] = []
@@ -170,7 +170,7 @@ def calibrate_intrinsics(
 
 
 def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Transform, float]:
-    """T_camera_board of one view of a calibrated camera, and its RMS reprojection error in px.
+    """T_camera_board of one view by a calibrated camera, and its RMS reprojection error in px.
 
     Raises:
         ComputeError: no pose explains the corners.
@@ -181,10 +181,10 @@ def locate_view(view: BoardView, board: Board, camera: CameraModel) -> tuple[Tra
 
 
 def leave_one_out(solution: Adjustment) -> Array:
-    """(N, P) how the parameters change without each view: one Newton step of the equations at the solution.
+    """(N, P) change of the parameters without each view, by one Newton step of the equations at the solution.
 
-    Without view i the gradient at the solution is minus this view's share, g_i, and the normal matrix lacks its
-    share, S_i: d = (S - S_i)^-1 g_i. NaN where the other views do not determine the camera.
+    Without view i, the gradient at the solution is minus this view's part, g_i, and the normal matrix lacks its part,
+    S_i: d = (S - S_i)^-1 g_i. NaN if the other views do not determine the camera.
     """
     normal = np.sum([view.normal for view in solution.views], axis=0) + np.diag(
         prior_precision(len(solution.parameters))
@@ -206,7 +206,7 @@ def _solve_without_outliers(
     used: list[int],
     reasons: dict[int, str],
 ) -> tuple[Adjustment, list[int]]:
-    """The solution, the views it rests on; `reasons` gains the others."""
+    """The solution and the views used; the reasons for the others are added to `reasons`."""
     count = PARAMETER_COUNT[model]
     suspects: list[int] = []
     begin: tuple[CameraModel, Array] | None = None
@@ -224,7 +224,7 @@ def _solve_without_outliers(
         solution = adjust(chosen, points, size, *begin, parameters=count)
         errors = np.array([view.rms_px for view in solution.views])
         limit = max(_OUTLIER * float(np.median(errors)), _OUTLIER_FLOOR_PX)
-        # One bad view raises the error of good ones: only those near the worst leave in one round.
+        # One bad view raises the errors of good ones: exclude only those near the worst in each round.
         bad = (errors > limit) & (errors > 0.5 * errors.max())
         if not bad.any():
             break
@@ -259,7 +259,7 @@ def _check_view(view: BoardView, count: int, index: int) -> None:
 
 
 def _inverse_root(normal: Array) -> Array:
-    """R (P, P) with R Rᵀ = the inverse of the normal matrix: in its coordinates the normal matrix is the identity.
+    """R (P, P) with R Rᵀ = the inverse of the normal matrix: in its coordinates, the normal matrix is the identity.
 
     Raises:
         ComputeError: the views do not determine the parameters.
@@ -275,11 +275,11 @@ def _inverse_root(normal: Array) -> Array:
 
 
 def _inflation(solution: Adjustment, root: Array, variance: float) -> tuple[float, Array]:
-    """How much larger the covariance is by images than by corners, over all directions; and by images (P, P).
+    """Ratio of the covariance from images to that from corners, over all directions, and that from images (P, P).
 
-    Each image's gradient is one draw of what its corners err by together. It is corrected for what the solution has
-    already fitted to it, without which few images look too good. The form of the covariance is still taken from the
-    corners and only its size from the images: a dozen images do not determine a matrix of 8 × 8.
+    Each image's gradient is one sample of the errors that its corners share. It is corrected for the part that the
+    solution has absorbed; otherwise few images would look too good. The shape of the covariance is still taken from
+    the corners and only its scale from the images: a dozen images do not determine an 8 × 8 matrix.
     Source: Bell and McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage samples",
     Survey Methodology 28, 2002 (CR2).
     """
@@ -300,9 +300,9 @@ def _sigma(names: Sequence[str], covariance: Array) -> dict[str, float]:
 
 
 def _check_tilt(views: Sequence[BoardView], points: Array, size: tuple[int, int]) -> None:
-    """Parallel boards leave the focal length undetermined: refuse before the solver invents one.
+    """Refuse views of parallel boards, which leave the focal length undetermined.
 
-    Perspective is judged by rough poses under a nominal lens, which is good enough for an angle between normals.
+    The angles are judged with rough poses under a nominal lens, which suffices for angles between normals.
     """
     focal = 1.2 * max(size)
     camera = CameraModel(*size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2)

@@ -1,4 +1,4 @@
-"""Whether images were taken with the lens as it was calibrated: focus, aperture, zoom, lens, body, size."""
+"""Checks whether images were taken with the optics as calibrated: focus, aperture, zoom, lens, body, size."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from dataclasses import dataclass
 
 from service.core.errors import DataError
 
-# Relative steps that are no change: EXIF rounds focal lengths and apertures; focus encoders read in coarse steps.
+# Relative differences that count as equal: EXIF rounds focal length and aperture; focus encoders are coarse.
 _TOLERANCE = {"focal_length_mm": 0.005, "aperture_f": 0.02, "focus_distance_m": 0.02}
-_FOCUS_STEPS = 1  # of a focus motor that stands still, by rounding
+_FOCUS_STEPS = 1  # rounding of a focus motor that stands still
 _FIELDS = (
     "width", "height", "focal_length_mm", "aperture_f", "focus_distance_m", "focus_mode", "focus_position", "lens",
     "lens_serial", "body", "body_serial",
 )  # fmt: skip
-_NAMED = 5  # images in a line of the summary
+_NAMED = 5  # images named in a line of the summary
 
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """What an image file says of the optics it was taken with; None or "" where it does not say."""
+    """The optics recorded in an image file; None or "" for unknown values."""
 
     image: str
     width: int | None = None
@@ -38,7 +38,7 @@ class Optics:
 
 @dataclass(frozen=True, slots=True)
 class OpticsDeparture:
-    """One property of one image that is not as it was at the calibration."""
+    """A property of an image that differs from the calibration."""
 
     image: str
     field: str
@@ -51,7 +51,7 @@ class OpticsDeparture:
 
 @dataclass(frozen=True, slots=True)
 class OpticsComparison:
-    """The departures, and which properties the files do not tell (so nobody knows)."""
+    """The differences, the properties compared, and those that the files do not contain."""
 
     departures: tuple[OpticsDeparture, ...]
     compared: tuple[str, ...]
@@ -59,12 +59,12 @@ class OpticsComparison:
 
     @property
     def images(self) -> tuple[str, ...]:
-        """Names of the images that depart, each once, in order."""
+        """Names of the images with differences, each once, in order."""
         return tuple(dict.fromkeys(departure.image for departure in self.departures))
 
 
 def summary(departures: Sequence[OpticsDeparture]) -> tuple[str, ...]:
-    """One line for each kind of departure, with the images that share it."""
+    """One line for each kind of difference, with the images that share it."""
     alike: dict[tuple[str, str, str], list[str]] = {}
     for departure in departures:
         alike.setdefault((departure.field, departure.found, departure.calibrated), []).append(departure.image)
@@ -76,18 +76,18 @@ def summary(departures: Sequence[OpticsDeparture]) -> tuple[str, ...]:
 
 
 def compare_optics(calibration: Sequence[Optics], capture: Sequence[Optics]) -> OpticsComparison:
-    """Hold images against those of the calibration, property by property.
+    """Compare images with those of the calibration, property by property.
 
-    The calibrated value is the one that most of the calibration's images state. Focus, aperture and zoom move the
+    The calibrated value is the one that most of the calibration's images state. Focus, aperture and zoom change the
     focal length and the distortion; another lens, body or image size is another camera. Exposure time and ISO do not
-    matter. With `capture` the calibration's own images, it is the calibration that is examined for changes within.
+    matter. Pass the calibration's own images as `capture` to check it for changes within.
 
     Args:
-        calibration: of the images that the camera was calibrated from.
-        capture: of the images it is to be used for.
+        calibration: optics of the images used for the calibration.
+        capture: optics of the images to be used with it.
 
     Raises:
-        DataError: no image on one of the two sides.
+        DataError: one of the two is empty.
     """
     if not calibration or not capture:
         raise DataError(
@@ -125,7 +125,7 @@ def _same(field: str, value: object, reference: object) -> bool:
 
 
 def states_focus(optics: Sequence[Optics]) -> bool:
-    """Whether the images would show a focus that was changed: a mode alone does not tell where it is."""
+    """Whether the images would reveal a change of focus; the focus mode alone does not."""
     return all(one.focus_position is not None or one.focus_distance_m is not None for one in optics)
 
 

@@ -1,4 +1,4 @@
-"""Plots of a calibration as PNG: where the corners were, what remains of them, how well the camera projects."""
+"""Plots of a calibration as PNG: corner coverage, residuals, projection uncertainty."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def calibration_plots(result: IntrinsicsResult, uncertainty: ProjectionUncertain
 
 
 def _coverage(result: IntrinsicsResult) -> Canvas:
-    """Corners in each cell, and the corners themselves."""
+    """Number of corners in each cell, and the corners themselves."""
     counts = result.coverage_map.astype(np.float64)
     canvas, scale = _frame(result, f"{result.coverage:.0%} of the cells hold a corner; {len(result.views)} views")
     _heat(canvas, 1 - 0.45 * counts / max(counts.max(), 1), cv2.COLORMAP_BONE, cv2.INTER_NEAREST)
@@ -50,7 +50,7 @@ def _coverage(result: IntrinsicsResult) -> Canvas:
 
 
 def _residuals(result: IntrinsicsResult) -> Canvas:
-    """Mean residual of each of 24 × 16 cells, which shows what the model does not hold, and each view's error."""
+    """Mean residual in each of 24 × 16 cells, which shows what the lens model misses, and each view's error."""
     field, counts = residual_field(result)
     mean, enough = field.reshape(-1, 2), np.flatnonzero(counts >= _ENOUGH)
     cells = np.array(counts.shape[::-1])
@@ -94,7 +94,7 @@ def _uncertainty(result: IntrinsicsResult, uncertainty: ProjectionUncertainty) -
 
 
 def _frame(result: IntrinsicsResult, title: str) -> tuple[Canvas, float]:
-    """A white canvas with the image's outline, and the canvas's pixels for one of the image."""
+    """A white canvas with the image's outline, and the canvas pixels per image pixel."""
     scale = (_WIDTH - 2 * _MARGIN) / result.camera.width
     height = round(result.camera.height * scale)
     canvas = np.full((height + 2 * _MARGIN, _WIDTH, 3), 255, dtype=np.uint8)

@@ -1,4 +1,4 @@
-"""A calibration as plain data, for camera.json and for the run's evidence."""
+"""A calibration as plain data, for camera.json and the run's evidence."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ def intrinsics_record(
     names: Sequence[str],
     excluded: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Everything but the camera itself; numbers that could not be had are null.
+    """Everything but the camera itself; unknown numbers are null.
 
     Args:
         names: of the images used, in the order of `result.views`.
-        excluded: reason by image name, images without the board included.
+        excluded: reason by image name, including images without the board.
     """
     board = result.board
     residuals, counts = residual_field(result, *COVERAGE_GRID)

@@ -1,4 +1,4 @@
-"""How well a calibrated camera projects, over the image, at the distance of the specimen."""
+"""Projection uncertainty of a calibrated camera over the image, at the specimen's distance."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class ProjectionUncertainty:
 
     Attributes:
         distance_m: of the points along the optical axis.
-        pixels: (rows, columns, 2) where.
+        pixels: (rows, columns, 2) positions of the grid.
         sigma_px: (rows, columns).
-        sigma_mm: (rows, columns) the same at that distance, across the line of sight.
+        sigma_mm: (rows, columns) the same at that distance, perpendicular to the line of sight.
         centre_px: at the middle of the image.
         worst_px: largest over the image.
         rms_px: root mean square over the image.
@@ -47,12 +47,12 @@ class ProjectionUncertainty:
 
 @dataclass(frozen=True, slots=True)
 class Determined:
-    """A camera as board images determine it: what the uncertainty of its projection follows from.
+    """A camera as determined by board images: the input of its projection uncertainty.
 
     Attributes:
-        camera: of the first `len(covariance)` parameters.
-        board: seen.
-        corners: (N) what of it.
+        camera: with `len(covariance)` estimated parameters.
+        board: the board in the images.
+        corners: (N) the board's points in each image.
         adjustment: the equations at the solution.
         covariance: (P, P) of the parameters.
         variance: of one coordinate of a corner, px².
@@ -75,23 +75,23 @@ def board_distance_m(result: IntrinsicsResult) -> float:
 def projection_uncertainty(
     result: IntrinsicsResult, distance_m: float, *, columns: int = 24, rows: int = 16
 ) -> ProjectionUncertainty:
-    """What the calibration's errors do to a projected point, whatever the camera's pose takes up left out.
+    """Effect of the calibration's errors on projected points, without the part that the camera's pose absorbs.
 
-    A calibration is a camera *and* where it stood: a wrong principal point is a turned camera. So the perturbed
-    camera is first moved by the rigid motion that fits its view of the boards best to the unperturbed one, as
-    whatever finds the camera's pose later will do. To first order, with b the parameters, e_i the pose of view i,
-    q(b, p) the projection and p_ij the board's points in the camera frame:
+    A calibration determines a camera *and* its poses: a wrong principal point acts like a rotated camera. So the
+    perturbed camera is first moved by the rigid motion that best aligns its view of the boards with the unperturbed
+    one, as any later pose estimation will do. To first order, with b the parameters, e_i the pose of view i, q(b, p)
+    the projection and p_ij the board's points in the camera frame:
 
         db ~ N(0, s² S^-1),   de_i = E_i db + n_i,   n_i ~ N(0, s² C_i^-1)
         dp_ij = L_ij de_i,    tau = argmin Σ |dp_ij - [I, -[p_ij]x] tau|² = K db + Σ H_i n_i
         dq(p) = (dq/db + dq/dp [I, -[p]x] K) db + dq/dp [I, -[p]x] Σ H_i n_i
 
-    and the covariance of dq follows, its size s² that of `result.covariance` (inflation included).
+    and the covariance of dq follows, with the scale s² of `result.covariance` (including inflation).
     Source: Kogan, mrcal, "Projection uncertainty", the form with a fitted implied transformation.
 
     Args:
-        result: of `calibrate_intrinsics`.
-        distance_m: of the plane z = distance in the camera frame where points are projected.
+        result: from `calibrate_intrinsics`.
+        distance_m: of the plane z = distance in the camera frame on which the projected points lie.
         columns: of the grid.
         rows: of the grid.
 
@@ -106,7 +106,7 @@ def projection_uncertainty(
 def uncertainty_of(
     result: Determined, distance_m: float, *, columns: int = 24, rows: int = 16
 ) -> ProjectionUncertainty:
-    """The same for a camera that is determined by any images, those of a plan included."""
+    """`projection_uncertainty` for a camera determined by any images, including planned ones."""
     if not 0 < distance_m < np.inf:
         raise DataError(f"a distance of {distance_m} m is not in front of the camera")
     K, noise = _implied_motion(result)
@@ -114,12 +114,12 @@ def uncertainty_of(
     x = np.linspace(0, camera.width - 1, columns)
     y = np.linspace(0, camera.height - 1, rows)
     grid = np.stack(np.meshgrid(x, y), axis=-1)
-    # The middle rides along as one more point.
+    # The image's middle is added as one more point.
     pixels = np.vstack([grid.reshape(-1, 2), [(camera.width - 1) / 2, (camera.height - 1) / 2]])
     rays = np.column_stack([camera.normalise(pixels), np.ones(len(pixels))])
     points = rays * distance_m
     _, by_pose, by_camera = project_with_jacobian(points, np.zeros(6), camera)
-    # At a zero rvec OpenCV's derivatives by rvec and tvec are those of a small turn and shift of the points.
+    # At a zero rvec, OpenCV's derivatives by rvec and tvec are those of a small rotation and shift of the points.
     J_motion = np.column_stack([by_pose[:, 3:], by_pose[:, :3]]).reshape(-1, 2, 6)
     J_camera = by_camera[:, : len(result.covariance)].reshape(-1, 2, len(result.covariance))
     A = J_camera + J_motion @ K
@@ -145,9 +145,9 @@ def uncertainty_of(
 
 
 def _implied_motion(result: Determined) -> tuple[Array, Array]:
-    """K (6, P), and the covariance (6, 6) of what the poses' own noise adds; motion (d, w), metres and radians.
+    """K (6, P), and the covariance (6, 6) that the poses' own noise adds; motion (d, w) in metres and radians.
 
-    What stood at p before a board from the camera stands at p + d + w x p after parameters and poses have changed.
+    A point p in the camera frame before a change of parameters and poses is at p + d + w x p after it.
     """
     board = result.board.points()
     count = len(result.covariance)

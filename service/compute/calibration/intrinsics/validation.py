@@ -1,4 +1,4 @@
-"""Cross-validation of a calibration over images, and what a careful person would object to."""
+"""Cross-validation of a calibration over images, and warnings about its weaknesses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from service.core.geometry import Array
 
 MIN_VIEWS_TO_VALIDATE = 4
 _FOLDS = 5
-# Gates of the procedure (the reasons are in the messages).
+# Limits for warnings (the reasons are in the messages).
 _VIEWS = 60
 _RMS_PX = 0.5
 _COVERAGE = 0.9
@@ -27,14 +27,14 @@ _INFLATION = 4.0
 
 @dataclass(frozen=True, slots=True)
 class CrossValidation:
-    """Errors of views that a calibration has not seen; only the view's own pose is fitted to it.
+    """Errors of views that were not used in the calibration; only the view's own pose is fitted to it.
 
     Attributes:
-        folds: how many parts the views were split in.
+        folds: number of parts into which the views were split.
         five_fold_rms_px: over all views, each held out once.
         five_fold_view_px: (N,).
-        leave_one_out_rms_px: each view judged by the calibration without it (one Newton step).
-        leave_one_out_view_px: (N,); NaN where the other views do not determine the camera.
+        leave_one_out_rms_px: each view judged by a calibration without it (one Newton step).
+        leave_one_out_view_px: (N,); NaN if the other views do not determine the camera.
     """
 
     folds: int
@@ -48,7 +48,7 @@ def cross_validate(result: IntrinsicsResult, *, seed: int = 0) -> CrossValidatio
     """Five-fold and leave-one-out over the views of a calibration.
 
     Raises:
-        ComputeError: fewer than four views, of which none can be spared.
+        ComputeError: fewer than four views.
     """
     n = len(result.corners)
     if n < MIN_VIEWS_TO_VALIDATE:
@@ -87,9 +87,9 @@ def _pooled(per_view_px: Array, counts: Array) -> float:
 
 
 def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) -> tuple[Array, NDArray[np.int64]]:
-    """Mean residual (rows, columns, 2) of the corners in each cell of the image, px, and how many (rows, columns).
+    """Mean residual (rows, columns, 2), px, and number (rows, columns) of the corners in each cell of the image.
 
-    Noise averages out; what remains is what the lens model does not hold.
+    Noise averages out; what remains is the error of the lens model.
     """
     corners = np.concatenate([view.corners for view in result.corners])
     residual = np.concatenate([view.residual.reshape(-1, 2) for view in result.adjustment.views])
@@ -106,7 +106,7 @@ def residual_field(result: IntrinsicsResult, columns: int = 24, rows: int = 16) 
 def calibration_warnings(
     result: IntrinsicsResult, validation: CrossValidation | None, uncertainty: ProjectionUncertainty
 ) -> tuple[str, ...]:
-    """Every reason to trust this calibration less, in words; none if there is none."""
+    """Reasons to trust this calibration less, in words; empty if there are none."""
     found: list[str] = []
     n = len(result.views)
     if n < _VIEWS:
@@ -114,7 +114,7 @@ def calibration_warnings(
     if result.rms_px > _RMS_PX:
         found.append(f"{result.rms_px:.2f} px rms, more than {_RMS_PX} px: blur, motion, bent board, wrong model")
     if result.coverage < _COVERAGE:
-        share = f"{floor(1000 * result.coverage) / 10:g} %"  # never rounded up to its limit
+        share = f"{floor(1000 * result.coverage) / 10:g} %"  # rounded down, so that it never reaches its limit
         found.append(f"corners in {share} of the image, less than {_COVERAGE:.0%}: show the board there")
     if result.tilt_deg.max() < _TILT_DEG:
         found.append(f"largest tilt {result.tilt_deg.max():.0f}°, less than {_TILT_DEG:.0f}°: focal length is weak")
