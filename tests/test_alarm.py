@@ -186,7 +186,7 @@ def test_a_secret_comes_from_the_environment(
     (tmp_path / "rig.yaml").write_text(RIG + "alerts: {webhook: {url_env: LAB_HOOK}}\n")
     alerts = load_rig(tmp_path / "rig.yaml").section.alerts
     assert alerts is not None
-    with pytest.raises(ConfigurationError, match="no LAB_HOOK"):
+    with pytest.raises(ConfigurationError, match="LAB_HOOK, which the rig file names for alerts, is not set"):
         Alarm(alerts, "run", "bench")
     monkeypatch.setenv("LAB_HOOK", "ftp://elsewhere")
     with pytest.raises(ConfigurationError, match="no webhook address"):
