@@ -69,7 +69,7 @@ def test_too_few_spheres_tell_nothing_and_the_image_says_so(monkeypatch: pytest.
 def test_a_third_of_the_spheres_behind_a_finger_are_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     everything = look(monkeypatch)
     view = look(monkeypatch, shown=round(0.55 * everything.spheres_expected))
-    assert "something stands before the lens" in view.why or view.T_scene_camera is None
+    assert "something is in front of the lens" in view.why or view.T_scene_camera is None
     assert view.why
 
 

@@ -1,1 +1,1 @@
-"""What images say while they are being taken: the registration so far, and hand-held views."""
+"""Results while images are being taken: the provisional registration, and hand-held views."""

@@ -1,4 +1,4 @@
-"""Spheres that nobody has measured, and where the camera was: adjusted together from the outlines of all images."""
+"""Adjusts unmeasured spheres and camera poses together, from the outlines of all images."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from service.compute.registration.problem import EXPECTED_COMMON_ERRORS
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, align_points, apply, inverse
 
-_WORST_CHI2 = 20.0  # per degree of freedom: beyond, some image was read wrongly
+_WORST_CHI2 = 20.0  # per degree of freedom: above it, the spheres of some image were mixed up
 _LEAST_SPHERES = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What one image contributes: an outline and a sphere's number, n times, and the camera as the image tells it."""
+    """One image's contribution: n outlines with their spheres' numbers, and the camera pose from this image alone."""
 
     viewpoint: str
     T_scene_camera: Transform
@@ -34,7 +34,7 @@ class Reading:
 
     @classmethod
     def of(cls, viewpoint: str, T_scene_camera: Transform, shown: Mapping[int, SphereOutline]) -> Reading:
-        """From the outlines of an image by the sphere that each of them shows."""
+        """From an image's outlines by sphere."""
         outlines = list(shown.values())
         return cls(
             viewpoint,
@@ -46,7 +46,7 @@ class Reading:
         )
 
     def of_spheres(self, numbers: NDArray[np.int64]) -> Reading:
-        """The same without all other spheres."""
+        """The reading with these spheres only."""
         kept = np.isin(self.spheres, numbers)
         return replace(
             self,
@@ -57,7 +57,7 @@ class Reading:
         )
 
     def record(self) -> dict[str, Any]:
-        """As plain data."""
+        """The reading as plain data, as `read` takes it."""
         return {
             "spheres": self.spheres.tolist(),
             "axes": self.axes.tolist(),
@@ -67,7 +67,7 @@ class Reading:
 
     @classmethod
     def read(cls, viewpoint: str, T_scene_camera: Transform, data: Mapping[str, Any]) -> Reading:
-        """What `record` wrote."""
+        """Read plain data written by `record`."""
         return cls(
             viewpoint,
             T_scene_camera,
@@ -78,19 +78,19 @@ class Reading:
         )
 
     def photograph(self, camera: CameraModel) -> Photograph:
-        """For the adjustment."""
+        """The reading as input of the adjustment."""
         cones = tuple(Cone(axis, float(half)) for axis, half in zip(self.axes, self.half_angles_rad, strict=True))
         return Photograph(camera, cones, self.covariances)
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """What the images say together.
+    """The adjusted spheres and poses.
 
     Attributes:
-        spheres_m: (N, 3), in the frame in which they were given; what two images do not show is where it was.
-        known: numbers of those that two images show.
-        sigma_m: of the sphere among these that is known worst against the others.
+        spheres_m: (N, 3) in the frame in which they were given; a sphere seen in fewer than two images is unchanged.
+        known: numbers of the spheres seen in at least two images.
+        sigma_m: standard deviation of the least certain of these against the others.
         poses: T_scene_camera by viewpoint.
     """
 
@@ -105,8 +105,8 @@ def adjust_together(
 ) -> Bundle | None:
     """Refine spheres (N, 3) and cameras from the outlines of all images.
 
-    A sphere takes part that two images show: one alone tells its distance badly. None where fewer than two images
-    have four of these, or where they do not fit together.
+    Spheres seen in only one image take no part, because one image determines their distance poorly. None if fewer
+    than two images show four of the others, or if the images do not fit together.
     """
     counts = np.zeros(len(spheres_m), dtype=np.int64)
     for reading in readings:
@@ -142,9 +142,9 @@ def adjust_together(
 
 
 def _worst_sigma_m(centres_m: Array, covariance: Array, scale_sigma: float) -> float:
-    """Of the shape alone: where the whole is, and how it is turned, is of no interest.
+    """Worst standard deviation of the shape alone, without position and rotation of the whole.
 
-    The spheres' radius is the only length in the images: outlines that are all too wide make the whole too small.
+    The spheres' radius is the only length in the images, so outlines that are all too wide make the whole too small.
     """
     away = centres_m - centres_m.mean(axis=0)
     turns = np.stack([np.cross(axis, away).ravel() for axis in np.eye(3)], axis=1)

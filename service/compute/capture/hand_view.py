@@ -1,4 +1,4 @@
-"""What one hand-held image says: where the camera was, by the spheres alone, and whether the image can be used."""
+"""One hand-held image: the camera pose from the spheres alone, and whether the image can be used."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse
 
-_LEAST_SPHERES = 4  # with four, a wrong reading of them contradicts itself
-_LEAST_SHARE = 0.7  # of the spheres that the image should show whole: with fewer, something stands before the lens
-_MOST_EDGE_PX = 3.5  # width of the step across an outline; a sharp image has about 1.5
+_LEAST_SPHERES = 4  # with four, a wrong assignment contradicts itself
+_LEAST_SHARE = 0.7  # of the spheres expected in the image; with fewer, something is in front of the lens
+_MOST_EDGE_PX = 3.5  # edge width across an outline; a sharp image has about 1.5
 _MOST_CLIPPED = 0.05  # of the pixels
-_LEAST_BRIGHT = 60.0  # of 255: what a hundredth of the pixels exceed
-_ROUGH_M, _ROUGH_SIGMA_M = 0.012, 0.01  # how far two layouts from photographs differ
-_POSE_SIGMA_M = 2e-3  # an outline that contradicts the image's own pose by more is no sphere of the list
+_LEAST_BRIGHT = 60.0  # of 255: exceeded by at least a hundredth of the pixels
+_ROUGH_M, _ROUGH_SIGMA_M = 0.012, 0.01  # difference between two layouts from photographs
+_POSE_SIGMA_M = 2e-3  # outlines that contradict the image's own pose by more are not spheres of the list
 
 
 @dataclass(frozen=True, slots=True)
 class HandView:
-    """One image.
+    """The result of looking at one image.
 
     Attributes:
-        T_scene_camera: (4, 4) in the frame of the spheres; None where they do not tell.
-        information: of the scan's pose in the camera's, None without a pose.
-        why: what makes the image unusable; empty for a good one.
-        shown: outlines by the sphere that each of them shows.
+        T_scene_camera: (4, 4) in the spheres' frame; None if the spheres do not determine it.
+        information: about the scan's pose relative to the camera; None without a pose.
+        why: why the image is unusable; empty if it is good.
+        shown: outlines by sphere.
     """
 
     T_scene_camera: Transform | None
@@ -61,10 +61,11 @@ def look_at_image(
     *,
     rough: bool = False,
 ) -> HandView:
-    """Search a whole image (H, W, 3) for the spheres (M, 3); nothing is known of where the camera was.
+    """Search a whole image (H, W, 3) for the spheres (M, 3), without a predicted camera pose.
 
     Args:
-        rough: the spheres are known from photographs alone, to some millimetres; so is the camera's pose then.
+        rough: whether the sphere centres come from photographs alone; they and the camera pose are then only good to
+            some millimetres.
     """
     outlines = detect_spheres(image_bgr, camera, options)
     quality = sharpness(image_bgr, outlines, camera)
@@ -74,8 +75,8 @@ def look_at_image(
     exposure = _exposure(image_bgr, clipped)
     if T_camera_scene is None:
         why = exposure or (
-            f"{len(outlines)} spheres found, which do not tell where the camera was: it may have moved, be out of "
-            "focus, too near, or something stands before the lens"
+            f"{len(outlines)} spheres found, which do not determine the camera pose: it may have moved, be out of "
+            "focus or too near, or something may be in front of the lens"
         )
         return HandView(None, None, len(outlines), 0, 0, quality.edge_px, quality.rms_px, clipped, why)
     T_scene_camera = inverse(T_camera_scene)
@@ -95,7 +96,7 @@ def look_at_image(
     if not why and quality.edge_px > _MOST_EDGE_PX:
         why = f"blurred: outlines are {quality.edge_px:.1f} px wide; hold the camera still"
     if not why and len(expected) >= _LEAST_SPHERES and seen < _LEAST_SHARE * len(expected):
-        why = f"{seen} of {len(expected)} spheres are seen: something stands before the lens"
+        why = f"{seen} of {len(expected)} spheres are seen: something is in front of the lens"
     return HandView(
         T_scene_camera,
         information,
@@ -113,7 +114,7 @@ def look_at_image(
 def _read(
     outlines: Sequence[SphereOutline], camera: CameraModel, spheres_m: Array, radius_m: float
 ) -> Transform | None:
-    """T_camera_scene by the one reading on which the spheres agree; None where there is none."""
+    """T_camera_scene from the assignment on which the spheres agree; None if there is none."""
     if len(outlines) < _LEAST_SPHERES:
         return None
     try:
@@ -124,7 +125,7 @@ def _read(
 
 
 def _rough_pose(outlines: Sequence[SphereOutline], spheres_m: Array, radius_m: float) -> Transform | None:
-    """The same from the spheres' places as this image alone shows them, laid over those of other photographs."""
+    """T_camera_scene by matching the spheres' positions in this image alone with those from other photographs."""
     places = places_by_size([outline.cone for outline in outlines], radius_m)
     if len(places) < _LEAST_SPHERES:
         return None
@@ -141,7 +142,7 @@ def _refined(
     spheres_m: Array,
     radius_m: float,
 ) -> tuple[Transform | None, dict[int, int]]:
-    """T_camera_scene and outline → sphere; None and nothing where fewer than four spheres agree."""
+    """T_camera_scene and outline → sphere; None and {} if fewer than four spheres agree."""
     if start is None:
         return None, {}
     markers = paired(outlines, start, spheres_m, radius_m, camera)

@@ -1,8 +1,8 @@
-"""What one more image brings while the capture runs: its spheres, and the registration of all images so far.
+"""Processes each new image during the capture: finds its spheres and registers all images so far.
 
-The first images of a station are searched whole; from then on the registration says where the spheres are, and only
-their regions are looked at. Stations are independent problems, for the robot's poses of each are in a base frame of
-their own: only the station of the new image is solved again.
+The first images of a station are searched whole; from then on the registration predicts the spheres, and only their
+regions are searched. Each station is an independent problem, since its robot poses are in a base frame of its own, so
+only the new image's station is solved again.
 """
 
 from __future__ import annotations
@@ -27,36 +27,36 @@ from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 
-_POINTS = 25  # of an outline in the provisional solution: its three numbers need no more
-_GATE = 0.5  # of a radius, what a robot that is off by millimetres still meets
+_POINTS = 25  # per outline in the provisional solution: enough for its three parameters
+_GATE = 0.5  # of a radius; wide enough for a robot that is off by millimetres
 _SIZE_GATE = 0.12
-_FULL_SCALE = 254  # of 255: JPEG moves a clipped 255 by one
-_MARGIN = 1.1  # of the outline's radius: a sphere nearer to the image's border is not expected to be found
+_FULL_SCALE = 254  # of 255: JPEG changes a clipped 255 by one
+_MARGIN = 1.1  # of the outline's radius: spheres nearer to the image's border are not expected to be found
 
 
 @dataclass(frozen=True, slots=True)
 class LiveView:
-    """One image as the provisional registration sees it."""
+    """One image with its outlines, as input of the provisional registration."""
 
     name: str
-    T_base_camera: Transform  # (4, 4) robot pose and hand-eye, in the base frame of its station
+    T_base_camera: Transform  # (4, 4) from robot pose and hand-eye, in its station's base frame
     outlines: tuple[SphereOutline, ...] = field(repr=False)
 
 
 @dataclass(frozen=True, slots=True)
 class Sharpness:
-    """How an image renders the outlines of its spheres."""
+    """Sharpness of the sphere outlines in an image."""
 
-    edge_px: float  # width of the luma step across the outlines, median; NaN without outlines
-    coverage: float  # part of the outlines with accepted edge points, median
-    rms_px: float  # of edge points against their own outline, median
+    edge_px: float  # median width of the luma step across the outlines; NaN without outlines
+    coverage: float  # median share of an outline with accepted edge points
+    rms_px: float  # median rms distance of edge points from their own outline
 
 
 @dataclass(frozen=True, slots=True)
 class Provisional:
     """The registration of one station's images so far.
 
-    `registration.residuals` refer to `used` images. `T_base_scan` maps the scan (or CT) frame to the station's base.
+    `registration.residuals` count the `used` images. `T_base_scan` maps the scan (or CT) frame to the station's base.
     """
 
     T_base_scan: Transform
@@ -64,12 +64,12 @@ class Provisional:
     used: tuple[str, ...]  # images with spheres assigned, in the order of the registration
 
     def predicted_error_m(self, point_scan_m: Array) -> float:
-        """Standard deviation (3D) of a point (3,) of the scan in this station's images."""
+        """Predicted standard deviation (3D) of a point (3,) of the scan in this station's images, metres."""
         return self.registration.sigma_at_m(point_scan_m)
 
 
 def expected_spheres(T_camera_scan: Transform, spheres_m: Array, radius_m: float, camera: CameraModel) -> list[int]:
-    """Indices of the spheres (M, 3) whose whole outline falls into the image, other things out of the way."""
+    """Indices of the spheres (M, 3) whose whole outline lies in the image, ignoring occlusion."""
     centres = apply(T_camera_scan, spheres_m)
     distance = np.linalg.norm(centres, axis=1)
     front = (centres[:, 2] > 0.3 * distance) & (distance > 2 * radius_m)
@@ -93,8 +93,8 @@ def find_spheres(
     """Outlines in an image (H, W, 3): near the predicted places, or by a search of the whole image.
 
     Args:
-        T_camera_scan: the prediction, right to about a tenth of a radius; None, or a prediction near which fewer
-            than three spheres are found: the whole image is searched.
+        T_camera_scan: the prediction, good to about a tenth of a radius; if it is None, or fewer than three spheres
+            are found near it, the whole image is searched.
     """
     if T_camera_scan is not None:
         found: list[SphereOutline] = []
@@ -115,13 +115,13 @@ def register_station(
     camera: CameraModel,
     T_base_scan: Transform | None = None,
 ) -> Provisional:
-    """The registration of the images of one station.
+    """Register the images of one station.
 
     Args:
-        views: images with their outlines, any number.
+        views: any number of images with their outlines.
         spheres_m: (M, 3) in the frame of the scan or the CT.
-        T_base_scan: a registration of earlier images, by which the spheres of all are told apart; None: they are
-            identified from scratch.
+        T_base_scan: from a registration of earlier images, by which spheres are identified; None: identified from
+            scratch.
 
     Raises:
         ComputeError: the outlines do not determine an answer yet.
@@ -153,7 +153,7 @@ def register_station(
 def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], camera: CameraModel) -> Sharpness:
     """Width of the luma step across the outlines, and the outlines' own quality.
 
-    The width of an edge is its height over its steepest slope, in pixels: about 1.5 for a sharp image of this kind.
+    The width of an edge is its height over its steepest slope, in pixels; about 1.5 in a sharp image.
     """
     if not outlines:
         return Sharpness(float("nan"), 0.0, float("nan"))
@@ -175,7 +175,7 @@ def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], c
 
 
 def clipped_fraction(image_bgr: NDArray[np.uint8]) -> float:
-    """Share of the pixels of an image (H, W, 3) with a channel at the end of its scale, by a sixteenth of them."""
+    """Share of the pixels of an image (H, W, 3) with a clipped channel, estimated from every sixteenth pixel."""
     return float(np.mean(image_bgr[::4, ::4].max(axis=2) >= _FULL_SCALE))
 
 
@@ -186,7 +186,7 @@ def paired(
     radius_m: float,
     camera: CameraModel,
 ) -> dict[int, int]:
-    """Outline → sphere, by the predicted directions and sizes."""
+    """Outline → sphere, matched by predicted directions and sizes."""
     seen = sightings(outlines, radius_m, camera)
     pairs = match(seen, apply(T_camera_scan, spheres_m), radius_m, _GATE, _SIZE_GATE)
     return {d: m for d, m, _ in pairs}

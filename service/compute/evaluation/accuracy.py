@@ -1,4 +1,4 @@
-"""How good a registration is: the paper's two errors on control spheres, and the true error where truth is known."""
+"""Accuracy of a registration: the paper's two errors on control spheres, and the true error if truth is known."""
 
 from __future__ import annotations
 
@@ -34,12 +34,8 @@ class ControlError:
     sphere: int
     radial_error_mm: float
     reprojection_error_px: float
-    sigma_mm: float | None = (
-        None  # predicted rms of the radial error; None where nothing was stated to predict it from
-    )
-    normalised: float | None = (
-        None  # the outline's three numbers against their prediction, in standard deviations, rms
-    )
+    sigma_mm: float | None = None  # predicted rms of the radial error; None without stated covariances
+    normalised: float | None = None  # rms of its three residuals over their predicted sigmas
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +48,7 @@ class Evaluation:
 
     @property
     def normalised_rms(self) -> float | None:
-        """Rms of the normalised errors: near 1 if the stated covariances are right; None where there are none."""
+        """Rms of the normalised errors: near 1 if the stated covariances are right; None if there are none."""
         values = [e.normalised for e in self.errors if e.normalised is not None]
         return float(np.sqrt(np.mean(np.square(values)))) if values else None
 
@@ -67,7 +63,7 @@ class Evaluation:
 
 
 def radial_errors_m(points: Array, centre_camera_m: Array, radius_m: float) -> Array:
-    """Distances (L,) between the rays through normalised points (L, 2) and the hull of the sphere."""
+    """Distances (L,) between the rays through normalised points (L, 2) and the surface of the sphere."""
     rays = np.column_stack([points, np.ones(len(points))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     along = rays @ centre_camera_m
@@ -85,20 +81,20 @@ def evaluate(
     registration: RegistrationResult | None = None,
     centre_covariance_m2: Array | None = None,
 ) -> Evaluation:
-    """Errors of spheres that took no part in the registration.
+    """Errors of spheres that were not used in the registration.
 
     Args:
         outlines: per image.
         assignments: per image, outline → index into `centres_scan_m`.
-        T_scan_camera: (N, 4, 4) the registered cameras, metric.
+        T_scan_camera: (N, 4, 4) registered cameras, metric.
         centres_scan_m: (C, 3) control spheres.
-        radius_m: of the control spheres.
+        radius_m: radius of the control spheres.
         camera: intrinsics.
-        registration: what predicts the errors; its covariance gives `sigma_mm` and `normalised`. The cameras must be
-            its `T_scan_camera` or its `T_scan_camera_refined`.
+        registration: predicts the errors; its covariance gives `sigma_mm` and `normalised`. The cameras must be its
+            `T_scan_camera` or its `T_scan_camera_refined`.
         centre_covariance_m2: (C, 3, 3) of the control spheres' centres; None takes them as exact.
 
-    Both errors are the paper's: radial, the mean distance between the rays of the outline's points and the hull of
+    Both errors are the paper's: radial, the mean distance between the rays of the outline's points and the surface of
     the sphere; reprojection, the mean distance of the points from the projected outline (geometric, to first order).
 
     Raises:
@@ -125,17 +121,17 @@ def evaluate(
 
 
 def leave_one_out(registration: RegistrationResult, *, refined: bool = False) -> Evaluation:
-    """Errors of every registration sphere as predicted by the others: evaluation where there are no control spheres.
+    """Errors of each registration sphere predicted from the others, for evaluation without control spheres.
 
     Args:
-        registration: with its solution, from which each sphere's outlines are taken out (one linear step; the
-            weights of the outlines and the sizes of all errors stay).
-        refined: predict with the errors found of the camera poses (from the other spheres) taken off.
+        registration: with its solution, from which each sphere's outlines are removed in turn (one linear step; the
+            weights of the outlines and the variance components stay).
+        refined: whether to predict with the camera poses corrected by their errors, estimated from the other spheres.
 
     A sphere without which a station would see fewer than three is left out of the result.
 
     Raises:
-        ComputeError: no sphere can be spared.
+        ComputeError: no sphere can be removed.
     """
     full = registration.solution
     problem = full.problem
@@ -205,15 +201,15 @@ def _summary(errors: list[ControlError]) -> Evaluation:
 
 
 def true_error_m(T_scan_camera: Array, T_scan_camera_true: Array, centre_scan_m: Array) -> float:
-    """Distance by which the scene's centre is misplaced, the cameras being laid over the true ones.
+    """Distance by which the scene's centre is misplaced when the cameras are aligned to the true ones.
 
     Args:
         T_scan_camera: (N, 4, 4) registered cameras in the scan frame, metric.
         T_scan_camera_true: (N, 4, 4) truth.
         centre_scan_m: (3,) a point of the scene, in the scan frame.
 
-    The estimated camera positions are aligned to the true ones by a rigid fit (the world frame of structure from
-    motion is arbitrary); with T that fit, the error is |T c - c|.
+    The estimated camera positions are aligned to the true ones by a rigid fit T, because the world frame of structure
+    from motion is arbitrary; the error is |T c - c|, metres.
     """
     good = np.all(np.isfinite(T_scan_camera.reshape(len(T_scan_camera), -1)), axis=1)
     T_true_estimated, _ = align_points(T_scan_camera_true[good, :3, 3], T_scan_camera[good, :3, 3])

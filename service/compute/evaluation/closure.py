@@ -1,4 +1,4 @@
-"""Loop closures: the same spheres measured by images, scan and CT, compared with what their covariances predict."""
+"""Loop closures: the same spheres measured by images, scan and CT, compared with their predicted differences."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ class SeenSphere:
 
 @dataclass(frozen=True, slots=True)
 class Closure:
-    """Two measurements of the same spheres.
+    """Comparison of two measurements of the same spheres.
 
     Attributes:
-        n: spheres compared.
+        n: number of spheres compared.
         rms_m: root mean square of the distances (3D), after the alignment if there is one.
-        predicted_m: what the covariances predict for it.
-        normalised_chi2: squared Mahalanobis distance a degree of freedom; near 1 when the covariances are right.
-        residuals_m: (n, 3) of a over b in the frame of a.
-        significance: (n,) Mahalanobis distance of each sphere's residual, as a number of standard deviations.
+        predicted_m: rms predicted from the covariances.
+        normalised_chi2: squared Mahalanobis distance per degree of freedom; near 1 if the covariances are right.
+        residuals_m: (n, 3) position in b minus position in a, in the frame of a.
+        significance: (n,) Mahalanobis distance of each sphere's residual, in standard deviations.
     """
 
     n: int
@@ -50,19 +50,19 @@ class Closure:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """T_a_b and its covariance (6, 6) of (d, w): exp(w) R, t + d, axes of a, metres and radians."""
+    """T_a_b and its covariance (6, 6) of (d, w): exp(w) R, t + d, in the axes of a, metres and radians."""
 
     T_a_b: Transform
     covariance: Array = field(repr=False)
 
     def covariance_at_m2(self, points_b_m: Array) -> Array:
-        """(n, 3, 3) in the axes of a: what the alignment's error does to points (n, 3) of b."""
+        """(n, 3, 3) covariance, in the axes of a, that the alignment's error adds to points (n, 3) of b."""
         J = place_jacobian(points_b_m @ self.T_a_b[:3, :3].T)
         return J @ self.covariance @ J.transpose(0, 2, 1)
 
 
 def place_jacobian(turned: Array) -> Array:
-    """(n, 3, 6) by which (d, w) of a pose moves points that it has turned to (n, 3), its translation not added."""
+    """(n, 3, 6) derivative of points by (d, w) of a pose; `turned` (n, 3): points rotated, not translated."""
     return np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -skew(turned)], axis=2)
 
 
@@ -75,18 +75,18 @@ def locate_in_images(
     *,
     least_images: int = 3,
 ) -> dict[int, SeenSphere]:
-    """Centres of spheres from their outlines and the registered cameras, each sphere alone.
+    """Centres of spheres from their outlines and the registered cameras, each sphere on its own.
 
-    Weighted least squares of the cones' three numbers (`cone_residuals`); an outline further than 4 sigma from the
-    others of its sphere is left out. The covariance is that of the outlines, inflated where they scatter more.
+    Weighted least squares of the cones' three parameters (`cone_residuals`); outlines more than 4 sigma from the
+    others of their sphere are excluded. The covariance follows from the outlines', inflated if they scatter more.
 
     Args:
         outlines: per image.
         assignments: per image, outline → index into `starts_scan_m`.
         T_scan_camera: (N, 4, 4), metric.
-        starts_scan_m: (M, 3) about where the spheres are.
-        radius_m: of the spheres.
-        least_images: spheres seen in fewer are not returned.
+        starts_scan_m: (M, 3) approximate centres.
+        radius_m: radius of the spheres.
+        least_images: spheres seen in fewer images are not returned.
     """
     seen: dict[int, list[tuple[int, SphereOutline]]] = {}
     for i, assignment in enumerate(assignments):
@@ -129,7 +129,7 @@ def _intersect(
 
 
 def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> Closure:
-    """Closure of measurements (n, 3) of the same points in the same frame, with covariances (n, 3, 3) in m²."""
+    """Closure of two measurements (n, 3) of the same points in the same frame, with covariances (n, 3, 3) in m²."""
     r = a - b
     C = covariance_a + covariance_b
     square = np.einsum("ni,nij,nj->n", r, np.linalg.inv(C), r)
@@ -144,12 +144,12 @@ def compare_in_frame(a: Array, covariance_a: Array, b: Array, covariance_b: Arra
 
 
 def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array) -> tuple[Closure, Alignment]:
-    """Closure of two constellations (n, 3) of the same spheres in frames of their own, and T_a_b that aligns them.
+    """Closure of two constellations (n, 3) of the same spheres in different frames, and the aligning T_a_b.
 
-    The alignment is weighted by the covariances (n, 3, 3), m²; six degrees of freedom are taken off.
+    The alignment is weighted by the covariances (n, 3, 3), m²; its six degrees of freedom are subtracted.
 
     Raises:
-        ComputeError: fewer than four spheres: nothing is left to compare.
+        ComputeError: fewer than four spheres, which leave nothing to compare.
     """
     if len(a) < 4:
         raise ComputeError(f"{len(a)} common spheres close no loop; four are needed")

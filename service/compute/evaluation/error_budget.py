@@ -1,4 +1,4 @@
-"""The error budget of a data set: what is predicted source by source, against what was observed."""
+"""The error budget of a data set: predicted contributions by source, checked against observations."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from service.core.geometry import Array
 from service.core.units import mm
 
 CONTROL_SPHERES = "control spheres"
-HONEST = (0.5, 2.0)  # normalised chi square between these: the covariances say what is observed
+HONEST = (0.5, 2.0)  # range of normalised chi square in which the covariances agree with the observation
 
 _HOW = {
     "outlines": "covariances of the outlines from their edge points, scaled to the residuals",
-    "common": "what every outline of the capture may have in common (edge bias)",
-    "intrinsics": "covariance of the camera calibration, the poses held (those from the same images absorb part)",
+    "common": "errors that all outlines of the capture may share (edge bias)",
+    "intrinsics": "covariance of the camera calibration, poses fixed (poses from the same images absorb part)",
     "outlines and poses": "covariances of the outlines, scaled to the residuals, each camera pose refined by its own",
     "poses": "covariance of the camera poses, their scatter estimated from the spheres' residuals",
     "spheres": "covariances of the sphere centres in the scan",
@@ -27,7 +27,7 @@ _HOW = {
 
 @dataclass(frozen=True, slots=True)
 class Contribution:
-    """One source of error at the target, as a 3D standard deviation, and how it was got."""
+    """One source of error at the target, as a 3D standard deviation, and how it was determined."""
 
     name: str
     sigma_m: float
@@ -37,7 +37,7 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """A comparison of independent measurements with its prediction."""
+    """A comparison of independent measurements with its predicted size."""
 
     name: str
     observed_m: float
@@ -45,11 +45,11 @@ class Observation:
     normalised_chi2: float
     n: int
     how: str
-    hides_common: bool = False  # what all spheres have in common cancels in this comparison
+    hides_common: bool = False  # errors common to all spheres cancel in this comparison
 
     @property
     def verdict(self) -> str:
-        """Whether the stated covariances can be believed."""
+        """Whether the stated covariances agree with the observation, in words."""
         low, high = HONEST
         if self.normalised_chi2 > high:
             factor = float(np.sqrt(self.normalised_chi2))
@@ -64,11 +64,11 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredSpheres:
-    """Sphere centres (n, 3) of a scan or a CT in its own frame, covariances (n, 3, 3), and how well they fit."""
+    """Sphere centres (n, 3) of a scan or a CT in its own frame, covariances (n, 3, 3), and the fit's residual."""
 
     centres_m: Array
     covariance_m2: Array
-    surface_rms_m: float  # of the points on the spheres against the spheres
+    surface_rms_m: float  # rms distance of the surface points from the fitted spheres
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +80,11 @@ class ErrorBudget:
 
     @property
     def total_m(self) -> float:
-        """Root sum of squares of what counts."""
+        """Root sum of squares of the counted contributions, metres."""
         return float(np.sqrt(sum(c.sigma_m**2 for c in self.contributions if c.counted)))
 
     def as_json(self) -> dict[str, object]:
-        """For a file: millimetres."""
+        """Plain data in millimetres."""
         return {
             "contributions": [
                 {"name": c.name, "sigma_mm": mm(c.sigma_m), "how": c.how, "counted": c.counted}
@@ -109,10 +109,10 @@ class ErrorBudget:
 def contributions(
     registration_m: Mapping[str, float], scan: MeasuredSpheres, ct: MeasuredSpheres | None
 ) -> tuple[Contribution, ...]:
-    """Every source at a target: `registration_m` holds the registration's components there, as 3D sigmas.
+    """Every source of error at a target; `registration_m` holds the registration's components there, as 3D sigmas.
 
-    The total is that of a point of the scan's surface in the images: the registration's components and the scan's own
-    noise. The CT counts where its surface is used; it is listed.
+    The total is for a point of the scan's surface in the images: the registration's components and the scan's own
+    noise. The CT is listed but not counted, since it only matters where its surface is used.
     """
     out = [
         Contribution(name, sigma_m, _HOW.get(name, "component of the registration's covariance"))
@@ -130,14 +130,14 @@ def contributions(
 def control_observation(
     registration: Alignment, seen: Mapping[int, SeenSphere], control: MeasuredSpheres
 ) -> Observation:
-    """Control spheres where the images see them, against where scan and registration say they are.
+    """Control spheres located in the images, compared with their positions by scan and registration.
 
-    Control and registration spheres are seen by the same camera: an error that moves all outlines alike moves both,
-    and does not show.
+    Control and registration spheres are seen by the same camera, so an error that moves all outlines alike moves both
+    and cancels.
 
     Args:
-        registration: T_world_scan with its covariance, as far as it can be told apart from such errors.
-        seen: located in the images through the registered cameras, by index into `control`; scan frame.
+        registration: T_world_scan with its covariance, without such common errors.
+        seen: spheres located in the images through the registered cameras, by index into `control`; scan frame.
         control: measured by the scanner; scan frame.
     """
     index = sorted(seen)
@@ -156,12 +156,12 @@ def control_observation(
 def loop_observations(
     seen: Mapping[int, SeenSphere], scan: MeasuredSpheres, ct_in_scan_order: MeasuredSpheres | None
 ) -> tuple[Observation, ...]:
-    """Closures camera ↔ scan, scan ↔ CT and camera ↔ CT of the spheres that each pair shares, shapes compared.
+    """Closures camera ↔ scan, scan ↔ CT and camera ↔ CT: shapes of the spheres that each pair shares.
 
-    Three pairs, not one way round: alignments on the same spheres undo one another whatever their errors are.
+    Three pairs instead of one loop, because alignments on the same spheres cancel one another whatever their errors.
 
     Args:
-        seen: by index into the scan's spheres, located in the images.
+        seen: spheres located in the images, by index into the scan's spheres.
         scan: the spheres of the registered scan.
         ct_in_scan_order: the CT's spheres, one for each of the scan's; rows of NaN where the CT has none.
     """

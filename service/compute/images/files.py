@@ -1,4 +1,4 @@
-"""Photographs from files: whole ones only, as the sensor saw them."""
+"""Reads photographs from files: only complete ones, with the pixels as stored."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from service.core.errors import DataError
 # In entropy-coded data 0xFF is followed by 0x00 (stuffing) or a restart marker; anything else ends the scan.
 _END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
-_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # headers that give the size
+_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # headers with the size
 _JPEG = b"\xff\xd8"
 _PNG = b"\x89PNG\r\n\x1a\n"
-_MOST_PIXELS = 400_000_000  # the largest cameras take a third; a damaged header may claim four gigabytes more
+_MOST_PIXELS = 400_000_000  # three times the largest cameras; a damaged header may claim up to four gigabytes
 _REDUCED = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
 
 
 def check_jpeg(data: bytes, where: str) -> None:
-    """Walk the segments of a JPEG up to its end-of-image marker.
+    """Check that a JPEG is complete, by walking its segments up to the end-of-image marker.
 
-    What cameras append behind that marker (previews) is allowed.
+    Data after that marker (previews that cameras append) is allowed.
 
     Raises:
-        DataError: the file is not a JPEG, or ends before its picture does.
+        DataError: the file is not a JPEG, or is truncated.
     """
     truncated = DataError(
         "the JPEG ends before its picture is complete",
@@ -64,17 +64,17 @@ def check_jpeg(data: bytes, where: str) -> None:
 
 
 def check_png(data: bytes, where: str) -> None:
-    """Walk the chunks of a PNG, with their check sums, up to its end.
+    """Check that a PNG is complete, by walking its chunks and their checksums to the end.
 
     Raises:
-        DataError: the file ends before its picture does, or is damaged.
+        DataError: the file is truncated or damaged.
     """
     _check_size(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), where)
     at, kind = len(_PNG), b""
     while kind != b"IEND":
         length, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
         end = at + 8 + length
-        if end + 4 > len(data):  # a decoder would make room for what the length claims, up to four gigabytes
+        if end + 4 > len(data):  # a decoder would allocate the claimed length, up to four gigabytes
             raise DataError(
                 "the PNG ends before its picture is complete",
                 where=where,
@@ -86,10 +86,10 @@ def check_png(data: bytes, where: str) -> None:
 
 
 def check_image(data: bytes, where: str, *, partly: bool = False) -> None:
-    """What can be told of a JPEG or PNG before it is decoded; of other kinds nothing. `partly`: a cut JPEG will do.
+    """Check a JPEG or PNG without decoding it; other formats are not checked. `partly` accepts a truncated JPEG.
 
     Raises:
-        DataError: the file ends before its picture does, or is damaged.
+        DataError: the file is truncated or damaged.
     """
     if data.startswith(_PNG):
         check_png(data, where)
@@ -107,7 +107,7 @@ def _check_size(width: int, height: int, where: str) -> None:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image as stored, after a look at whether it is whole; a JPEG is not decoded for it.
+    """Width and height of an image as stored, after checking that it is complete; a JPEG is not decoded.
 
     Raises:
         DataError: as `read_image`.
@@ -147,16 +147,16 @@ def _unreadable(path: Path, error: OSError) -> DataError:
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) BGR as stored: the orientation tag is ignored, so that the camera model fits.
+    """(H, W, 3) BGR as stored: the orientation tag is ignored, to match the camera model.
 
     Raises:
-        DataError: the file is missing, truncated, or no image that can be decoded.
+        DataError: the file is missing, truncated or not a decodable image.
     """
     return _decode(path, cv2.IMREAD_COLOR)
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """(H, W) brightness as stored (of a JPEG its luma, which has the full resolution), in a third of the memory.
+    """(H, W) brightness as stored (a JPEG's luma, at full resolution), in a third of the memory of `read_image`.
 
     Raises:
         DataError: as `read_image`.
@@ -187,10 +187,10 @@ def _decode(path: Path, how: int) -> NDArray[np.uint8]:
 
 
 def read_image_of(path: Path, camera: CameraModel) -> NDArray[np.uint8]:
-    """`read_image`, of the camera's size.
+    """`read_image` for an image of the camera's size.
 
     Raises:
-        DataError: as `read_image`, and when the size is not the camera's.
+        DataError: as `read_image`, or the image has another size.
     """
     image = read_image(path)
     if image.shape[:2] != (camera.height, camera.width):
@@ -204,9 +204,9 @@ def read_image_of(path: Path, camera: CameraModel) -> NDArray[np.uint8]:
 
 
 def read_reduced(path: Path, camera: CameraModel, least_width: int) -> tuple[NDArray[np.uint8], CameraModel]:
-    """The image at a half, a quarter or an eighth of its size, not narrower than `least_width`, and its camera.
+    """The image reduced to a half, a quarter or an eighth, at least `least_width` wide, and its camera.
 
-    A JPEG is decoded at that size, which takes a third of the time and a sixty-fourth of the memory.
+    A JPEG is decoded at that size, which takes a third of the time and at an eighth 1/64 of the memory.
 
     Raises:
         DataError: as `read_image_of`.
@@ -217,8 +217,8 @@ def read_reduced(path: Path, camera: CameraModel, least_width: int) -> tuple[NDA
     image = _decode(path, _REDUCED[reduction])
     height, width = image.shape[:2]
     if abs(width - camera.width / reduction) >= 1 or abs(height - camera.height / reduction) >= 1:
-        read_image_of(path, camera)  # says what is wrong in the image's own pixels
-    # The scale is the reduction itself, also where the last row or column stands for fewer pixels.
+        read_image_of(path, camera)  # raises with the size of the image as stored
+    # Scale by the exact reduction factor, even if the last row or column covers fewer pixels.
     smaller = dataclasses.replace(
         camera,
         width=width,

@@ -1,7 +1,8 @@
-"""A folder of images, by one rule for all commands: odd files are left out by name, damaged ones are errors.
+"""Reads a folder of images by one rule for all commands: odd files are left out, damaged ones are errors.
 
-Odd is what is whole and does not belong: the notes that macOS lays beside files (`._…`), a second copy of an image,
-one of another size. `strict` refuses odd files too.
+Odd files are intact but do not belong: macOS's notes beside files (`._…`), second copies of an image, images of
+    another
+size. `strict` refuses these too.
 """
 
 from __future__ import annotations
@@ -17,32 +18,33 @@ from service.core.errors import DataError
 
 IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm"})
 READ = "JPEG, PNG, TIFF, BMP, PGM and PNM files are read"
-_NAMED = 5  # damaged files that a refusal names
+_NAMED = 5  # damaged files named in an error
 
 
 @dataclass(frozen=True, slots=True)
 class ImageFolder:
-    """Images of a folder, by name, and what was left out of it, with reasons."""
+    """Images of a folder, by name, and the reasons for files left out."""
 
     files: tuple[Path, ...]
     left_out: dict[str, str] = field(default_factory=dict[str, str])
 
     def without(self, reasons: dict[str, str]) -> ImageFolder:
-        """The same without these images."""
+        """The folder without these images, whose reasons are added."""
         kept = tuple(file for file in self.files if file.name not in reasons)
         return ImageFolder(kept, self.left_out | reasons)
 
 
 def image_folder(folder: Path, *, size: tuple[int, int] | None = None, strict: bool = False) -> ImageFolder:
-    """The images of a folder, each looked at: whole, once, of the size wanted.
+    """The images of a folder, each checked to be complete, unique and of the wanted size.
 
     Args:
-        folder: not looked into deeper.
-        size: width and height that the images must have; None takes the size that most have.
-        strict: odd files are errors too.
+        folder: subfolders are not searched.
+        size: width and height that the images must have; None: the most common size.
+        strict: whether odd files are errors too.
 
     Raises:
-        DataError: no such folder, no image, damaged ones (all are named), none of the size; odd ones where `strict`.
+        DataError: the folder does not exist, has no image (of the size), or has damaged ones (all are counted); with
+            `strict`, it has odd ones.
     """
     if not folder.is_dir():
         raise DataError("the image folder does not exist", where=str(folder), remedy="Check --images")
@@ -72,7 +74,7 @@ def image_folder(folder: Path, *, size: tuple[int, int] | None = None, strict: b
 
 
 def strict_refusal(reasons: dict[str, str], folder: Path) -> DataError:
-    """What `--strict` says of odd files."""
+    """The error for odd files with `--strict`."""
     return DataError(
         f"{len(reasons)} files are odd: " + "; ".join(f"{name}: {reason}" for name, reason in reasons.items()),
         where=str(folder),
@@ -99,7 +101,7 @@ def _sizes(files: Sequence[Path], folder: Path) -> dict[str, tuple[int, int]]:
 
 
 def _copies(files: Sequence[Path]) -> dict[str, str]:
-    """Images that are byte for byte the same as an earlier one."""
+    """Images that are byte-for-byte copies of an earlier one, with reasons."""
     alike: defaultdict[int, list[Path]] = defaultdict(list)
     for file in files:
         alike[file.stat().st_size].append(file)

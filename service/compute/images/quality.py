@@ -1,4 +1,4 @@
-"""Whether a photograph is worth anything, whatever it shows: how wide its edges are, and whether it is black."""
+"""Basic quality of a photograph, whatever it shows: the width of its edges, and whether it is black."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_TILES, _TILE_PX = (4, 3), 512  # looked at: one tile in each part of the image, at full resolution
-_REACH_PX = 8  # an edge's height is looked for this far to both sides
-_STEP = 30.0  # grey levels that an edge must have, well above the noise
+_TILES, _TILE_PX = (4, 3), 512  # one tile in each part of the image is examined, at full resolution
+_REACH_PX = 8  # range on either side within which an edge's height is measured
+_STEP = 30.0  # smallest edge height, grey levels, well above the noise
 _SLOPE = 1.0  # grey levels per pixel
-_STEEPEST = 97  # percentile of the edges' slopes: soft shading has edges as well, which tell nothing
+_STEEPEST = 97  # percentile of the edges' slopes: gradual shading has edges too, which say nothing about sharpness
 _FEWEST = 50  # edges
-_DARK = 12.0  # grey level that hardly a pixel of a black image exceeds
+_DARK = 12.0  # grey level that hardly any pixel of a black image exceeds
 _SIGMA_PX = 0.7  # smoothing against noise
 
 
 @dataclass(frozen=True, slots=True)
 class ImageQuality:
-    """What an image is like.
+    """Sharpness and brightness of an image.
 
     Attributes:
-        edge_px: width of its clearest edges (height over steepest slope), median; 2 to 4 in a sharp image, NaN where
-            it has none.
-        black: hardly a pixel is brighter than black.
+        edge_px: median width of its clearest edges (height over steepest slope); 2 to 4 in a sharp image, NaN if it
+            has none.
+        black: whether hardly any pixel is brighter than black.
     """
 
     edge_px: float
@@ -33,7 +33,7 @@ class ImageQuality:
 
 
 def image_quality(grey: NDArray[np.uint8]) -> ImageQuality:
-    """Of an image (H, W); takes some milliseconds a megapixel looked at, at most three of them."""
+    """Quality of an image (H, W); takes some milliseconds per megapixel examined, at most three."""
     dark = float(np.percentile(grey[::4, ::4], 99)) < _DARK
     return ImageQuality(float("nan") if dark else _edge_px(grey), dark)
 

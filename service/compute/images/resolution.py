@@ -1,4 +1,4 @@
-"""The same photograph at another resolution: reduced, cut to shape, with the camera that goes with it."""
+"""Resamples a photograph to another resolution and aspect ratio, with the matching camera."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from service.core.errors import ConfigurationError
 
 
 def camera_at(camera: CameraModel, width: int, height: int) -> CameraModel:
-    """The camera of `resample`'s answer.
+    """The camera of the image that `resample` returns.
 
     Raises:
-        ConfigurationError: larger than the photograph.
+        ConfigurationError: the size is larger than the photograph.
     """
     whole = _whole(camera, width, height)
     x, y = (whole.width - width) // 2, (whole.height - height) // 2
@@ -24,13 +24,13 @@ def camera_at(camera: CameraModel, width: int, height: int) -> CameraModel:
 
 
 def resample(image: NDArray[np.uint8], camera: CameraModel, width: int, height: int) -> NDArray[np.uint8]:
-    """The photograph (H, W, 3) as (height, width, 3): reduced by area averaging until it covers, the rest cut evenly.
+    """The photograph (H, W, 3) as (height, width, 3): reduced by area averaging, then cropped evenly on both sides.
 
-    A shape other than the camera's (1920 × 1080 of a 3:2 sensor, as in the paper) loses strips at two sides; pixels
+    An aspect ratio other than the camera's (1920 × 1080 from a 3:2 sensor, as in the paper) crops two sides; pixels
     stay square.
 
     Raises:
-        ConfigurationError: larger than the photograph.
+        ConfigurationError: the size is larger than the photograph.
     """
     whole = _whole(camera, width, height)
     reduced = cv2.resize(image, (whole.width, whole.height), interpolation=cv2.INTER_AREA)
