@@ -1,1 +1,1 @@
-"""Whether placed spheres can be told apart, and which one to move."""
+"""Whether placed spheres can be told apart, and which one to move if not."""

@@ -1,4 +1,4 @@
-"""Whether placed spheres can be told from one another: the least misfit of any wrong assignment, and what to move."""
+"""Whether spheres can be told apart by their layout: the least misfit of any wrong assignment, and what to change."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from service.core.units import deg, mm
 
 IntArray = NDArray[np.int64]
 
-SUBSET = 4  # spheres that an image shows at least
-# Ten centres at random leave 0.5 to 4 mm to the best wrong assignment of four; measured centres err by 0.01 mm, and
-# one image of exactly those four may be told by the others. Five that can be mistaken leave nothing to tell them by.
+SUBSET = 4  # least number of spheres visible in an image
+# For ten random centres, the best wrong assignment of four misfits by 0.5 to 4 mm. Measured centres err by 0.01 mm,
+# and an image of exactly those four may be resolved by the others. If five can be confused, nothing resolves them.
 REQUIRED_MARGIN_M = 0.4e-3
 REQUIRED_MARGIN_OF_FIVE_M = 2.0e-3
-REQUIRED_DEPTH_M = 5.0e-3  # rms height over the best plane: a flat layout has no handedness and weak poses
-LARGEST_GAP_RAD = np.deg2rad(150.0)  # between neighbouring azimuths: wider, and the spheres stand on one side only
+REQUIRED_DEPTH_M = 5.0e-3  # rms height over the best plane: a flat layout has no handedness and gives weak poses
+LARGEST_GAP_RAD = np.deg2rad(150.0)  # between neighbouring azimuths; above it the spheres are all on one side
 _FIRST_TOLERANCE_M = 1.0e-3
-_ROWS = 2_000_000  # combinations worked on at a time
+_ROWS = 2_000_000  # combinations processed at a time
 _MOST_MATCHES = 200_000  # a layout with so many near-symmetries needs no longer list
-_REACH_M = 3.0e-3  # misfits up to which assignments of four are judged, and carried on to more spheres
+_REACH_M = 3.0e-3  # misfits up to which assignments of four are judged and extended to more spheres
 _MOST_JUDGED = 600  # assignments whose bounds are computed, the best first
-_QUANTILE = 2.326  # of a normal distribution at the bounds' 99 %
+_QUANTILE = 2.326  # of the normal distribution at 99 %
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +36,8 @@ class Confusion:
     """A wrong assignment that nearly fits.
 
     Attributes:
-        spheres: indices that are seen.
-        taken_for: the spheres that they would be taken for, in the same order.
+        spheres: indices of the visible spheres.
+        taken_for: the spheres that they would be mistaken for, in the same order.
         misfit_m: rms distance after the best rigid motion.
     """
 
@@ -48,7 +48,7 @@ class Confusion:
 
 @dataclass(frozen=True, slots=True)
 class Bounded:
-    """A length in metres with bounds that hold with 99 % each; all three alike where no uncertainty is known."""
+    """A length in metres with one-sided 99 % bounds; all three values are equal if no uncertainty is known."""
 
     value_m: float
     lower_m: float
@@ -56,11 +56,11 @@ class Bounded:
 
     @property
     def sigma_m(self) -> float:
-        """The standard deviation of a normal distribution with bounds as far apart."""
+        """Standard deviation of a normal distribution with bounds this far apart."""
         return (self.upper_m - self.lower_m) / (2 * _QUANTILE)
 
     def record_mm(self) -> dict[str, float]:
-        """Plain data in millimetres, as gates take it."""
+        """Plain data in millimetres, as gates read it."""
         return {"sigma": mm(self.sigma_m), "lower": mm(self.lower_m), "upper": mm(self.upper_m)}
 
 
@@ -69,15 +69,15 @@ class LayoutReport:
     """How well the spheres of a layout can be told apart.
 
     Attributes:
-        margin: least misfit of any wrong assignment of any four spheres: what noise must stay well below.
-        margin_of_five: the same of five spheres; infinite where none was found.
-        worst: the assignments that fit best, best first.
-        margin_by_count_m: least misfit found when so many spheres are seen (4, 5, … all).
-        sphere_margins_m: (N,) least misfit among the assignments that take this sphere for another.
+        margin: least misfit of any wrong assignment of any four spheres; noise must stay well below it.
+        margin_of_five: the same of five spheres; infinite if none was found.
+        worst: the assignments with the least misfit, least first.
+        margin_by_count_m: least misfit by number of visible spheres (4, 5, … all).
+        sphere_margins_m: (N,) least misfit of the assignments that mistake this sphere for another.
         depth: rms distance of the centres from their best plane.
         extent_m: rms distance of the centres from their mean.
         largest_gap_rad: between neighbouring azimuths around the mean, in the best plane.
-        problems: what must be changed, in words; none: the layout passes.
+        problems: what must be changed, in words; empty if the layout passes.
     """
 
     margin: Bounded
@@ -108,22 +108,22 @@ def check_layout(
     radius_m: float = 0.015,
     required_margin_m: float = REQUIRED_MARGIN_M,
 ) -> LayoutReport:
-    """Judge a layout of spheres, before anything is measured with it.
+    """Judge a layout of spheres before anything is measured with it.
 
-    Every assignment of four spheres to four others (or to themselves in another order) is a way to mistake them;
-    its misfit is that of the best rigid motion. Mirror-symmetric layouts fail too: two mirrored pairs make a
-    trapezoid, which half a turn maps onto itself. The search is exhaustive, by pairwise distances: distances that
-    differ by more than 2√2 times a misfit rule that misfit out.
+    Every assignment of four spheres to four others (or to themselves in another order) could be a confusion; its
+    misfit is the rms distance after the best rigid motion. Mirror-symmetric layouts fail too: two mirrored pairs form
+    a trapezoid, which half a turn maps onto itself. The search is exhaustive and uses pairwise distances: if two of
+    them differ by more than 2√2 times a misfit, that misfit is impossible.
 
     Args:
         centres_m: (N, 3), N ≥ 4.
-        covariance: (3N, 3N) m² of all centres together, or (N, 3, 3) of centres that were measured one by one.
-        radius_m: of the spheres.
-        required_margin_m: misfit below which a wrong assignment of four counts as possible; give more when the
+        covariance: (3N, 3N) m² of all centres jointly, or (N, 3, 3) of centres measured one by one.
+        radius_m: radius of the spheres.
+        required_margin_m: misfit below which a wrong assignment of four counts as possible; use a larger value if the
             centres are only roughly known.
 
     Raises:
-        DataError: not centres (N, 3), or not finite.
+        DataError: the centres are not (N, 3), or not finite.
         ComputeError: fewer than four spheres, or two at the same place.
     """
     centres = np.asarray(centres_m, dtype=np.float64)
@@ -168,7 +168,7 @@ def check_layout(
 
 
 def _problems(report: LayoutReport, required_margin_m: float) -> tuple[str, ...]:
-    """What must be changed, by the values themselves: gates judge the bounds."""
+    """What must be changed, judged by the values themselves; gates judge the bounds."""
     problems: list[str] = []
     if report.margin_m < required_margin_m:
         first = report.worst[0]
@@ -211,7 +211,7 @@ def layout_record(report: LayoutReport) -> dict[str, Any]:
 
 
 def layout_bounds(report: LayoutReport) -> dict[str, tuple[Bounded, float]]:
-    """The numbers of a layout that gates judge, by the name of their measure, each with what it must reach (m)."""
+    """The numbers of a layout that gates judge, by measure name, each with its required value (m)."""
     found = {
         "layout_margin_mm": (report.margin, REQUIRED_MARGIN_M),
         "layout_margin_of_five_mm": (report.margin_of_five, REQUIRED_MARGIN_OF_FIVE_M),
@@ -221,7 +221,7 @@ def layout_bounds(report: LayoutReport) -> dict[str, tuple[Bounded, float]]:
 
 
 def layout_measures(report: LayoutReport) -> dict[str, float]:
-    """The numbers of a layout, lengths in mm, by the names of their measures: alike in every step."""
+    """The numbers of a layout by measure name, lengths in mm; the same in every step."""
     return {
         **{name: mm(bounded.value_m) for name, (bounded, _) in layout_bounds(report).items()},
         "layout_margin_sigma_mm": mm(report.margin.sigma_m),
@@ -243,7 +243,7 @@ class Matches:
 
 
 def confusions(centres: Array, beyond_m: float = 0.0) -> Matches:
-    """All wrong assignments of four up to a misfit of `beyond_m`, or more until there is one."""
+    """All wrong assignments of four up to a misfit of `beyond_m`; if there are none, up to the first found."""
     between = distances(centres)
     tolerance = max(_FIRST_TOLERANCE_M, beyond_m)
     while True:
@@ -256,7 +256,7 @@ def confusions(centres: Array, beyond_m: float = 0.0) -> Matches:
 
 
 def similar(between: Array, tolerance: float) -> tuple[IntArray, IntArray]:
-    """Quadruples (M, 4) and others (M, 4) whose six distances agree; the quadruple itself is left out."""
+    """Quadruples (M, 4) and others (M, 4) with equal pairwise distances, without the quadruple itself."""
     n = len(between)
     seen = np.stack(np.triu_indices(n, 1), axis=1)
     taken = np.array([(p, q) for p in range(n) for q in range(n) if p != q])
@@ -302,7 +302,7 @@ def distances(centres: Array) -> Array:
 
 
 def _distinct(matches: Matches, order: IntArray, most: int = 8) -> list[int]:
-    """The best assignments, each pair of sets once: an assignment and its inverse fit alike."""
+    """Indices of the best assignments, each pair of sets once: an assignment and its inverse have equal misfits."""
     chosen: list[int] = []
     known: set[frozenset[tuple[int, int]]] = set()
     for k in order[: 50 * most]:
@@ -317,7 +317,7 @@ def _distinct(matches: Matches, order: IntArray, most: int = 8) -> list[int]:
 
 
 def _by_count(centres: Array, matches: Matches, order: IntArray) -> dict[int, Matches]:
-    """The best assignments by the number of spheres seen, best first: those of four, carried on to the others."""
+    """The best assignments by number of visible spheres, best first; those of four are extended to more spheres."""
     n = len(centres)
     seen, taken = matches.seen[order[:2000]], matches.taken[order[:2000]]
     found = {SUBSET: Matches(seen, taken, matches.misfit[order[:2000]])}
@@ -343,7 +343,7 @@ _NO_BOUND = Bounded(np.inf, np.inf, np.inf)
 
 
 def _least(centres: Array, joint: Array | None, matches: Matches) -> Bounded:
-    """The least misfit: at least the least of all lower bounds, at most the least of all upper ones."""
+    """The least misfit, bounded by the least of all lower bounds and the least of all upper ones."""
     if joint is None:
         least = float(matches.misfit.min())
         return Bounded(least, least, least)
@@ -353,7 +353,7 @@ def _least(centres: Array, joint: Array | None, matches: Matches) -> Bounded:
 
 
 def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) -> Bounded:
-    """rms height over the best plane, with the first-order variance of a singular value."""
+    """RMS height over the best plane, with the first-order variance of a singular value."""
     n = len(centres)
     depth = float(singular[2] / np.sqrt(n))
     if joint is None:
@@ -365,7 +365,7 @@ def _depth(centres: Array, singular: Array, axes: Array, joint: Array | None) ->
 
 
 def _joint(covariance: Array | None, n: int) -> Array | None:
-    """(3N, 3N) of all centres; None where nothing is known."""
+    """(3N, 3N) covariance of all centres; None if nothing is known."""
     if covariance is None or covariance.ndim == 2:
         return covariance
     joint = np.zeros((n, 3, n, 3))

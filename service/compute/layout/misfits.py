@@ -1,4 +1,4 @@
-"""How well wrong assignments of spheres fit, with bounds from the centres' covariance."""
+"""Misfits of wrong sphere assignments, with bounds from the centres' covariance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BISECTIONS = 40
 
 @dataclass(frozen=True, slots=True)
 class BoundedMisfits:
-    """Misfits (M,) in metres: without what noise adds to them, and their one-sided bounds."""
+    """Misfits (M,) in metres without the part due to noise, and their one-sided bounds."""
 
     misfit_m: Array
     lower_m: Array
@@ -26,7 +26,7 @@ class BoundedMisfits:
 
 
 def misfits(centres: Array, seen: IntArray, taken: IntArray) -> Array:
-    """rms (M,) after the best proper rigid motion of each assignment (M, n). Source: as `align_points`."""
+    """Rms distance (M,) after the best proper rigid motion of each assignment (M, n). Source: as `align_points`."""
     if len(seen) == 0:
         return np.empty(0)
     a, b, _, S = _aligned(centres, seen, taken)
@@ -35,7 +35,7 @@ def misfits(centres: Array, seen: IntArray, taken: IntArray) -> Array:
 
 
 def rigid_motions(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Array]:
-    """R (M, 3, 3) and t (M, 3) that bring `seen` best onto `taken`."""
+    """R (M, 3, 3) and t (M, 3) of the rigid motion that best maps `seen` onto `taken`."""
     _, _, R, _ = _aligned(centres, seen, taken)  # a ≈ R b
     turned = np.swapaxes(R, 1, 2)
     return turned, centres[taken].mean(axis=1) - np.einsum("mij,mj->mi", turned, centres[seen].mean(axis=1))
@@ -53,16 +53,16 @@ def _aligned(centres: Array, seen: IntArray, taken: IntArray) -> tuple[Array, Ar
 
 
 def bounded_misfits(centres: Array, covariance: Array, seen: IntArray, taken: IntArray) -> BoundedMisfits:
-    """Misfits of assignments (M, n) and bounds that hold with a probability of CONFIDENCE each.
+    """Misfits of assignments (M, n) and one-sided bounds with probability CONFIDENCE each.
 
-    The residuals r after the best motion have the covariance Q of the noise that a motion cannot take up. Then
-    |r|² has the mean |r₀|² + tr Q and the variance 2 tr Q² + 4 r₀ᵀ Q r₀, r₀ being the true residuals; a gamma
+    The residuals r after the best motion have the covariance Q of the noise, less what a rigid motion absorbs. Then
+    |r|² has the mean |r₀|² + tr Q and the variance 2 tr Q² + 4 r₀ᵀ Q r₀, with r₀ the true residuals; a gamma
     distribution with these two moments gives the bounds. Source: Satterthwaite (1946), for a non-central sum.
 
     Args:
         centres: (N, 3).
         covariance: (3N, 3N) m².
-        seen, taken: indices of the spheres and of those that they are taken for.
+        seen, taken: indices of the spheres and of those they are mistaken for.
     """
     n = seen.shape[1]
     a, b, R, _ = _aligned(centres, seen, taken)
@@ -84,7 +84,7 @@ def bounded_misfits(centres: Array, covariance: Array, seen: IntArray, taken: In
     def solve(low: Array, high: Array, *, upper: bool) -> Array:
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
-            # As the true misfit grows, so does the chance of more than what was seen.
+            # The larger the true misfit, the more likely is one above the observed.
             larger = tail(middle, upper=upper) > 1 - CONFIDENCE
             low, high = (
                 (np.where(larger, middle, low), np.where(larger, high, middle))
@@ -102,7 +102,7 @@ def bounded_misfits(centres: Array, covariance: Array, seen: IntArray, taken: In
 
 
 def _residual_covariance(covariance: Array, a: Array, R: Array, seen: IntArray, taken: IntArray) -> Array:
-    """(M, 3n, 3n) of the residuals: the noise of both sides, without what a rigid motion takes up."""
+    """(M, 3n, 3n) covariance of the residuals: the noise of both sides, less what a rigid motion absorbs."""
     M, n = seen.shape
     blocks = covariance.reshape(len(covariance) // 3, 3, -1, 3).transpose(0, 2, 1, 3)  # (N, N, 3, 3)
     ss = blocks[seen[:, :, None], seen[:, None, :]]

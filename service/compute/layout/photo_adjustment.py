@@ -1,4 +1,4 @@
-"""Spheres, camera poses and the camera itself from outlines in photographs: least squares with stated priors."""
+"""Least-squares adjustment of spheres, camera poses and intrinsics to outlines in photographs, with priors."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from service.core.geometry import Array, Transform, transform
 
 IntArray = NDArray[np.int64]
 
-_RIM: Array = np.linspace(0.0, 2 * np.pi, 12, endpoint=False)  # azimuths of the rays that stand for an outline
+_RIM: Array = np.linspace(0.0, 2 * np.pi, 12, endpoint=False)  # azimuths of the rays that represent an outline
 _LENS = 8  # focal length, fy over fx, cx, cy, k1, k2, p1, p2
 _ITERATIONS = 12
 _DONE = 1e-6  # metres and radians
 _LONGEST_STEP = 0.1
-# Outlines err by more than they state: chi² per coordinate in bench/results/outlines*.md.
+# Outlines err by more than their stated covariance: chi² per coordinate in bench/results/outlines*.md.
 _OUTLINE_CHI2 = 1.5
-_DOUBTFUL = 3.5  # standard deviations beyond which an outline counts for less
+_DOUBTFUL = 3.5  # standard deviations beyond which an outline is downweighted
 
 
 @dataclass(frozen=True, slots=True)
 class LensPrior:
-    """How well a camera is known beforehand, as standard deviations.
+    """Prior standard deviations of a camera's parameters.
 
     Attributes:
-        focal: relative, of all photographs together.
-        refocused: relative, of one photograph's focal length against the others': the lens may have been focused.
+        focal: relative, common to all photographs.
+        refocused: relative, of one photograph's focal length against the others', since the lens may have been
+            refocused.
         aspect: of fy over fx.
         centre: of the principal point, relative to the image's width.
         k1, k2: of radial distortion.
@@ -49,7 +50,7 @@ class LensPrior:
     tangential: float = 1e-3
 
     def sigmas(self) -> Array:
-        """(8,) in the order of the lens' parameters."""
+        """(8,) standard deviations in the order of the lens parameters."""
         return np.array(
             [self.focal, self.aspect, self.centre, self.centre, self.k1, self.k2, self.tangential, self.tangential]
         )
@@ -60,11 +61,11 @@ CALIBRATED = LensPrior(focal=2e-4, refocused=1e-4, aspect=5e-5, centre=2e-4, k1=
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """Sphere outlines of one photograph as a nominal camera reads them.
+    """Sphere outlines of one photograph, interpreted with a nominal camera.
 
     Attributes:
         camera: the nominal camera.
-        cones: one for each outline, of the nominal camera.
+        cones: one for each outline, from the nominal camera.
         covariances: (n, 3, 3), as SphereOutline.cone_covariance.
     """
 
@@ -74,7 +75,7 @@ class Photograph:
 
     @classmethod
     def of(cls, camera: CameraModel, outlines: Sequence[SphereOutline]) -> Photograph:
-        """From what the detector found with this camera."""
+        """From the outlines that the detector found with this camera."""
         return cls(
             camera,
             tuple(o.cone for o in outlines),
@@ -82,20 +83,20 @@ class Photograph:
         )
 
     def rim_px(self) -> Array:
-        """(n, 12, 2) pixels of the image as captured, on every outline."""
+        """(n, 12, 2) points on every outline, in pixels of the image as captured."""
         rays = [cone.rays(_RIM, np.full_like(_RIM, cone.half_angle_rad)) for cone in self.cones]
         return np.array([self.camera.project(r) for r in rays]).reshape(-1, len(_RIM), 2)
 
 
 @dataclass(frozen=True, slots=True)
 class Adjusted:
-    """What the outlines say together.
+    """The adjusted spheres and poses.
 
     Attributes:
         centres_m: (N, 3) in the frame of the first photograph.
-        covariance: (3N, 3N) m², of all centres together, with what the camera's uncertainty does to them.
-        T_photo_first: of every photograph, maps the first photograph's frame to its own.
-        chi2: per degree of freedom; the covariance holds it where it is more than 1.
+        covariance: (3N, 3N) m² of all centres jointly, including the camera's uncertainty.
+        T_photo_first: for every photograph, maps the first photograph's frame to its own.
+        chi2: per degree of freedom; if above 1, the covariance is scaled by it.
     """
 
     centres_m: Array
@@ -112,18 +113,18 @@ def adjust(
     radius_m: float,
     prior: LensPrior,
 ) -> Adjusted:
-    """Adjust spheres, poses and camera to all outlines together. Source: Gauss–Newton with Huber's weights.
+    """Adjust spheres, poses and camera to all outlines by Gauss–Newton with Huber weights.
 
     Args:
         photographs: of the same camera.
-        spheres: for every photograph (n,), the sphere that each outline shows.
-        centres_m: (N, 3) to begin with; every one is seen in some photograph.
-        T_photo_first: to begin with; the first one stays the identity.
-        radius_m: of the spheres: it gives the scale.
+        spheres: for every photograph (n,), the sphere index of each outline.
+        centres_m: (N, 3) initial centres; each sphere must be seen in some photograph.
+        T_photo_first: initial poses; the first one stays the identity.
+        radius_m: radius of the spheres, which defines the scale.
         prior: of the camera.
 
     Raises:
-        ComputeError: it does not converge: the photographs show something else.
+        ComputeError: no convergence, because the outlines do not fit together.
     """
     problem = _Problem.of(photographs, spheres, radius_m, prior, len(centres_m))
     x = _State(
@@ -154,7 +155,7 @@ class _State:
     centres: Array  # (N, 3)
     rotations: Array  # (K, 3, 3)
     shifts: Array  # (K, 3)
-    lens: Array  # (8,) departures from the nominal camera
+    lens: Array  # (8,) differences from the nominal camera
     focal: Array  # (K,) relative
 
 
@@ -182,7 +183,7 @@ class _Problem:
         n_spheres: int,
     ) -> _Problem:
         covariances = _OUTLINE_CHI2 * np.concatenate([p.covariances for p in photographs])
-        # A measurement below is (half angle, axis) where the covariance has (axis, half angle).
+        # Measurements below are (half angle, axis), but the covariance is (axis, half angle).
         order = np.array([2, 0, 1])
         ordered = covariances[:, order][:, :, order]
         camera = photographs[0].camera
@@ -206,7 +207,7 @@ class _Problem:
 
     @property
     def geometry(self) -> slice:
-        """The unknowns that are lengths and angles: centres, then six of every photograph but the first."""
+        """The columns of lengths and angles: centres, then six for every photograph but the first."""
         return slice(0, 3 * self.n_spheres + 6 * (self.n_photos - 1))
 
     def step(self, x: _State) -> tuple[Array, Array, float]:
@@ -271,7 +272,7 @@ class _Problem:
         )
 
     def _measure(self, seen: Array, lens: Array, focal: Array) -> Array:
-        """(M, 3): by how much outlines are larger, and their axes off, from those of spheres at `seen` (M, 3)."""
+        """(M, 3) size and axis differences of the outlines from those of spheres at `seen` (M, 3)."""
         scale = 1.0 + lens[0] + focal
         fx, fy = self.nominal[:, 0] * scale, self.nominal[:, 1] * scale * (1.0 + lens[1])
         centre = self.nominal[:, 2:] + lens[2:4] * self.width
@@ -282,20 +283,20 @@ class _Problem:
         axis = (seen / distance[:, None])[:, None]
         angle = np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=2), np.sum(rays * axis, axis=2))
         gap = angle - np.arcsin(np.minimum(self.radius_m / distance, 0.9))[:, None]
-        # A shift of the axis by d changes the angle to a ray at azimuth φ by -d·(cos φ, sin φ).
+        # Shifting the axis by d changes the angle to a ray at azimuth φ by -d·(cos φ, sin φ).
         return np.stack(
             [gap.mean(axis=1), -2 * (gap * np.cos(_RIM)).mean(axis=1), -2 * (gap * np.sin(_RIM)).mean(axis=1)], axis=1
         )
 
     @staticmethod
     def _derivative(measure: Callable[[Array], Array], m: Array, deltas: Array) -> Array:
-        """(M, 3, len(deltas)) by differences."""
+        """(M, 3, len(deltas)) derivatives by finite differences."""
         steps = np.diag(deltas)
         return np.stack([(measure(d) - m) / h for d, h in zip(steps, deltas, strict=True)], axis=2)
 
 
 def _undistorted(xd: Array, yd: Array, distortion: Array) -> Array:
-    """Unit rays (M, 12, 3) of distorted normalised coordinates, by fixed-point iteration as OpenCV's."""
+    """Unit rays (M, 12, 3) of distorted normalised coordinates, by fixed-point iteration as in OpenCV."""
     k1, k2, p1, p2 = distortion
     x, y = xd, yd
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""Places of spheres from photographs by a camera that nobody has calibrated: one, or several from different sides."""
+"""Sphere centres from one or more photographs taken with an uncalibrated camera."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from service.core.geometry import Array, Transform, align_points, apply, inverse
 IntArray = NDArray[np.int64]
 
 LEAST_SPHERES = 4
-_TOLERANCE_M = 0.015  # between two photographs that are read each by itself: depths err by some millimetres
-_TRIANGLES = 10  # of the leading photograph, the largest ones, with which poses of another one are proposed
+_TOLERANCE_M = 0.015  # between centres from two single photographs: depths err by some millimetres
+_TRIANGLES = 10  # largest triangles of the leading photograph, with which poses of another are proposed
 _PROPOSALS = 4000
-_READINGS = 3  # of one photograph, tried in the adjustment of all
-_APART = 1.5  # radii, at least, between two centres: 2 for spheres that touch, less what is uncertain
-_WORST_CHI2 = 20.0  # per degree of freedom: beyond, the photograph shows something else
+_READINGS = 3  # assignments of one photograph that are tried in the joint adjustment
+_APART = 1.5  # radii, least distance of two centres: 2 for spheres that touch, less their uncertainty
+_WORST_CHI2 = 20.0  # per degree of freedom: above it, the photograph shows something else
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,10 +32,10 @@ class PhotoLayout:
 
     Attributes:
         centres_m: (N, 3) in the frame of the leading photograph.
-        covariance: (3N, 3N) m², of all centres together.
-        spheres: for every photograph given, the sphere that each of its outlines shows (-1: none); an empty array
-            where the photograph could not be used.
-        T_photo_first: of every photograph, from the frame of the centres; None where it could not be used.
+        covariance: (3N, 3N) m² of all centres jointly.
+        spheres: for every photograph, the sphere of each of its outlines (-1: none); an empty array if the photograph
+            could not be used.
+        T_photo_first: for every photograph, maps the centres' frame to its own; None if it could not be used.
         chi2: of the adjustment, per degree of freedom.
     """
 
@@ -47,7 +47,7 @@ class PhotoLayout:
 
     @property
     def used(self) -> int:
-        """How many photographs went into it."""
+        """Number of photographs used."""
         return sum(T is not None for T in self.T_photo_first)
 
 
@@ -56,15 +56,15 @@ def layout_from_photographs(
 ) -> PhotoLayout:
     """One layout from photographs of spheres that did not move in between.
 
-    The photograph with most spheres leads. Of one photograph, depths follow from the outlines' sizes, to some
-    tenths of a millimetre at best; from a second side they follow from the directions, ten times better, and the
-    camera is calibrated on the way.
+    The photograph with the most spheres leads. From a single photograph, depths follow from the outlines' sizes, to
+    some tenths of a millimetre at best. With a second viewpoint they follow from the directions, ten times better,
+    and the camera is calibrated at the same time.
 
     Args:
-        photographs: of one camera.
-        radius_m: of the spheres.
-        prior: what is known of the camera.
-        expected: how many spheres there are; of more, those that fewest photographs show are left out.
+        photographs: from one camera.
+        radius_m: radius of the spheres.
+        prior: of the camera.
+        expected: number of spheres; if more are found, those seen in the fewest photographs are dropped.
 
     Raises:
         ComputeError: no photograph shows four spheres.
@@ -92,7 +92,7 @@ def layout_from_photographs(
 
 @dataclass(frozen=True, slots=True)
 class _Group:
-    """The photographs that are in register: their numbers, the spheres of their outlines (-1: none), their poses."""
+    """The photographs registered so far: their numbers, the spheres of their outlines (-1: none), their poses."""
 
     photographs: list[int]
     spheres: list[IntArray]
@@ -115,7 +115,7 @@ def _adjusted(
 def _joined(
     photographs: Sequence[Photograph], group: _Group, found: Adjusted, k: int, radius_m: float, prior: LensPrior
 ) -> tuple[_Group, Adjusted]:
-    """With photograph k, in the reading that fits best; without it where none does."""
+    """The group with photograph k added by its best-fitting assignment; unchanged if none fits."""
     places = places_by_size(photographs[k].cones, radius_m)
     best: tuple[_Group, Adjusted] | None = None
     best_rank = (True, np.inf)
@@ -132,9 +132,9 @@ def _joined(
         try:
             adjusted = _adjusted(photographs, joined, centres, radius_m, prior)
         except ComputeError:
-            continue  # not this reading
-        # Spheres are solid: where two share a place, an outline of a known one was read as one more, or one sphere
-        # was outlined twice. Such a reading counts only where there is no other.
+            continue  # this assignment does not fit
+        # Spheres are solid. If two overlap, either an outline of a known sphere was taken for a new one, or one
+        # sphere was outlined twice. Such an assignment counts only if there is no other.
         rank = (_nearest_m(adjusted.centres_m) < _APART * radius_m, adjusted.chi2)
         if adjusted.chi2 < _WORST_CHI2 and (best is None or rank < best_rank):
             best, best_rank = (joined, adjusted), rank
@@ -142,7 +142,7 @@ def _joined(
 
 
 def _nearest_m(centres: Array) -> float:
-    """Between the two nearest of the centres (N, 3)."""
+    """Least distance between two of the centres (N, 3)."""
     return float(distances(centres)[~np.eye(len(centres), dtype=bool)].min())
 
 
@@ -154,11 +154,11 @@ def _reduced(
     radius_m: float,
     prior: LensPrior,
 ) -> tuple[_Group, Adjusted]:
-    """Without the spheres that fewest photographs show: something else that is round was taken for one."""
+    """Without the spheres seen in the fewest photographs, which are other round objects."""
     count = np.bincount(np.concatenate([i[i >= 0] for i in group.spheres]), minlength=len(found.centres_m))
     kept = np.sort(np.argsort(-count, kind="stable")[:expected])
     if count[kept].min() == count[np.setdiff1d(np.arange(len(count)), kept)].max():
-        return group, found  # nothing tells which: the count itself says that something is wrong
+        return group, found  # a tie: nothing shows which are wrong, and the wrong count is reported
     number = np.full(len(count) + 1, -1, dtype=np.int64)
     number[kept] = np.arange(expected)
     smaller = _Group(group.photographs, [number[ids] for ids in group.spheres], list(found.T_photo_first))
@@ -166,17 +166,18 @@ def _reduced(
 
 
 def places_by_size(cones: Sequence[Cone], radius_m: float) -> Array:
-    """(n, 3) centres in the photograph's own frame, by the sizes of the outlines."""
+    """(n, 3) centres in the photograph's own frame, with depths from the outlines' sizes."""
     return np.array(
         [cone.axis * (radius_m / np.sin(cone.half_angle_rad)) for cone in cones], dtype=np.float64
     ).reshape(-1, 3)
 
 
 def _readings(a: Array, b: Array) -> list[tuple[Transform, list[tuple[int, int]]]]:
-    """T_a_b and pairs (index in a, index in b) of the ways in which places b (N, 3) agree with a (M, 3), best first.
+    """T_a_b and pairs (index in a, index in b) for every way in which b (N, 3) matches a (M, 3), best first.
 
-    Layouts that are nearly symmetric agree in more than one way: the adjustment tells which is true, and where it
-    cannot, the layout is the same either way.
+    Nearly symmetric layouts match in more than one way: the adjustment decides between them, and if it cannot, the
+        layout
+    is the same either way.
     """
     if min(len(a), len(b)) < LEAST_SPHERES:
         return []
@@ -197,7 +198,7 @@ def _readings(a: Array, b: Array) -> list[tuple[Transform, list[tuple[int, int]]
 
 
 def _refined(a: Array, b: Array, start: Transform) -> tuple[list[tuple[int, int]], Transform, float]:
-    """Pairs within the tolerance, the pose that fits them all, and the sum of their squares over the tolerance's."""
+    """Pairs within the tolerance, the pose fitted to them, and their sum of squares relative to the tolerance's."""
     pairs: list[tuple[int, int]] = []
     cost, T_a_b = float("inf"), start
     for _ in range(2):
@@ -213,7 +214,7 @@ def _refined(a: Array, b: Array, start: Transform) -> tuple[list[tuple[int, int]
 
 
 def _alike_triangles(a: Array, b: Array) -> tuple[IntArray, IntArray]:
-    """Index triples (M, 3) of a, the largest triangles only, and of b, whose sides agree."""
+    """Index triples (M, 3) into a (its largest triangles only) and into b, with equal sides."""
     da, db = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (a, b))
     i, j, k = np.array([(p, q, r) for p in range(len(a)) for q in range(p) for r in range(q)]).T
     area = np.linalg.norm(np.cross(a[j] - a[i], a[k] - a[i]), axis=1)
@@ -234,7 +235,7 @@ def _alike_triangles(a: Array, b: Array) -> tuple[IntArray, IntArray]:
 
 
 def _rigid(a: Array, b: Array) -> Array:
-    """T_a_b (M, 4, 4) of point triples a, b (M, 3, 3). Source: as `align_points`."""
+    """T_a_b (M, 4, 4) for point triples a, b (M, 3, 3). Source: as `align_points`."""
     mean_a, mean_b = a.mean(axis=1), b.mean(axis=1)
     H = np.einsum("mki,mkj->mij", b - mean_b[:, None], a - mean_a[:, None])
     U, _, Vt = np.linalg.svd(H)

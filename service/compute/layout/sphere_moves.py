@@ -1,4 +1,4 @@
-"""Which sphere of a layout to move, and where to, so that the spheres can be told from one another."""
+"""Suggests which sphere of a layout to move, and where to, so that the spheres can be told apart."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from service.compute.layout.misfits import misfits
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 
-_STEPS_M = (0.02, 0.04)  # how far a sphere is tried elsewhere, along the table
+_STEPS_M = (0.02, 0.04)  # tried shifts along the table
 _HEIGHTS_M = (-0.02, 0.0, 0.02)
 _SPHERES_TRIED = 2
 _MOST_MOVES = 5
-_LOOKED_AT = 3  # of all moves tried, the most promising
+_LOOKED_AT = 3  # most promising of all tried moves, which are rated in full
 _CLEARANCE_RADII = 3.0  # between centres
-_AMPLE = 2.0  # times the required margin: more than this makes no move better
-_PLACING_M = 0.004  # how far beside the advice a person places a sphere
-_OUTWARDS = 1.06  # of the outermost sphere's distance from the middle: beyond, there may be no table
+_AMPLE = 2.0  # times the required margin: a larger margin does not make a move better
+_PLACING_M = 0.004  # how inaccurately a person places a sphere
+_OUTWARDS = 1.06  # of the outermost sphere's distance from the middle: beyond, the table may end
 
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A sphere that is better placed elsewhere.
+    """A suggested move of one sphere.
 
     Attributes:
         sphere: its index.
-        by_m: (3,) shift in the frame of the centres.
+        by_m: (3,) shift in the centres' frame.
         margin_m: of the layout after this move and those before it.
     """
 
@@ -47,7 +47,7 @@ class Move:
 
 
 def innermost(centres_m: Array, count: int) -> frozenset[int]:
-    """The `count` spheres nearest to the layout's middle: control spheres, which the specimen carries."""
+    """The `count` spheres nearest to the layout's middle: the control spheres on the specimen."""
     _, _, axes = np.linalg.svd(centres_m - centres_m.mean(axis=0), full_matrices=False)
     flat = (centres_m - centres_m.mean(axis=0)) @ axes[:2].T
     return frozenset(int(i) for i in np.argsort(np.linalg.norm(flat, axis=1), kind="stable")[:count])
@@ -61,19 +61,19 @@ def suggest_moves(
     fixed: Collection[int] = (),
     required_margin_m: float = REQUIRED_MARGIN_M,
 ) -> tuple[Move, ...]:
-    """Moves, one after the other, until no assignment is confused; each one that which leaves most margin.
+    """Successive moves until no assignment can be confused; each is the one that leaves the largest margin.
 
-    The margin of a move is the least over the places to which a person who follows it may bring the sphere.
+    The margin of a move is the least over all places where a person following the advice may put the sphere.
 
     Args:
         centres_m: (N, 3).
-        up: (3,) unit vector away from the table, in the frame of the centres.
-        radius_m: of the spheres; moves keep them apart.
+        up: (3,) unit vector away from the table, in the centres' frame.
+        radius_m: radius of the spheres; moves keep them apart.
         fixed: spheres that cannot be moved.
         required_margin_m: of four spheres.
 
     Raises:
-        ComputeError: no single move makes it better.
+        ComputeError: no single move improves the layout.
     """
     placed = np.array(centres_m, dtype=np.float64)
     chosen: list[Move] = []
@@ -110,16 +110,16 @@ def _moved(centres: Array, sphere: int, by: Array) -> Array:
 
 
 def _quick_rating(centres: Array, required: float) -> float:
-    """The margin over what it must be, _AMPLE at most, less by one for each assignment that is confused."""
+    """The margin over the required one, at most _AMPLE, minus one for each confusable assignment."""
     misfit = misfits(centres, *similar(distances(centres), 2 * np.sqrt(2.0) * _AMPLE * required))
     least = float(misfit.min(initial=_AMPLE * required)) / required
     return least - int(np.count_nonzero(misfit < required))
 
 
 def _rating(centres: Array, required: float) -> float:
-    """The least of the layout's numbers over what each must reach, _AMPLE at most; less by one for each shortfall.
+    """The least ratio of the layout's numbers to their required values, at most _AMPLE, minus one for each shortfall.
 
-    So the best of several moves that do not suffice is the one that leaves fewest assignments confused.
+    So among several insufficient moves, the best is the one that leaves the fewest confusable assignments.
     """
     quick = _quick_rating(centres, required)
     if quick < 1:
@@ -130,13 +130,13 @@ def _rating(centres: Array, required: float) -> float:
 
 
 def _around(trial: Array, sphere: int) -> list[Array]:
-    """The layout, and those in which the sphere is a little beside its place."""
+    """The layout itself and variants with the sphere slightly displaced."""
     offsets = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)]) * _PLACING_M
     return [_moved(trial, sphere, offset) for offset in offsets]
 
 
 def _involved(centres: Array, fixed: Collection[int], required: float) -> list[int]:
-    """The spheres that are most often taken for others, those that can be moved."""
+    """The movable spheres that are most often mistaken for others."""
     found = confusions(centres, beyond_m=2 * required)
     moved = found.seen != found.taken
     count = np.bincount(
@@ -146,7 +146,7 @@ def _involved(centres: Array, fixed: Collection[int], required: float) -> list[i
 
 
 def _directions(up: Array) -> list[Array]:
-    """Shifts along the table and up or down, the short ones first."""
+    """Shifts along the table combined with height changes, the short ones first."""
     first = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
     first /= np.linalg.norm(first)
     second = np.cross(up, first)
@@ -160,7 +160,7 @@ def _directions(up: Array) -> list[Array]:
 
 
 def _fits(placed: Array, trial: Array, sphere: int, up: Array, radius_m: float) -> bool:
-    """Whether a sphere can be there: clear of the others, over the table, neither higher nor lower than these."""
+    """Whether a sphere fits there: clear of the others, over the table, within their range of heights."""
     others = np.delete(distances(trial)[sphere], sphere)
     middle = placed.mean(axis=0)
     flat = placed - middle - np.outer((placed - middle) @ up, up)

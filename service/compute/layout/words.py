@@ -1,4 +1,4 @@
-"""A sphere's move as a person at the table follows it: in words and as an arrow in a photograph."""
+"""A sphere's move for a person at the table: in words, and as an arrow in a photograph."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class ShownMove:
 
     Attributes:
         words: what to do.
-        from_px: (2,) where the sphere is in the image as captured.
-        to_px: (2,) where it would be after the move along the table, before it is raised or lowered.
-        higher_m: by how much it is to be higher.
+        from_px: (2,) the sphere's position in the image as captured.
+        to_px: (2,) its position after the move along the table, before the change of height.
+        higher_m: change of height.
     """
 
     words: str
@@ -37,15 +37,15 @@ class ShownMove:
 def show_move(
     move: Move, centres_m: Array, up: Array, T_photo_centres: Transform, camera: CameraModel, limit_m: float
 ) -> ShownMove:
-    """The move as `camera` sees it in a photograph.
+    """The move as seen in a photograph taken with `camera`.
 
     Args:
-        move: in the frame of the centres.
-        centres_m: (N, 3) as they are before the move.
-        up: (3,) unit vector away from the table, in the frame of the centres.
+        move: in the centres' frame.
+        centres_m: (N, 3) before the move.
+        up: (3,) unit vector away from the table, in the centres' frame.
         T_photo_centres: maps that frame to the camera's.
         camera: of the photograph.
-        limit_m: of the margin.
+        limit_m: required margin.
     """
     higher = float(move.by_m @ up)
     along = move.by_m - higher * up

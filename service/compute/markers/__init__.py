@@ -1,1 +1,1 @@
-"""Spheres in images: from pixels to outlines on the viewing sphere."""
+"""Detection of spheres in images: from pixels to outlines as cones of rays."""

@@ -1,4 +1,4 @@
-"""Outlines as plain data and back: a cone and its evidence say everything, the points follow from it."""
+"""Converts outlines to plain data and back: the cone and its evidence are stored, the points follow from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _EVIDENCE = tuple(field.name for field in dataclasses.fields(Evidence))
 
 
 def outline_record(outline: SphereOutline) -> dict[str, Any]:
-    """An outline as JSON data."""
+    """An outline as JSON-compatible data."""
     record: dict[str, Any] = {name: getattr(outline, name) for name in _EVIDENCE}
     record["cone_covariance"] = outline.cone_covariance.tolist()
     record["axis"] = outline.cone.axis.tolist()
@@ -27,7 +27,7 @@ def outline_record(outline: SphereOutline) -> dict[str, Any]:
 
 
 def outline_from_record(record: dict[str, Any], camera: CameraModel) -> SphereOutline:
-    """The outline again, its points sampled anew on the same conic."""
+    """Rebuild an outline from `outline_record`'s data, with its points sampled anew on the same conic."""
     values = {name: _value(record[name]) for name in _EVIDENCE}
     values["cone_covariance"] = np.array(record["cone_covariance"], dtype=np.float64)
     evidence = Evidence(**values)

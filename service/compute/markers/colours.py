@@ -1,4 +1,4 @@
-"""The colour of the spheres: names, and how far a colour is from it, whatever the light's strength."""
+"""The colour of the spheres: named colours, and distances between colours independent of the light's strength."""
 
 from __future__ import annotations
 
@@ -13,32 +13,32 @@ from service.core.geometry import Array
 
 Colour = tuple[float, float, float]  # B, G, R as coded in an image, 0..255
 
-# Typical matte plastic under neutral light, and how far a sphere that bears the name may be from it.
+# Typical matte plastic under neutral light, and the chromaticity tolerance for spheres of that name.
 NAMED_BGR: Mapping[str, tuple[Colour, float]] = {
     "white": ((230.0, 230.0, 230.0), 0.16),
     "grey": ((140.0, 140.0, 140.0), 0.16),
     "green": ((75.0, 200.0, 130.0), 0.3),  # from yellowish to dark green
     "orange": ((56.0, 139.0, 236.0), 0.22),
 }
-_HEX_TOLERANCE = 0.18  # the light's colour and the camera's white balance
-_ALIKE = 0.07  # distance of discs of one colour
-_LEARNT_TOLERANCE = (0.1, 0.16)  # least and greatest distance of a pixel from the colour of the clearest spheres
-_PALEST = 0.2  # saturation of a pale picture over that of the colour's name
+_HEX_TOLERANCE = 0.18  # covers the light's colour and the camera's white balance
+_ALIKE = 0.07  # largest distance of discs of one colour
+_LEARNT_TOLERANCE = (0.1, 0.16)  # smallest and largest tolerance of a learnt colour
+_PALEST = 0.2  # saturation of a pale picture over that of the named colour
 _SAME_HUE_RAD = 0.45
-_MEMBERS = 3  # discs of one colour from which it is learnt
+_MEMBERS = 3  # least number of discs from which a colour is learnt
 
 
 @dataclass(frozen=True, slots=True)
 class ColourModel:
-    """The chromaticity of the spheres in an image (2,) and how far from it a pixel of theirs may be."""
+    """The chromaticity (2,) of the spheres in an image, and its tolerance for single pixels."""
 
     middle: Array
     tolerance: float
     srgb: bool
-    palest: float = 1.0  # least saturation over that of `middle`; below 1 the hue counts, not the saturation
+    palest: float = 1.0  # least saturation over that of `middle`; below 1, the hue decides, not the saturation
 
     def distance(self, colours_bgr: Array) -> Array:
-        """(N,) of colours (N, 3), in tolerances: up to 1 is a sphere's."""
+        """(N,) distance of colours (N, 3) in tolerances; up to 1 is a sphere's colour."""
         tones = chromaticity(colours_bgr, srgb=self.srgb)
         if self.palest == 1.0:
             return np.linalg.norm(tones - self.middle, axis=1) / self.tolerance
@@ -48,7 +48,7 @@ class ColourModel:
         return np.asarray(np.where(np.hypot(along, across) < self.palest, 9.0, off), dtype=np.float64)
 
     def paler(self) -> ColourModel | None:
-        """The same hue as a cheap camera's pale picture has it; None of colours that have hardly any."""
+        """The model for pale pictures of cheap cameras, by its hue; None if the colour has hardly any saturation."""
         pale = float(np.linalg.norm(self.middle)) > 2 * self.tolerance
         return replace(self, palest=_PALEST) if pale else None
 
@@ -59,10 +59,10 @@ def _axes(unit: Array) -> tuple[tuple[float, float], tuple[float, float]]:
 
 
 def colour_of(text: str) -> tuple[Colour, float]:
-    """A colour and its tolerance in chromaticity by its name (white, grey, green, orange) or as #rrggbb.
+    """A colour and its chromaticity tolerance from a name (white, grey, green, orange) or #rrggbb.
 
     Raises:
-        ConfigurationError: neither.
+        ConfigurationError: neither a known name nor #rrggbb.
     """
     word = text.strip().lower()
     if word in NAMED_BGR:
@@ -76,13 +76,13 @@ def colour_of(text: str) -> tuple[Colour, float]:
 
 
 def learn_colour(colours_bgr: Array, weights: Array, clear: NDArray[np.bool_], *, srgb: bool) -> ColourModel | None:
-    """The colour that most of the discs share (all markers come from one batch); None when too few agree.
+    """The colour that most of the discs share, since all spheres have one colour; None if too few agree.
 
     Args:
         colours_bgr: (N, 3) median colours of discs.
         weights: (N,) how much each looks like a sphere.
-        clear: (N,) discs that pass every test by themselves; one at least must be of the colour.
-        srgb: the values carry the sRGB curve.
+        clear: (N,) discs that pass every test by themselves; at least one must have the colour.
+        srgb: whether the values are sRGB coded.
     """
     if len(colours_bgr) < _MEMBERS:
         return None
@@ -98,14 +98,14 @@ def learn_colour(colours_bgr: Array, weights: Array, clear: NDArray[np.bool_], *
 
 
 def given_colour(colour_bgr: Colour, tolerance: float, *, srgb: bool) -> ColourModel:
-    """The model of a colour that is known before."""
+    """The model of a colour known in advance."""
     return ColourModel(chromaticity(np.array([colour_bgr]), srgb=srgb)[0], tolerance, srgb)
 
 
 def chromaticity(colours_bgr: Array, *, srgb: bool = True) -> Array:
-    """(N, 2) opponent colours over luma, of colours (N, 3) 0..255; the light's strength cancels.
+    """(N, 2) opponent colours over the channel sum, of colours (N, 3) 0..255; independent of the light's strength.
 
-    Red minus green and blue minus yellow over the sum: a stronger lamp scales all channels alike.
+    They are red minus green and blue minus yellow, divided by the sum: a stronger lamp scales all channels alike.
     """
     x = np.asarray(colours_bgr, dtype=np.float64).reshape(-1, 3) / 255
     if srgb:

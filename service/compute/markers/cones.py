@@ -1,4 +1,4 @@
-"""A sphere seen by a camera is a circular cone of rays: three numbers, whatever the position in the image."""
+"""The circular cone of rays of a sphere seen by a camera: three parameters, wherever it is in the image."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class Cone:
         return np.array(entries, dtype=np.float64)
 
     def frame(self) -> Array:
-        """(3, 3) columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""
+        """(3, 3) with columns e1, e2, axis: an orthonormal frame; e1 lies in the plane of axis and image x."""
         x, y, z = (float(v) for v in self.axis)
         n = math.sqrt((1 - x * x) ** 2 + (x * y) ** 2 + (x * z) ** 2)
         a, b, c = (1 - x * x) / n, -x * y / n, -x * z / n
         return np.array([[a, y * c - z * b, x], [b, z * a - x * c, y], [c, x * b - y * a, z]])
 
     def rays(self, azimuth_rad: Array, angle_rad: Array) -> Array:
-        """Unit rays (..., 3) at `angle_rad` from the axis and `azimuth_rad` about it (broadcast)."""
+        """Unit rays (..., 3) at `angle_rad` from the axis and `azimuth_rad` around it (broadcast)."""
         local = np.stack(
             np.broadcast_arrays(
                 np.sin(angle_rad) * np.cos(azimuth_rad), np.sin(angle_rad) * np.sin(azimuth_rad), np.cos(angle_rad)
@@ -50,7 +50,7 @@ class Cone:
 
 
 def cone_of_sphere(centre_camera_m: Array, radius_m: float) -> Cone:
-    """The cone of a sphere whose centre is (3,) in the camera frame."""
+    """The cone of a sphere with centre (3,) in the camera frame."""
     distance = float(np.linalg.norm(centre_camera_m))
     return Cone(centre_camera_m / distance, float(np.arcsin(radius_m / distance)))
 
@@ -76,7 +76,7 @@ class Ellipse:
 
 
 def cone_ellipse(cone: Cone) -> Ellipse:
-    """The ellipse in which the cone meets the plane z = 1 (the cone must lie in front of the camera)."""
+    """The ellipse in which the cone intersects the plane z = 1; the cone must lie in front of the camera."""
     E = cone.conic
     A, b, c = E[:2, :2], E[:2, 2], E[2, 2]
     centre = -np.linalg.solve(A, b).astype(np.float64)
@@ -91,14 +91,14 @@ def cone_ellipse(cone: Cone) -> Ellipse:
 
 
 def angles_to(cone: Cone, rays: Array) -> Array:
-    """Angular distance (N,) of unit rays (N, 3) from the cone's surface, positive outside."""
+    """Angular distance (N,) of unit rays (N, 3) from the cone's surface, radians, positive outside."""
     along = rays @ cone.axis
     across = np.linalg.norm(rays - along[:, None] * cone.axis, axis=1)
     return np.arctan2(across, along) - cone.half_angle_rad
 
 
 def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> Cone:
-    """Least squares of the angular (geometric) distance of unit rays (N, 3) to the cone, by Gauss–Newton."""
+    """Weighted least-squares fit of a cone to unit rays (N, 3) by their angular (geometric) distance; Gauss–Newton."""
     cone = start
     for _ in range(iterations):
         frame = cone.frame()
@@ -109,7 +109,7 @@ def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> C
         weighted = J.T * weights
         try:
             step = np.linalg.solve(weighted @ J, -weighted @ residual)
-        except np.linalg.LinAlgError:  # points in one place tell nothing
+        except np.linalg.LinAlgError:  # all points in one place
             return cone
         axis = cone.axis + frame[:, :2] @ step[:2]
         cone = Cone(axis / np.linalg.norm(axis), cone.half_angle_rad + float(step[2]))
@@ -119,9 +119,9 @@ def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> C
 
 
 def distance_gradient(azimuth_rad: Array) -> Array:
-    """(N, 3) change of the angular distance of rays at these azimuths with the axis's shift along frame() and h.
+    """(N, 3) derivative of the angular distance of rays at these azimuths by the axis's shift along frame() and h.
 
-    Tilting the axis by t towards azimuth p shortens the distance of a ray at azimuth q by t cos(p - q).
+    Tilting the axis by t towards azimuth p reduces the distance of a ray at azimuth q by t cos(p - q).
     """
     return np.stack([-np.cos(azimuth_rad), -np.sin(azimuth_rad), -np.ones(len(azimuth_rad))], axis=1)
 
@@ -146,24 +146,24 @@ def ransac_cone(
     rng: np.random.Generator,
     trials: int = 400,
 ) -> tuple[Cone, NDArray[np.bool_]] | None:
-    """The cone that most edge points agree with, and the points (N,) that do.
+    """RANSAC: the cone on which most edge points agree, and which points (N,) do.
 
     Args:
         rays: (N, 3) unit rays of edge points.
         strengths: (N,) weight of a point's vote, 0..1.
         slots: (N,) azimuth slot of each point; a slot votes once, with its strongest agreeing point.
-        bounds: least and largest half angle allowed.
-        tolerance_rad: angular distance at which a point agrees.
-        rng: generator of the samples.
+        bounds: smallest and largest half angle allowed.
+        tolerance_rad: angular distance within which a point agrees.
+        rng: random generator.
         trials: number of triples drawn.
 
-    Returns None when no triple gives a cone within the bounds.
+    Returns None if no triple gives a cone within the bounds.
     """
     if len(rays) < 8:
         return None
     order = np.argsort(slots, kind="stable")
     rays, strengths, sorted_slots = rays[order], strengths[order], slots[order]
-    # Triples spread around the outline for a whole one, closer together where only an arc is seen.
+    # Triples spread around the whole outline; closer together for outlines visible only as an arc.
     first = rng.integers(0, len(rays), trials)
     apart = np.where(np.arange(trials) % 2 == 0, 1 / 3, 0.14)[:, None] * [[0.0, 1.0, 2.0]]
     shift = ((apart + rng.uniform(-0.05, 0.05, (trials, 3))) * len(rays)).astype(int)
@@ -173,7 +173,7 @@ def ransac_cone(
     if not np.any(good):
         return None
     axis, half = axis[good], half[good]
-    # |angle - half| < tolerance, by cosines, which fall as the angle grows; in single precision, for speed.
+    # |angle - half| < tolerance, in cosines, which decrease with the angle; single precision for speed.
     far, close = np.cos(half + tolerance_rad), np.cos(np.maximum(half - tolerance_rad, 0))
     off = np.abs((rays @ axis.T - 0.5 * (close + far)).astype(np.float32))  # (N, K)
     agree = off < (0.5 * (close - far)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Spheres in one image: box, mask, rough ellipse, edge points in an envelope, RANSAC, equidistant outline points."""
+"""Detects spheres in one image: candidates, rough outlines, colour, then outlines at full resolution."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ from service.core.errors import DataError
 from service.core.geometry import Array
 
 _LEAST_SHARE, _DOUBTFUL_SHARE = 0.35, 0.55  # of a disc's pixels that must have the spheres' colour
-_POSSIBLE_SHARE = 0.2  # below it a circle is not looked at, once the colour is known
-_CLEAR_SPHERES = 4  # clear discs from which it is known
+_POSSIBLE_SHARE = 0.2  # a circle with less is skipped, once the colour is known
+_CLEAR_SPHERES = 4  # clear discs needed to learn it
 _SIZES = (0.4, 2.5)  # of a sphere in the image, over the median of the clear ones
 _CLEAN_SHARE = 0.85
-_AROUND, _MOST_AROUND = (1.1, 1.35), 0.35  # the ring beside a disc, in radii, and how much of it may have the colour
-_ALTERNATIVES = 3  # rough outlines of one place that are tried until one holds
-_WHOLE = 0.8  # coverage of an outline that needs no second look
-_OTHER_STARTS = (0.95, 1.06)  # of the radius, for the second look
-_STARTS = (1.0, 1.08, 1.2)  # of the rough radius, tried until one holds
+_AROUND, _MOST_AROUND = (1.1, 1.35), 0.35  # ring around a disc, in radii, and its largest share of the colour
+_ALTERNATIVES = 3  # rough outlines of one place that are tried until one is confirmed
+_WHOLE = 0.8  # coverage of an outline that needs no second check
+_OTHER_STARTS = (0.95, 1.06)  # of the radius, for the second check
+_STARTS = (1.0, 1.08, 1.2)  # of the rough radius, tried until one is confirmed
 _SAME_PX = 0.5
-_DISTINCT = 0.85  # of the larger radius: of a sphere nearer behind another too little is seen
+_DISTINCT = 0.85  # of the larger radius: a sphere closer behind another is too hidden to be measured
 
 
 def detect_spheres(
     image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions = DEFAULTS
 ) -> tuple[SphereOutline, ...]:
-    """The outlines of all spheres in an image (H, W, 3), the most certain first; none is an empty tuple.
+    """Outlines of all spheres in an image (H, W, 3), the most certain first; an empty tuple if there are none.
 
-    What is returned looks like a sphere; whether it is one of the markers is for identity and registration to say.
+    Everything that looks like a sphere is returned; identity and registration decide which are markers.
 
     Raises:
-        DataError: the image has not the camera's size.
+        DataError: the image does not have the camera's size.
     """
     if image_bgr.shape[:2] != (camera.height, camera.width) or image_bgr.ndim != 3:
         raise DataError(
@@ -58,7 +58,7 @@ def detect_spheres(
     todo = find_rough(image_bgr, camera, options)
     found: list[SphereOutline] = []
     while todo:
-        # One rough outline of each place at a time, the best first; all places side by side.
+        # One rough outline of each place at a time, the best first; all places in parallel.
         now: list[RoughSphere] = []
         for rough in todo:
             if all(apart_rad(rough.cone, n.cone) > 0.6 * n.cone.half_angle_rad for n in now):
@@ -77,9 +77,9 @@ def detect_spheres(
 def _refined(
     image: NDArray[np.uint8], camera: CameraModel, roughs: list[RoughSphere], options: DetectionOptions
 ) -> list[SphereOutline]:
-    """The outlines of those that hold at full resolution."""
+    """The outlines that are confirmed at full resolution."""
     kept: list[SphereOutline] = []
-    # Shading within a blurred outline can hold the rough one too far inside.
+    # In a blurred outline, shading can place the rough outline too far inside.
     for factor in _STARTS:
         starts = [Cone(r.cone.axis, factor * r.cone.half_angle_rad) for r in roughs]
         outlines = refine_outlines(image, camera, starts, options, scores=[r.score for r in roughs])
@@ -99,9 +99,9 @@ def _refined(
 def _confirmed(
     image: NDArray[np.uint8], camera: CameraModel, outline: SphereOutline, options: DetectionOptions
 ) -> SphereOutline | None:
-    """The outline, or a better one near it; None where what is seen agrees with two outlines.
+    """The outline, or a better one near it; None if two different outlines explain the edges.
 
-    Where only parts of an outline are seen, shading or a border beside it can be taken for the rest.
+    If only parts of an outline are visible, shading or a border beside it can be mistaken for the rest.
     """
     if outline.coverage < LEAST_UNAIDED:
         return None
@@ -115,7 +115,7 @@ def _confirmed(
 
 
 def _contradict(best: SphereOutline, other: SphereOutline, camera: CameraModel) -> bool:
-    """Whether two outlines of one place are nearly as good and differ by more than both admit."""
+    """Whether two outlines of one place are nearly as good but differ by more than their uncertainty."""
     tilt = best.cone.frame()[:, :2].T @ (other.cone.axis - best.cone.axis)
     d = np.append(tilt, other.cone.half_angle_rad - best.cone.half_angle_rad)
     chi2 = float(d @ np.linalg.solve(best.cone_covariance + other.cone_covariance, d)) / 3
@@ -123,7 +123,7 @@ def _contradict(best: SphereOutline, other: SphereOutline, camera: CameraModel) 
 
 
 def find_rough(image_bgr: NDArray[np.uint8], camera: CameraModel, options: DetectionOptions) -> list[RoughSphere]:
-    """Discs on the coarse copy that pass the tests of coverage, interior and mask, without overlaps."""
+    """Discs in the reduced image that pass the tests of coverage, interior and mask, without overlaps."""
     scale = min(1.0, options.coarse_width_px / camera.width)
     coarse_camera = camera
     coarse = image_bgr
@@ -150,7 +150,7 @@ def _searched(
     given: ColourModel | None,
     options: DetectionOptions,
 ) -> list[RoughSphere]:
-    """The discs among the candidates, of the colour if one is given."""
+    """The discs among the candidates, of the given colour if any."""
     edge_map = edges(*colour_gradient(coarse))
     rng = np.random.default_rng(options.seed)
     kept: list[RoughSphere] = []
@@ -159,7 +159,7 @@ def _searched(
         middle = np.append(camera.normalise(np.array([[candidate.x, candidate.y]]))[0], 1.0)
         angle = float(np.arctan(candidate.radius / camera.fx))
         if any(_within(middle, k.cone) and angle < 1.4 * k.cone.half_angle_rad for k in kept if k.score > 0.6):
-            continue  # a highlight or a shadow on a sphere that is already known
+            continue  # a highlight or a shadow on a sphere already found
         here = Cone(middle / float(np.linalg.norm(middle)), angle)
         if model is not None and share(coarse, camera, here, model) < _POSSIBLE_SHARE:
             continue
@@ -184,8 +184,8 @@ def _on(inner: Cone, outer: Cone) -> bool:
 
 
 def _without_overlaps(roughs: list[RoughSphere]) -> list[RoughSphere]:
-    """Without what lies on larger discs, and not too many for one place."""
-    # Stains and highlights are discs too, but on a sphere.
+    """Without discs on larger discs, and not too many for one place."""
+    # Stains and highlights are discs too, but lie on a sphere.
     whole = [r for r in roughs if r.coverage > 0.6 and r.mask_loss < 0.4]
     roughs = [r for r in roughs if not any(_on(r.cone, w.cone) for w in whole)]
     kept: list[RoughSphere] = []
@@ -206,7 +206,7 @@ def _of_one_colour(
     given: ColourModel | None,
     options: DetectionOptions,
 ) -> list[RoughSphere]:
-    """The discs that have the spheres' colour; doubtful ones only when it is known, from clear ones or in advance."""
+    """The discs of the spheres' colour; doubtful ones only if the colour is given or learnt from clear discs."""
     if given is not None:
         roughs = [r for r in roughs if share(coarse, camera, r.cone, given) >= _LEAST_SHARE]
     model = _learnt(roughs, options) or given
@@ -218,8 +218,8 @@ def _of_one_colour(
         if rough.plain:
             good = part >= _LEAST_SHARE
         else:
-            # Something lies across the disc, whose surroundings are of another colour; or, on ground of the spheres'
-            # colour, what stands before it is smooth.
+            # Either something crosses the disc, and its surroundings have another colour; or the background has the
+            # spheres' colour, and what lies in front is smooth.
             across = part >= _DOUBTFUL_SHARE and share(coarse, camera, rough.cone, model, _AROUND) < _MOST_AROUND
             good = across or (part >= _CLEAN_SHARE and rough.interior_edges < CLEAN_INTERIOR)
         if good:
@@ -228,7 +228,7 @@ def _of_one_colour(
 
 
 def _of_one_size(roughs: list[RoughSphere]) -> list[RoughSphere]:
-    """Without discs much smaller or larger than the clear ones: equal spheres stand at like distances."""
+    """Without discs much smaller or larger than the clear ones: equal spheres are at similar distances."""
     clear = [r.cone.half_angle_rad for r in roughs if r.score > CLEAR]
     if len(clear) < _CLEAR_SPHERES:
         return roughs

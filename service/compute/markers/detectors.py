@@ -1,4 +1,4 @@
-"""The detectors that can be chosen by name; a new one is a function and a line here."""
+"""The detectors selectable by name; a new one is a function and a line here."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class Detector(Protocol):
 
 
 def options_for(colour: str | None, largest: float | None = None) -> DetectionOptions:
-    """The default options with the spheres' colour, by name or as #rrggbb; None: it is learnt.
+    """Default options with the spheres' colour, by name or as #rrggbb; None: it is learnt from each image.
 
     Args:
         colour: of the spheres.
-        largest: radius of the largest sphere looked for, over the image's width; None: the default.
+        largest: largest radius searched for, over the image's width; None: the default.
 
     Raises:
-        ConfigurationError: no such colour.
+        ConfigurationError: the colour is unknown.
     """
     options = DEFAULTS if largest is None else replace(DEFAULTS, max_radius=largest)
     if colour is None:

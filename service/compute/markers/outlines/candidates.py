@@ -1,4 +1,4 @@
-"""Coarse search: where circles may be, by votes of edge pixels along their gradient, at several scales."""
+"""Coarse search for circles by votes of edge pixels along their gradient, at several scales."""
 
 from __future__ import annotations
 
@@ -8,24 +8,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_LEAST_RADIUS = (
-    11  # pixels at the scale at which a circle is searched: small enough to be quick, large enough to tell
-)
+_LEAST_RADIUS = 11  # pixels at the scale of a search: small enough to be fast, large enough to be distinct
 _OCTAVE = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A circle in pixels of the coarse image: the bounding box and the first rough outline in one."""
+    """A circle in pixels of the reduced image, which serves as bounding box and as initial outline."""
 
     x: float
     y: float
     radius: float
-    vote: float  # part of the circumference that votes for it
+    vote: float  # share of the circumference that votes for it
 
 
 def colour_gradient(image: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Sobel derivatives (H, W) of the channel that changes most at each pixel of a BGR image."""
+    """Sobel derivatives (H, W) in x and y of each pixel's channel with the largest change; `image` is BGR."""
     smooth = cv2.GaussianBlur(image, (5, 5), 1.1)
     dx = cv2.Sobel(smooth, cv2.CV_16S, 1, 0)
     dy = cv2.Sobel(smooth, cv2.CV_16S, 0, 1)
@@ -41,7 +39,7 @@ def colour_gradient(image: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArra
 
 
 def edges(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> NDArray[np.bool_]:
-    """Thin edge pixels, with thresholds from the image's own median gradient, not from its maximum."""
+    """Thin edge pixels (H, W), with thresholds from the image's median gradient, not from its maximum."""
     size = np.abs(gx[::3, ::3].astype(np.int32)) + np.abs(gy[::3, ::3])
     low = float(np.clip(2.5 * np.median(size), 24, 80))
     return np.asarray(cv2.Canny(gx, gy, low, 2.2 * low) > 0)
@@ -50,9 +48,9 @@ def edges(gx: NDArray[np.int16], gy: NDArray[np.int16]) -> NDArray[np.bool_]:
 def find_candidates(
     image: NDArray[np.uint8], least_radius: float, greatest_radius: float, min_vote: float, limit: int
 ) -> list[Candidate]:
-    """Circles of the radii given (pixels of this image), the best voted first, one for each place and size.
+    """Circles with radii in a range (pixels of this image), the most votes first, one for each place and size.
 
-    Each octave of radii is searched on a copy on which its smallest radius is about eleven pixels.
+    Each octave of radii is searched in a copy where its smallest radius is about eleven pixels.
     """
     found: list[Candidate] = []
     radius = least_radius
@@ -81,7 +79,7 @@ def _apart(a: Candidate, b: Candidate) -> bool:
 def _keep_best(
     best: NDArray[np.float32], best_index: NDArray[np.uint8], index: int, planes: list[NDArray[np.float32]]
 ) -> None:
-    """Raises `best` to the sum of the planes where that is more, and notes the radius there."""
+    """Raise `best` to the sum of the planes where that is larger, and store the radius index there."""
     total = planes[0]
     for plane in planes[1:]:
         total = cv2.add(total, plane)
@@ -104,7 +102,7 @@ def _search(
     radii = np.arange(max(3, int(least) - 1), int(np.ceil(greatest)) + 2)
     margin = int(radii[-1])  # a centre may lie outside the image
     rows, columns = h + 2 * margin, w + 2 * margin
-    # A circle's votes spread over neighbouring radii: each plane counts with the two beside it.
+    # A circle's votes spread over neighbouring radii, so each plane is summed with the two beside it.
     best = np.zeros((rows, columns), dtype=np.float32)
     best_index = np.zeros((rows, columns), dtype=np.uint8)
     planes: list[NDArray[np.float32]] = []

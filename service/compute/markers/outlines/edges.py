@@ -1,4 +1,4 @@
-"""Profiles across an outline, through the lens, and every edge in an envelope of it."""
+"""Profiles across an outline, sampled through the lens distortion, and the edges on them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from service.core.geometry import Array
 
 @dataclass(frozen=True, slots=True)
 class Profiles:
-    """Where the rays of a cone's neighbourhood fall in the image.
+    """Sample positions across a cone's outline in the image.
 
-    `pixels` (K, J, 2) of K azimuths and J offsets; `inside` (K, J) whether in the image; `per_pixel_rad` (K,) the
-    angle that one pixel subtends across the outline there. Of G cones, these have a first axis (G, ...).
+    `pixels` (K, J, 2) for K azimuths and J offsets; `inside` (K, J) whether in the image; `per_pixel_rad` (K,) the
+    angle that one pixel subtends across the outline. For G cones, these have a leading axis (G, ...).
     """
 
     azimuth_rad: Array
@@ -30,13 +30,13 @@ class Profiles:
 
 
 def profiles(cone: Cone, camera: CameraModel, n_azimuths: int, offsets_px: Array) -> Profiles:
-    """Sample positions across the outline, through the lens's distortion, so that edges need no undistortion."""
+    """Sample positions across the outline, with the lens distortion applied, so that edges need no undistortion."""
     where = profiles_of([cone], camera, n_azimuths, offsets_px)
     return Profiles(where.azimuth_rad, offsets_px, where.pixels[0], where.inside[0], where.per_pixel_rad[0])
 
 
 def profiles_of(cones: Sequence[Cone], camera: CameraModel, n_azimuths: int, offsets_px: Array) -> Profiles:
-    """`profiles` of G cones at once."""
+    """`profiles` for G cones at once."""
     azimuth = np.linspace(0.0, 2 * np.pi, n_azimuths, endpoint=False).astype(np.float64)
     half = np.array([c.half_angle_rad for c in cones])[:, None]
     frames = np.array([c.frame() for c in cones])
@@ -56,7 +56,7 @@ def profiles_of(cones: Sequence[Cone], camera: CameraModel, n_azimuths: int, off
 
 
 def sample(image: NDArray[np.float32] | NDArray[np.uint8], pixels: Array) -> NDArray[np.float32]:
-    """Bilinear values (K, J[, C]) at pixels (K, J, 2); exact coordinates, where cv2.remap rounds to 1/32 px."""
+    """Bilinear values (K, J[, C]) at pixels (K, J, 2), at exact positions; cv2.remap would round them to 1/32 px."""
     h, w = image.shape[:2]
     x = np.clip(pixels[..., 0], 0, w - 1.001)
     y = np.clip(pixels[..., 1], 0, h - 1.001)
@@ -72,14 +72,14 @@ def sample(image: NDArray[np.float32] | NDArray[np.uint8], pixels: Array) -> NDA
 def sample_sharp(image: NDArray[np.uint8], pixels: Array) -> NDArray[np.uint8]:
     """Values (..., J, 3) at pixels (..., J, 2) by Lanczos interpolation, which does not blur.
 
-    Bilinear values are means of coded values: a blur behind the transfer curve, which moves edges of high contrast by
-    a tenth of a pixel. Positions are rounded to 1/32 px, evenly up and down.
+    Bilinear interpolation averages coded values, which blurs after the transfer curve and moves high-contrast edges
+    by a tenth of a pixel. Positions are rounded to 1/32 px, without bias.
     """
     return _remapped(image, pixels, cv2.INTER_LANCZOS4)
 
 
 def sample_averaged(image: NDArray[np.uint8], pixels: Array, count: int) -> NDArray[np.uint8]:
-    """Means (..., J, 3) of `count` neighbouring values each along profiles (..., J * count, 2)."""
+    """Means (..., J, 3) of every `count` neighbouring values along profiles (..., J * count, 2)."""
     values = _remapped(image, pixels, cv2.INTER_LINEAR)
     means = values.reshape(*values.shape[:-2], -1, count, 3).mean(axis=-2, dtype=np.float32)
     return np.rint(means).astype(np.uint8)
@@ -93,7 +93,7 @@ def _remapped(image: NDArray[np.uint8], pixels: Array, how: int) -> NDArray[np.u
 
 @dataclass(frozen=True, slots=True)
 class EdgePoints:
-    """Edge points across an outline: slot (N,) is the azimuth's index, offset (N,) in pixels, strength (N,) 0..1."""
+    """Edge points across an outline: azimuth index `slot` (N,), `offset_px` (N,) and `strength` (N,) 0..1."""
 
     slot: NDArray[np.int64]
     offset_px: Array
@@ -101,10 +101,10 @@ class EdgePoints:
 
 
 def envelope_edges(values: NDArray[np.float32], where: Profiles, peaks_per_ray: int = 3) -> EdgePoints:
-    """The strongest edges of each profile: maxima of the derivative along it of any channel.
+    """The strongest edges of each profile: maxima of any channel's derivative along it.
 
-    `values` (K, J, C) of an 8-bit image. Strength is relative to the strongest edge of the same profile, so that a
-    faint outline counts, but less where something stronger is beside it.
+    `values` (K, J, C) are of an 8-bit image. Strength is relative to the strongest edge of the profile, so a faint
+    outline counts fully unless something stronger is beside it.
     """
     step = where.offsets_px[1] - where.offsets_px[0]
     smooth = cv2.GaussianBlur(values, (5, 1), 0.9 / max(step, 0.3), borderType=cv2.BORDER_REPLICATE)
@@ -125,6 +125,6 @@ def envelope_edges(values: NDArray[np.float32], where: Profiles, peaks_per_ray: 
     shift = np.where(bend < 0, 0.5 * (a - c) / np.where(bend < 0, bend, 1), 0)
     offset = where.offsets_px[columns + 2] + np.clip(shift, -0.5, 0.5) * step
     strongest = height.max(axis=1)
-    # 12 grey levels per pixel is an edge nobody doubts; below, belief falls.
+    # From 12 grey levels per pixel an edge is certain; below, its strength is reduced.
     belief = np.minimum(1.0, 0.4 + top / 20.0)
     return EdgePoints(rows.astype(np.int64), offset, top / strongest[rows] * belief)
