@@ -98,7 +98,7 @@ def angles_to(cone: Cone, rays: Array) -> Array:
 
 
 def fit_cone(rays: Array, weights: Array, start: Cone, iterations: int = 4) -> Cone:
-    """Weighted least-squares fit of a cone to unit rays (N, 3) by their angular (geometric) distance; Gauss–Newton."""
+    """Weighted least-squares fit of a cone to unit rays (N, 3) by angular (geometric) distance; Gauss–Newton."""
     cone = start
     for _ in range(iterations):
         frame = cone.frame()

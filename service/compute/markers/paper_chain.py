@@ -18,15 +18,15 @@ from service.core.geometry import Array
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 
-_MARGIN = 0.35  # of a circle's radius, around its box
+_MARGIN = 0.35  # of a circle's radius, added around its box
 _MASK_SIDE = 96  # pixels to which a box is reduced for its mask and the ellipse
 _MAX_LOSS = 0.3  # false pixels of the best ellipse over the mask's area
-_LEAST_STEP = 10.0  # grey values between sphere and surroundings, for a channel to be used
-_ENVELOPE = 0.08  # of the semi-axis, to both sides of the ellipse
-_SLOTS = 96  # in which the outline's coverage is counted
+_LEAST_STEP = 10.0  # grey levels between sphere and surroundings for a channel to be used
+_ENVELOPE = 0.08  # of the semi-axis, on both sides of the ellipse
+_SLOTS = 96  # azimuth bins for the outline's coverage
 _MOST_BOXES = 24
 _LEAST_BOX_PX = 8
-# Canny's points lie on pixels; these share errors along the outline: about so many are independent.
+# Canny points lie on pixel centres and share errors along the outline; about this many are independent.
 _INDEPENDENT = 20
 _LEAST_SIGMA_PX = 0.15
 
@@ -49,17 +49,18 @@ def detect_by_masks(
     options: DetectionOptions = DEFAULTS,
     boxes: Sequence[Box] | None = None,
 ) -> tuple[SphereOutline, ...]:
-    """The outlines in an image (H, W, 3) by the paper's chain (supplement, "Ellipse Detection"); the best first.
+    """Outlines in an image (H, W, 3) by the paper's chain (supplement, "Ellipse Detection"), the best first.
 
-    Grounding DINO's boxes and SAM 2's masks are replaced where they are not given: boxes by a vote for circles, masks
-    by GrabCut on each channel, started from the middle. Kept for comparison with the default: its
-    edge points lie on whole pixels of one grey image.
+    Boxes and masks replace Grounding DINO and SAM 2: boxes come from circle votes unless given, masks from GrabCut on
+        each
+    channel, started at the middle. Kept for comparison with the default detector; its edge points lie on whole pixels
+    of one grey image.
 
     Args:
         image_bgr: at the camera's size.
-        camera: points are undistorted before the conic is fitted.
+        camera: used to undistort points before the conic is fitted.
         options: radii, coverage and number of points are used.
-        boxes: of another detector; None: found here.
+        boxes: from another detector; None: found here.
     """
     found: list[SphereOutline] = []
     for box in find_boxes(image_bgr, options) if boxes is None else boxes:
@@ -96,10 +97,10 @@ def find_boxes(image_bgr: NDArray[np.uint8], options: DetectionOptions = DEFAULT
 
 
 def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | None:
-    """(side, side) the box reduced, true where the sphere in its middle is; None when nothing is there.
+    """(side, side) mask of the sphere in the middle of the reduced box; None if there is none.
 
-    A mask for each channel, joined, opened and closed; the component that holds the middle is kept. The middle is
-    assumed to be sphere and the box's corners not to be; GrabCut decides the rest.
+    The masks of the channels are joined, opened and closed, and the component that contains the middle is kept. The
+    middle is assumed to be sphere and the box's corners background; GrabCut decides the rest.
     """
     patch = cv2.resize(_cut(image_bgr, box), (_MASK_SIDE, _MASK_SIDE), interpolation=cv2.INTER_AREA)
     rows, columns = np.mgrid[0:_MASK_SIDE, 0:_MASK_SIDE] - (_MASK_SIDE - 1) / 2
@@ -109,7 +110,7 @@ def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | N
         values = patch[:, :, channel]
         step = float(np.median(values[distance < 0.8])) - float(np.median(values[distance > 1.15]))
         if abs(step) < _LEAST_STEP:
-            continue  # a channel in which sphere and surroundings look alike has nothing to add to the others
+            continue  # this channel does not separate sphere and surroundings
         labels = np.full((_MASK_SIDE, _MASK_SIDE), cv2.GC_PR_BGD, dtype=np.uint8)
         labels[distance < 1.0] = cv2.GC_PR_FGD
         labels[distance < 0.5] = cv2.GC_FGD
@@ -127,7 +128,7 @@ def sphere_mask(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.bool_] | N
 
 
 def _cut(image_bgr: NDArray[np.uint8], box: Box) -> NDArray[np.uint8]:
-    """The box out of the image; what lies beyond the image repeats its border."""
+    """The box cropped from the image; beyond the image, its border is repeated."""
     height, width = image_bgr.shape[:2]
     rows = np.clip(np.arange(round(box[1]), round(box[3])), 0, height - 1)
     columns = np.clip(np.arange(round(box[0]), round(box[2])), 0, width - 1)
@@ -144,7 +145,7 @@ def fit_ellipse(mask: NDArray[np.bool_], box: Box) -> EllipseEstimate:
         dx, dy = columns - p[0], rows - p[1]
         c, s = np.cos(p[4]), np.sin(p[4])
         a, b = max(float(p[2]), 2.0), max(float(p[3]), 2.0)
-        # Half a pixel of softness gives the simplex something to follow.
+        # An edge softened by half a pixel gives the simplex search a slope to follow.
         r = np.hypot((c * dx + s * dy) / a, (c * dy - s * dx) / b)
         e = np.clip(0.5 + (1 - r) * 0.5 * (a + b), 0.0, 1.0)
         return float(np.abs(e - inside).sum() / inside.sum())
@@ -170,7 +171,7 @@ def fit_ellipse(mask: NDArray[np.bool_], box: Box) -> EllipseEstimate:
 def _outline(
     image_bgr: NDArray[np.uint8], camera: CameraModel, estimate: EllipseEstimate, options: DetectionOptions
 ) -> SphereOutline | None:
-    """Canny points in the envelope of the ellipse, undistorted, through RANSAC, as an outline."""
+    """The outline by Canny points in the ellipse's envelope, undistorted and fitted by RANSAC."""
     radius = 0.5 * (estimate.a + estimate.b)
     reach = max(3.0, _ENVELOPE * radius)
     half = max(estimate.a, estimate.b) + reach + 4
@@ -179,7 +180,7 @@ def _outline(
     if min(patch.shape[:2]) < 8:
         return None
     grey = cv2.GaussianBlur(cv2.cvtColor(patch, cv2.COLOR_BGR2GRAY), (5, 5), 1.0)
-    # Thresholds from this region: relative to the whole image's maximum, one highlight decides over all spheres.
+    # Thresholds from this region: relative to the whole image's maximum, one highlight would affect all spheres.
     steep = float(np.percentile(np.abs(cv2.Laplacian(grey, cv2.CV_32F)), 90))
     edge = cv2.Canny(np.asarray(grey, dtype=np.uint8), 4.0 * steep, 10.0 * steep)
     pixels = np.argwhere(edge > 0)[:, ::-1].astype(np.float64) + np.array([left, top])
@@ -234,7 +235,7 @@ def _evidence(
         contrast=0.0,  # not measured by this chain
         colour_bgr=(b, g, r),
         score=coverage * (1 - estimate.loss),
-        # Two directions share the points' noise by halves, the radius has all of it.
+        # A direction is determined by half of each point's information, the radius by all of it.
         cone_covariance=np.diag([2 * variance, 2 * variance, variance]),
     )
 

@@ -1,4 +1,4 @@
-"""What the sphere detector is told and what it returns."""
+"""Options and results of the sphere detector."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from service.core.geometry import Array
 
 @dataclass(frozen=True, slots=True)
 class DetectionOptions:
-    """Parameters of the detector; lengths that are relative are relative to the image's width.
+    """Parameters of the detector; relative lengths are fractions of the image's width.
 
-    The defaults suit spheres that fill 2 % to 25 % of the image's width, whatever their colour.
+    The defaults suit spheres of any colour that fill 2 % to 25 % of the image's width.
     """
 
-    coarse_width_px: int = 1500  # the search runs on a copy not wider than this
-    min_radius: float = 0.011  # of the image width
+    coarse_width_px: int = 1500  # largest width of the copy that is searched
+    min_radius: float = 0.011  # of the image's width
     max_radius: float = 0.13
-    max_candidates: int = 60  # circles looked at more closely in one image
-    min_vote: float = 0.2  # part of a circle's edge that must vote for its centre
-    min_coverage: float = 0.38  # part of the outline that must be seen
+    max_candidates: int = 60  # circles examined in one image
+    min_vote: float = 0.2  # share of a circle's edge that must vote for its centre
+    min_coverage: float = 0.38  # share of the outline that must be visible
     max_rms_px: float = 1.0  # of the edge points of one outline, after rejection
     max_interior_edges: float = 0.11  # edge pixels inside a sphere over its area
-    min_score: float = 0.2  # of a disc on the coarse copy
+    min_score: float = 0.2  # of a disc in the reduced image
     min_contrast: float = 0.01  # median step across the outline over full scale, linear light
-    max_leak: float = 0.2  # part of the outline across which the sphere's colour goes on without an edge
+    max_leak: float = 0.2  # share of the outline across which the sphere's colour continues without an edge
     n_points: int = 200  # L, points sampled equidistantly on an outline
-    srgb: bool = True  # pixel values carry the sRGB transfer curve
+    srgb: bool = True  # whether pixel values are sRGB coded
     seed: int = 0  # of RANSAC
     colour_bgr: tuple[float, float, float] | None = None  # of the spheres, 0..255; None: learnt in each image
-    colour_tolerance: float = 0.18  # in chromaticity, of the colour given: see colours.chromaticity
+    colour_tolerance: float = 0.18  # in chromaticity, around `colour_bgr`; see colours.chromaticity
 
 
 DEFAULTS = DetectionOptions()
@@ -43,13 +43,13 @@ DEFAULTS = DetectionOptions()
 class SphereOutline:
     """The outline of one sphere in one image.
 
-    `points` are (L, 2) undistorted normalised coordinates (z = 1), equidistant on the fitted conic, and
-    `points_px` the same in pixels of an ideal pinhole with the camera's K. `centre_px` is the conic's centre in the
-    image as captured; it is not the projection of the sphere's centre, whose direction is `cone.axis`.
+    `points` are (L, 2) undistorted normalised coordinates (z = 1), equidistant on the fitted conic; `points_px` are
+    the same in pixels of an ideal pinhole with the camera's K. `centre_px` is the conic's centre in the image as
+    captured; it is not the projection of the sphere's centre, whose direction is `cone.axis`.
 
     `cone_covariance` (3, 3), rad²: of the displacement of the cone's axis along the first and the second column of
     `cone.frame()` and of the half angle, in this order (true axis ~ axis + frame[:, :2] @ d[:2], true half angle ~
-    half angle + d[2]). It holds the noise of the edge points and what is systematic within one outline.
+    half angle + d[2]). It includes the noise of the edge points and the systematic error of one outline.
     """
 
     points: Array = field(repr=False)
@@ -58,19 +58,19 @@ class SphereOutline:
     cone: Cone
     centre_px: tuple[float, float]
     semi_axes_px: tuple[float, float]
-    angle_rad: float  # of the major axis against x
-    coverage: float  # part of the outline with accepted edge points, 0..1
-    rms_px: float  # of the accepted edge points against the conic
+    angle_rad: float  # of the major axis from x
+    coverage: float  # share of the outline with accepted edge points, 0..1
+    rms_px: float  # of the accepted edge points from the conic
     sigma_px: float  # robust standard deviation of one edge point
     n_edges: int
-    systematic_px: float  # of the outline as a whole, beyond the noise of its edge points
+    systematic_px: float  # error of the outline as a whole, beyond the noise of its edge points
     contrast: float  # median step across the outline over full scale, linear light
     colour_bgr: tuple[float, float, float]  # median inside, 0..255
     score: float  # 0..1, how much it looks like a sphere
     cone_covariance: Array = field(repr=False)
 
     def captured_px(self, camera: CameraModel) -> Array:
-        """(L, 2) the outline in pixels of the image as captured (with distortion)."""
+        """(L, 2) points of the outline in pixels of the image as captured (with distortion)."""
         return camera.project(np.column_stack([self.points, np.ones(len(self.points))]))
 
     def centre_camera_m(self, radius_m: float) -> Array:
@@ -80,7 +80,7 @@ class SphereOutline:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What the fit of one outline was made of."""
+    """Quality measures of the fit of one outline."""
 
     coverage: float
     rms_px: float
@@ -94,7 +94,7 @@ class Evidence:
 
 
 def outline_from_cone(cone: Cone, camera: CameraModel, n_points: int, evidence: Evidence) -> SphereOutline:
-    """The record of an outline, with its conic and `n_points` equidistant points."""
+    """The outline of a cone, with its conic and `n_points` equidistant points."""
     ellipse = cone_ellipse(cone)
     points = ellipse.equidistant(n_points)
     focal = np.array([camera.fx, camera.fy])

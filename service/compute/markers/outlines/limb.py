@@ -1,11 +1,11 @@
-"""Sub-pixel places of a sphere's outline: a forward model of the limb, from light to JPEG, fitted to profiles.
+"""Sub-pixel edges of a sphere's outline, by fitting a forward model of the limb, from light to JPEG, to profiles.
 
 The model of one profile, in linear light: inside a shaded sphere, outside a surface with a slope, both blurred by the
-lens and the pixel; then the transfer curve, luma and colour differences, and the loss of resolution that the colour
-differences suffer in JPEG. Because every one of these moves the apparent edge, none of them is taken off afterwards.
+lens and the pixel; then the transfer curve, luma and colour differences, and JPEG's loss of resolution in the colour
+differences. Each of these shifts the apparent edge, so all are modelled instead of corrected afterwards.
 
-The outlines of an image are fitted side by side, each with a blur of its own: one sphere does not touch another's
-result, but the arrays are long enough that their handling costs little.
+The outlines of an image are fitted in parallel, each with its own blur. They do not affect one another; batching only
+reduces the overhead of small arrays.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ Mask = NDArray[np.bool_]
 # Rows: Y, Cb, Cr of B, G, R (ITU-R BT.601, which JPEG uses).
 TO_YCC = np.array([[0.114, 0.587, 0.299], [0.5, -0.331264, -0.168736], [-0.081312, -0.418688, 0.5]])
 _MIX = TO_YCC.astype(np.float32)
-# Of a profile: A (3), limb, inner slope, D (3), outer slope, offset. Of an outline: blur, that of colour differences.
+# Of a profile: A (3), limb, inner slope, D (3), outer slope, offset. Of an outline: blur, extra blur of the colours.
 _LIMB, _SLOPE, _OUTER, _OFFSET, _OWN, _N = 3, 4, 8, 9, 10, 12
 _TABLE = np.linspace(-12.0, 12.0, 1201)
 
 
 @dataclass(frozen=True, slots=True)
 class LimbFit:
-    """Edges of K profiles of each of G outlines, lengths in the unit of the profiles' offsets.
+    """Edges of K profiles for each of G outlines, lengths in the unit of the profiles' offsets.
 
-    Offset, formal sigma, usable, and contrast (largest step of a linear channel over full scale) are (G, K); the blur
-    and that of the colour differences (G,).
+    Offset, formal sigma, usable, and contrast (largest step of a linear channel over full scale) are (G, K); blur and
+    the extra blur of the colour differences are (G,).
     """
 
     offset: Array
@@ -59,25 +59,25 @@ def _limb_table() -> tuple[Array32, Array32]:
 
 @lru_cache(maxsize=2)
 def _light(*, srgb: bool) -> Array32:
-    """(256,) linear light of a coded value."""
+    """(256,) linear light of each coded value."""
     x = np.arange(256) / 255
     linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4) if srgb else x
     return linear.astype(np.float32)
 
 
 def _coded(linear: Array32, *, srgb: bool) -> tuple[Array32, Array32]:
-    """Values as coded in the image, and their derivative."""
+    """Coded values of linear light, and their derivative."""
     if not srgb:
         return linear, np.ones_like(linear)
     x = np.maximum(linear, np.float32(1e-5))
-    root = np.exp(np.log(x) * np.float32(1 / 2.4))  # twice as quick as a power
+    root = np.exp(np.log(x) * np.float32(1 / 2.4))  # twice as fast as a power
     low = x <= 0.0031308
     value = np.where(low, np.float32(12.92) * linear, np.float32(1.055) * root - np.float32(0.055))
     return value, np.where(low, np.float32(12.92), np.float32(1.055 / 2.4) * root / x)
 
 
 def _smoothing(t: Array, wide: Array, blur: Array) -> tuple[Array32, Array32]:
-    """(G, J', J) what takes values at `wide` to values at `t` blurred by Gaussians (G,), and its derivative."""
+    """(G, J', J) matrices that blur values at `wide` by Gaussians (G,) and sample at `t`, and their derivative."""
     s = blur[:, None, None]
     square = (t - wide[:, None]) ** 2
     weight = np.exp(-0.5 * square / s**2)
@@ -88,9 +88,9 @@ def _smoothing(t: Array, wide: Array, blur: Array) -> tuple[Array32, Array32]:
 
 
 def _interpolation(t: Array, wide: Array) -> Array32:
-    """(J', J) what Lanczos interpolation of the pixels does to a profile on the average over the pixels' places.
+    """(J', J) mean effect of Lanczos interpolation on a profile, averaged over sub-pixel positions.
 
-    The kernel is stretched to the mean of the directions: across the pixels' diagonal it is narrower.
+    The kernel is stretched to the mean over directions: along the pixels' diagonal it is narrower.
     """
     d = 1.1 * (t - wide[:, None])
     weight = np.where(np.abs(d) < 4, np.sinc(d) * np.sinc(d / 4), 0.0)
@@ -98,7 +98,7 @@ def _interpolation(t: Array, wide: Array) -> Array32:
 
 
 def masked_median(values: Array | Array32, mask: Mask) -> Array:
-    """Medians along the last axis of what the mask admits; infinite where it admits nothing."""
+    """Medians along the last axis of the values selected by the mask; infinite if there are none."""
     ordered = np.sort(np.where(mask, values, np.inf), axis=-1)
     count = np.broadcast_to(mask, values.shape).sum(axis=-1, keepdims=True)
     low = np.take_along_axis(ordered, np.maximum(count - 1, 0) // 2, axis=-1)
@@ -118,20 +118,20 @@ def fit_limb(
     iterations: int = 4,
     reach: float = 2.0,
 ) -> LimbFit:
-    """Edges by Gauss–Newton of the forward model, the blur common to all profiles of an outline.
+    """Edges by Gauss–Newton on the forward model, with one blur for all profiles of an outline.
 
-    Lengths are in one unit, the pixel of the image, or what the samples were averaged over.
+    Lengths are in one unit: the image's pixel, or the step over which samples were averaged.
 
     Args:
         coded_bgr: (G, K, J, 3) values along the profiles.
-        offsets: (J,) places across the outline, evenly spaced, positive outside.
-        inside: (G, K) profiles that lie in the image.
+        offsets: (J,) positions across the outline, evenly spaced, positive outside.
+        inside: (G, K) whether a profile lies in the image.
         radius: (G,) of the outlines.
-        srgb: values carry the sRGB curve.
-        blur: (G,) standard deviation of lens and pixel, to start from.
-        chroma_blur: (G,) further standard deviation of the colour differences, to start from; about 1.1 for 4:2:0.
-        iterations: of Gauss–Newton.
-        reach: greatest offset.
+        srgb: whether values are sRGB coded.
+        blur: (G,) initial standard deviation of lens and pixel.
+        chroma_blur: (G,) initial extra standard deviation of the colour differences; about 1.1 for 4:2:0.
+        iterations: number of Gauss–Newton steps.
+        reach: largest offset.
     """
     t = offsets
     step = float(t[1] - t[0])
@@ -160,7 +160,7 @@ def fit_limb(
         normal = (rows @ rows.transpose(0, 1, 3, 2)).astype(np.float64)
         misfit = normal[..., _N, _N] / (3 * J)
         typical = masked_median(misfit, usable)[:, None]
-        # The limb's rise is alike all around, slopes are small, the offset is near.
+        # The limb's rise is similar all around, slopes are small, and the offset is small.
         priors = ((_LIMB, limb, limb_sigma), (_SLOPE, slope, slope_sigma), (_OUTER, 0.0, 0.04), (_OFFSET, 0.0, 1.5))
         good = usable & (misfit < 4 * typical)
         delta, change, variance = _gauss_newton(normal, p, priors, good)
@@ -181,7 +181,7 @@ def fit_limb(
     sigma = np.sqrt(variance * np.maximum(misfit, 0.3 * typical))
     contrast = np.abs(p[..., :3] - p[..., 5:8]).max(axis=2)
     ok = usable & (np.abs(p[..., _OFFSET]) < reach - 1e-3) & (sigma < 0.6) & (misfit < 9 * typical)
-    # The blur also works along the outline, which bends away: it pulls the edge of a disc inwards.
+    # Blur also acts along the curved outline, which shifts the edge of a disc inwards.
     offset = p[..., _OFFSET] + (blur**2 / (2 * radius))[:, None]
     return LimbFit(offset, sigma, ok, contrast, blur, chroma_blur)
 
@@ -189,11 +189,11 @@ def fit_limb(
 def _gauss_newton(
     normal: Array, p: Array, priors: tuple[tuple[int, Array | float, Array | float], ...], good: Mask
 ) -> tuple[Array, Array, Array]:
-    """Steps of the profiles' own (G, K, 10) and of the outlines' (G, 2) parameters; the offset's formal variance.
+    """Steps of the profiles' own (G, K, 10) and of the outlines' (G, 2) parameters, and the offset's formal variance.
 
-    `normal` (G, K, 13, 13) are the weighted products of the Jacobian's columns and, last, the residual. The own
-    parameters are eliminated profile by profile; `priors` are (index, value, sigma), `good` the profiles that may
-    tell of what is common.
+    `normal` (G, K, 13, 13) holds the weighted products of the Jacobian's columns and, last, the residual. The
+    profiles' own parameters are eliminated; `priors` are (index, value, sigma); `good` selects the profiles used for
+    the common parameters.
     """
     own, cross, g = normal[..., :_OWN, :_OWN], normal[..., :_OWN, _OWN:_N], normal[..., :_N, _N]
     for index, middle, sigma in priors:
@@ -216,9 +216,9 @@ def _gauss_newton(
 
 
 def _around(values: Array, good: Mask, least: float) -> tuple[Array, Array]:
-    """A term of the shading as it is in the neighbourhood (G, K), and how far single profiles may depart (G, 1).
+    """A shading term averaged over the neighbourhood (G, K), and how far single profiles may deviate (G, 1).
 
-    A running median over a twelfth of the outline keeps the jump where the light's terminator meets the limb.
+    A running median over a twelfth of the outline preserves the jump where the light's terminator meets the limb.
     """
     half = max(2, values.shape[1] // 24)
     kept = np.where(good, values, np.nan)
@@ -232,7 +232,7 @@ def _around(values: Array, good: Mask, least: float) -> tuple[Array, Array]:
 
 
 def _albedo(coded_bgr: NDArray[np.uint8], light: Array32, usable: Mask, t: Array) -> Array32:
-    """(G, 3) the spheres' colour in linear light, of unit luma, from where no edge reaches."""
+    """(G, 3) the spheres' colour in linear light, of unit luma, measured away from the edges."""
     inner = np.moveaxis(coded_bgr[:, :, t < t[0] + 2.1], 3, 1)  # (G, 3, K, n)
     mask = np.broadcast_to(usable[:, None, :, None], inner.shape)
     flat = (*inner.shape[:2], -1)
@@ -248,7 +248,7 @@ def _start(coded_bgr: NDArray[np.uint8], light: Array32, t: Array) -> Array:
 
 
 def _scales(r: Array32, share: Array32, usable: Mask) -> tuple[Array, Array]:
-    """Robust standard deviations (G, 3) of residuals inside and outside."""
+    """Robust standard deviations (G, 3) of the residuals inside and outside the sphere."""
     size = np.abs(r).reshape(*r.shape[:2], -1)
     out: list[Array] = []
     for side in (share > 0.9, share < 0.1):
@@ -318,7 +318,7 @@ def _evaluate(
     rows[:, _N] = data - rows[:, _N]
     rows[:, _OWN + 1, 0] = 0
     rows[:, _OWN + 1, 1:] = (mixed[:, 1:, 5].reshape(G, -1, wider) @ d_smooth).reshape(G, 2, K, J)
-    # A colour's own columns are of that channel alone.
+    # Columns of a colour's own parameters affect only its channel.
     for first, part_of in ((0, S), (5, rest)):
         single = (slope * part_of[:, None]).reshape(G, -1, wider)
         rows[:, first : first + 3, 0] = (single @ sharp).reshape(G, 3, K, J) * _MIX[0][:, None, None]

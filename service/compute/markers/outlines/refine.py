@@ -1,4 +1,4 @@
-"""Outlines at full resolution: edges of an envelope, RANSAC, the forward model of the limb; their covariance."""
+"""Outlines at full resolution by envelope edges, RANSAC and the limb's forward model, with their covariance."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from service.compute.markers.outlines.limb import fit_limb, masked_median
 from service.compute.markers.records import DEFAULTS, DetectionOptions, Evidence, SphereOutline, outline_from_cone
 from service.core.geometry import Array
 
-# Measured on rendered scenes with exact truth: what stays of an outline's error when its noise has averaged out.
-# It comes from what the limb's fall and the blur can be taken for each other, so it grows with the blur.
+# Measured on rendered scenes with exact truth: an outline's remaining error after its noise has averaged out. It
+# arises because the limb's falloff and the blur can be confused, so it grows with the blur.
 SYSTEMATIC_PER_BLUR = 0.05
-MOST_SIGMA_PX = 0.5  # of an edge point; where there is no outline, places within the search's reach scatter more
-TEXTURE_FACTOR = 3.0  # sigma of an edge point over the one its own profile tells
-REACH = 0.04  # of the radius: as far as `approach_outlines` sees
+MOST_SIGMA_PX = 0.5  # of an edge point; without a real outline, edges within the search range scatter more
+TEXTURE_FACTOR = 3.0  # sigma of an edge point over the one from its own profile
+REACH = 0.04  # of the radius: search range of `approach_outlines`
 _BLOCKS = 16  # of an outline, for the noise that neighbouring edge points share
-_TRIALS = 150  # of RANSAC: the rough outline is near
+_TRIALS = 150  # of RANSAC; few, because the rough outline is near
 _FIRST_PROFILES, _FIRST_OF_LARGE = 48, 32
 _MOST_PROFILES, _FEWEST_PROFILES = 128, 48
-_FINE_RADIUS_PX = 75.0  # up to here every profile counts; beyond, fewer tell the sphere's place in space as well
+_FINE_RADIUS_PX = 75.0  # up to here every profile counts; for larger outlines, fewer give the position as precisely
 _UNIT_RADIUS_PX = 60.0  # radius in samples of the first approach, which averages the pixels of larger outlines
 _LEAST_PART = 0.19  # of the profiles that must agree
 _START_BLUR_PX, _START_CHROMA_BLUR_PX = 0.7, 1.2
-_ALIKE = 1.5  # radius over the smallest of outlines whose profiles are of one length
-_LEAST_RADIUS = 3.0  # samples; smaller ones have no inside to compare the outside with
-_MOST_CHANGE = 2.0  # of the radius in one fit of sub-pixel edges: such a one extrapolates, to less than nothing even
-_FOCUS = 1.3  # blur over the expected one from which on profiles were too short for it
+_ALIKE = 1.5  # largest ratio of radii among outlines with profiles of one length
+_LEAST_RADIUS = 3.0  # samples; smaller ones have no interior to compare with the outside
+_MOST_CHANGE = 2.0  # of the radius in one fit of sub-pixel edges; more is extrapolation, even to negative radii
+_FOCUS = 1.3  # ratio of blur to expected blur above which the profiles were too short
 
 
 @dataclass(frozen=True, slots=True)
 class Approached:
-    """A cone as good as averaged pixels tell it, and the blurs to expect (px)."""
+    """A cone measured on averaged pixels, and the expected blurs (px)."""
 
     cone: Cone
     blur_px: float = _START_BLUR_PX
@@ -59,9 +59,9 @@ def refine_outline(
     *,
     score: float = 1.0,
 ) -> SphereOutline | None:
-    """The outline near `rough` at full resolution, touching only its region; None when there is none to be trusted.
+    """The outline near `rough` at full resolution, reading only its region; None if no reliable one is found.
 
-    `rough` may come from the coarse search or from a prediction; it must be right to about a tenth of the radius.
+    `rough` comes from the coarse search or from a prediction and must be good to about a tenth of the radius.
     """
     return refine_outlines(image_bgr, camera, [rough], options, scores=[score])[0]
 
@@ -74,7 +74,7 @@ def refine_outlines(
     *,
     scores: Sequence[float],
 ) -> list[SphereOutline | None]:
-    """`refine_outline` of several, those of like size side by side."""
+    """`refine_outline` for several cones; those of similar size are processed together."""
     out: list[SphereOutline | None] = [None] * len(roughs)
     found = {i: _by_envelope(image_bgr, camera, rough, options) for i, rough in enumerate(roughs)}
     cones = {i: cone for i, cone in found.items() if cone is not None}
@@ -96,7 +96,7 @@ def refine_outlines(
 def approach_outlines(
     image_bgr: NDArray[np.uint8], camera: CameraModel, roughs: Sequence[Cone], options: DetectionOptions = DEFAULTS
 ) -> list[Approached | None]:
-    """The cones near `roughs`, which must be right to REACH of their radii, on pixels averaged across the outline."""
+    """Cones refined on pixels averaged across the outline; `roughs` must be good to REACH of their radii."""
     if not roughs:
         return []
     radius_px = float(np.median([c.half_angle_rad for c in roughs])) * camera.fx
@@ -113,7 +113,7 @@ def approach_outlines(
             if found is None:
                 continue
             if unit > 1:
-                out[i] = Approached(found.cone)  # finer than these samples, the blur is still to be found
+                out[i] = Approached(found.cone)  # the blur is finer than these samples and still unknown
                 continue
             out[i] = Approached(found.cone, found.blur_px, found.chroma_blur_px)
             if found.blur_px >= _FOCUS * max(1.0, before.blur_px):
@@ -130,10 +130,10 @@ def measure_outlines(
     *,
     scores: Sequence[float] = (),
 ) -> list[SphereOutline | None]:
-    """The outlines at full resolution, starting from cones that are right to about a pixel; None as `refine_outline`.
+    """Outlines at full resolution from cones that are good to about a pixel; None as in `refine_outline`.
 
-    An outline has more edge the larger it is, and the sphere's place in space is known the better: the number of
-    profiles falls as that allows.
+    The larger an outline, the more edge it has and the better it determines the sphere's position, so the number of
+    profiles decreases with its size.
     """
     if not starts:
         return []
@@ -175,7 +175,7 @@ def _outline(
 def _by_envelope(
     image: NDArray[np.uint8], camera: CameraModel, rough: Cone, options: DetectionOptions
 ) -> Cone | None:
-    """The cone that most edges in an envelope of a tenth of the radius around `rough` agree with."""
+    """The cone on which most edges agree, within a tenth of the radius around `rough`."""
     rng = np.random.default_rng(options.seed)
     radius_px = rough.half_angle_rad * camera.fx
     reach = max(4.0, 0.1 * radius_px)
@@ -193,7 +193,7 @@ def _by_envelope(
 
 @dataclass(frozen=True, slots=True)
 class _Measured:
-    """A cone by sub-pixel edges."""
+    """A cone measured by sub-pixel edges."""
 
     cone: Cone
     blur_px: float
@@ -218,7 +218,7 @@ def _measure(
     unit: int,
     options: DetectionOptions,
 ) -> list[_Measured | None]:
-    """Cones near those given, from `n_profiles` each; lengths are in `unit` pixels, whose values are averaged."""
+    """Cones near `starts` from `n_profiles` each; lengths are in units of `unit` averaged pixels."""
     cones = [s.cone for s in starts]
     radius = np.array([c.half_angle_rad for c in cones]) * camera.fx / unit
     if not np.all(radius >= _LEAST_RADIUS):
@@ -230,7 +230,7 @@ def _measure(
         )
         return [next(found) if i in large else None for i in range(len(starts))]
     typical = float(np.median(radius))
-    # Inside, as far as tells the limb's fall from the edge; outside, only what the blurred edge needs.
+    # Inside, far enough to separate the limb's falloff from the edge; outside, only what the blurred edge needs.
     blur = max(1.0, float(np.median([s.blur_px for s in starts])))
     inner = min(float(np.clip(0.13 * typical, 4.0, 12.0)) + 2 * (blur - 1), 0.6 * typical)
     outer = 4.0 + 2.5 * (blur - 1)
@@ -255,7 +255,7 @@ def _measure(
             out.append(None)
             continue
         half = cone.half_angle_rad + float(fit.step[i, 2] * angle[i])
-        if not 1 / _MOST_CHANGE < half / cone.half_angle_rad < _MOST_CHANGE:  # a short arc tells no radius
+        if not 1 / _MOST_CHANGE < half / cone.half_angle_rad < _MOST_CHANGE:  # a short arc gives no radius
             out.append(None)
             continue
         axis = cone.axis + cone.frame()[:, :2] @ fit.step[i, :2] * angle[i]
@@ -279,7 +279,7 @@ def _measure(
 
 @dataclass(frozen=True, slots=True)
 class _ConeFits:
-    """Of G cones: steps (G, 3), points used, residuals and weights (G, K), scale, coverage, whether there is one."""
+    """Fits of G cones: steps (G, 3), points used, residuals and weights (G, K), scale, coverage, success."""
 
     step: Array
     used: NDArray[np.bool_]
@@ -291,11 +291,11 @@ class _ConeFits:
 
 
 def _robust_cones(azimuth: Array, offset: Array, sigma: Array, ok: NDArray[np.bool_]) -> _ConeFits:
-    """Cones by Tukey's weights on the geometric distances (G, K), linear in the small steps from the given cones."""
+    """Cones by Tukey weights on the geometric distances (G, K), linearised around the given cones."""
     J = -distance_gradient(azimuth)
     least = max(12, round(_LEAST_PART * len(azimuth)))
     good = ok.sum(axis=1) >= least
-    # Texture beside the outline is no white noise, and no edge is known better than a few hundredths of a pixel.
+    # Texture beside the outline is not white noise, and no edge is known better than a few hundredths of a pixel.
     base = np.where(ok, 1.0 / ((TEXTURE_FACTOR * sigma) ** 2 + 0.05**2), 0.0)
     weights, residual, scale = base, offset, np.ones(len(offset))
     step = np.zeros((len(offset), 3))
@@ -303,7 +303,7 @@ def _robust_cones(azimuth: Array, offset: Array, sigma: Array, ok: NDArray[np.bo
         weighted = J.T * weights[:, None, :]  # (G, 3, K)
         normal = weighted @ J
         trace = np.trace(normal, axis1=1, axis2=2)
-        good = good & (np.linalg.det(normal) >= 1e-9 * trace**3) & (trace > 0)  # else an arc too short to tell
+        good = good & (np.linalg.det(normal) >= 1e-9 * trace**3) & (trace > 0)  # otherwise the arc is too short
         normal = np.where(good[:, None, None], normal, np.eye(3))
         step = np.asarray(np.linalg.solve(normal, weighted @ offset[..., None])[..., 0], dtype=np.float64)
         residual = offset - step @ J.T
@@ -320,10 +320,10 @@ def _robust_cones(azimuth: Array, offset: Array, sigma: Array, ok: NDArray[np.bo
 
 
 def _covariances(azimuth: Array, fit: _ConeFits) -> Array:
-    """(G, 3, 3) of the cone's two directions and half angle, in squared units, from the scatter of the edge points.
+    """(G, 3, 3) covariance of the cone's two directions and half angle, in squared units, from edge points' scatter.
 
-    Neighbouring edge points share pixels, texture and shading, so they err alike. Means over blocks of the outline
-    show by how much more than independent points would: that factor multiplies the plain covariance.
+    Neighbouring edge points share pixels, texture and shading, so their errors are correlated. Means over blocks of
+    the outline show by how much they exceed those of independent points; that factor multiplies the plain covariance.
     """
     J = -distance_gradient(azimuth)
     w = np.where(fit.used & fit.good[:, None], fit.weights, 0.0)
@@ -335,7 +335,7 @@ def _covariances(azimuth: Array, fit: _ConeFits) -> Array:
     square = (w * w).reshape(blocks).sum(axis=2)
     sums = (w * np.where(fit.used, fit.residual, 0.0)).reshape(blocks).sum(axis=2)
     filled = total > 0.25 * np.median(total, axis=1, keepdims=True)
-    # Three parameters were fitted to these means.
+    # Subtract the three fitted parameters from the degrees of freedom.
     chi2 = np.where(filled, sums**2 / np.maximum(square, 1e-12), 0.0).sum(axis=1)
     factor = chi2 / np.maximum(filled.sum(axis=1) - 3, 3) / fit.scale**2
     return noise * np.maximum(1.0, factor)[:, None, None]

@@ -1,4 +1,4 @@
-"""One disc on the coarse copy: its rough outline, the outermost of several, and whether it can be a sphere."""
+"""One disc in the reduced image: its rough outline, a larger one around it, and whether it can be a sphere."""
 
 from __future__ import annotations
 
@@ -16,29 +16,30 @@ from service.compute.markers.outlines.edges import envelope_edges, profiles, sam
 from service.compute.markers.records import DetectionOptions
 from service.core.geometry import Array
 
-# A disc with wires, stains or highlights on it, or on ground of its own colour, counts if it has the spheres' colour.
+# A disc crossed by wires, stains or highlights, or on a background of its colour, counts if it has the spheres'
+# colour.
 _DOUBTFUL_INTERIOR, _DOUBTFUL_LEAK = 0.3, 0.36
 _DOUBTFUL_COVERAGE = 0.58
-_DARK = 0.3  # L* over that of the disc's middle, below which its colour does not go on
-_OUTWARD = (1.07, 1.65)  # of the radius: where a larger outline around a disc is looked for
-_LEAST_AROUND = 0.7  # part of it that must be seen
-_LEAST_RINGED_PX = 30.0  # radius of the disc; around smaller ones edges of any texture agree by chance
-_TRIALS = 200  # of RANSAC, on a coarse outline
-LEAST_UNAIDED = 0.5  # coverage below which only a prediction can tell what is outline
-_LEAST_RING = 0.55  # of the ring between two outlines that must have the inner disc's colour
+_DARK = 0.3  # L* over that of the disc's middle; darker pixels are not counted as the same colour
+_OUTWARD = (1.07, 1.65)  # of the radius: where a larger outline around a disc is searched for
+_LEAST_AROUND = 0.7  # share of it that must be visible
+_LEAST_RINGED_PX = 30.0  # radius of the disc; around smaller ones, edges of any texture agree by chance
+_TRIALS = 200  # of RANSAC on a coarse outline
+LEAST_UNAIDED = 0.5  # coverage below which an outline can be recognised only with a prediction
+_LEAST_RING = 0.55  # share of the ring between two outlines that must have the inner disc's colour
 CLEAN_INTERIOR = 0.03
-CLEAR = 0.6  # score of discs that are certainly some
+CLEAR = 0.6  # score from which discs are certainly spheres
 
 
 @dataclass(frozen=True, slots=True)
 class RoughSphere:
-    """An outline found on the coarse copy."""
+    """An outline found in the reduced image."""
 
     cone: Cone
-    coverage: float  # of the outline by edges, weighted by their strength
+    coverage: float  # share of the outline with edges, weighted by their strength
     interior_edges: float  # edge pixels inside over area
     mask_loss: float  # false positives and negatives of the ellipse against the mask, over the ellipse's area
-    leak: float  # part of the outline across which the disc's colour goes on without an edge
+    leak: float  # share of the outline across which the disc's colour continues without an edge
     colour_bgr: tuple[float, float, float]
     plain: bool  # passes every test by itself
 
@@ -57,7 +58,7 @@ def examine(
     options: DetectionOptions,
     rng: np.random.Generator,
 ) -> RoughSphere | None:
-    """The disc at a candidate, if its outline is seen and it can be a sphere."""
+    """The disc at a candidate, if its outline is visible and it can be a sphere."""
     axis = np.append(camera.normalise(np.array([[candidate.x, candidate.y]]))[0], 1.0)
     length = float(np.linalg.norm(axis))
     cone = Cone(axis / length, float(np.arctan(candidate.radius / camera.fx / length)))
@@ -83,7 +84,7 @@ def _fitted(
     radius_px: float,
     rng: np.random.Generator,
 ) -> tuple[Cone, Array] | None:
-    """The cone that most edges within reach of one agree with, and how strongly at each of 96 azimuths."""
+    """The cone on which most edges within reach of `near` agree, and the agreement at each of 96 azimuths."""
     step = max(0.5, (reach_px[1] - reach_px[0]) / 48)
     where = profiles(near, camera, 96, np.arange(reach_px[0], reach_px[1] + 0.1, step))
     points = envelope_edges(sample(coarse, where.pixels), where)
@@ -109,9 +110,9 @@ def outermost(
     options: DetectionOptions,
     rng: np.random.Generator,
 ) -> RoughSphere:
-    """The disc, or the larger one of its colour whose outline runs around it.
+    """The disc, or a larger one of its colour whose outline surrounds it.
 
-    A glossy ball mirrors the horizon as a ring on itself, often sharper than its limb.
+    A glossy ball reflects the horizon as a ring on itself, which is often sharper than its limb.
     """
     inner, radius_px = rough.cone, rough.cone.half_angle_rad * camera.fx
     if rough.score < CLEAR or radius_px < _LEAST_RINGED_PX:
@@ -145,7 +146,7 @@ def _judged(
     votes: Array,
     options: DetectionOptions,
 ) -> RoughSphere | None:
-    """The disc of an outline with these votes, if it can be a sphere."""
+    """The disc of an outline with these votes, if it can be a sphere; otherwise None."""
     coverage = float(votes.mean())
     if cone.axis[2] < 0.3:
         return None
@@ -170,9 +171,9 @@ def _interior(
 ) -> tuple[float, float, float, tuple[float, float, float]]:
     """Edge density inside, loss of the ellipse against the colour mask, leak, and median colour.
 
-    The mask holds what has the chromaticity of the disc's own middle; the loss is the paper's FP + FN, over the
-    area. The leak is the part of the outline without an edge (`edgeless`, one for each of K azimuths) across which
-    the mask goes on: the circle is then only a part of something of another shape.
+    The mask holds the pixels with the chromaticity of the disc's middle; the loss is the paper's FP + FN over the
+    area. The leak is the share of the outline without an edge (`edgeless`, one for each of K azimuths) across which
+    the mask continues: the circle is then only part of a differently shaped object.
     """
     outline = camera.project(cone.rays(np.linspace(0, 2 * np.pi, 64), np.full(64, cone.half_angle_rad)))
     centre = outline.mean(axis=0)
@@ -195,7 +196,7 @@ def _interior(
     inside = lab[core]
     middle = np.median(inside, axis=0)
     spread = np.maximum(1.4826 * np.median(np.abs(inside - middle), axis=0), [12.0, 2.5, 2.5])
-    # Shading moves lightness within a sphere much more than its colour.
+    # Shading changes lightness within a sphere much more than its colour.
     mask = np.all(np.abs(lab - middle) < spread * [4.0, 3.5, 3.5], axis=2)
     colour = np.median(box[core], axis=0)
     loss = float((whole & ~mask).sum()) / float(whole.sum())
@@ -206,7 +207,7 @@ def _interior(
         x, y = np.rint(at).astype(int).T
         here = (x >= 0) & (y >= 0) & (x < mask.shape[1]) & (y < mask.shape[0])
         leaks &= here
-        # In the shadow of sphere and ground nothing tells where the one ends and the other begins.
+        # Where sphere and background are both in shadow, the boundary is invisible.
         leaks[here] &= mask[y[here], x[here]] & (lab[y[here], x[here], 0] > _DARK * middle[0])
     return interior, loss, float(leaks.mean()), (float(colour[0]), float(colour[1]), float(colour[2]))
 
@@ -218,7 +219,7 @@ def share(
     model: ColourModel,
     reach: tuple[float, float] = (0.0, 0.92),
 ) -> float:
-    """The part of a disc, or of the ring between two shares of its radius, that has the spheres' colour."""
+    """Share of a disc, or of the ring between two fractions of its radius, that has the spheres' colour."""
     low, high = reach
     rings = np.sqrt(low**2 + (high**2 - low**2) * (np.arange(8) + 0.5) / 8)
     azimuth = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
@@ -231,5 +232,5 @@ def share(
 
 
 def apart_rad(a: Cone, b: Cone) -> float:
-    """The angle between the axes of two cones."""
+    """Angle between the axes of two cones, radians."""
     return float(np.arccos(np.clip(a.axis @ b.axis, -1, 1)))

@@ -1,1 +1,1 @@
-"""Spheres in many images: a few are searched whole, in the others only where they are predicted."""
+"""Search for spheres in many images: a few are searched whole, the others only where spheres are predicted."""

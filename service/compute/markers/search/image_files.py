@@ -1,4 +1,4 @@
-"""The search over image files: a few are searched whole; they predict where to look in all the others."""
+"""Searches image files for spheres: a few whole ones, which predict where to look in all others."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ from service.compute.registration.solve import register
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, apply, inverse
 
-_ANCHORS = (2, 4)  # images of a station that are searched first; more when these do not agree
+_ANCHORS = (2, 4)  # images of a station that are searched first; the larger number if the first do not agree
 _ANCHORS_WITHOUT_SCALE = (3, 6)
-ANCHOR_WIDTH_PX = 1000  # at least, of the reduced image on which an anchor is searched
-_ANCHOR_CANDIDATES = 36  # circles of an anchor that are looked at more closely, the best voted first
-_MOST_FAILED = 0.4  # of the images whose prediction may fail before the prediction itself is doubted
-_SAME_SPHERE = 0.15  # in radii: one unlisted sphere seen from two sides
-_GATE, _SIZE_GATE = 0.5, 0.12  # of an outline of a whole search, against its prediction
+ANCHOR_WIDTH_PX = 1000  # least width of the reduced image on which an anchor is searched
+_ANCHOR_CANDIDATES = 36  # circles examined in an anchor, those with the most votes
+_MOST_FAILED = 0.4  # share of images whose prediction may fail before the prediction itself is doubted
+_SAME_SPHERE = 0.15  # in radii: largest distance of one unlisted sphere seen from two sides
+_GATE, _SIZE_GATE = 0.5, 0.12  # between an outline from a whole search and its prediction
 
 Progress = Callable[[int, int], None]
 DetectFile = Callable[[Path, CameraModel, DetectionOptions], tuple[SphereOutline, ...]]
@@ -54,7 +54,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True, slots=True)
 class ImageSearch:
-    """How the outlines of one image were found; `missing` are spheres expected but not found, with the reason."""
+    """How the outlines of one image were found; `missing` holds expected spheres not found, with reasons."""
 
     how: Literal["searched", "predicted"]
     expected: int = 0
@@ -65,9 +65,9 @@ class ImageSearch:
 class LocatedOutlines:
     """Outlines of all images and how they were found.
 
-    `assignments` tells which are registration spheres; it is None when every image was searched whole: identity is
-    then still to be found. In `ImageSearch.missing` spheres count on from the registration spheres to the control
-    spheres, then to others that the anchors show.
+    `assignments` tells which outlines are registration spheres; None if every image was searched whole, so that they
+    must still be identified. `ImageSearch.missing` numbers the registration spheres first, then the control spheres,
+    then others that the anchors show.
     """
 
     outlines: tuple[tuple[SphereOutline, ...], ...]
@@ -86,7 +86,7 @@ class _Map(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """One image file and, unless it is to be searched whole, what is expected in it."""
+    """One image file and the prediction for it; None: it is searched whole."""
 
     path: Path
     expected: Prediction | None = None
@@ -94,7 +94,7 @@ class _Task:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """Outlines of one image; of a predicted one, the sphere of each, and what is missing."""
+    """Outlines of one image; with a prediction, the sphere of each, and the missing ones."""
 
     outlines: tuple[SphereOutline, ...]
     spheres: tuple[int, ...] | None
@@ -103,21 +103,21 @@ class _Found:
 
 @dataclass(frozen=True, slots=True)
 class _Provisional:
-    """What the anchors tell."""
+    """The provisional registration from the anchors."""
 
     T_scan_camera: Array  # (N, 4, 4)
     scale: float
     margin: float
     tone: Tone
-    unlisted_m: Array  # (U, 3) spheres that are in no list, scan frame
+    unlisted_m: Array  # (U, 3) spheres in no list, scan frame
     anchors: tuple[int, ...]
 
 
 def detect_file(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    """The outlines in one image file, which is searched whole.
+    """The outlines in one image file, searched whole.
 
     Raises:
-        DataError: the file is missing, truncated, no image, or not of the camera's size; `where` names it.
+        DataError: the file is missing, truncated, no image or not of the camera's size; `where` names it.
     """
     return detect_spheres(read_image_of(path, camera), camera, options)
 
@@ -130,18 +130,18 @@ def detect_all(
     progress: Progress | None = None,
     detect: DetectFile | None = None,
 ) -> tuple[tuple[SphereOutline, ...], ...]:
-    """The outlines in all images, in the order given, every image searched whole.
+    """The outlines in all images, in the given order, every image searched whole.
 
     Args:
         image_paths: JPEG, PNG or TIFF files of the camera's size.
         camera: intrinsics.
         options: of the detector.
-        workers: processes; 1 computes here.
-        progress: called with (done, all) after each image.
-        detect: another detector of one file, which can be pickled; None: `detect_file`.
+        workers: number of processes; 1 computes in this one.
+        progress: called with (done, total) after each image.
+        detect: another detector for one file, which must be picklable; None: `detect_file`.
 
     Raises:
-        DataError: an image cannot be used; the first one is named.
+        DataError: an image cannot be used; the message names the first one.
     """
     with _mapping(workers, len(image_paths)) as mapped:
         work = partial(_detected, detect or detect_file, camera, options)
@@ -169,30 +169,30 @@ def locate_outlines(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> LocatedOutlines:
-    """The outlines in all images, searched only where the poses say that spheres are.
+    """The outlines in all images, searched only where the poses predict spheres.
 
-    A few images of each station, spread over its poses, are searched whole at a reduced size; identity and a
-    provisional registration of these predict every sphere in every image, and how far the poses may be off. An
-    image in which too little is found where predicted is searched whole; when too many are, or the anchors do not
-    agree, all are.
+    A few images of each station, spread over its poses, are searched whole at reduced size. Their identification and
+    a provisional registration predict every sphere in every image, and how far the poses may be off. An image with
+    too few spheres at their predicted places is searched whole; if there are too many such images, or if the anchors
+    do not agree, all images are.
 
     Args:
         image_paths: N JPEG, PNG or TIFF files of the camera's size.
         camera: intrinsics.
-        poses: (N, 4, 4) T_world_camera, or T_base_camera of each image's group.
+        poses: (N, 4, 4) T_world_camera, or T_base_camera in the base frame of each image's group.
         registration_centres_m: (M, 3) in the scan frame.
-        radius_m: of all spheres.
-        control_centres_m: (C, 3) spheres that only serve the evaluation, or None.
-        groups: (N,) station of each image; None: all one.
-        scenes: (N,) images with one number show the same spheres, in other ones spheres that no list names may have
-            come or gone; None: all one.
-        metric: the positions of the poses are in metres.
+        radius_m: radius of all spheres.
+        control_centres_m: (C, 3) spheres used only for the evaluation, or None.
+        groups: (N,) station of each image; None: all the same.
+        scenes: (N,) images of the same number show the same spheres; between numbers, spheres that are in no list may
+            have come or gone. None: all the same.
+        metric: whether the poses' positions are in metres.
         options: of the detector.
-        workers: processes; 1 computes here.
-        progress: called with (done, all) after each image.
+        workers: number of processes; 1 computes in this one.
+        progress: called with (done, total) after each image.
 
     Raises:
-        DataError: lengths do not agree, or an image cannot be used; the first one is named.
+        DataError: lengths do not agree, or an image cannot be used; the message names the first one.
     """
     n = len(image_paths)
     stations = np.zeros(n, dtype=np.int64) if groups is None else np.asarray(groups, dtype=np.int64)
@@ -250,7 +250,7 @@ def locate_outlines(
 
 
 def searched_whole(outlines: Sequence[tuple[SphereOutline, ...]]) -> LocatedOutlines:
-    """The record of a search of whole images, such as `detect_all` makes."""
+    """`LocatedOutlines` for images searched whole, as by `detect_all`."""
     return LocatedOutlines(tuple(outlines), None, tuple(ImageSearch("searched") for _ in outlines))
 
 
@@ -264,7 +264,7 @@ def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> _Found
 
 
 def _look_reduced(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:
-    """The clearest outlines of an anchor. A doubtful one would do no harm, but identity needs only some."""
+    """The clearest outlines of an anchor; identification needs only some, so doubtful ones are dropped."""
     image, smaller = read_reduced(path, camera, ANCHOR_WIDTH_PX)
     few = dataclasses.replace(options, max_candidates=min(_ANCHOR_CANDIDATES, options.max_candidates))
     roughs = find_rough(image, smaller, few)
@@ -290,14 +290,14 @@ def _provisional(
     options: DetectionOptions,
     mapped: _Map,
 ) -> _Provisional | None:
-    """The registration of a few images of each of the `sets`; None when none is to be had that can be trusted."""
+    """The registration of a few images of each of the `sets`; None if no reliable one is found."""
     seen: dict[int, tuple[SphereOutline, ...]] = {}
     look = partial(_look_reduced, camera=camera, options=options)
     nothing: tuple[SphereOutline, ...] = ()
     for per_station in _ANCHORS if metric else _ANCHORS_WITHOUT_SCALE:
         chosen = [i for mine in sets for i in spread_views(poses, mine, per_station)]
         if len(chosen) > 0.5 * len(poses):
-            return None  # nothing to be saved
+            return None  # the anchors would be all images
         new = [i for i in chosen if i not in seen]
         seen |= dict(zip(new, mapped(look, [image_paths[i] for i in new]), strict=True))
         outlines = [seen.get(i, nothing) for i in range(len(poses))]
@@ -310,7 +310,7 @@ def _provisional(
                 estimate_scale=not metric,
             )  # fmt: skip
         except ComputeError:
-            continue  # more anchors may tell; if not, the search of all images says what is wrong
+            continue  # more anchors may help; if not, the search of all images reports the error
         used = {(r.image, r.outline) for r in solved.residuals if not r.excluded}
         agreeing = {i for i, _ in used}
         if any(len(agreeing.intersection(mine.tolist())) < 2 for mine in sets):
@@ -324,7 +324,7 @@ def _provisional(
         return _Provisional(
             T_scan_camera,
             solved.scale,
-            # Two or more anchors share the error of their poses; the next image's may be some times that.
+            # The anchors share part of their poses' error; the next image's may be several times as large.
             float(np.clip(0.03 + 4 * max(off), 0.05, WIDE)),
             tone_of(markers),
             _unlisted(outlines, assignments, T_scan_camera, spheres, radius_m),
@@ -334,7 +334,7 @@ def _provisional(
 
 
 def spread_views(poses: Array, members: NDArray[np.int64], count: int) -> list[int]:
-    """`count` of the images `members`, spread over their poses: a middle one, then always the farthest from those."""
+    """`count` of the images `members`, spread over their poses: a central one, then always the farthest."""
     place = poses[members, :3, 3]
     spread = float(np.median(np.linalg.norm(place - np.median(place, axis=0), axis=1)))
     views = np.hstack([place / max(spread, 1e-12), poses[members, :3, 2]])
@@ -348,7 +348,7 @@ def spread_views(poses: Array, members: NDArray[np.int64], count: int) -> list[i
 def _pose_error(
     outlines: Sequence[SphereOutline], assignment: Assignment, T: Array, spheres: Array, radius_m: float
 ) -> float:
-    """How far (in radii) an image's own best pose moves the spheres: what its given pose is off."""
+    """How far (in radii) the best pose from this image alone moves the spheres: the error of its given pose."""
     index = list(assignment.markers.items())
     if len(index) < 4:
         return 0.0
@@ -370,7 +370,7 @@ def _unlisted(
     spheres: Array,
     radius_m: float,
 ) -> Array:
-    """(U, 3) spheres that no list names but two anchors show in one place."""
+    """(U, 3) spheres in no list that two anchors show at one place."""
     rays: list[tuple[int, Array, Array, float]] = []  # image, origin, direction, half angle
     for i, found in enumerate(outlines):
         T = T_scan_camera[i]
@@ -400,11 +400,11 @@ def _unlisted(
 
 @contextmanager
 def _mapping(workers: int, items: int) -> Generator[_Map]:
-    """A map over processes, or the plain one."""
+    """A map over processes, or the plain one for a single worker."""
     if workers <= 1 or items <= 1:
         yield map
         return
-    context = multiprocessing.get_context("spawn")  # forking a process that runs threads may deadlock
+    context = multiprocessing.get_context("spawn")  # forking a process with threads may deadlock
     with ProcessPoolExecutor(min(workers, items), mp_context=context, initializer=_one_thread) as pool:
         yield pool.map
 

@@ -1,4 +1,4 @@
-"""The paper's detector on image files, with its own boxes or with those of another detector."""
+"""The paper's detector on image files, with its own boxes or another detector's."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ def detect_file_by_masks(
         path: JPEG, PNG or TIFF of the camera's size.
         camera: intrinsics.
         options: of the detector.
-        boxes: by the file's name, (left, top, right, bottom) in pixels; an image without an entry has no sphere.
-            None: found by a vote for circles.
+        boxes: (left, top, right, bottom) in pixels by file name; an image without an entry has no sphere. None: found
+            by circle votes.
 
     Raises:
-        DataError: the file is no image of the camera's size.
+        DataError: the file is not an image of the camera's size.
     """
     mine = None if boxes is None else boxes.get(path.name, ())
     return detect_by_masks(read_image_of(path, camera), camera, options, boxes=mine)
@@ -43,7 +43,7 @@ def read_boxes(path: Path, names: Sequence[str]) -> dict[str, list[Box]]:
     """Boxes by image name from a JSON file, such as Grounding DINO's.
 
     Raises:
-        DataError: no JSON of this form, a box without area, or an image that is none of `names`.
+        DataError: the file is not JSON of this form, a box has no area, or an image is not among `names`.
     """
     data = parse_json(file_text(path), name=str(path), remedy=_FORM)
     if not isinstance(data, dict):

@@ -1,4 +1,4 @@
-"""Spheres in one image whose places are predicted: only their regions are touched, and nothing is forced."""
+"""Finds predicted spheres in one image by searching only their regions; nothing is forced to be found."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOu
 from service.compute.registration.cost import skew
 from service.core.geometry import Array, Transform, apply, transform
 
-# Distances below are parts of a sphere's radius as the image shows it, unless the name has a unit.
-NEAR = 0.08  # a prediction as good as this is approached at once, and searched only when that fails
-WIDE = 0.42  # the worst that is looked for: a robot that is off by millimetres
-_PLACE_GATE, _SIZE_GATE = 0.05, 0.04  # of a whole outline against the image's other spheres; of a part, in proportion
+# Lengths below are fractions of a sphere's apparent radius, unless the name has a unit.
+NEAR = 0.08  # a prediction this good is refined directly; its region is searched only if that fails
+WIDE = 0.42  # largest search range, for a robot that is off by millimetres
+_PLACE_GATE, _SIZE_GATE = 0.05, 0.04  # of a whole outline from the image's other spheres; scaled for partial ones
 _ROUGH_GATE = 0.12
-_APPROACH_GATE = 0.02  # of outlines approached, on whose agreement the others are predicted
-_LEAST_PART = 0.45  # of an outline that must be inside the image and not behind another sphere
-_REGION_RADIUS_PX = 24.0  # of a sphere in the reduced region on which a search runs
+_APPROACH_GATE = 0.02  # of approached outlines, on whose agreement the others are predicted
+_LEAST_PART = 0.45  # share of an outline that must be inside the image and not behind another sphere
+_REGION_RADIUS_PX = 24.0  # of a sphere in the reduced region that is searched
 _REGION_RAYS = 64
-_APPROACHED = 5  # spheres on which an image's pose is first found; all, where these do not agree
-_POSE_SPHERES = 3  # three numbers each: with three, a pose is determined and contradicted by something
+_APPROACHED = 5  # spheres from which an image's pose is first found; all, if these do not agree
+_POSE_SPHERES = 3  # three parameters each: three spheres determine a pose with redundancy
 
 
 @dataclass(frozen=True, slots=True)
 class Tone:
-    """Colour of the markers: chromaticity (a, b of CIELAB of 8-bit colours), and how far an outline's may be off."""
+    """Colour of the markers: chromaticity (a, b of CIELAB of 8-bit colours), and its tolerance."""
 
     a: float
     b: float
@@ -47,7 +47,7 @@ class Tone:
 
 
 def tone_of(outlines: Sequence[SphereOutline]) -> Tone:
-    """The colour that the outlines (one or more) share."""
+    """The common colour of one or more outlines."""
     tones = _chromaticity(outlines)
     middle = np.median(tones, axis=0)
     spread = float(np.median(np.linalg.norm(tones - middle, axis=1)))
@@ -61,7 +61,7 @@ def _chromaticity(outlines: Sequence[SphereOutline]) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Where the spheres `centres_m` (M, 3), scan frame, are expected, and how far off (in radii) they may be."""
+    """Expected positions of the spheres `centres_m` (M, 3), scan frame, and their tolerance `margin` in radii."""
 
     T_camera_scan: Transform = field(repr=False)
     centres_m: Array = field(repr=False)
@@ -72,7 +72,7 @@ class Prediction:
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """Outlines by sphere; spheres expected and not found, each with the reason; the image's own pose."""
+    """Outlines by sphere; reasons for spheres expected but not found; the image's own pose."""
 
     outlines: dict[int, SphereOutline]
     missing: dict[int, str]
@@ -80,12 +80,12 @@ class Located:
 
     @property
     def expected(self) -> int:
-        """Spheres that the image should show."""
+        """Number of spheres that the image should show."""
         return len(self.outlines) + len(self.missing)
 
     @property
     def convincing(self) -> bool:
-        """Whether so much was found where it was predicted that the prediction must be right."""
+        """Whether so many spheres were found where predicted that the prediction must be right."""
         return len(self.outlines) >= max(min(4, self.expected), 0.5 * self.expected)
 
 
@@ -94,8 +94,9 @@ def locate_predicted(
 ) -> Located:
     """The outlines of the predicted spheres in an image (H, W, 3) of the camera's size.
 
-    Each region is searched as far as the prediction may be off; what is found must agree with one pose of the camera
-    (its own, so that a robot may err), in place, size and colour. A sphere that does not is reported as missing.
+    Each region is searched as far as the prediction may be off. The outlines found must agree with one camera pose
+    (the image's own, so the robot's pose may be off) in place, size and colour; spheres that do not are reported as
+    missing.
     """
     found = _attempt(image_bgr, camera, expected, options)
     if not found.convincing and expected.margin < WIDE:
@@ -116,7 +117,7 @@ def _attempt(
     if starts is None:
         pose = _approached_pose(image, camera, expected, visible_cones(pose, centres, radius_m, camera))
         starts = _starts(image, camera, expected, pose, options)
-    if starts is None:  # too few spheres to tell of one another
+    if starts is None:  # too few spheres to predict the others from
         shown = visible_cones(pose, centres, radius_m, camera)
         found = [refine_outline(image, camera, cone, options) for cone in shown.values()]
     else:
@@ -146,9 +147,9 @@ def _attempt(
 def _starts(
     image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, pose: Transform, options: DetectionOptions
 ) -> dict[int, Approached] | None:
-    """Cones to measure, right to about a pixel: as approached, or where the spheres approached put the others.
+    """Cones good to about a pixel for measurement: approached ones, and predictions from these for the others.
 
-    None when the spheres approached do not agree on a pose.
+    None if the approached spheres do not agree on a pose.
     """
     centres, radius_m = expected.centres_m, expected.radius_m
     shown = visible_cones(pose, centres, radius_m, camera)
@@ -167,8 +168,8 @@ def _starts(
 
 
 def deviation(cone: Cone, predicted: Cone) -> tuple[float, float]:
-    """Distance of the centres in radii, and difference of the sizes as a part of the size."""
-    apart = float(np.linalg.norm(cone.axis - predicted.axis))  # of unit vectors: the angle, where it is small
+    """Distance of the centres in radii, and relative difference of the sizes."""
+    apart = float(np.linalg.norm(cone.axis - predicted.axis))  # of unit vectors: equals a small angle
     half = predicted.half_angle_rad
     return apart / half, abs(cone.half_angle_rad / half - 1.0)
 
@@ -176,13 +177,13 @@ def deviation(cone: Cone, predicted: Cone) -> tuple[float, float]:
 def visible_cones(
     T_camera_scan: Transform, centres_scan_m: Array, radius_m: float, camera: CameraModel
 ) -> dict[int, Cone]:
-    """Cones of the spheres whose outline is for the most part in the image and not behind another sphere."""
+    """Cones of the spheres whose outline is mostly in the image and not behind another sphere."""
     centres = apply(T_camera_scan, centres_scan_m)
     distance = np.linalg.norm(centres, axis=1)
     cones = {
         m: cone_of_sphere(c, radius_m)
         for m, c in enumerate(centres)
-        if c[2] > max(2 * radius_m, 0.35 * distance[m])  # what lies further aside no lens here shows
+        if c[2] > max(2 * radius_m, 0.35 * distance[m])  # farther to the side is outside any field of view here
     }
     corners = camera.normalise(np.array([[0.0, 0.0], [camera.width - 1.0, camera.height - 1.0]]))
     low, high = 1.2 * corners.min(axis=0), 1.2 * corners.max(axis=0)
@@ -193,7 +194,7 @@ def visible_cones(
         if np.any(rays[:, 2] <= 0.1):
             continue
         plane = rays[:, :2] / rays[:, 2:]
-        seen = np.all((plane > low) & (plane < high), axis=1)  # beyond, a distortion polynomial may fold back
+        seen = np.all((plane > low) & (plane < high), axis=1)  # beyond, the distortion polynomial may fold back
         pixels = camera.project(rays)
         seen &= np.all((pixels > 2) & (pixels < [camera.width - 3, camera.height - 3]), axis=1)
         for k, other in cones.items():
@@ -205,7 +206,7 @@ def visible_cones(
 
 
 def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin: float) -> Cone | None:
-    """The circle near a predicted one, searched on the region at a reduced size."""
+    """The circle near a predicted one, searched in its region at reduced size."""
     shrink = max(1.0, cone.half_angle_rad * camera.fx / _REGION_RADIUS_PX)
     angle = cone.half_angle_rad * (1.15 + margin)
     rim = camera.project(cone.rays(np.linspace(0, 2 * np.pi, 24), np.full(24, angle)))
@@ -248,7 +249,7 @@ def _approach(image: NDArray[np.uint8], camera: CameraModel, cone: Cone, margin:
 def _approached_pose(
     image: NDArray[np.uint8], camera: CameraModel, expected: Prediction, shown: dict[int, Cone]
 ) -> Transform:
-    """The image's pose from circles near the predicted ones: of a few spheres, of all where those do not agree."""
+    """The image's pose from circles near the predicted ones: from a few spheres, or from all if those disagree."""
     order = _spread(shown)
     roughs: dict[int, Cone] = {}
     for part, agreeing in ((order[:_APPROACHED], 4), (order[_APPROACHED:], 3)):
@@ -264,7 +265,7 @@ def _approached_pose(
 
 
 def _spread(cones: dict[int, Cone]) -> list[int]:
-    """The spheres, each as far as can be from those before it."""
+    """The spheres in an order in which each is as far as possible from those before it."""
     if not cones:
         return []
     names = list(cones)
@@ -281,7 +282,7 @@ def _spread(cones: dict[int, Cone]) -> list[int]:
 def _agreed_pose(
     cones: dict[int, Cone], expected: Prediction, start: Transform, gate: float, least: float
 ) -> Transform | None:
-    """T_camera_scan on which `least` cones, and three, agree; None where they do not."""
+    """T_camera_scan on which `least` cones (at least three) agree; None if they do not."""
     if len(cones) < _POSE_SPHERES:
         return None
     index = list(cones)
@@ -302,11 +303,11 @@ def fit_pose(
 
     Args:
         axes: (N, 3) unit directions to the centres, camera frame; N ≥ 3.
-        half_angles: (N,) of the cones.
+        half_angles: (N,) of the cones, radians.
         centres_m: (N, 3) of the spheres, scan frame.
-        radius_m: of the spheres.
-        start: T_camera_scan.
-        iterations: at most.
+        radius_m: radius of the spheres.
+        start: initial T_camera_scan.
+        iterations: largest number.
     """
     pose = start
     for _ in range(iterations):
@@ -320,7 +321,7 @@ def fit_pose(
 
 
 def _pose_step(pose: Transform, axes: Array, half_angles: Array, centres_m: Array, radius_m: float) -> Array | None:
-    """One Gauss–Newton step (6,) of translation and rotation; None where the camera would be within a sphere."""
+    """One Gauss–Newton step (6,) of translation and rotation; None if the camera would be inside a sphere."""
     rotated = centres_m @ pose[:3, :3].T
     c = rotated + pose[:3, 3]
     distance = np.linalg.norm(c, axis=1)
