@@ -1,1 +1,1 @@
-"""Where the camera should go next, and how good the data is so far."""
+"""Planning of viewpoints and motions, and the predicted quality of the data so far."""

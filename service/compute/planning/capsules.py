@@ -10,7 +10,7 @@ _TINY = 1e-15
 
 
 def segment_distance_m(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
-    """Least distance (...,) between segments p0–p1 and q0–q1, all (..., 3) and broadcast; points are segments too.
+    """Least distance (...,) between segments p0–p1 and q0–q1, all (..., 3), broadcast; a segment may be a point.
 
     Source: C. Ericson, Real-Time Collision Detection, 2005, section 5.1.9.
     """
@@ -22,7 +22,7 @@ def segment_distance_m(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
         s = np.where(denominator > 1e-12 * a * e, (b * f - c * e) / denominator, 0.0)
         s = np.where(a > _TINY, np.clip(s, 0.0, 1.0), 0.0)
         t = np.where(e > _TINY, (b * s + f) / np.where(e > _TINY, e, 1.0), 0.0)
-        # Where t leaves its segment it is clamped, and s follows.
+        # If t is outside its segment, it is clamped, and s is recomputed.
         clamped = np.clip(t, 0.0, 1.0)
         s = np.where(a > _TINY, np.clip((b * clamped - c) / np.where(a > _TINY, a, 1.0), 0.0, 1.0), 0.0)
     gap = r + s[..., None] * d1 - clamped[..., None] * d2
@@ -30,10 +30,10 @@ def segment_distance_m(p0: Array, p1: Array, q0: Array, q1: Array) -> Array:
 
 
 def segment_box_distance_m(p0: Array, p1: Array, half_extent_m: Array) -> Array:
-    """Least distance (...,) of segments p0–p1 (..., 3) to the box of ± half extents (3,) about the origin; 0 inside.
+    """Least distance (...,) of segments p0–p1 (..., 3) to the box of ± half extents (3,) at the origin; 0 inside.
 
-    The distance to a convex body is convex along a segment: ternary search finds its least value, to a micrometre
-    on segments of a metre.
+    The distance to a convex body is convex along a segment, so ternary search finds its minimum, to a micrometre on
+    segments of a metre.
     """
     low, high = (
         np.zeros(np.broadcast_shapes(p0.shape, p1.shape)[:-1]),

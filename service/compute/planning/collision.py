@@ -1,7 +1,7 @@
-"""Whether an arm with a camera on its flange touches table, specimen, spheres or itself: links as capsules.
+"""Collision checks of an arm with a camera on its flange: table, specimen, spheres and the arm itself, as capsules.
 
-No meshes: a capsule around each link errs on the safe side by some centimetres. This keeps a plan out of trouble; it
-is no safety function.
+There are no meshes: a capsule around each link errs on the safe side by some centimetres. The checks keep plans free
+of collisions; they are not a safety function.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from service.core.geometry import Array, Transform, apply, inverse
 from service.core.units import mm
 
 LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3", "camera")
-# Neighbours touch by construction; the mount holds the camera beside the last two joints. The shoulder and the base
-# stand where they stand: the table is no matter of theirs.
+# Neighbouring links touch by design, and the mount holds the camera beside the last two joints. Shoulder and base do
+# not move relative to the table, so it is not checked against them.
 ALLOWED_PAIRS = frozenset(
     {
         ("base", "shoulder"), ("base", "upper_arm"), ("shoulder", "upper_arm"), ("upper_arm", "forearm"),
@@ -41,37 +41,37 @@ class Capsule:
 
 @dataclass(frozen=True, slots=True)
 class Obstacles:
-    """What stands around the arm, in its base frame."""
+    """The arm's surroundings, in its base frame."""
 
-    table_z_m: float  # everything below is table
-    T_base_specimen: Transform = field(repr=False)  # centre and axes of the box around the specimen
+    table_z_m: float  # the table fills everything below
+    T_base_specimen: Transform = field(repr=False)  # centre and axes of the specimen's bounding box
     specimen_half_m: Array  # (3,)
-    spheres: tuple[Capsule, ...] = ()  # spheres and their posts, where they are known
+    spheres: tuple[Capsule, ...] = ()  # spheres and their posts, if known
 
 
 @dataclass(frozen=True, slots=True)
 class ArmBody:
-    """An arm's capsules: DH parameters, radii, the sideways offset of its long links, and what the flange holds."""
+    """An arm's capsules: DH parameters, radii, sideways offsets of the long links, and the camera on the flange."""
 
     model: ArmModel
-    radii_m: tuple[float, float, float, float, float, float, float]  # of LINKS but the camera
-    upper_arm_offset_m: float  # along the second axis, from the plane in which the DH parameters put the links
+    radii_m: tuple[float, float, float, float, float, float, float]  # of LINKS except the camera
+    upper_arm_offset_m: float  # along the second axis, from the plane of the links in the DH model
     forearm_offset_m: float
     T_flange_camera: Transform = field(repr=False)
-    camera: Capsule = field(repr=False)  # in the camera's frame
-    base_depth_m: float = 0.10  # of the pedestal's top below the base frame
+    camera: Capsule = field(repr=False)  # in the camera frame
+    base_depth_m: float = 0.10  # pedestal top below the base frame
 
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """The nearest pair of a configuration."""
+    """The pair with the least clearance in a configuration."""
 
     first: str
     second: str
-    clearance_m: float  # negative: as deep as the capsules overlap
+    clearance_m: float  # negative: depth of the overlap
 
     def __str__(self) -> str:
-        """One phrase for a technician."""
+        """The contact in words, for a technician."""
         if self.clearance_m < 0:
             return f"the {_words(self.first)} would touch the {_words(self.second)}"
         return (
@@ -80,7 +80,7 @@ class Contact:
 
 
 def universal_robot_body(model: ArmModel, T_flange_camera: Transform, camera: Capsule) -> ArmBody:
-    """Capsules for a Universal Robots arm, sized for the UR10e and in proportion to the wrist's offset for others."""
+    """Capsules for a Universal Robots arm, sized for the UR10e and scaled by the wrist's offset for others."""
     scale = float(model.d_m[3]) / 0.17415
     return ArmBody(
         model,
@@ -117,7 +117,7 @@ def link_segments(body: ArmBody, joints_rad: Array) -> tuple[Array, Array, Array
 def nearest_contacts(
     body: ArmBody, obstacles: Obstacles, joints_rad: Array, allowed: frozenset[tuple[str, str]] = ALLOWED_PAIRS
 ) -> list[Contact]:
-    """The pair with the least clearance at each of the joints (K, 6), allowed pairs left out."""
+    """The pair with the least clearance at each of the joints (K, 6), without allowed pairs."""
     starts, ends, radii = link_segments(body, joints_rad)
     pairs: list[tuple[str, str]] = []
     clearances: list[Array] = []
@@ -151,7 +151,7 @@ def nearest_contacts(
 
 
 def straight_path(start_rad: Array, end_rad: Array, step_rad: float) -> Array:
-    """Joints (K, 6) along the straight way in joint space, both ends included, no joint turning more than a step."""
+    """Joints (K, 6) on the straight path in joint space, both ends included, in steps of at most `step_rad`."""
     count = max(1, int(np.ceil(float(np.abs(end_rad - start_rad).max()) / step_rad)))
     return start_rad + np.linspace(0.0, 1.0, count + 1)[:, None] * (end_rad - start_rad)
 

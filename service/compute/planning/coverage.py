@@ -1,7 +1,7 @@
-"""How much of the specimen's surface the images have seen: sample points, and ray casting against the CT's surface.
+"""Coverage of the specimen's surface by images: sample points, and ray casting against the CT's surface.
 
-The whole is what can be seen at all from a dome of directions above: what lies inside, underneath or in folds that no
-camera reaches is not counted as missing.
+Coverage is relative to the surface visible from a dome of directions above: surfaces inside, underneath or in folds
+that no camera reaches do not count as missing.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 
-_CELL_M = 0.0025  # of the occluder
-_LIFT_M = 0.002  # above the simplified surface, so that it does not hide its own points
+_CELL_M = 0.0025  # of the simplified occluder
+_LIFT_M = 0.002  # of points above the simplified surface, so that it does not occlude its own points
 _BOARD_M = 0.004  # thickness of the layer that counts as the board
 _CLEAR_OF_SPHERES = 1.4  # radii
 _DOME_TILTS_DEG = (0.0, 20.0, 40.0, 55.0)
-_MARGIN_M = 0.08  # of the surface kept around the spheres
+_MARGIN_M = 0.08  # margin of surface kept around the spheres
 
 
 @dataclass(frozen=True, slots=True)
 class CoverageLimits:
-    """When a view counts for a point."""
+    """Conditions for a view of a point to count."""
 
     max_angle_deg: float = 65.0  # between the surface's normal and the direction to the camera
     max_distance_m: float = 1.0
@@ -40,7 +40,7 @@ class CoverageLimits:
 
 @dataclass(frozen=True)
 class CoverageSurface:
-    """Points of the specimen with their outward normals, and what may hide them; all in the frame of the scan."""
+    """Points of the specimen with outward normals, and the surface that may occlude them; in the scan frame."""
 
     points_m: Array = field(repr=False)  # (N, 3)
     normals: Array = field(repr=False)  # (N, 3)
@@ -49,13 +49,13 @@ class CoverageSurface:
 
     @cached_property
     def rays(self) -> Any:
-        """The ray caster of the occluder; None where there is none."""
+        """The ray caster of the occluder; None if there is none."""
         if len(self.occluder_faces) == 0:
             return None
         return RayMeshIntersector(trimesh.Trimesh(self.occluder_vertices_m, self.occluder_faces, process=False))
 
     def free(self, origins: Array, target: Array) -> NDArray[np.bool_]:
-        """Whether the way from origins (K, 3) to `target` (3,) or targets (K, 3) is free (K,)."""
+        """(K,) whether the line from origins (K, 3) to `target` (3,) or targets (K, 3) is unobstructed."""
         if self.rays is None or len(origins) == 0:
             return np.ones(len(origins), dtype=bool)
         return ~np.asarray(self.rays.intersects_any(origins, target - origins), dtype=bool)
@@ -71,14 +71,14 @@ def coverage_surface(
     n_points: int = 3000,
     seed: int = 0,
 ) -> CoverageSurface:
-    """Sample what can be seen of the specimen from above.
+    """Sample the part of the specimen's surface that is visible from above.
 
     Args:
-        vertices_m, faces: surface of the scene (V, 3), (F, 3) with outward winding, spheres and board included.
-        spheres_m: (M, 3) around the specimen; it lies within their hull, seen from above.
+        vertices_m, faces: surface of the scene (V, 3), (F, 3) with outward winding, including spheres and board.
+        spheres_m: (M, 3) around the specimen, which lies within their hull as seen from above.
 
     Raises:
-        ComputeError: no surface lies between the spheres.
+        ComputeError: there is no surface between the spheres.
     """
     centre = spheres_m.mean(axis=0)
     low, high = spheres_m.min(axis=0) - _MARGIN_M, spheres_m.max(axis=0) + _MARGIN_M
@@ -120,7 +120,7 @@ def seen(
     T_scan_camera: Transform | None = None,
     camera: CameraModel | None = None,
 ) -> NDArray[np.bool_]:
-    """Which points (N,) a camera at `eye_m` (3,) sees at a good angle; with a camera, only those in its image."""
+    """(N,) points that a camera at `eye_m` (3,) sees at a good angle; with a camera, only those in its image."""
     way = eye_m - surface.points_m
     distance = np.linalg.norm(way, axis=1)
     facing = np.einsum("ni,ni->n", way, surface.normals) / distance
@@ -137,14 +137,14 @@ def seen(
 
 
 def covered_fraction(views: Sequence[NDArray[np.bool_]], min_views: int) -> float:
-    """Share of the points that at least `min_views` of the views (N,) have seen; 0 without views."""
+    """Share of the points seen in at least `min_views` of the views (N,); 0 without views."""
     if not views:
         return 0.0
     return float(np.mean(np.sum(views, axis=0) >= min_views))
 
 
 def _up(spheres_m: Array, middles: Array, area: Array) -> Array:
-    """Away from the board: the spheres stand on it, and most of the surface around them is its."""
+    """Unit vector (3,) away from the board, on which the spheres stand: most surface around them is the board's."""
     normal = np.linalg.svd(spheres_m - spheres_m.mean(axis=0))[2][2]
     below = (np.average(middles, axis=0, weights=area) - spheres_m.mean(axis=0)) @ normal
     return np.asarray(normal if below < 0 else -normal, dtype=np.float64)
@@ -157,7 +157,7 @@ def _plane_axes(up: Array) -> Array:
 
 
 def _between(points: Array, spheres_m: Array, radius_m: float, up: Array) -> NDArray[np.bool_]:
-    """Within the hull of the spheres seen from above, and neither on a sphere nor on its post."""
+    """Points within the hull of the spheres as seen from above, and not on a sphere or its post."""
     axes = _plane_axes(up)
     flat, feet = points @ axes.T, spheres_m @ axes.T
     hull = ConvexHull(feet)
@@ -170,9 +170,9 @@ def _between(points: Array, spheres_m: Array, radius_m: float, up: Array) -> NDA
 
 
 def _on_board(points: Array, normals: Array, up: Array, centre: Array) -> NDArray[np.bool_]:
-    """Points of the plane on which the specimen lies, if one stands out among the heights of level surface."""
+    """Points on the plane under the specimen, if one height dominates among the level surfaces."""
     height = (points - centre) @ up
-    level = normals @ up > 0.97  # its top: the underside is as large
+    level = normals @ up > 0.97  # only the top: the underside has the same area
     if level.sum() < 50:
         return np.zeros(len(points), dtype=bool)
     edges = np.arange(height[level].min(), height[level].max() + 2 * _BOARD_M, _BOARD_M / 2)
@@ -185,7 +185,7 @@ def _on_board(points: Array, normals: Array, up: Array, centre: Array) -> NDArra
 
 
 def _dome(centre: Array, up: Array, distance_m: float) -> list[Array]:
-    """Eye positions on the dome."""
+    """Eye positions on a dome of directions around the centre."""
     axes = _plane_axes(up)
     eyes: list[Array] = []
     for tilt in np.radians(_DOME_TILTS_DEG):
@@ -197,7 +197,7 @@ def _dome(centre: Array, up: Array, distance_m: float) -> list[Array]:
 
 
 def _simplified(vertices_m: Array, faces: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices joined within cells of _CELL_M: fine enough for shadows; millions of faces take a second."""
+    """The mesh with vertices merged within cells of _CELL_M: fine enough for occlusion, and fast."""
     cells = np.floor(vertices_m[faces.ravel()] / _CELL_M).astype(np.int64)
     cells -= cells.min(axis=0)
     extent = cells.max(axis=0) + 1

@@ -1,9 +1,9 @@
-"""Words that lead a hand-held camera from where it is to where it is wanted, and the places where it is wanted.
+"""Guidance for a hand-held camera: the wanted places, and words that lead from the current one to them.
 
-A level frame stands in the middle of the scene: z up, y the way the first image's top pointed, so that the person
-stood at −y. A camera's attitude is `turn` about z, `lean` of its right side down and `tilt` of its axis down from the
-horizon: R = Rz(turn) Ry(lean) Rx(−tilt) C0, where C0 looks along y with its top up. This has no singularity where a
-camera looks straight down, only where its side points up.
+The level frame is in the middle of the scene: z up, y in the direction in which the first image's top pointed, so
+that the person stood at −y. A camera's attitude is `turn` about z, `lean` of its right side down and `tilt` of its
+axis down from the horizon: R = Rz(turn) Ry(lean) Rx(−tilt) C0, where C0 looks along y with its top up. This is
+singular only if the camera's side points up, not if it looks straight down.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from service.core.geometry import Array, Transform, inverse, transform
 from service.core.units import deg
 
 _FORWARD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # C0: columns are x, y, z of the camera
-_COARSE_FROM_M = 0.10  # from here on distances are told to five centimetres, below to one
+_COARSE_FROM_M = 0.10  # distances above are given in steps of five centimetres, below in steps of one
 _ANGLE_STEP_DEG = 5.0
 RELEASE = "hold it there and release the shutter"
 
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """How a camera is held, radians; see the module."""
+    """A camera's orientation in the level frame, radians; see the module's docstring."""
 
     turn_rad: float
     lean_rad: float
@@ -33,7 +33,7 @@ class Attitude:
 
     @classmethod
     def of(cls, R_level_camera: Array) -> Attitude:
-        """Of a rotation matrix (3, 3)."""
+        """The attitude of a rotation matrix R_level_camera (3, 3)."""
         x, z = R_level_camera[:, 0], R_level_camera[:, 2]
         turn, lean = float(np.arctan2(x[1], x[0])), float(np.arcsin(np.clip(-x[2], -1.0, 1.0)))
         ahead = (Rotation.from_euler("z", turn) * Rotation.from_euler("y", lean)).inv().apply(z)
@@ -47,15 +47,15 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A view that is wanted: where the camera should be, in the level frame."""
+    """A wanted view: the camera pose in the level frame."""
 
     name: str
     T_level_camera: Transform
-    aim_m: Array  # (3,) the point that is looked at
+    aim_m: Array  # (3,) point that the camera looks at
 
 
 def level_frame(centre_m: Array, up: Array, top: Array) -> Transform:
-    """T_scene_level: origin at `centre_m` (3,), z along `up` (3,), y along `top` (3,) as far as that is level."""
+    """T_scene_level: origin at `centre_m` (3,), z along `up` (3,), y along the level part of `top` (3,)."""
     z = up / np.linalg.norm(up)
     y = top - z * (top @ z)
     if np.linalg.norm(y) < 1e-6:
@@ -65,7 +65,7 @@ def level_frame(centre_m: Array, up: Array, top: Array) -> Transform:
 
 
 def away_from_plane(spheres_m: Array, eye_m: Array) -> Array:
-    """The normal (3,) of the plane nearest to the spheres (M, 3), on the side of the camera at `eye_m` (3,)."""
+    """The normal (3,) of the best plane through the spheres (M, 3), towards the camera at `eye_m` (3,)."""
     middle = spheres_m.mean(axis=0)
     normal = np.linalg.svd(spheres_m - middle)[2][2]
     return np.asarray(normal if (eye_m - middle) @ normal > 0 else -normal, dtype=np.float64)
@@ -74,15 +74,15 @@ def away_from_plane(spheres_m: Array, eye_m: Array) -> Array:
 def place_at(
     name: str, *, tilt_deg: float, azimuth_deg: float, distance_m: float, walk_round: bool, aim_m: Sequence[float]
 ) -> Place:
-    """A place on the hemisphere.
+    """A place on the hemisphere around the scene.
 
     Args:
         tilt_deg: of the line of sight from the vertical.
-        azimuth_deg: 0 is the person's side, positive to its right.
-        distance_m: from the point that is looked at.
-        walk_round: the top of the image points away from the person who walks round the scene; otherwise it stays as
-            it was in the first image.
-        aim_m: (3,) the point that is looked at, level frame.
+        azimuth_deg: 0 is the person's side, positive to the person's right.
+        distance_m: from `aim_m`.
+        walk_round: whether the person walks round the scene and the top of the image points away from the person;
+            otherwise it stays as in the first image.
+        aim_m: (3,) point that the camera looks at, level frame.
     """
     tilt, azimuth = np.deg2rad(tilt_deg), np.deg2rad(azimuth_deg)
     aim, out = np.asarray(aim_m, dtype=np.float64), np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
@@ -94,10 +94,10 @@ def place_at(
 
 
 def words(T_level_here: Transform, T_level_there: Transform) -> str:
-    """`20 cm to the left, 10 cm lower, tilt 15° down`: from one camera pose (4, 4) to another, level frame.
+    """Words such as `20 cm to the left, 10 cm lower, tilt 15° down` from one camera pose (4, 4) to another.
 
-    Left, right, forward and back are the holder's, who looks the way the top of the image points; the camera is moved
-    first and turned then. Empty where there is nothing to change.
+    Both poses are in the level frame. Left, right, forward and back are those of a holder who looks in the direction
+    of the image's top; the camera is first moved, then turned. Empty if there is nothing to change.
     """
     here, there = Attitude.of(T_level_here[:3, :3]), Attitude.of(T_level_there[:3, :3])
     moved = Rotation.from_euler("z", -here.turn_rad).apply(T_level_there[:3, 3] - T_level_here[:3, 3])
@@ -125,7 +125,7 @@ def _angle(radians: float, verb: str, positive: str, negative: str) -> str:
 
 
 def covered(places: Iterable[Place], T_level_cameras: Sequence[Transform], within_deg: float) -> set[str]:
-    """Names of the places from which an image looks: side and axis agree to `within_deg`."""
+    """Names of the places that an image covers: position and axis agree within `within_deg`."""
     limit = np.cos(np.deg2rad(within_deg))
     done: set[str] = set()
     for place in places:
@@ -140,7 +140,7 @@ def covered(places: Iterable[Place], T_level_cameras: Sequence[Transform], withi
 
 
 def nearest(places: Iterable[Place], T_level_here: Transform) -> Place:
-    """The place with the shortest way from here, a radian of turning counted as 40 cm. Needs at least one place."""
+    """The place with the shortest way from here, a radian of rotation counting as 40 cm; `places` must not be empty."""
 
     def way(place: Place) -> float:
         moved = float(np.linalg.norm(place.T_level_camera[:3, 3] - T_level_here[:3, 3]))
@@ -151,6 +151,6 @@ def nearest(places: Iterable[Place], T_level_here: Transform) -> Place:
 
 
 def same_view(T_a: Transform, T_b: Transform, apart_m: float, apart_rad: float) -> bool:
-    """Whether two camera poses in one frame are so near that the second image brings nothing new."""
+    """Whether two camera poses in one frame are so near that the second image adds nothing."""
     T = inverse(T_a) @ T_b
     return bool(np.linalg.norm(T[:3, 3]) < apart_m and Rotation.from_matrix(T[:3, :3]).magnitude() < apart_rad)

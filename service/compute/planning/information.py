@@ -1,10 +1,10 @@
-"""What images tell about the pose of the scan, and the target error that follows: measured views and planned ones.
+"""Information of images about the scan's pose, and the target error that follows, for taken and planned views.
 
-A view is one measurement of the pose of the scan in the base frame: its outlines have an information matrix I (6, 6)
-and the pose of the camera has a covariance P (6, 6), which all spheres of the view share. Both are of a perturbation
-(d, w) of the scan about the scene's centre c: p → c + d + exp(w) (p − c), in base axes, metres and radians. The
-registration weights views by I, so the covariance of its answer is H⁻¹ (Σ I + I P I) H⁻¹ with H = Σ I (the sandwich
-of weighted least squares with errors that a group shares).
+A view is one measurement of the scan's pose in the base frame: its outlines have an information matrix I (6, 6), and
+the camera pose has a covariance P (6, 6), which all spheres of the view share. Both refer to a perturbation (d, w) of
+the scan about the scene's centre c: p → c + d + exp(w) (p − c), in base axes, metres and radians. The registration
+weights views by I, so the covariance of its result is H⁻¹ (Σ I + I P I) H⁻¹ with H = Σ I (the sandwich estimator of
+weighted least squares with errors shared within groups).
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from service.compute.registration.cost import skew
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 
-_PRIOR_VIEWS = 2.0  # as many views' worth of belief in the arm's nominal scatter
-_OUTLIER = 25.0  # squared Mahalanobis distance of an outline from the solution, arm's scatter included
+_PRIOR_VIEWS = 2.0  # weight of the arm's nominal scatter, in views
+_OUTLIER = 25.0  # squared Mahalanobis distance of an outline from the solution, including the arm's scatter
 
 
 @dataclass(frozen=True, slots=True)
 class ViewInformation:
-    """One view: information (6, 6) of its outlines, and where they alone would put the scan (6,), as (d, w)."""
+    """One view: information (6, 6) of its outlines, and the scan's offset (6,), as (d, w), from them alone."""
 
     information: Array = field(repr=False)
     offset: Array
@@ -35,14 +35,14 @@ class ViewInformation:
 
 @dataclass(frozen=True, slots=True)
 class TargetError:
-    """The covariance (6, 6) of the scan's pose about `centre_m`, and the scatter P (6, 6) of the camera poses."""
+    """Covariance (6, 6) of the scan's pose about `centre_m`, and scatter P (6, 6) of the camera poses."""
 
     centre_m: Array  # (3,) base frame
     covariance: Array = field(repr=False)
     pose_covariance: Array = field(repr=False)
 
     def at_m(self, points_m: Array) -> Array:
-        """Standard deviation (N,) in 3D of points (N, 3) of the base frame."""
+        """Standard deviation (N,) in 3D at points (N, 3) of the base frame, metres."""
         return point_sigmas_m(self.covariance, points_m - self.centre_m)
 
 
@@ -56,13 +56,13 @@ def view_information(
     centre_m: Array,
     pose_sigma_m: float,
 ) -> ViewInformation:
-    """What the assigned outlines of one image say about T_base_scan, linearised there.
+    """Information of one image's assigned outlines about T_base_scan, linearised there.
 
     Args:
         markers: outline → sphere.
         spheres_m: (M, 3) in the scan frame.
         centre_m: (3,) base frame.
-        pose_sigma_m: the arm's nominal scatter; an outline that contradicts the solution by much more is left out.
+        pose_sigma_m: the arm's nominal scatter; outlines that contradict the solution by much more are excluded.
     """
     base = apply(T_base_scan, spheres_m)
     normal, b, used = np.zeros((6, 6)), np.zeros(6), 0
@@ -84,7 +84,7 @@ def view_information(
 def predicted_information(
     T_base_camera: Transform, spheres_base_m: Array, radius_m: float, centre_m: Array, cone_covariance: Array
 ) -> Array:
-    """Information (6, 6) that a view of these spheres (K, 3) will have, with outlines of this covariance (3, 3)."""
+    """Information (6, 6) predicted for a view of spheres (K, 3) with outlines of this covariance (3, 3)."""
     normal = np.zeros((6, 6))
     weight = np.linalg.inv(cone_covariance)
     for sphere in spheres_base_m:
@@ -96,9 +96,9 @@ def predicted_information(
 def cone_jacobian(
     T_base_camera: Transform, sphere_base_m: Array, centre_m: Array, radius_m: float, frame: Array | None
 ) -> tuple[Array, Array, float]:
-    """Derivative (3, 6) of a sphere's cone by (d, w), with its axis (3,) and half angle as predicted.
+    """Derivative (3, 6) of a sphere's cone by (d, w), and its predicted axis (3,) and half angle.
 
-    The cone's rows are the axis along the first two columns of `frame` (3, 3) (None: any frame about the axis) and
+    The three rows are the axis along the first two columns of `frame` (3, 3) (None: any frame around the axis) and
     the half angle asin(r / |c|).
     """
     R = T_base_camera[:3, :3].T
@@ -114,11 +114,11 @@ def cone_jacobian(
 
 
 def pose_scatter(views: Sequence[ViewInformation], sigma_m: float, sigma_rad: float) -> Array:
-    """Covariance P (6, 6) of the camera poses of a station: the scatter of the views, on top of the nominal one.
+    """Covariance P (6, 6) of a station's camera poses, from the views' scatter and the nominal scatter.
 
     Args:
-        views: their offsets scatter by the arm's error and by their outlines' noise.
-        sigma_m, sigma_rad: nominal scatter in 3D, which counts as much as two views.
+        views: their offsets scatter by the arm's error and the noise of their outlines.
+        sigma_m, sigma_rad: nominal scatter in 3D, with the weight of two views.
     """
     nominal = np.diag([sigma_m**2 / 3] * 3 + [sigma_rad**2 / 3] * 3)
     offsets = np.array([v.offset for v in views if v.spheres >= 4]).reshape(-1, 6)
@@ -130,7 +130,7 @@ def pose_scatter(views: Sequence[ViewInformation], sigma_m: float, sigma_rad: fl
 
 
 def pose_covariance(informations: Iterable[Array], P: Array) -> Array:
-    """Covariance (6, 6) of the scan's pose from views of these informations (6, 6) and pose errors P each.
+    """Covariance (6, 6) of the scan's pose from views with these informations (6, 6) and pose errors P each.
 
     Raises:
         ComputeError: the views together do not determine the pose.
@@ -151,10 +151,10 @@ def pose_covariance(informations: Iterable[Array], P: Array) -> Array:
 def mounting_covariance(
     views: Iterable[tuple[Array, Transform]], T_flange_camera: Transform, covariance: Array, centre_m: Array
 ) -> Array:
-    """Covariance (6, 6) of the scan's pose from what is not known of the camera's mounting, which all views share.
+    """Covariance (6, 6) of the scan's pose due to the uncertain camera mount, which all views share.
 
     Args:
-        views: information (6, 6) and T_base_camera of each; they must determine the pose.
+        views: information (6, 6) and T_base_camera of each; together they must determine the pose.
         covariance: (6, 6) of T_flange_camera, as (d, w) in flange axes with R → exp(w) R, t → t + d.
         centre_m: (3,) base frame.
     """
@@ -172,7 +172,7 @@ def mounting_covariance(
 def target_error(
     views: Sequence[ViewInformation], centre_m: Array, *, sigma_m: float, sigma_rad: float
 ) -> TargetError:
-    """The error of the registration from these views of one station, their own scatter included.
+    """Error of the registration from these views of one station, including their observed scatter.
 
     Raises:
         ComputeError: the views do not determine the pose.
@@ -182,6 +182,6 @@ def target_error(
 
 
 def point_sigmas_m(covariance: Array, points_m: Array) -> Array:
-    """Standard deviation (N,) in 3D of points (N, 3) relative to the centre, for a covariance (6, 6) of (d, w)."""
+    """Standard deviation (N,) in 3D, metres, at points (N, 3) from the centre, for a covariance (6, 6) of (d, w)."""
     J = np.concatenate([np.broadcast_to(np.eye(3), (len(points_m), 3, 3)), -skew(points_m)], axis=2)
     return np.sqrt(np.einsum("nij,jk,nik->n", J, covariance, J))

@@ -1,4 +1,4 @@
-"""From wished camera poses to a motion: reachable, free of collisions, sharp, and in a short order."""
+"""Turns wanted camera poses into a motion: reachable, free of collisions, in focus and in a short order."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _PATH_STEP_RAD = np.radians(3.0)
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """All that a plan depends on, in the base frame of the station."""
+    """Everything that a plan depends on, in the station's base frame."""
 
     body: ArmBody
     obstacles: Obstacles
     centre_m: Array  # (3,) of the scene
-    margin_m: float  # clearance that must stay
-    start_rad: Array  # (6,) where the arm stands
+    margin_m: float  # required clearance
+    start_rad: Array  # (6,) current joints of the arm
     speed_rad_s: float
     acceleration_rad_s2: float
     sharp: DepthOfField | None = None
@@ -38,43 +38,43 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class PlannedView:
-    """One viewpoint and what became of it."""
+    """One viewpoint of a plan and its outcome."""
 
     name: str
-    T_base_camera: Transform = field(repr=False)  # as it will be taken
+    T_base_camera: Transform = field(repr=False)  # as planned, after nudging
     outcome: Literal["feasible", "nudged", "refused"]
     reason: str = ""  # of a nudge or a refusal
     nudge_deg: float = 0.0  # about the vertical through the scene's centre
     joints_rad: Array = field(default_factory=lambda: np.full(6, np.nan), repr=False)
-    travel_s: float = 0.0  # from the one before
+    travel_s: float = 0.0  # from the previous view
 
 
 @dataclass(frozen=True, slots=True)
 class MotionPlan:
-    """Views in the order in which they will be taken, then the refused ones."""
+    """Views in the planned order, then the refused ones."""
 
     views: tuple[PlannedView, ...]
     order: Order
     total_s: float
-    listed_s: float  # the same views in the order of the list
+    listed_s: float  # time of the same views in the order of the list
 
     @property
     def feasible(self) -> tuple[PlannedView, ...]:
-        """Those that will be taken."""
+        """The views that will be taken."""
         return tuple(view for view in self.views if view.outcome != "refused")
 
     @property
     def refused(self) -> tuple[PlannedView, ...]:
-        """Those that will not."""
+        """The views that will not be taken."""
         return tuple(view for view in self.views if view.outcome == "refused")
 
 
 def plan_motion(views: Sequence[tuple[str, Transform]], situation: Situation, order: Order) -> MotionPlan:
     """Check, nudge and order camera poses (name, T_base_camera).
 
-    A pose out of reach, in collision or with the scene out of focus is turned about the vertical through the scene's
-    centre, by up to 15°, until it is none of that; failing this it is refused with the reason of the original pose.
-    A viewpoint to which the straight way in joint space is blocked is refused where it stands in the order.
+    A pose that is out of reach, in collision or out of focus is turned about the vertical through the scene's centre,
+    by up to 15°, until it is feasible; otherwise it is refused with the reason of the original pose. A viewpoint
+    whose straight path in joint space is blocked is refused at its place in the order.
     """
     placed = [_place(name, T, situation) for name, T in views]
     able = [view for view in placed if view.outcome != "refused"]
@@ -104,7 +104,7 @@ def plan_motion(views: Sequence[tuple[str, Transform]], situation: Situation, or
 
 
 def infeasible_reason(T_base_camera: Transform, joints_rad: Array | None, situation: Situation) -> str:
-    """Why a pose cannot be taken, or an empty text."""
+    """Why a pose cannot be taken; "" if it can."""
     if joints_rad is None:
         return "the arm does not reach it"
     contact = nearest_contacts(situation.body, situation.obstacles, joints_rad[None])[0]
@@ -123,7 +123,7 @@ def _blurred(T_base_camera: Transform, situation: Situation) -> str:
 
 
 def travel_times_s(joints_rad: Array, situation: Situation) -> Array:
-    """(K, K) time between joint positions (K, 6), by the joint that turns furthest: ramp up, constant, ramp down."""
+    """(K, K) time between joint positions (K, 6), by the joint that turns farthest: ramp up, constant, ramp down."""
     distance = np.zeros((len(joints_rad), len(joints_rad)))
     for turns in joints_rad.T:
         np.maximum(distance, np.abs(turns[:, None] - turns[None]), out=distance)
@@ -137,16 +137,16 @@ def _legs_s(joints_rad: Array, situation: Situation) -> Array:
 
 
 def turn_times_s(turns_rad: Array, speed_rad_s: float, acceleration_rad_s2: float) -> Array:
-    """Time for joints to turn by angles of any shape: ramp up, constant speed if it is reached, ramp down."""
+    """Time for joints to turn by angles of any shape: ramp up, constant speed if reached, ramp down."""
     v, a = speed_rad_s, acceleration_rad_s2
     return np.where(turns_rad > v**2 / a, turns_rad / v + v / a, 2 * np.sqrt(turns_rad / a))
 
 
 def shortest_order(times_s: Array) -> list[int]:
-    """A short open path from node 0 through all others of (K + 1, K + 1), as indices 0 … K − 1 of the others.
+    """A short open path from node 0 through all others, for times (K + 1, K + 1); indices 0 … K − 1 of the others.
 
-    The better of the listed order and the nearest neighbour's, improved by 2-opt until no reversal helps: never
-    longer than the listed order, the same at every call.
+    Starts from the better of the listed order and the nearest-neighbour order and improves it by 2-opt until no
+    reversal helps. It is deterministic and never longer than the listed order.
     """
     count = len(times_s) - 1
     paths = [list(range(1, count + 1)), _nearest_neighbours(times_s)]
@@ -201,14 +201,14 @@ def _place(name: str, T_base_camera: Transform, situation: Situation) -> Planned
 
 
 def turned_about_scene(T_base_camera: Transform, centre_m: Array, angle_rad: float) -> Transform:
-    """The camera carried along its arc: about the vertical through the scene's centre."""
+    """The camera pose turned about the vertical through the scene's centre."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return transform(R, centre_m - R @ centre_m) @ T_base_camera
 
 
 def _postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
-    """Joints (6,) that reach a pose, nearest to where the arm stands first."""
+    """Joints (6,) that reach a pose, those nearest to the arm's current ones first."""
     start = situation.start_rad
     found = postures(situation.body.model, T_base_camera @ inverse(situation.body.T_flange_camera))
     found = found + 2 * np.pi * np.round((start - found) / (2 * np.pi))
@@ -217,7 +217,7 @@ def _postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
 
 
 def able_postures(T_base_camera: Transform, situation: Situation) -> list[Array]:
-    """Joints (6,) that reach a pose, clear of everything, the scene sharp; those nearest to the arm's own first."""
+    """Joints (6,) that reach a pose free of collisions and in focus, nearest to the arm's current ones first."""
     found = _postures(T_base_camera, situation)
     if not found or _blurred(T_base_camera, situation):
         return []
@@ -226,7 +226,7 @@ def able_postures(T_base_camera: Transform, situation: Situation) -> list[Array]
 
 
 def _blocked(here: Array, there: Array, situation: Situation) -> str:
-    # Both ends are known to be free, or are where the arm stands already.
+    # Both ends are free, or the arm is there already.
     way = straight_path(here, there, float(_PATH_STEP_RAD))[1:-1]
     if not len(way):
         return ""

@@ -1,4 +1,4 @@
-"""Which viewpoints bring the predicted target error under its limit soonest: greedy on the views' information."""
+"""Suggests the viewpoints that bring the predicted target error below its limit soonest; greedy, by information."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from service.compute.planning.information import point_sigmas_m, pose_covariance
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 
-_AS_GOOD = 1.01  # errors within a hundredth count as equal; coverage and travel decide between them
+_AS_GOOD = 1.01  # errors within 1 % count as equal; coverage and travel then decide
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A viewpoint that could be taken, and what it would bring."""
+    """A possible viewpoint and its predicted gain."""
 
     name: str
     information: Array = field(repr=False)  # (6, 6), see planning.information
-    seen: NDArray[np.bool_] = field(repr=False)  # (N,) points of the coverage surface
+    seen: NDArray[np.bool_] = field(repr=False)  # (N,) points of the coverage surface that it sees
     travel_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class CurrentInformation:
-    """What the station's images have brought so far."""
+    """The information from the station's images so far."""
 
     informations: tuple[Array, ...] = field(repr=False)
     pose_covariance: Array = field(repr=False)  # P (6, 6), the arm's scatter
-    targets_m: Array = field(repr=False)  # (T, 3) points that matter, relative to the scene's centre, base axes
-    seen_count: NDArray[np.int64] = field(repr=False)  # (N,) views of each surface point, of all stations
+    targets_m: Array = field(repr=False)  # (T, 3) target points relative to the scene's centre, base axes
+    seen_count: NDArray[np.int64] = field(repr=False)  # (N,) views of each surface point from all stations
     min_views: int = 2
-    shared: Array | None = field(default=None, repr=False)  # (6, 6) of what no further view makes better
+    shared: Array | None = field(default=None, repr=False)  # (6, 6) covariance that further views do not reduce
 
     def error_m(self, *more: Array) -> float:
-        """Predicted error of the worst target with these further informations; infinite if undetermined."""
+        """Predicted error of the worst target, m, with this further information added; infinite if undetermined."""
         try:
             covariance = pose_covariance([*self.informations, *more], self.pose_covariance)
         except ComputeError:
@@ -49,7 +49,7 @@ class CurrentInformation:
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """A viewpoint to take next, with what holds once it and those before it are taken."""
+    """A suggested viewpoint, and the predicted results once it and those before it are taken."""
 
     name: str
     predicted_error_m: float
@@ -64,10 +64,10 @@ def next_best_views(
     min_coverage: float,
     at_most: int = 6,
 ) -> tuple[Suggestion, ...]:
-    """The shortest greedy list of viewpoints after which error and coverage keep their limits, or `at_most` of them.
+    """The shortest greedy list of viewpoints that brings error and coverage within limits, or `at_most` of them.
 
-    While the error is above its limit, each choice is the candidate after which it is least, among equals the one
-    that covers most, then the nearest; after that, the one that covers most.
+    While the error exceeds its limit, each choice minimises it; among equals, the one with the largest coverage, then
+    the nearest wins. After that, each choice maximises coverage.
     """
     chosen: list[Suggestion] = []
     informations: list[Array] = []
@@ -98,7 +98,7 @@ def _covered(count: NDArray[np.int64], min_views: int) -> float:
 
 
 def _gain(count: NDArray[np.int64], seen: NDArray[np.bool_], min_views: int) -> float:
-    """Progress towards `min_views` of every point, so that a first look counts too."""
+    """Progress of all points towards `min_views`, so that a first view of a point counts too."""
     if not len(count):
         return 0.0
     return float(np.mean(np.minimum(count + seen, min_views) - np.minimum(count, min_views))) / min_views

@@ -1,4 +1,4 @@
-"""Depth of field: which distances a lens renders sharp."""
+"""Depth of field: the range of distances that a lens renders sharp."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from service.core.geometry import Array, Transform, apply, inverse
 
 @dataclass(frozen=True, slots=True)
 class DepthOfField:
-    """Distances along the optical axis within which a point is drawn no wider than the circle of confusion."""
+    """Distances along the optical axis within which a point is blurred no wider than the circle of confusion."""
 
     near_m: float
-    far_m: float  # infinite beyond the hyperfocal distance
+    far_m: float  # infinite if focused at the hyperfocal distance or beyond
 
 
 def depth_of_field(
@@ -32,6 +32,6 @@ def depth_of_field(
 
 
 def depths_m(T_base_camera: Transform, points_base_m: Array) -> tuple[float, float]:
-    """Least and greatest distance along the optical axis of points (N, 3)."""
+    """Least and greatest depth along the optical axis of points (N, 3) in base coordinates, metres."""
     depth = apply(inverse(T_base_camera), points_base_m)[:, 2]
     return float(np.min(depth)), float(np.max(depth))

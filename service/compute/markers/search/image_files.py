@@ -297,7 +297,7 @@ def _provisional(
     for per_station in _ANCHORS if metric else _ANCHORS_WITHOUT_SCALE:
         chosen = [i for mine in sets for i in spread_views(poses, mine, per_station)]
         if len(chosen) > 0.5 * len(poses):
-            return None  # the anchors would be all images
+            return None  # a search of whole images costs little more
         new = [i for i in chosen if i not in seen]
         seen |= dict(zip(new, mapped(look, [image_paths[i] for i in new]), strict=True))
         outlines = [seen.get(i, nothing) for i in range(len(poses))]
