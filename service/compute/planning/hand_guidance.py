@@ -140,7 +140,7 @@ def covered(places: Iterable[Place], T_level_cameras: Sequence[Transform], withi
 
 
 def nearest(places: Iterable[Place], T_level_here: Transform) -> Place:
-    """The place with the shortest way from here, a radian of rotation counting as 40 cm; `places` must not be empty."""
+    """The place with the shortest way from here, a radian of rotation counting as 40 cm. `places` is not empty."""
 
     def way(place: Place) -> float:
         moved = float(np.linalg.norm(place.T_level_camera[:3, 3] - T_level_here[:3, 3]))
