@@ -62,5 +62,5 @@ class Line:
                     try:
                         if selector.select(0.0):  # otherwise the child does not read, and the beat would arrive late
                             self._connection.send((0, BEAT, (time.monotonic(),), {}))
-                    except OSError:  # the child is gone: the next call or ping reports it
+                    except OSError:  # the child is gone: the next call reports it
                         return

@@ -164,13 +164,6 @@ class HostedDevice:
         with self._lock:
             return self._exchange(method, args, kwargs, self._call_timeout_s)
 
-    def ping(self) -> float:
-        """Check that the child answers. Returns the round-trip time in seconds; raises as `call` does."""
-        start = time.monotonic()
-        with self._lock:
-            self._exchange("", (), {}, PING_TIMEOUT_S)
-        return time.monotonic() - start
-
     # --- conversation --------------------------------------------------------------------------------
 
     def _exchange(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], timeout_s: float) -> Any:

@@ -194,10 +194,6 @@ class RobotArm(Device, Protocol):
         """
         ...
 
-    def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Start a linear motion of the flange and return at once."""
-        ...
-
     def stop(self) -> None:
         """Decelerate to a standstill. This is a software stop, not an emergency stop."""
         ...
@@ -340,10 +336,6 @@ class Scanner(Device, Protocol):
 
     def exports(self) -> tuple[ScanExport, ...]:
         """Return the complete, stable exports, oldest first, without those that are still being written."""
-        ...
-
-    def pending(self) -> tuple[str, ...]:
-        """Return one sentence for each incomplete export in the folder, with the reason."""
         ...
 
     def read(self, export: ScanExport) -> ScannedMesh:

@@ -62,11 +62,6 @@ class ScanFolder:
         require_folder(self._config.folder)
         return tuple(one for one in self._watch.poll()[0] if self._config.only in ("", one.name))
 
-    def pending(self) -> tuple[str, ...]:
-        """Return one sentence for each export that cannot be used yet, with the reason."""
-        require_folder(self._config.folder)
-        return self._watch.poll()[1]
-
     def read(self, export: ScanExport) -> ScannedMesh:
         """Read one export, in metres.
 

@@ -94,7 +94,6 @@ def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
 def test_heartbeat_finds_a_child_that_died_between_calls(caplog: pytest.LogCaptureFixture) -> None:
     device = HostedDevice(SPEC, FakeConfig(), call_timeout_s=5, name="mortal", heartbeat_s=0.1)
     device.open()
-    assert device.ping() < 5
     device.call("crash_later", 0.1)
     until(lambda: device.pid is None, "the death is noticed", 10)
     until(

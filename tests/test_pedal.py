@@ -13,7 +13,7 @@ from service.runner.pedal import Pedal
 
 QUESTION = AskOperator("fixation", "confirm", "Go on?", (), ("confirm", "skip"))
 OTHER = AskOperator("capture", "confirm", "Move?", (), ("confirm",))
-NO_CONFIRM = AskOperator("capture", "recovery", "What now?", (), ("retry", "abort"))
+NO_CONFIRM = AskOperator("capture", "recovery", "What now?", (), ("redo", "abort"))
 
 
 @dataclass

@@ -141,7 +141,7 @@ def test_a_scan_appears_gradually_and_is_not_taken_before_it_is_whole(tmp_path: 
 
     def watch() -> None:
         while not done.is_set():
-            seen.extend(scanner.pending())
+            seen.extend(scanner.report().problems)
             for export in scanner.exports():
                 scanner.read(export)
                 done.set()

@@ -175,10 +175,10 @@ def test_companions_are_found_whatever_their_case(tmp_path: Path) -> None:
     obj = tmp_path / "scan.obj"
     obj.write_text("mtllib Scan.mtl\nv 0 0 0\nv 100 0 0\nv 0 100 0\nf 1 2 3\n")
     scanner = ScanFolder(ScanFolderConfig(folder=tmp_path, stable_s=0.0))
-    assert "Scan.mtl' is missing" in scanner.pending()[0]
+    assert "Scan.mtl' is missing" in scanner.report().problems[0]
     assert scanner.exports() == ()
     (tmp_path / "SCAN.MTL").write_text("newmtl a\nmap_Kd -s 1 1 1 textures\\Skin 0.PNG\n")
-    assert "Skin 0.PNG' is missing" in scanner.pending()[0]
+    assert "Skin 0.PNG' is missing" in scanner.report().problems[0]
     (tmp_path / "Textures").mkdir()
     (tmp_path / "Textures" / "skin 0.png").write_bytes(b"image")
     (export,) = scanner.exports()
@@ -213,10 +213,10 @@ def test_an_export_counts_when_it_has_stopped_changing(tmp_path: Path) -> None:
     (tmp_path / "template.ply").unlink()
     path = tmp_path / "scan.ply"
     path.write_bytes(data[: len(data) // 2])
-    assert "cut short" in scanner.pending()[0]
+    assert "cut short" in scanner.report().problems[0]
     path.write_bytes(data)
     assert scanner.exports() == ()
-    assert "waiting" in scanner.pending()[0]
+    assert "waiting" in scanner.report().problems[0]
     time.sleep(0.1)
     path.write_bytes(data)  # written again: the waiting time restarts
     scanner.exports()
@@ -224,7 +224,7 @@ def test_an_export_counts_when_it_has_stopped_changing(tmp_path: Path) -> None:
     assert scanner.exports() == ()
     time.sleep(0.1)
     (export,) = scanner.exports()
-    assert scanner.pending() == ()
+    assert scanner.report().problems == ()
     assert scanner.read(export).source == export
     path.unlink()
     with pytest.raises(IncompleteExportError, match="gone"):
@@ -239,7 +239,7 @@ def test_an_obj_without_a_newline_at_its_end_counts_once_it_is_stable(tmp_path: 
     path = tmp_path / "scan.obj"
     path.write_bytes(whole)
     assert scanner.exports() == ()
-    assert "waiting" in scanner.pending()[0]
+    assert "waiting" in scanner.report().problems[0]
     time.sleep(0.2)
     (export,) = scanner.exports()
     assert scanner.read(export).findings["faces"] == len(SPHERE.faces)

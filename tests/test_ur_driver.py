@@ -144,20 +144,6 @@ def test_move_to_a_pose_settle_and_read_the_exposure(robot: RobotArm) -> None:
     assert {s.safety for s in samples} == {SafetyState.NORMAL}
 
 
-def test_linear_motion_runs_straight(robot: RobotArm) -> None:
-    start = robot.state().sample.T_base_flange
-    goal = start.copy()
-    goal[:3, 3] += [0.0, 0.06, 0.03]
-    begin = time.monotonic()
-    robot.move_linear(goal, speed_m_s=0.1, acceleration_m_s2=0.5)
-    wait_for(lambda: not robot.is_moving())
-    wait_for(lambda: robot.settle(SettleCriteria()).settled)  # the last tenth of a millimetre is slow
-    path = np.array([s.T_base_flange[:3, 3] for s in robot.samples(begin, time.monotonic())]) - start[:3, 3]
-    direction = np.array([0.0, 2.0, 1.0]) / np.sqrt(5)
-    assert np.max(np.linalg.norm(path - np.outer(path @ direction, direction), axis=1)) < 2e-4
-    np.testing.assert_allclose(path[-1], [0.0, 0.06, 0.03], atol=1e-4)
-
-
 def test_stop_in_mid_motion(robot: RobotArm) -> None:
     start = robot.state().sample.joints_rad[0]
     move(robot, turned(robot, 1.5))

@@ -298,18 +298,6 @@ class UrRobot:
         target = _joints(target_rad, self._where)
         self._begin("joint motion", lambda control: control.moveJ(target, speed_rad_s, acceleration_rad_s2, True))
 
-    def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
-        """Start a linear motion of the flange to `T_base_flange` (4, 4, metres) and return at once.
-
-        Raises SafetyStopError, LeaveNeededError, or DeviceRefusedError if the controller does not start it.
-        """
-
-        def start(control: library.Control) -> bool:
-            pose = to_rotation_vector(T_base_flange @ self._T_flange_tcp).tolist()
-            return control.moveL(pose, speed_m_s, acceleration_m_s2, True)
-
-        self._begin("linear motion", start)
-
     def stop(self) -> None:
         """Decelerate and return when the arm stands still; without a running script, stop the program by dashboard.
 

@@ -65,7 +65,6 @@ class Control(Connection, Protocol):
     def getTCPOffset(self) -> list[float]: ...  # noqa: D102
     def setPayload(self, mass_kg: float, cog_m: list[float]) -> bool: ...  # noqa: D102
     def moveJ(self, q: list[float], speed: float, acceleration: float, asynchronous: bool) -> bool: ...  # noqa: D102
-    def moveL(self, pose: list[float], speed: float, acceleration: float, asynchronous: bool) -> bool: ...  # noqa: D102
     def stopJ(self, deceleration: float, asynchronous: bool) -> None: ...  # noqa: D102
     def setWatchdog(self, min_frequency_hz: float) -> bool: ...  # noqa: D102
     def kickWatchdog(self) -> bool: ...  # noqa: D102

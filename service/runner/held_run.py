@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -40,7 +40,7 @@ class HeldRun:
 
 
 @contextmanager
-def held_run(store: Store, run_id: str, protocol: Protocol) -> Iterator[HeldRun]:
+def held_run(store: Store, run_id: str, protocol: Protocol) -> Generator[HeldRun]:
     """Hold the lease of a run, renewed all the time, and release it at the end.
 
     Raises LeaseHeldError where another process that may still live holds it.

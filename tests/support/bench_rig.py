@@ -114,9 +114,6 @@ class BenchArm:
         self.moves += 1
         self.on_move(self.moves)
 
-    def move_linear(self, T_base_flange: Transform, *, speed_m_s: float, acceleration_m_s2: float) -> None:
-        self.move_joints(to_rotation_vector(T_base_flange), speed_rad_s=1.0, acceleration_rad_s2=1.0)
-
     def dawdle(self) -> None:
         """Make the current motion take ten seconds, so that a test has time to stop it on any machine."""
         start_s, start, _, target = self._legs[-1]

@@ -72,7 +72,7 @@ def scene_tables(log: RunRecord, data: Path) -> SceneTables:
     rows: list[CameraRow] = []
     for poses, planned in ((now.scene.cameras, False), (now.scene.planned, True)):
         for name, T in poses.items():
-            tilt = deg(np.arccos(np.clip(T[:3, 2] @ down, -1, 1)))
+            tilt = deg(float(np.arccos(np.clip(T[:3, 2] @ down, -1, 1))))
             away = mm(float(np.linalg.norm(T[:3, 3] - centre)))
             rows.append(CameraRow(name, now.scene.stations.get(name, ""), _mm(T[:3, 3]), tilt, away, planned))
     stations = [
