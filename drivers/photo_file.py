@@ -11,12 +11,12 @@ from typing import Any
 
 from drivers.errors import UnreadableFileError
 from drivers.interfaces import CameraSettings
+from service.core.errors import DataError
+from service.core.picture_files import TruncatedPictureError, check_jpeg
 
 # The library has no types; see docs/decisions/0002-strict-typing.md.
 exiv2: Any = importlib.import_module("exiv2")
-_SOI, _EOI, _SOS = 0xD8, 0xD9, 0xDA
 _LONGEST_TEXT = 500  # limit for a name or a time; cameras write less than a tenth of it
-_STANDALONE = {0x01, *range(0xD0, 0xD8)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,28 +172,15 @@ def taken_utc_s(taken: str) -> float | None:
 def check_jpeg_complete(path: Path) -> None:
     """Raise UnreadableFileError unless the file is a JPEG whose image has its end marker.
 
-    Data after the first image (the previews that Sony appends) is allowed. Within compressed data FF D9 can only be
-    the end marker (ITU T.81, B.1.1.2), so it is enough to find it after the first scan header.
+    Data after the first image (the previews that Sony appends) is allowed.
     """
     data = path.read_bytes()
-    if data[:2] != bytes((0xFF, _SOI)):
-        raise _incomplete(path, "does not begin as a JPEG", len(data))
-    position = 2
-    while position + 4 <= len(data):
-        if data[position] != 0xFF:
-            break
-        marker = data[position + 1]
-        if marker == 0xFF:
-            position += 1
-        elif marker in _STANDALONE:
-            position += 2
-        elif marker == _SOS:
-            if data.find(bytes((0xFF, _EOI)), position) < 0:
-                break
-            return
-        else:
-            position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-    raise _incomplete(path, "is cut off: its end marker is missing", len(data))
+    try:
+        check_jpeg(data, str(path))
+    except TruncatedPictureError as error:
+        raise _incomplete(path, "is cut off: its end marker is missing", len(data)) from error
+    except DataError as error:
+        raise _incomplete(path, f"cannot be used: {error.what}", len(data)) from error
 
 
 def _incomplete(path: Path, what: str, size_bytes: int) -> UnreadableFileError:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.core.errors import DataError, IllegalTransitionError
+from service.core.picture_files import JPEG_BEGINS, PNG_BEGINS, check_jpeg, check_png, picture_size
 from service.core.records.entered import NoteTaken, paragraphs
 from service.core.records.events import Event
 from service.run_record import RunRecord
@@ -14,7 +15,6 @@ from service.store.records import NewArtefact
 PHOTOGRAPH_BYTES = 16_000_000
 NOTE_PHOTOGRAPH = "note_photograph"  # kind of the artefact
 _PIXELS = 120_000_000
-_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _REMEDY = "Take the photograph again, as JPEG or PNG"
 
 
@@ -91,16 +91,14 @@ def _checked(photograph: Photograph) -> tuple[str, str]:
     import cv2  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
 
-    from service.compute.images.files import check_jpeg, check_png  # noqa: PLC0415
-
     content, name = photograph.content, _plain(photograph.name)
     require_size(len(content), name)
-    if content.startswith(_JPEG):
+    if content.startswith(JPEG_BEGINS):
         check_jpeg(content, name)
         kind = "image/jpeg", ".jpg"
-    elif content.startswith(_PNG):
+    elif content.startswith(PNG_BEGINS):
         kind = "image/png", ".png"
-        width, height = (int.from_bytes(content[at : at + 4], "big") for at in (16, 20))
+        width, height = picture_size(content, name)
         if width * height > _PIXELS:
             raise DataError(f"the picture claims {width} × {height} pixels", where=name, remedy=_REMEDY)
         check_png(content, name)

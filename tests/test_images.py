@@ -8,8 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from service.compute.images.files import read_grey
+from drivers.errors import UnreadableFileError
+from drivers.photo_file import check_jpeg_complete
+from service.compute.images.files import image_size, read_grey
 from service.core.errors import DataError
+from service.core.picture_files import picture_size
 from service.web.record.pictures import reduced_jpeg
 
 PICTURE = np.random.default_rng(3).integers(0, 255, (32, 48), dtype=np.uint8)
@@ -50,3 +53,26 @@ def test_a_png_that_claims_gigabytes_is_refused_at_once(tmp_path: Path, png: byt
         read_grey(tmp_path / "a.png")
     with pytest.raises(DataError, match="the PNG ends before its picture is complete"):
         reduced_jpeg(tmp_path / "a.png", 40)
+
+
+def jpeg(*, progressive: bool) -> bytes:
+    how = [cv2.IMWRITE_JPEG_PROGRESSIVE, int(progressive), cv2.IMWRITE_JPEG_RST_INTERVAL, 4]
+    whole, data = cv2.imencode(".jpg", PICTURE, how)
+    assert whole
+    return data.tobytes()
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_every_reader_of_a_jpeg_judges_it_alike(tmp_path: Path, progressive: bool) -> None:
+    """The driver that fetches it and what computes with it or shows it: cut anywhere, or damaged, none takes it."""
+    whole, path = jpeg(progressive=progressive), tmp_path / "a.jpg"
+    path.write_bytes(whole + whole)  # a preview behind the picture is no damage
+    check_jpeg_complete(path)
+    assert image_size(path) == picture_size(whole) == (48, 32)
+    assert read_grey(path).shape == (32, 48)
+    damaged = whole.replace(b"\xff\xc4", b"\x00\xc4", 1)
+    for content in (*(whole[:kept] for kept in range(len(whole) - 1)), damaged):
+        path.write_bytes(content)
+        for read, refusal in ((check_jpeg_complete, UnreadableFileError), (image_size, DataError)):
+            with pytest.raises(refusal):
+                read(path)

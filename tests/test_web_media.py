@@ -14,18 +14,11 @@ import numpy as np
 import pytest
 
 from service.core.errors import DataError
+from service.core.picture_files import picture_size
 from service.core.records.events import FilesKept
 from service.monitor.snapshot import frame_path, frames_wanted, write_frame
 from service.store.records import NewArtefact
-from service.web.record.pictures import (
-    DrawnOutline,
-    cached,
-    draw_marks,
-    nearest_width,
-    picture_size,
-    reduced_jpeg,
-    safe_name,
-)
+from service.web.record.pictures import DrawnOutline, cached, draw_marks, nearest_width, reduced_jpeg, safe_name
 from tests.support.calibrated_run import begin_calibrated_run, capture
 from tests.support.core import EYE
 from tests.support.web import Browser, WebSite, web_site

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from service.core.errors import DataError
+from service.core.picture_files import check_picture, picture_size
 
 if TYPE_CHECKING:
     import numpy as np
@@ -91,17 +92,16 @@ def reduced_jpeg(path: Path, width: int, marks: Sequence[DrawnOutline] = (), *, 
     import cv2  # noqa: PLC0415 - a web process starts without it
     import numpy as np  # noqa: PLC0415
 
-    from service.compute.images.files import check_image  # noqa: PLC0415
-
     data = np.fromfile(path, np.uint8)
-    full = picture_size(data.tobytes())
+    content = data.tobytes()
+    full = picture_size(content)
     if full[0] * full[1] > _MOST_PIXELS:
         raise DataError(
             f"the picture has {full[0]} × {full[1]} pixels, which is too many to show",
             where=path.name,
             remedy=_REMEDY,
         )
-    check_image(data.tobytes(), path.name, partly=True)
+    check_picture(content, path.name, partly=True)
     how = cv2.IMREAD_COLOR
     for flag, k in (
         (cv2.IMREAD_REDUCED_COLOR_8, 8),
@@ -157,27 +157,6 @@ def _segments(curve: NDArray[np.int32], dash: tuple[int, int] | None) -> list[ND
         return [curve]
     on, off = dash
     return [curve[k : k + on + 1] for k in range(0, len(curve), on + off)]
-
-
-def picture_size(data: bytes) -> tuple[int, int]:
-    """Width and height of a JPEG or PNG, from its header.
-
-    Raises:
-        DataError: it is neither, or its header is damaged.
-    """
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
-        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    at = 2
-    if data[:2] == b"\xff\xd8":
-        while at + 9 <= len(data) and data[at] == 0xFF:
-            marker = data[at + 1]
-            if marker == 0xFF:  # fill byte
-                at += 1
-                continue
-            if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # start of frame
-                return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    raise DataError("the file is not a picture", where="its first bytes", remedy="Only JPEG and PNG are shown")
 
 
 def safe_name(name: str, sha256: str) -> str:

@@ -1,0 +1,138 @@
+"""JPEG and PNG files as bytes: whether they are whole, and their size, before anything is decoded."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Iterator
+
+from service.core.errors import DataError
+
+JPEG_BEGINS = b"\xff\xd8"
+PNG_BEGINS = b"\x89PNG\r\n\x1a\n"
+MOST_PIXELS = 400_000_000  # three times the largest cameras; a damaged header may claim up to four gigabytes
+
+# In entropy-coded data 0xFF is followed by 0x00 (stuffing) or a restart marker; anything else ends the scan
+# (ITU-T T.81, B.1.1.5).
+_END_OF_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+_FILL, _START_OF_SCAN, _END_OF_IMAGE = 0xFF, 0xDA, 0xD9
+_STANDALONE = {0x01, *range(0xD0, 0xD8)}  # markers without a length
+_FRAMES = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}  # headers with the size
+
+
+class TruncatedPictureError(DataError):
+    """A file ends before its picture does."""
+
+
+def check_jpeg(data: bytes, where: str) -> None:
+    """Check that a JPEG is complete, by walking its segments up to the end-of-image marker.
+
+    Data after that marker (previews that cameras append) is allowed.
+
+    Raises:
+        TruncatedPictureError: the file ends before its picture does.
+        DataError: the file is not a JPEG, is damaged, or claims more pixels than any camera has.
+    """
+    if not data.startswith(JPEG_BEGINS):
+        raise DataError("this is not a JPEG file", where=where, remedy="Use JPEG or PNG images")
+    for marker, at in _segments(data, where):
+        if marker == _END_OF_IMAGE:
+            return
+        if marker in _FRAMES:
+            _check_size(*_frame_size(data, at), where)
+    raise TruncatedPictureError(
+        "the JPEG ends before its picture is complete",
+        where=where,
+        remedy="Copy the file from the camera again; a half-written image is not used",
+    )
+
+
+def check_png(data: bytes, where: str) -> None:
+    """Check that a PNG is complete, by walking its chunks and their checksums to the end.
+
+    Raises:
+        TruncatedPictureError: the file ends before its picture does.
+        DataError: the file is damaged, or claims more pixels than any camera has.
+    """
+    _check_size(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"), where)
+    at, kind = len(PNG_BEGINS), b""
+    while kind != b"IEND":
+        length, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
+        end = at + 8 + length
+        if end + 4 > len(data):  # a decoder would allocate the claimed length, up to four gigabytes
+            raise TruncatedPictureError(
+                "the PNG ends before its picture is complete",
+                where=where,
+                remedy="Copy the file again; a half-written image is not used",
+            )
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise DataError("the PNG is damaged", where=where, remedy="Copy the file again")
+        at = end + 4
+
+
+def check_picture(data: bytes, where: str, *, partly: bool = False) -> None:
+    """Check a JPEG or PNG without decoding it; other formats are not checked. `partly` accepts a truncated JPEG.
+
+    Raises:
+        DataError: as `check_jpeg` and `check_png`.
+    """
+    if data.startswith(PNG_BEGINS):
+        check_png(data, where)
+    elif data.startswith(JPEG_BEGINS) and not partly:
+        check_jpeg(data, where)
+
+
+def picture_size(data: bytes, where: str = "its first bytes") -> tuple[int, int]:
+    """Width and height of a JPEG or PNG in pixels as stored, from its header; the rest may be missing.
+
+    Raises:
+        DataError: it is neither, or its header is damaged or missing.
+    """
+    if data.startswith(PNG_BEGINS) and len(data) >= 24:
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    if data.startswith(JPEG_BEGINS):
+        for marker, at in _segments(data, where):
+            if marker in _FRAMES and at + 9 <= len(data):
+                return _frame_size(data, at)
+    raise DataError("the file is not a picture", where=where, remedy="Only JPEG and PNG are shown")
+
+
+def _segments(data: bytes, where: str) -> Iterator[tuple[int, int]]:
+    """Marker and position of each segment up to the end of image, or to where the data end. Raises DataError."""
+    at = len(JPEG_BEGINS)
+    while at + 2 <= len(data):
+        if data[at] != 0xFF:
+            raise DataError("the JPEG's structure is damaged", where=where, remedy="Copy the file again")
+        marker = data[at + 1]
+        if marker == _FILL:
+            at += 1
+            continue
+        if marker in _STANDALONE:
+            at += 2
+            continue
+        if marker == _END_OF_IMAGE:
+            yield marker, at
+            return
+        if at + 4 > len(data):
+            return
+        yield marker, at
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if marker == _START_OF_SCAN:
+            end = _END_OF_SCAN.search(data, at)
+            if end is None:
+                return
+            at = end.start()
+
+
+def _frame_size(data: bytes, at: int) -> tuple[int, int]:
+    """Width and height of a frame header that begins at `at`."""
+    return int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big")
+
+
+def _check_size(width: int, height: int, where: str) -> None:
+    if width * height > MOST_PIXELS:
+        raise DataError(
+            f"the image claims to have {width} × {height} pixels",
+            where=where,
+            remedy="Copy the file from the camera again; no camera takes such images",
+        )
