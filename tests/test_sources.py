@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,11 +13,13 @@ from service.cli.run.commands import status_record
 from service.core.geometry import look_at
 from service.core.jobs.priorities import LATER, REDUCED, WAITED
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
-from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished
+from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished, RunStarted
 from service.core.results.arrival import late_s, late_words
 from service.core.results.registrations import better_later, evaluated, own_registration, registrations
 from service.core.run.fold import fold, initial_state
 from service.core.run.state import JobState, Note, RunState
+from service.dataset.summary import RunSummary
+from service.run_record import RunRecord
 from service.run_start import recorded_run
 from service.steps import params_models
 from service.steps.sources import PLANNED, decisive, due, registration_ways
@@ -25,6 +27,7 @@ from service.steps.time_left import missing_results
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
+from service.web.record.known_spheres import best_registration as shown_registration
 from service.worker.loop import work
 from tests.support.recorded_run import record_run
 
@@ -228,6 +231,38 @@ def test_a_later_and_better_registration_is_reported_and_takes_nobodys_place() -
     better = better_later(run.protocol, state)
     assert better is not None
     assert better["poses"] == "colmap"
+
+
+def test_page_report_and_export_show_the_same_registration(tmp_path: Path) -> None:
+    """Before the evaluation the most certain of full resolution, then what was signed, whatever its resolution."""
+
+    def registered(poses: str, variance: float, full: dict[str, Any] | None = None) -> dict[str, Any]:
+        return {
+            "poses": poses, "camera": {"width": 640, "height": 360}, "full_camera": full,
+            "covariance": (variance * np.eye(6)).tolist(),
+        }  # fmt: skip
+
+    run = _Run(protocol())
+    steps = dict(run.state.steps)
+    records = {
+        "robot": registered("robot", 4e-10),
+        "colmap": registered("colmap", 1e-10),
+        "colmap_640x360": registered("colmap", 0.5e-10, {"width": 1280, "height": 720}),
+    }
+    steps["registration"] = replace(steps["registration"], result={"registrations": records})
+    begun = replace(run.state, steps=dict(steps))
+    rows = [
+        {"poses": "robot", "mean_radial_error_mm": 0.02},
+        {"poses": "colmap_640x360", "mean_radial_error_mm": 0.01},
+    ]
+    steps["evaluation"] = replace(steps["evaluation"], result={"table": rows, "budgets": {}})
+    judged = replace(run.state, steps=steps)
+    with Store.open(tmp_path) as store:
+        shown = [shown_registration(RunRecord(store, "a", run.protocol, (), state)) for state in (begun, judged)]
+        root = cast(RunStarted, None)
+        reported = [RunSummary("a", run.protocol, root, state, (), store).best() for state in (begun, judged)]
+    assert [None if one is None else one.name for one in shown] == ["colmap", "colmap_640x360"]
+    assert reported == [None, "colmap_640x360"], "nothing is reported or exported that was not evaluated"
 
 
 def test_lateness_counts_from_the_release_of_the_specimen() -> None:

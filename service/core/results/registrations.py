@@ -2,12 +2,13 @@
 
 The run's own registration is the one with the smallest error on the control spheres among those that the
 evaluation step judged: that is what was signed, and by what the specimen was released. One that arrives later may be
-better; it is reported beside it and does not take its place.
+better; it is reported beside it and does not take its place. Pages, report, exports and audit all go by this rule.
+Before the evaluation, what is shown goes by each registration's own prediction (`best_registration`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from service.core.jobs.priorities import lane_of
@@ -104,14 +105,31 @@ def budgets(protocol: Protocol, state: RunState) -> dict[str, Mapping[str, Any]]
 def own_registration(protocol: Protocol, state: RunState) -> str | None:
     """The name of the run's own registration (see above); None before the evaluation."""
     rows = signed_rows(protocol, state)
-    return str(min(rows, key=_error_mm)["poses"]) if rows else None
+    return str(best_row(rows)["poses"]) if rows else None
+
+
+def best_registration(protocol: Protocol, state: RunState) -> str | None:
+    """The name of the registration to show: the run's own; before the evaluation, the most certain one.
+
+    Reduced resolutions are for comparison; before the evaluation they are not shown. None where there is none.
+    """
+    own, found = own_registration(protocol, state), registrations(protocol, state)
+    if own in found:
+        return own
+    full = [name for name, record in found.items() if record.get("full_camera") is None]
+    return min(full, key=lambda name: _predicted_m2(found[name]), default=None)
+
+
+def best_row(rows: Sequence[Row]) -> Row:
+    """The row of an evaluation's table with the smallest error on the control spheres; of equal ones the first."""
+    return min(rows, key=_error_mm)
 
 
 def better_later(protocol: Protocol, state: RunState) -> Row | None:
     """The best of those that came after the evaluation, where it is better than the run's own."""
     own = own_registration(protocol, state)
     rows = evaluated(protocol, state)
-    best = min(rows, key=_error_mm, default=None)
+    best = best_row(rows) if rows else None
     signed = {row["poses"] for row in signed_rows(protocol, state)}
     return best if own is not None and best is not None and best["poses"] not in signed else None
 
@@ -123,6 +141,12 @@ def signed_rows(protocol: Protocol, state: RunState) -> list[Row]:
 
 def _error_mm(row: Row) -> float:
     return float(row["mean_radial_error_mm"])
+
+
+def _predicted_m2(record: Mapping[str, Any]) -> float:
+    """Variance of the position that a registration states of itself, over all three axes."""
+    covariance = record["covariance"]
+    return float(sum(covariance[axis][axis] for axis in range(3)))
 
 
 def later_evaluations(protocol: Protocol, state: RunState) -> list[tuple[str, JobState]]:

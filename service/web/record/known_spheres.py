@@ -12,7 +12,8 @@ import numpy as np
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply
-from service.core.results.registrations import own_registration, registrations
+from service.core.results.registrations import best_registration as best_registration_name
+from service.core.results.registrations import registrations
 from service.run_record import RunRecord
 
 SphereKind = Literal["registration", "control", "sphere"]
@@ -31,7 +32,7 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True)
 class ShownRegistration:
-    """The registration that pages show: the run's own, or before that the best one by its own prediction."""
+    """The registration that pages show: see service.core.results.registrations.best_registration."""
 
     name: str
     record: Mapping[str, Any]
@@ -50,19 +51,13 @@ def result_of_kind(log: RunRecord, kind: str) -> tuple[str, Mapping[str, Any]]:
 def best_registration(log: RunRecord) -> ShownRegistration | None:
     """None before there is one."""
     step, _ = result_of_kind(log, "registration")
-    records = registrations(log.protocol, log.state)
-    full = {name: record for name, record in records.items() if record.get("full_camera") is None}
-    if not full:
-        return None
-    own = own_registration(log.protocol, log.state)
-    predicted = sorted(full, key=lambda n: float(np.trace(np.array(full[n]["covariance"])[:3, :3])))
-    name = own if own in full else predicted[0]
-    return ShownRegistration(name, full[name], step)
+    name = best_registration_name(log.protocol, log.state)
+    return None if name is None else ShownRegistration(name, registrations(log.protocol, log.state)[name], step)
 
 
-def scan_spheres(log: RunRecord, registered: ShownRegistration) -> tuple[Sphere, ...]:
+def scan_spheres(log: RunRecord, by: ShownRegistration) -> tuple[Sphere, ...]:
     """Spheres of the registered scan, and the control spheres, in its frame."""
-    params = log.protocol.step(registered.step).params.model_dump()
+    params = log.protocol.step(by.step).params.model_dump()
     scan = log.state.steps[params["scan"]].result if params["scan"] in log.state.steps else {}
     if not scan:
         return ()
