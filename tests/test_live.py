@@ -20,7 +20,7 @@ from drivers.interfaces import CameraSettings, CtSource, Mesh, ScanExport, Scann
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.inverse_kinematics import postures
 from service.compute.arm.kinematics import arm_model
-from service.compute.capture.live import LiveView, clipped_fraction, find_spheres, paired, register_station, sharpness
+from service.compute.capture.live import LiveView, clipped_fraction, find_spheres, register_station, sharpness
 from service.compute.planning.coverage import (
     CoverageLimits,
     CoverageSurface,
@@ -38,6 +38,7 @@ from service.compute.planning.information import (
     view_information,
 )
 from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
+from service.compute.registration.pairing import paired
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote

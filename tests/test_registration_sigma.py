@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.registration.cost import skew
 from service.compute.registration.identity import Assignment, identify
 from service.compute.registration.problem import CommonErrors
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import DataError
-from service.core.geometry import Array, apply, inverse, transform
+from service.core.geometry import Array, apply, inverse, skew, transform
 from tests.support.sphere_images import RADIUS_M, REGISTRATION_M, Scene, exact_outlines, scene
 from tests.support.tracked_scene import tracked_scene
 

@@ -14,17 +14,14 @@ from service.compute.evaluation.accuracy import Evaluation, evaluate
 from service.compute.markers.records import SphereOutline
 from service.compute.markers.search.image_files import detect_all, locate_outlines
 from service.compute.registration.cost import Cost
-from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.pairing import CONTROL_GATE, paired
 from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
 from service.core.errors import DataError
-from service.core.geometry import Array, Transform, apply, inverse
+from service.core.geometry import Array, Transform, inverse
 from service.core.units import mm
 
 __all__ = ["Detection", "ImageDetections", "PipelineResult", "detect_all", "locate_outlines", "register_images"]
-
-CONTROL_GATE = 0.5  # of the radius: if a control sphere is farther from its prediction, the registration is wrong
-CONTROL_SIZE_GATE = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +217,6 @@ def _find_controls(
         if len(controls) == 0 or not free or not np.all(np.isfinite(T)):
             out.append(Assignment())
             continue
-        seen = sightings([found[j] for j in free], radius_m, camera)
-        pairs = match(seen, apply(inverse(T), controls), radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
-        out.append(Assignment({free[d]: m for d, m, _ in pairs}, inverse(T), registration.scale))
+        pairs = paired([found[j] for j in free], inverse(T), controls, radius_m, camera, CONTROL_GATE)
+        out.append(Assignment({free[d]: m for d, m in pairs.items()}, inverse(T), registration.scale))
     return tuple(out)

@@ -44,6 +44,15 @@ def from_quaternion(translation_m: Array, quaternion_xyzw: Array) -> Transform:
     return transform(Rotation.from_quat(quaternion_xyzw), translation_m)
 
 
+def skew(v: Array) -> Array:
+    """(..., 3, 3) cross-product matrices of vectors (..., 3)."""
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
 def look_at(eye: Array, target: Array, up: Array) -> Transform:
     """T_world_camera (x right, y down, z forward) at `eye`, looking at `target`, image top towards `up`."""
     z = (target - eye) / np.linalg.norm(target - eye)

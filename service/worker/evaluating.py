@@ -27,13 +27,14 @@ from service.compute.images.resolution import resample
 from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
 from service.compute.overlay import draw_overlay
-from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE, Detection
-from service.compute.registration.hypotheses import match, sightings
+from service.compute.pipeline import Detection
 from service.compute.registration.identity import Assignment
+from service.compute.registration.pairing import CONTROL_GATE, paired
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
 from service.core.records.events import ArtefactRef
+from service.core.results.registrations import best_row
 from service.worker.job import JobAnswer, JobContext
 
 _COMMON = ("common", "intrinsics")  # components that move all spheres alike
@@ -77,7 +78,7 @@ def evaluate(context: JobContext) -> JobAnswer:
         budgets[name] = budget.as_json()
         table.append({**_row(registered, budget), **_errors(registered, measured, radius_m)})
         pictures[name] = partial(_overlays, context, registered, measured, radius_m)
-    best = min(table, key=lambda row: row["mean_radial_error_mm"])
+    best = best_row(table)
     # The best source, and beside it the robot's own poses: the eye sees the difference.
     refs = [ref for name in dict.fromkeys((best["poses"], "robot")) if name in pictures for ref in pictures[name]()]
     measures = {f"{row['poses']}_mean_radial_error_mm": row["mean_radial_error_mm"] for row in table}
@@ -203,10 +204,9 @@ def _registered(
     markers: list[Assignment] = []
     controls: list[Assignment] = []
     for mine, T in zip(outlines, T_scan_camera, strict=True):
-        placed = apply(inverse(T), centres)
-        pairs = match(sightings(mine, radius_m, camera), placed, radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
-        markers.append(Assignment({outline: m for outline, m, _ in pairs if m < n}, inverse(T)))
-        controls.append(Assignment({outline: m - n for outline, m, _ in pairs if m >= n}, inverse(T)))
+        pairs = paired(mine, inverse(T), centres, radius_m, camera, CONTROL_GATE).items()
+        markers.append(Assignment({outline: m for outline, m in pairs if m < n}, inverse(T)))
+        controls.append(Assignment({outline: m - n for outline, m in pairs if m >= n}, inverse(T)))
     return _Registered(name, record, camera, images, outlines, T_scan_camera, markers, controls)
 
 

@@ -19,7 +19,6 @@ from service.compute.capture.live import (
     clipped_fraction,
     expected_spheres,
     find_spheres,
-    paired,
     register_station,
     sharpness,
 )
@@ -43,6 +42,7 @@ from service.compute.planning.information import (
     view_information,
 )
 from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
+from service.compute.registration.pairing import paired
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 from service.worker.job import JobAnswer, JobContext

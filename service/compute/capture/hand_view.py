@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.capture.live import clipped_fraction, expected_spheres, paired, sharpness
+from service.compute.capture.live import clipped_fraction, expected_spheres, sharpness
 from service.compute.layout.photographs import places_by_size
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DetectionOptions, SphereOutline
 from service.compute.markers.search.predicted import fit_pose
 from service.compute.planning.information import ViewInformation, view_information
 from service.compute.registration.identity import identify
+from service.compute.registration.pairing import paired
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse

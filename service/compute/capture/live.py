@@ -21,15 +21,13 @@ from service.compute.markers.detect import detect_spheres
 from service.compute.markers.outlines.edges import profiles, sample
 from service.compute.markers.outlines.refine import refine_outline
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
-from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.pairing import paired
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
 
 _POINTS = 25  # per outline in the provisional solution: enough for its three parameters
-_GATE = 0.5  # of a radius; wide enough for a robot that is off by millimetres
-_SIZE_GATE = 0.12
 _FULL_SCALE = 254  # of 255: JPEG changes a clipped 255 by one
 _MARGIN = 1.1  # of the outline's radius: spheres nearer to the image's border are not expected to be found
 
@@ -177,19 +175,6 @@ def sharpness(image_bgr: NDArray[np.uint8], outlines: Sequence[SphereOutline], c
 def clipped_fraction(image_bgr: NDArray[np.uint8]) -> float:
     """Share of the pixels of an image (H, W, 3) with a clipped channel, estimated from every sixteenth pixel."""
     return float(np.mean(image_bgr[::4, ::4].max(axis=2) >= _FULL_SCALE))
-
-
-def paired(
-    outlines: Sequence[SphereOutline],
-    T_camera_scan: Transform,
-    spheres_m: Array,
-    radius_m: float,
-    camera: CameraModel,
-) -> dict[int, int]:
-    """Outline → sphere, matched by predicted directions and sizes."""
-    seen = sightings(outlines, radius_m, camera)
-    pairs = match(seen, apply(T_camera_scan, spheres_m), radius_m, _GATE, _SIZE_GATE)
-    return {d: m for d, m, _ in pairs}
 
 
 def _fewer_points(outline: SphereOutline) -> SphereOutline:

@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import cone_residuals, skew
+from service.compute.registration.cost import cone_residuals
 from service.compute.registration.identity import Assignment
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, align_points, apply, transform
+from service.core.geometry import Array, Transform, align_points, apply, skew, transform
 
 _MAX_STEPS = 20
 _OUTLIER_SIGMA = 4.0

@@ -14,11 +14,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from service.compute.markers.cones import Cone
+from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import skew
+from service.compute.registration.cost import cone_residuals
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, apply, inverse
+from service.core.geometry import Array, Transform, apply, inverse, skew
 
 _PRIOR_VIEWS = 2.0  # weight of the arm's nominal scatter, in views
 _OUTLIER = 25.0  # squared Mahalanobis distance of an outline from the solution, including the arm's scatter
@@ -68,8 +68,7 @@ def view_information(
     normal, b, used = np.zeros((6, 6)), np.zeros(6), 0
     for o, m in markers.items():
         outline = outlines[o]
-        J, predicted, half = cone_jacobian(T_base_camera, base[m], centre_m, radius_m, outline.cone.frame())
-        residual = np.append(outline.cone.frame()[:, :2].T @ predicted, half - outline.cone.half_angle_rad)
+        residual, J = cone_rows(T_base_camera, base[m], centre_m, radius_m, outline.cone)
         slack = pose_sigma_m**2 * (J[:, :3] @ J[:, :3].T)
         if residual @ np.linalg.solve(outline.cone_covariance + slack, residual) > _OUTLIER:
             continue
@@ -88,29 +87,21 @@ def predicted_information(
     normal = np.zeros((6, 6))
     weight = np.linalg.inv(cone_covariance)
     for sphere in spheres_base_m:
-        J, _, _ = cone_jacobian(T_base_camera, sphere, centre_m, radius_m, None)
+        seen = cone_of_sphere(apply(inverse(T_base_camera), sphere), radius_m)
+        _, J = cone_rows(T_base_camera, sphere, centre_m, radius_m, seen)
         normal += J.T @ weight @ J
     return normal
 
 
-def cone_jacobian(
-    T_base_camera: Transform, sphere_base_m: Array, centre_m: Array, radius_m: float, frame: Array | None
-) -> tuple[Array, Array, float]:
-    """Derivative (3, 6) of a sphere's cone by (d, w), and its predicted axis (3,) and half angle.
-
-    The three rows are the axis along the first two columns of `frame` (3, 3) (None: any frame around the axis) and
-    the half angle asin(r / |c|).
-    """
-    R = T_base_camera[:3, :3].T
+def cone_rows(
+    T_base_camera: Transform, sphere_base_m: Array, centre_m: Array, radius_m: float, seen: Cone
+) -> tuple[Array, Array]:
+    """Residual (3,) in radians of a sphere's cone as seen, and its derivative (3, 6) by (d, w)."""
     c = apply(inverse(T_base_camera), sphere_base_m)
-    distance = float(np.linalg.norm(c))
-    u = c / distance
-    if frame is None:
-        frame = Cone(u, 0.0).frame()
-    move = R @ np.hstack([np.eye(3), -skew(sphere_base_m - centre_m)])  # (3, 6) of c
-    across = frame[:, :2].T @ (np.eye(3) - np.outer(u, u)) / distance
-    size = -radius_m / (distance * np.sqrt(distance**2 - radius_m**2)) * u
-    return np.vstack([across, size]) @ move, u, float(np.arcsin(radius_m / distance))
+    half = np.array([seen.half_angle_rad])
+    residual, by_centre = cone_residuals(seen.axis[None], seen.frame()[None, :, :2], half, c[None], radius_m)
+    move = T_base_camera[:3, :3].T @ np.hstack([np.eye(3), -skew(sphere_base_m - centre_m)])  # (3, 6) of c
+    return residual[0], by_centre[0] @ move
 
 
 def pose_scatter(views: Sequence[ViewInformation], sigma_m: float, sigma_rad: float) -> Array:

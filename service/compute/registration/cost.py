@@ -85,12 +85,3 @@ def _value_and_gradient(
         d_length /= length[:, None]
         d_value = d_value / length[:, None] - (value / length**2)[:, None] * d_length
     return value / length, d_value
-
-
-def skew(v: Array) -> Array:
-    """(..., 3, 3) cross-product matrices of vectors (..., 3)."""
-    out = np.zeros((*v.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
-    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
-    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
-    return out

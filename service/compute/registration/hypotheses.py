@@ -12,31 +12,20 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import cone_residuals, skew
-from service.core.geometry import Array, Transform, apply, transform
+from service.compute.registration.cost import cone_residuals
+from service.compute.registration.pairing import Gate, Sightings, match, sightings
+from service.core.geometry import Array, Transform, apply, skew, transform
 
 _MOST_DETECTIONS = 18  # of one image, the best ones: triples grow with the cube
 _MOST_REFINED = 150
+_CLOSE = Gate(0.1, 0.03)  # of a pose solved from several outlines
 _CHUNK = 4000  # triples refined at a time
-_FLOOR_RAD = 1.2e-4  # what the sphere list and the lens add to an outline's own error: 0.1 mm at a metre and less
 _TRIPLE_CHI2 = 30.0  # 3 degrees of freedom
 _OUTLINE_CHI2 = 30.0  # 3 degrees of freedom
 _EVIDENCE = (
     14.0  # log of how much rarer a stranger is where a sphere is expected, than a sphere; kept on the low side
 )
 _MARGIN = 9.0  # log of the odds at which a reading counts as the only one
-
-
-@dataclass(frozen=True, slots=True)
-class Sightings:
-    """The detections of one image as geometry: directions, sizes, and positions from the known radius."""
-
-    axes: Array  # (D, 3) unit vectors to the centres: not the ellipses' centres
-    half_angles: Array  # (D,)
-    positions_m: Array  # (D, 3) in the camera frame, good across the ray, weak along it
-    depth_sigma_m: Array  # (D,)
-    frames: Array  # (D, 3, 2) first columns of the cones' frames
-    sigma_rad: Array  # (D, 3) of tilt, tilt and half angle
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,46 +41,6 @@ class Hypothesis:
     def count(self) -> int:
         """How many detections it explains."""
         return len(self.markers)
-
-
-def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: CameraModel) -> Sightings:
-    """Geometry of the outlines of one image."""
-    if not outlines:
-        return Sightings(
-            np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 2)), np.zeros((0, 3))
-        )
-    axes = np.array([o.cone.axis for o in outlines])
-    half = np.array([o.cone.half_angle_rad for o in outlines])
-    distance = radius_m / np.sin(half)
-    # Half a pixel of the radius covers the systematic error of an outline, more where only a part is seen.
-    sigma = 0.5 / camera.fx / np.array([max(o.coverage, 0.2) for o in outlines])
-    own = np.array([np.diag(o.cone_covariance) for o in outlines])
-    return Sightings(
-        axes, half, axes * distance[:, None], distance * sigma / half,
-        np.array([o.cone.frame()[:, :2] for o in outlines]), np.sqrt(own + _FLOOR_RAD**2),
-    )  # fmt: skip
-
-
-def match(
-    seen: Sightings, centres_camera_m: Array, radius_m: float, gate: float, size_gate: float
-) -> list[tuple[int, int, float]]:
-    """Mutually nearest (detection, marker, angle): angle below `gate` marker radii, size within `size_gate`."""
-    if len(seen.axes) == 0:
-        return []
-    distance = np.linalg.norm(centres_camera_m, axis=1)
-    front = (centres_camera_m[:, 2] > 0) & (distance > 2 * radius_m)
-    safe = np.maximum(distance, 2 * radius_m)
-    half = np.arcsin(radius_m / safe)
-    angle = np.arccos(np.clip(seen.axes @ (centres_camera_m / safe[:, None]).T, -1, 1))
-    ratio = seen.half_angles[:, None] / half
-    angle[(angle > gate * half) | (np.abs(ratio - 1) > size_gate) | ~front[None, :]] = np.inf
-    nearest = np.argmin(angle, axis=1)
-    back = np.argmin(angle, axis=0)
-    return [
-        (d, int(m), float(angle[d, m]))
-        for d, m in enumerate(nearest)
-        if np.isfinite(angle[d, m]) and int(back[m]) == d
-    ]
 
 
 def image_hypotheses(
@@ -119,7 +68,7 @@ def image_hypotheses(
     for h in order[:4000]:
         if counts[h] < 4 or len(tried) >= _MOST_REFINED:
             break
-        pairs = match(seen, centres_scan_m @ R[h].T + t[h], radius_m, *_LOOSE)
+        pairs = match(seen, centres_scan_m @ R[h].T + t[h], radius_m, _LOOSE)
         key = frozenset((d, m) for d, m, _ in pairs)
         if len(pairs) < 4 or key in tried:
             continue
@@ -180,7 +129,7 @@ def _kabsch(model: Array, image: Array) -> tuple[Array, Array]:
     return R, ci - np.einsum("kij,kj->ki", R, cm)
 
 
-_LOOSE = (0.4, 0.06)  # of a triple's pose: marker radii, and part of the size
+_LOOSE = Gate(0.4, 0.06)  # of a triple's pose
 
 
 def _fitting(
@@ -245,7 +194,7 @@ def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: floa
         half = np.arcsin(radius_m / distance)
         angle = np.arccos(np.clip(cosine, -1, 1)) / half[:, None, :]
         ratio = seen.half_angles[None, :, None] / half[:, None, :]
-        angle[(angle > _LOOSE[0]) | (np.abs(ratio - 1) > _LOOSE[1])] = np.inf
+        angle[(angle > _LOOSE.place) | (np.abs(ratio - 1) > _LOOSE.size)] = np.inf
         nearest = angle.min(axis=2)
         ok = np.isfinite(nearest)
         counts[part] = ok.sum(axis=1)
@@ -278,7 +227,7 @@ def _refine(
             worst = int(pick[int(np.argmax(own))])
             markers = {d: m for d, m in markers.items() if d != worst}
             continue
-        near = {d: m for d, m, _ in match(seen, c, radius_m, 0.1, 0.03)}
+        near = {d: m for d, m, _ in match(seen, c, radius_m, _CLOSE)}
         more = {d: m for d, m in near.items() if d not in markers and m not in markers.values()}
         fresh = np.array(list(more), dtype=np.int64)
         if len(fresh):

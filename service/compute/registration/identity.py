@@ -12,12 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.hypotheses import Hypothesis, Sightings, image_hypotheses, match, rivals, sightings
+from service.compute.registration.hypotheses import Hypothesis, image_hypotheses, rivals
+from service.compute.registration.pairing import ROBOT_GATE, Sightings, match, sightings
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse, rotation_angle_rad, transform
 
-_GATE = 0.5  # of a marker's radius: what poses of a robot that is off by millimetres still meet
-_SIZE_GATE = 0.12
 _HYPOTHESES_PER_IMAGE = 6
 _MOST_TRIED = 80
 
@@ -273,7 +272,7 @@ def _read(
     cost, total = 0.0, 0
     for sight, pose in zip(seen, poses, strict=True):
         c = _camera_centres(T_world_scan, s, pose, centres)
-        pairs = match(sight, c, radius_m, _GATE, _SIZE_GATE)
+        pairs = match(sight, c, radius_m, ROBOT_GATE)
         markers.append({d: m for d, m, _ in pairs})
         cost += sum(angle / sight.half_angles[d] for d, _, angle in pairs)
         total += len(pairs)

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
-from service.compute.registration.cost import Cost, PointCost, cone_residuals, residuals_and_derivative, skew
+from service.compute.registration.cost import Cost, PointCost, cone_residuals, residuals_and_derivative
 from service.compute.registration.identity import Assignment
 from service.core.errors import ComputeError
-from service.core.geometry import Array
+from service.core.geometry import Array, skew
 
 _CHUNK = 500  # outlines whose points are expanded at a time
 

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from service.compute.registration.cost import skew
 from service.compute.registration.normal_equations import Blocks, Marginal
 from service.compute.registration.problem import Linearised, Problem, State
-from service.core.geometry import Array, Transform
+from service.core.geometry import Array, Transform, skew
 
 
 @dataclass(frozen=True, slots=True)

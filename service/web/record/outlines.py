@@ -14,9 +14,8 @@ import numpy as np
 from service.compute.camera_model import CameraModel
 from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
-from service.compute.pipeline import CONTROL_GATE, CONTROL_SIZE_GATE
-from service.compute.registration.hypotheses import match, sightings
-from service.core.geometry import Transform, apply, inverse
+from service.compute.registration.pairing import CONTROL_GATE, paired
+from service.core.geometry import Transform, inverse
 from service.core.units import metres
 from service.run_record import RunRecord
 from service.web.record.images import Capture
@@ -37,7 +36,8 @@ class OutlineSource:
     source: str
     artefact: str
     spheres: tuple[Sphere, ...]
-    camera: CameraModel
+    camera: CameraModel  # of the images that it was found in
+    photograph: CameraModel  # of the photographs as captured, which may be larger
     T_camera_scan: Transform | None
     live: bool
 
@@ -54,6 +54,7 @@ def outlines_of(log: RunRecord, capture: Capture) -> OutlineSource | None:
                 artefact,
                 scan_spheres(log, registered),
                 CameraModel.from_record(registered.record["camera"]),
+                CameraModel.from_record(registered.record.get("full_camera") or registered.record["camera"]),
                 inverse(np.array(T, dtype=np.float64)),
                 live=False,
             )
@@ -62,7 +63,7 @@ def outlines_of(log: RunRecord, capture: Capture) -> OutlineSource | None:
         return None
     camera = CameraModel.from_record(job.arguments["camera"])
     return OutlineSource(
-        f"live-{job.artefacts[0].sha256[:16]}", job.artefacts[0].sha256, ct_spheres(log), camera, None, True
+        f"live-{job.artefacts[0].sha256[:16]}", job.artefacts[0].sha256, ct_spheres(log), camera, camera, None, True
     )
 
 
@@ -80,7 +81,7 @@ def marks_of(log: RunRecord, capture: Capture) -> tuple[DrawnOutline, ...]:
         DrawnOutline(
             named[i].kind if i in named else "unassigned",
             named[i].label if i in named else "?",
-            outline.captured_px(found.camera),
+            outline.captured_px(found.photograph),
         )
         for i, outline in enumerate(outlines)
     )
@@ -97,9 +98,9 @@ def _named(
 ) -> Mapping[int, Sphere]:
     if T_camera_scan is None or not outlines or not found.spheres:
         return {}
-    placed = apply(T_camera_scan, np.array([sphere.centre_m for sphere in found.spheres]))
-    pairs = match(sightings(outlines, radius_m, found.camera), placed, radius_m, CONTROL_GATE, CONTROL_SIZE_GATE)
-    return {outline: found.spheres[m] for outline, m, _ in pairs}
+    centres = np.array([sphere.centre_m for sphere in found.spheres])
+    pairs = paired(outlines, T_camera_scan, centres, radius_m, found.camera, CONTROL_GATE)
+    return {outline: found.spheres[m] for outline, m in pairs.items()}
 
 
 @lru_cache(maxsize=8)

@@ -32,8 +32,8 @@ from service.compute.markers.search.predicted import (
     locate_predicted,
     tone_of,
 )
-from service.compute.registration.hypotheses import match, sightings
 from service.compute.registration.identity import Assignment, identify
+from service.compute.registration.pairing import paired
 from service.compute.registration.solve import register
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, apply, inverse
@@ -44,7 +44,6 @@ ANCHOR_WIDTH_PX = 1000  # least width of the reduced image on which an anchor is
 _ANCHOR_CANDIDATES = 36  # circles examined in an anchor, those with the most votes
 _MOST_FAILED = 0.4  # share of images whose prediction may fail before the prediction itself is doubted
 _SAME_SPHERE = 0.15  # in radii: largest distance of one unlisted sphere seen from two sides
-_GATE, _SIZE_GATE = 0.5, 0.12  # between an outline from a whole search and its prediction
 
 Progress = Callable[[int, int], None]
 DetectFile = Callable[[Path, CameraModel, DetectionOptions], tuple[SphereOutline, ...]]
@@ -228,10 +227,7 @@ def locate_outlines(
     assignments: list[Assignment] = []
     for f, T in zip(found, first.T_scan_camera, strict=True):
         if f.spheres is None:
-            pairs = match(
-                sightings(f.outlines, radius_m, camera), apply(inverse(T), spheres), radius_m, _GATE, _SIZE_GATE
-            )
-            named = {d: m for d, m, _ in pairs}
+            named = paired(f.outlines, inverse(T), spheres, radius_m, camera)
         else:
             named = dict(enumerate(f.spheres))
         markers = {d: m for d, m in named.items() if m < n_registration}

@@ -16,8 +16,7 @@ from service.compute.markers.cones import Cone, cone_of_sphere, ransac_cone
 from service.compute.markers.outlines.edges import envelope_edges, profiles, sample
 from service.compute.markers.outlines.refine import Approached, approach_outlines, measure_outlines, refine_outline
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
-from service.compute.registration.cost import skew
-from service.core.geometry import Array, Transform, apply, transform
+from service.core.geometry import Array, Transform, apply, skew, transform
 
 # Lengths below are fractions of a sphere's apparent radius, unless the name has a unit.
 NEAR = 0.08  # a prediction this good is refined directly; its region is searched only if that fails

@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.poses.sfm.tracks import Tracks
+from service.compute.registration.cost import cone_residuals
 from service.core.errors import ComputeError
-from service.core.geometry import Array
+from service.core.geometry import Array, skew
 
 Index = NDArray[np.int64]
 LENS = ("fx", "fy", "cx", "cy")
@@ -208,7 +209,7 @@ def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
     R, t = cameras[:, :3, :3], cameras[:, :3, 3]
     v = points - t
     Rt = np.swapaxes(R, 1, 2)
-    d_pose = np.concatenate([-Rt, Rt @ _skew(v)], axis=2)
+    d_pose = np.concatenate([-Rt, Rt @ skew(v)], axis=2)
     return np.einsum("oij,oj->oi", Rt, v), d_pose, Rt
 
 
@@ -235,10 +236,7 @@ def _sphere_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
     point = s.marker + len(data.tracks.points)
     light = data.light_unit_m * state.common[3:]
     c, d_pose, d_point = _seen(state.cameras[s.image], state.points[point] + light)
-    distance = np.linalg.norm(c, axis=1)
-    u = c / distance[:, None]
     e = s.frames[:, :, :2]
-    sine = data.radius_m / distance
     axes, lens = s.axes, None
     if data.lens_covariance is not None:
         assert data.calibrated is not None
@@ -255,12 +253,8 @@ def _sphere_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
     shift = np.zeros((len(c), 3, len(COMMON)))  # what the detector adds to a cone
     shift[:, :2, :2] = np.swapaxes(e[:, :2], 1, 2) * (axes[:, 2] / focal)[:, None, None]
     shift[:, 2, 2] = axes[:, 2] ** 2 / focal
-    seen = np.concatenate([np.einsum("sik,si->sk", e, u - axes), (np.arcsin(sine) - s.half_angles)[:, None]], axis=1)
+    seen, d = cone_residuals(axes, e, s.half_angles, c, data.radius_m)
     residual = seen + shift @ state.common
-    d = np.zeros((len(c), 3, 3))
-    tangent = (np.eye(3) - u[:, :, None] * u[:, None, :]) / distance[:, None, None]
-    d[:, :2] = np.swapaxes(e, 1, 2) @ tangent
-    d[:, 2] = -(sine / (distance * np.sqrt(1 - sine**2)))[:, None] * u
     whitening = s.whitening / sigmas.sphere
     d = whitening @ d
     more = whitening @ shift
@@ -348,7 +342,7 @@ def _robot_rows(state: State, data: Data, sigmas: Sigmas) -> tuple[Rows, Rows]:
     zero = np.zeros_like(one)
     out: list[Rows] = []
     for residual, d_camera, d_base, sigma in (
-        (position, np.concatenate([one, zero], axis=2), np.concatenate([-one, _skew(arm)], axis=2), sigmas.robot_m),
+        (position, np.concatenate([one, zero], axis=2), np.concatenate([-one, skew(arm)], axis=2), sigmas.robot_m),
         (rotation, np.concatenate([zero, one], axis=2), np.concatenate([zero, -one], axis=2), sigmas.robot_rad),
     ):
         row = np.arange(3 * len(image)).reshape(-1, 3, 1)
@@ -385,11 +379,3 @@ def _lens_rows(state: State, data: Data) -> Rows:
 def whitening_of(covariance: Array) -> Array:
     """(..., k, k) W with W C W^T = I for covariances C."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=np.float64)
-
-
-def _skew(v: Array) -> Array:
-    out = np.zeros((*v.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
-    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
-    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
-    return out

@@ -25,7 +25,7 @@ from service.compute.registration.identity import identify
 from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, apply, inverse, transform
+from service.core.geometry import Array, Transform, apply, inverse, skew, transform
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,8 +138,8 @@ class HybridPoses:
         arm = point_scan_m - self.T_scan_camera[:, :3, 3].mean(axis=0)
         J = np.zeros((3, len(self.covariance)))
         for i in range(len(v)):
-            turn = np.linalg.solve(inertia, _skew(centred[i]))
-            J[:, 6 * i : 6 * i + 3] = np.eye(3) / n - _skew(arm) @ turn
+            turn = np.linalg.solve(inertia, skew(centred[i]))
+            J[:, 6 * i : 6 * i + 3] = np.eye(3) / n - skew(arm) @ turn
         return float(np.sqrt(np.trace(J @ self.covariance @ J.T)))
 
 
@@ -302,10 +302,6 @@ def _bases(
     return np.array(bases), order, group
 
 
-def _skew(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
 def _block(a: Array, b: Array) -> Array:
     out = np.zeros((6, 6))
     out[:3, :3], out[3:, 3:] = a, b
@@ -315,5 +311,5 @@ def _block(a: Array, b: Array) -> Array:
 def _relative(R_world_scan: Array, lever_scan: Array) -> Array:
     """(6, 6) derivative of T_world_x = T_scan_base^-1 T_scan_x by T_scan_base, lever = x's origin less the base's."""
     out = _block(-R_world_scan, -R_world_scan)
-    out[:3, 3:] = R_world_scan @ _skew(lever_scan)
+    out[:3, 3:] = R_world_scan @ skew(lever_scan)
     return out

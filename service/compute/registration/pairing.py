@@ -1,0 +1,89 @@
+"""Which outline is which sphere where the camera's pose is known well enough: the nearest one, within a gate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.compute.camera_model import CameraModel
+from service.compute.markers.records import SphereOutline
+from service.core.geometry import Array, Transform, apply
+
+_FLOOR_RAD = 1.2e-4  # what the sphere list and the lens add to an outline's own error: 0.1 mm at a metre and less
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """How far an outline may be from a predicted sphere to be taken for it."""
+
+    place: float  # of the sphere's radius as the image shows it
+    size: float  # relative
+
+
+ROBOT_GATE = Gate(0.5, 0.12)  # wide enough for a robot that is off by millimetres
+CONTROL_GATE = Gate(0.5, 0.15)  # if a control sphere is farther from its prediction, the registration is wrong
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """The detections of one image as geometry: directions, sizes, and positions from the known radius."""
+
+    axes: Array  # (D, 3) unit vectors to the centres: not the ellipses' centres
+    half_angles: Array  # (D,)
+    positions_m: Array  # (D, 3) in the camera frame, good across the ray, weak along it
+    depth_sigma_m: Array  # (D,)
+    frames: Array  # (D, 3, 2) first columns of the cones' frames
+    sigma_rad: Array  # (D, 3) of tilt, tilt and half angle
+
+
+def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: CameraModel) -> Sightings:
+    """Geometry of the outlines of one image."""
+    if not outlines:
+        return Sightings(
+            np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 2)), np.zeros((0, 3))
+        )
+    axes = np.array([o.cone.axis for o in outlines])
+    half = np.array([o.cone.half_angle_rad for o in outlines])
+    distance = radius_m / np.sin(half)
+    # Half a pixel of the radius covers the systematic error of an outline, more where only a part is seen.
+    sigma = 0.5 / camera.fx / np.array([max(o.coverage, 0.2) for o in outlines])
+    own = np.array([np.diag(o.cone_covariance) for o in outlines])
+    return Sightings(
+        axes, half, axes * distance[:, None], distance * sigma / half,
+        np.array([o.cone.frame()[:, :2] for o in outlines]), np.sqrt(own + _FLOOR_RAD**2),
+    )  # fmt: skip
+
+
+def match(seen: Sightings, centres_camera_m: Array, radius_m: float, gate: Gate) -> list[tuple[int, int, float]]:
+    """Mutually nearest (detection, marker, angle in radians) within the gate; centres (M, 3) in the camera frame."""
+    if len(seen.axes) == 0:
+        return []
+    distance = np.linalg.norm(centres_camera_m, axis=1)
+    front = (centres_camera_m[:, 2] > 0) & (distance > 2 * radius_m)
+    safe = np.maximum(distance, 2 * radius_m)
+    half = np.arcsin(radius_m / safe)
+    angle = np.arccos(np.clip(seen.axes @ (centres_camera_m / safe[:, None]).T, -1, 1))
+    ratio = seen.half_angles[:, None] / half
+    angle[(angle > gate.place * half) | (np.abs(ratio - 1) > gate.size) | ~front[None, :]] = np.inf
+    nearest = np.argmin(angle, axis=1)
+    back = np.argmin(angle, axis=0)
+    return [
+        (d, int(m), float(angle[d, m]))
+        for d, m in enumerate(nearest)
+        if np.isfinite(angle[d, m]) and int(back[m]) == d
+    ]
+
+
+def paired(
+    outlines: Sequence[SphereOutline],
+    T_camera_scan: Transform,
+    spheres_m: Array,
+    radius_m: float,
+    camera: CameraModel,
+    gate: Gate = ROBOT_GATE,
+) -> dict[int, int]:
+    """Outline → sphere (M, 3) of the scan frame, matched by predicted directions and sizes."""
+    pairs = match(sightings(outlines, radius_m, camera), apply(T_camera_scan, spheres_m), radius_m, gate)
+    return {d: m for d, m, _ in pairs}
