@@ -20,7 +20,8 @@ from drivers.interfaces import CameraSettings, CtSource, Mesh, ScanExport, Scann
 from service.compute.arm.correction import ArmCorrection, corrected_T_base_flange
 from service.compute.arm.inverse_kinematics import postures
 from service.compute.arm.kinematics import arm_model
-from service.compute.capture.live import LiveView, clipped_fraction, find_spheres, register_station, sharpness
+from service.compute.capture.live import LiveView, clipped_fraction, register_station, sharpness
+from service.compute.markers.search.predicted import NEAR, Found, Prediction, find_spheres, tone_of
 from service.compute.planning.coverage import (
     CoverageLimits,
     CoverageSurface,
@@ -231,18 +232,18 @@ def pictures() -> tuple[Scene, list[Any]]:
 def test_prediction_finds_what_a_search_of_the_whole_image_finds(pictures: tuple[Scene, list[Any]]) -> None:
     made, images = pictures
     T_camera_scan = inverse(made.T_world_camera[0]) @ made.T_world_scan
-    whole = find_spheres(images[0], made.camera, SPHERES_M, RADIUS_M, None)
-    near = find_spheres(
-        images[0], made.camera, SPHERES_M, RADIUS_M, transform(np.eye(3), np.full(3, 5e-4)) @ T_camera_scan
-    )
+    whole = find_spheres(images[0], made.camera, None).outlines
+
+    def near_to(off_m: Array) -> Prediction:
+        return Prediction(transform(np.eye(3), off_m) @ T_camera_scan, SPHERES_M, RADIUS_M, NEAR, tone_of(whole))
+
+    near = find_spheres(images[0], made.camera, near_to(np.full(3, 5e-4))).outlines
     assert len(near) >= len(whole) >= 6
     by_marker = {m: whole[o] for o, m in paired(whole, T_camera_scan, SPHERES_M, RADIUS_M, made.camera).items()}
     for o, m in paired(near, T_camera_scan, SPHERES_M, RADIUS_M, made.camera).items():
         if m in by_marker:
             assert np.allclose(near[o].centre_px, by_marker[m].centre_px, atol=0.2)
-    lost = find_spheres(
-        images[0], made.camera, SPHERES_M, RADIUS_M, transform(np.eye(3), np.array([0.1, 0.0, 0.0])) @ T_camera_scan
-    )
+    lost = find_spheres(images[0], made.camera, near_to(np.array([0.1, 0.0, 0.0]))).outlines
     assert len(lost) == len(whole), "a prediction that is wrong is noticed, and the whole image searched"
     quality = sharpness(images[0], near, made.camera)
     blurred = sharpness(cv2.GaussianBlur(images[0], (0, 0), 2.5), near, made.camera)
@@ -262,8 +263,11 @@ def test_images_register_one_after_the_other(pictures: tuple[Scene, list[Any]]) 
     made, images = pictures
     known, views = None, list[LiveView]()
     for i, image in enumerate(images):
-        predicted = None if known is None else inverse(made.T_world_camera[i]) @ known
-        outlines = find_spheres(image, made.camera, SPHERES_M, RADIUS_M, predicted)
+        expected = None
+        if known is not None:
+            shown = tone_of([o for view in views for o in view.outlines])
+            expected = Prediction(inverse(made.T_world_camera[i]) @ known, SPHERES_M, RADIUS_M, NEAR, shown)
+        outlines = find_spheres(image, made.camera, expected).outlines
         views.append(LiveView(f"v{i}", made.T_world_camera[i], outlines))
         known = register_station(views, SPHERES_M, RADIUS_M, made.camera, known).T_base_scan
         error = np.linalg.norm(apply(known, CENTRE_M) - apply(made.T_world_scan, CENTRE_M))
@@ -480,7 +484,8 @@ def measured_run(
         return live_view(context)
 
     def exactly(*_args: Any) -> Any:
-        return exact_outlines(Scene(T_base_scan, np.array(here), made), 0, SPHERES_M, 0.1, margin_px=30)[0]
+        seen = exact_outlines(Scene(T_base_scan, np.array(here), made), 0, SPHERES_M, 0.1, margin_px=30)[0]
+        return Found(tuple(seen), None, {})
 
     def serve(_what: str) -> None:
         job = bench.store.claim_job("test", 30, kinds=list(known))

@@ -18,13 +18,13 @@ from service.compute.capture.live import (
     Provisional,
     clipped_fraction,
     expected_spheres,
-    find_spheres,
     register_station,
     sharpness,
 )
 from service.compute.images.files import read_image
 from service.compute.images.quality import image_quality
 from service.compute.markers.archive import outline_from_record, outline_record
+from service.compute.markers.search.predicted import NEAR, Prediction, find_spheres, tone_of
 from service.compute.planning.coverage import (
     CoverageLimits,
     CoverageSurface,
@@ -115,8 +115,11 @@ def live_view(context: JobContext) -> JobAnswer:
     known = next((r.T_base_scan for r in reversed(mine) if r.T_base_scan is not None), None)
     (T_base_camera,) = robot_camera_poses(arguments, [image])
     pixels = read_image(context.input(image["sha256"]))
-    predicted = None if known is None else inverse(T_base_camera) @ known
-    outlines = find_spheres(pixels, camera, spheres, radius_m, predicted)
+    expected: Prediction | None = None
+    shown = [o for r in mine for o in r.view.outlines]
+    if known is not None and shown:
+        expected = Prediction(inverse(T_base_camera) @ known, spheres, radius_m, NEAR, tone_of(shown))
+    outlines = find_spheres(pixels, camera, expected).outlines
     quality = sharpness(pixels, outlines, camera)
     whole = image_quality(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), dtype=np.uint8))
     view = LiveView(image["viewpoint"], T_base_camera, outlines)

@@ -1,8 +1,8 @@
 """Processes each new image during the capture: finds its spheres and registers all images so far.
 
 The first images of a station are searched whole; from then on the registration predicts the spheres, and only their
-regions are searched. Each station is an independent problem, since its robot poses are in a base frame of its own, so
-only the new image's station is solved again.
+regions are searched (markers/search/predicted.py). Each station is an independent problem, since its robot poses are in
+a base frame of its own, so only the new image's station is solved again.
 """
 
 from __future__ import annotations
@@ -16,11 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.compute.camera_model import CameraModel
-from service.compute.markers.cones import cone_of_sphere
-from service.compute.markers.detect import detect_spheres
 from service.compute.markers.outlines.edges import profiles, sample
-from service.compute.markers.outlines.refine import refine_outline
-from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
+from service.compute.markers.records import SphereOutline
 from service.compute.registration.identity import Assignment, identify
 from service.compute.registration.pairing import paired
 from service.compute.registration.solve import RegistrationResult, register
@@ -78,32 +75,6 @@ def expected_spheres(T_camera_scan: Transform, spheres_m: Array, radius_m: float
         if reach <= x <= camera.width - 1 - reach and reach <= y <= camera.height - 1 - reach:
             out.append(int(m))
     return out
-
-
-def find_spheres(
-    image_bgr: NDArray[np.uint8],
-    camera: CameraModel,
-    spheres_m: Array,
-    radius_m: float,
-    T_camera_scan: Transform | None,
-    options: DetectionOptions = DEFAULTS,
-) -> tuple[SphereOutline, ...]:
-    """Outlines in an image (H, W, 3): near the predicted places, or by a search of the whole image.
-
-    Args:
-        T_camera_scan: the prediction, good to about a tenth of a radius; if it is None, or fewer than three spheres
-            are found near it, the whole image is searched.
-    """
-    if T_camera_scan is not None:
-        found: list[SphereOutline] = []
-        for m in expected_spheres(T_camera_scan, spheres_m, radius_m, camera):
-            cone = cone_of_sphere(apply(T_camera_scan, spheres_m[m]), radius_m)
-            outline = refine_outline(image_bgr, camera, cone, options)
-            if outline is not None:
-                found.append(outline)
-        if len(paired(found, T_camera_scan, spheres_m, radius_m, camera)) >= 3:
-            return tuple(found)
-    return detect_spheres(image_bgr, camera, options)
 
 
 def register_station(

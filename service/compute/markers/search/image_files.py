@@ -25,11 +25,12 @@ from service.compute.markers.outlines.refine import refine_outlines
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
 from service.compute.markers.search.predicted import (
     WIDE,
+    Found,
     Prediction,
     Tone,
     deviation,
+    find_spheres,
     fit_pose,
-    locate_predicted,
     tone_of,
 )
 from service.compute.registration.identity import Assignment, identify
@@ -89,15 +90,6 @@ class _Task:
 
     path: Path
     expected: Prediction | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Found:
-    """Outlines of one image; with a prediction, the sphere of each, and the missing ones."""
-
-    outlines: tuple[SphereOutline, ...]
-    spheres: tuple[int, ...] | None
-    missing: dict[int, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,13 +242,8 @@ def searched_whole(outlines: Sequence[tuple[SphereOutline, ...]]) -> LocatedOutl
     return LocatedOutlines(tuple(outlines), None, tuple(ImageSearch("searched") for _ in outlines))
 
 
-def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> _Found:
-    image = read_image_of(task.path, camera)
-    if task.expected is not None:
-        located = locate_predicted(image, camera, task.expected, options)
-        if located.convincing:
-            return _Found(tuple(located.outlines.values()), tuple(located.outlines), located.missing)
-    return _Found(detect_spheres(image, camera, options), None, {})
+def _look(task: _Task, camera: CameraModel, options: DetectionOptions) -> Found:
+    return find_spheres(read_image_of(task.path, camera), camera, task.expected, options)
 
 
 def _look_reduced(path: Path, camera: CameraModel, options: DetectionOptions) -> tuple[SphereOutline, ...]:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.cones import Cone, cone_of_sphere, ransac_cone
+from service.compute.markers.detect import detect_spheres
 from service.compute.markers.outlines.edges import envelope_edges, profiles, sample
 from service.compute.markers.outlines.refine import Approached, approach_outlines, measure_outlines, refine_outline
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
@@ -86,6 +87,35 @@ class Located:
     def convincing(self) -> bool:
         """Whether so many spheres were found where predicted that the prediction must be right."""
         return len(self.outlines) >= max(min(4, self.expected), 0.5 * self.expected)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Outlines of one image; where they were predicted, the sphere of each, and the reason for each missing one."""
+
+    outlines: tuple[SphereOutline, ...] = field(repr=False)
+    spheres: tuple[int, ...] | None  # None: the whole image was searched, and which is which is still to be told
+    missing: dict[int, str]
+
+
+def find_spheres(
+    image_bgr: NDArray[np.uint8],
+    camera: CameraModel,
+    expected: Prediction | None,
+    options: DetectionOptions = DEFAULTS,
+) -> Found:
+    """Outlines in an image (H, W, 3) of the camera's size: where they are predicted, or by a search of all of it.
+
+    The search of a capture under way and that of a registration are this one.
+
+    Args:
+        expected: None, or a prediction that too little of what is found confirms: the whole image is searched.
+    """
+    if expected is not None:
+        located = locate_predicted(image_bgr, camera, expected, options)
+        if located.convincing:
+            return Found(tuple(located.outlines.values()), tuple(located.outlines), located.missing)
+    return Found(detect_spheres(image_bgr, camera, options), None, {})
 
 
 def locate_predicted(
