@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.compute.arm.kinematics import increment
 from service.compute.calibration.board.board import Board, BoardView
 from service.compute.calibration.board_poses.candidates import PoseWishes, board_candidates
 from service.compute.calibration.board_poses.design import NOTHING, Aims, as_taken, choose_poses, predict
@@ -21,7 +20,7 @@ from service.compute.calibration.board_poses.knowledge import (
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics
 from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
 from service.compute.camera_model import CameraModel
-from service.core.geometry import Array, Transform, apply, inverse, transform
+from service.core.geometry import Array, Transform, apply, increment, inverse, transform
 from service.steps.board_plan import FIRST
 
 BOARD = Board(16, 23, 0.015)

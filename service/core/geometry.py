@@ -53,6 +53,16 @@ def skew(v: Array) -> Array:
     return out
 
 
+def increment(T: Transform, d: Array, w: Array) -> Transform:
+    """exp(w) R, t + d: the project's pose perturbation, in the axes of the outer frame."""
+    return transform(Rotation.from_rotvec(w).as_matrix() @ T[:3, :3], T[:3, 3] + d)
+
+
+def place_jacobian(turned: Array) -> Array:
+    """(n, 3, 6) derivative of points by (d, w) of a pose; `turned` (n, 3): points rotated, not translated."""
+    return np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -skew(turned)], axis=2)
+
+
 def look_at(eye: Array, target: Array, up: Array) -> Transform:
     """T_world_camera (x right, y down, z forward) at `eye`, looking at `target`, image top towards `up`."""
     z = (target - eye) / np.linalg.norm(target - eye)

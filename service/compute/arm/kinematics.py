@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from service.core.errors import ConfigurationError, DataError
-from service.core.geometry import Array, Transform, inverse, transform
+from service.core.geometry import Array, Transform, inverse
 
 JOINT_LIMIT_RAD = 2 * np.pi
 
@@ -188,8 +188,3 @@ def _joints(joints_rad: Array) -> Array:
     if joints.ndim != 2 or joints.shape[1] != 6 or not np.isfinite(joints).all():
         raise DataError(f"joint positions {joints.shape}, (N, 6) finite numbers are needed")
     return joints
-
-
-def increment(T: Transform, d: Array, w: Array) -> Transform:
-    """exp(w) R, t + d: the project's pose perturbation, in the axes of the outer frame."""
-    return transform(Rotation.from_rotvec(w).as_matrix() @ T[:3, :3], T[:3, 3] + d)

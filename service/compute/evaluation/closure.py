@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from service.compute.descent import gauss_newton
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import cone_residuals
 from service.compute.registration.identity import Assignment
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, align_points, apply, skew, transform
+from service.core.geometry import Array, Transform, align_points, apply, increment, place_jacobian
 
 _MAX_STEPS = 20
 _OUTLIER_SIGMA = 4.0
@@ -59,11 +59,6 @@ class Alignment:
         """(n, 3, 3) covariance, in the axes of a, that the alignment's error adds to points (n, 3) of b."""
         J = place_jacobian(points_b_m @ self.T_a_b[:3, :3].T)
         return J @ self.covariance @ J.transpose(0, 2, 1)
-
-
-def place_jacobian(turned: Array) -> Array:
-    """(n, 3, 6) derivative of points by (d, w) of a pose; `turned` (n, 3): points rotated, not translated."""
-    return np.concatenate([np.broadcast_to(np.eye(3), (len(turned), 3, 3)), -skew(turned)], axis=2)
 
 
 def locate_in_images(
@@ -153,23 +148,26 @@ def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array)
     """
     if len(a) < 4:
         raise ComputeError(f"{len(a)} common spheres close no loop; four are needed")
-    T_a_b, _ = align_points(a, b)
-    covariance = np.zeros((len(a), 3, 3))
-    information = np.zeros((6, 6))
-    r = np.zeros_like(a)
-    slope = np.zeros((len(a), 3, 6))
-    for _ in range(_MAX_STEPS):
-        R = T_a_b[:3, :3]
-        covariance = covariance_a + R @ covariance_b @ R.T
+
+    def parts(T: Transform) -> tuple[Array, Array, Array]:
+        R = T[:3, :3]
+        return a - apply(T, b), place_jacobian(b @ R.T), covariance_a + R @ covariance_b @ R.T
+
+    def equations(T: Transform) -> tuple[Array, Array]:
+        r, slope, covariance = parts(T)
         weight = np.linalg.inv(covariance)
-        turned = b @ R.T
-        r = a - apply(T_a_b, b)
-        slope = place_jacobian(turned)
         information = np.einsum("nki,nkl,nlj->ij", slope, weight, slope)
-        step = np.linalg.solve(information, np.einsum("nki,nkl,nl->i", slope, weight, r))
-        T_a_b = transform(Rotation.from_rotvec(step[3:]).as_matrix() @ R, T_a_b[:3, 3] + step[:3])
-        if float(np.abs(step).max()) < 1e-12:
-            break
+        return information, np.einsum("nki,nkl,nl->i", slope, weight, r)
+
+    T_a_b = gauss_newton(
+        align_points(a, b)[0],
+        lambda T: np.asarray(np.linalg.solve(*equations(T)), dtype=np.float64),
+        lambda T, step: increment(T, step[:3], step[3:]),
+        most=_MAX_STEPS,
+        settled=1e-12,
+    )
+    r, slope, covariance = parts(T_a_b)
+    information = equations(T_a_b)[0]
     left = covariance - slope @ np.linalg.inv(information) @ slope.transpose(
         0, 2, 1
     )  # of a residual, the alignment being fitted

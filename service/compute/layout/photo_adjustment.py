@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.descent import gauss_newton, largest
 from service.compute.markers.cones import Cone
 from service.compute.markers.records import SphereOutline
 from service.core.errors import ComputeError
@@ -134,12 +135,18 @@ def adjust(
         np.zeros(_LENS),
         np.zeros(len(photographs)),
     )
-    for _ in range(_ITERATIONS):
-        step, _, _ = problem.step(x)
-        largest = float(np.max(np.abs(step[problem.geometry])))
-        x = problem.moved(x, step * min(1.0, _LONGEST_STEP / max(largest, 1e-12)))
-        if largest < _DONE:
-            break
+
+    def size(step: Array) -> float:
+        return largest(step[problem.geometry])
+
+    x = gauss_newton(
+        x,
+        lambda x: problem.step(x)[0],
+        lambda x, step: problem.moved(x, step * min(1.0, _LONGEST_STEP / max(size(step), 1e-12))),
+        most=_ITERATIONS,
+        settled=_DONE,
+        size=size,
+    )
     _, covariance, chi2 = problem.step(x)
     count = 3 * len(centres_m)
     return Adjusted(

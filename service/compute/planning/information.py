@@ -18,7 +18,7 @@ from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import cone_residuals
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, apply, inverse, skew
+from service.core.geometry import Array, Transform, apply, inverse, place_jacobian, skew
 
 _PRIOR_VIEWS = 2.0  # weight of the arm's nominal scatter, in views
 _OUTLIER = 25.0  # squared Mahalanobis distance of an outline from the solution, including the arm's scatter
@@ -174,5 +174,5 @@ def target_error(
 
 def point_sigmas_m(covariance: Array, points_m: Array) -> Array:
     """Standard deviation (N,) in 3D, metres, at points (N, 3) from the centre, for a covariance (6, 6) of (d, w)."""
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points_m), 3, 3)), -skew(points_m)], axis=2)
+    J = place_jacobian(points_m)
     return np.sqrt(np.einsum("nij,jk,nik->n", J, covariance, J))

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from service.compute.descent import gauss_newton
 from service.compute.surfaces.constellations import ConstellationMatch
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform, apply, transform
+from service.core.geometry import Array, Transform, apply, place_jacobian, transform
 
 SYSTEMATIC_SIGMA_M = 2.0e-5  # of each coordinate: what two instruments differ by beyond their noise (scale, warmth)
 MOVED_PROBABILITY = 1.0e-3  # of calling any sphere moved when none did
@@ -131,7 +132,7 @@ def _against_others(
     others[i] = False
     T, covariance = _weighted(a[others], b[others], C[others], start)
     predicted = apply(T, b[i])
-    J = _jacobian(predicted[None])[0]
+    J = place_jacobian(predicted[None])[0]
     S = C[i] + J @ covariance @ J.T
     d = predicted - a[i]
     length = float(np.linalg.norm(d))
@@ -139,29 +140,21 @@ def _against_others(
     return d, float(d @ np.linalg.solve(S, d)), float(np.sqrt(along @ S @ along))
 
 
-def _jacobian(points: Array) -> Array:
-    """d(exp(w) p + t) / d(t, w): (N, 3, 6)."""
-    J = np.zeros((len(points), 3, 6))
-    J[:, :, :3] = np.eye(3)
-    x, y, z = points.T
-    J[:, 0, 4], J[:, 0, 5] = z, -y
-    J[:, 1, 3], J[:, 1, 5] = -z, x
-    J[:, 2, 3], J[:, 2, 4] = y, -x
-    return J
-
-
 def _weighted(a: Array, b: Array, C: Array, start: Transform) -> tuple[Transform, Array]:
     """Rigid T_a_b by generalised least squares, and its covariance (6, 6) of (t, w) at a's origin, outer frame."""
-    T = start.copy()
     W = np.linalg.inv(C)
-    normal = np.eye(6)
-    for _ in range(8):
+
+    def equations(T: Transform) -> tuple[Array, Array]:
         points = apply(T, b)
-        J = _jacobian(points)
+        J = place_jacobian(points)
         JW = np.einsum("nki,nkl->nil", J, W)
-        normal = np.einsum("nil,nlj->ij", JW, J)
-        step = np.linalg.solve(normal, np.einsum("nil,nl->i", JW, a - points))
-        T[:] = transform(Rotation.from_rotvec(step[3:]), step[:3]) @ T
-        if float(np.abs(step).max()) < 1e-12:
-            break
-    return T, np.asarray(np.linalg.inv(normal), dtype=np.float64)
+        return np.einsum("nil,nlj->ij", JW, J), np.einsum("nil,nl->i", JW, a - points)
+
+    T = gauss_newton(
+        start,
+        lambda T: np.asarray(np.linalg.solve(*equations(T)), dtype=np.float64),
+        lambda T, step: transform(Rotation.from_rotvec(step[3:]), step[:3]) @ T,
+        most=8,
+        settled=1e-12,
+    )
+    return T, np.asarray(np.linalg.inv(equations(T)[0]), dtype=np.float64)

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.compute.arm.kinematics import increment
 from service.compute.calibration.board.board import Board, BoardView
 from service.compute.calibration.hand_eye.weighted import cross, linearise
 from service.compute.calibration.intrinsics.adjustment import parameters_of
 from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, inverse, transform
+from service.core.geometry import Array, Transform, increment, inverse, transform
 
 _ARM_M, _ARM_RAD = 0.7e-3, 1e-3  # per axis: pose error of an uncalibrated arm
 _ROUNDS = 6

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.compute.arm.kinematics import increment
 from service.compute.calibration.hand_eye.weighted import cross, linearise
 from service.compute.camera_model import CameraModel
 from service.core.errors import ComputeError, DataError
-from service.core.geometry import Array, Transform, inverse
+from service.core.geometry import Array, Transform, increment, inverse
 
 _STEP_M = 1e-6
 _ITERATIONS = 30

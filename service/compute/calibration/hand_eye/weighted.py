@@ -21,9 +21,8 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from service.compute.arm.kinematics import increment
 from service.core.errors import ComputeError
-from service.core.geometry import Array, Transform
+from service.core.geometry import Array, Transform, increment
 
 FLOOR_M = 2e-7
 _ITERATIONS = 8

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from service.compute.calibration.board.board import BoardView
 from service.compute.camera_model import CameraModel
+from service.compute.descent import Damping, levenberg_marquardt
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, transform
 
@@ -22,6 +24,7 @@ PARAMETER_COUNT: dict[LensModel, int] = {"pinhole": 4, "radial2": 6, "opencv4": 
 
 _HUBER = 3.0  # standard deviations of one coordinate beyond which a corner is downweighted
 _MAX_ITERATIONS = 40
+_DAMPING = Damping(1e-4)
 # In px per unit of a term: pulls k3 … k6 towards 0 ± 3 with the weight of one corner of 0.03 px. If the images
 # determine these terms, the effect vanishes; if not, it stops numerator and denominator from cancelling without
 # limit.
@@ -203,39 +206,70 @@ def adjust(
     Raises:
         ComputeError: the equations are singular, or the solution did not stay finite.
     """
-    theta = parameters_of(camera, parameters)
-    damping = 1e-4
     prior = prior_precision(parameters)
-    state, cost, scale = _linearise(views, points, theta, poses, size)
-    cost += float(prior @ theta**2)
-    for _ in range(iterations):
-        normal = np.sum([view.normal for view in state], axis=0) + np.diag(prior)
-        gradient = np.sum([view.gradient for view in state], axis=0) + prior * theta
+
+    def at(theta: Array, poses: Array, scale: float | None = None, step: Array | None = None) -> _Linearised:
+        equations, cost, present = _linearise(views, points, theta, poses, size, scale)
+        cost += float(prior @ theta**2)
+        return _Linearised(theta, poses, equations, cost, present if scale is None else scale, present, step)
+
+    def candidate(here: _Linearised, damping: float) -> _Linearised:
+        normal = np.sum([view.normal for view in here.equations], axis=0) + np.diag(prior)
+        gradient = np.sum([view.gradient for view in here.equations], axis=0) + prior * here.theta
         shape = np.sqrt(np.diag(normal))
         if not np.isfinite(shape).all() or shape.min() <= 0:
             raise ComputeError("the views do not determine the camera", remedy="take views with more tilt")
         scaled = normal / np.outer(shape, shape) + damping * np.eye(parameters)
         step = -np.linalg.solve(scaled, gradient / shape) / shape
-        moved = np.stack([p + _pose_step(view, step) for p, view in zip(poses, state, strict=True)])
-        trial, trial_cost, trial_scale = _linearise(views, points, theta + step, moved, size, scale)
-        trial_cost += float(prior @ (theta + step) ** 2)
-        if not np.isfinite(trial_cost) or trial_cost > cost * (1 + 1e-12):
-            damping *= 10
-            if damping > 1e6:
-                break
-            continue
-        small = np.abs(step / np.maximum(np.abs(theta), 1e-3)).max() < 1e-9 or cost - trial_cost < 1e-13 * cost
-        theta, poses, state, damping = theta + step, moved, trial, damping / 10
-        cost = trial_cost
-        if small:
-            break
-        if trial_scale < 0.7 * scale:  # far from the solution, the scale of the residuals is not yet known
-            state, cost, scale = _linearise(views, points, theta, poses, size)
-            cost += float(prior @ theta**2)
+        moved = np.stack([p + _pose_step(view, step) for p, view in zip(here.poses, here.equations, strict=True)])
+        return at(here.theta + step, moved, here.scale, step)
+
+    end = levenberg_marquardt(
+        at(parameters_of(camera, parameters), poses),
+        candidate,
+        _gain,
+        _settles,
+        damping=_DAMPING,
+        most=iterations,
+        # Far from the solution, the scale of the residuals is not yet known.
+        renewed=lambda here: at(here.theta, here.poses) if here.present < 0.7 * here.scale else here,
+    ).state
+    theta, poses = end.theta, end.poses
     state, _, scale = _linearise(views, points, theta, poses, size)
     if not np.isfinite(theta).all() or theta[:2].min() <= 0:
         raise ComputeError("the calibration did not converge", remedy="check the board's size and the views")
     return Adjustment(camera_of(theta, size), theta, poses, state, scale)
+
+
+@dataclass(frozen=True, slots=True)
+class _Linearised:
+    """Camera and poses with the views' equations.
+
+    Attributes:
+        scale: robust scale of the corners in px by which the cost was taken.
+        present: that of the residuals here.
+        step: of the camera, by which it was reached; None at the beginning.
+    """
+
+    theta: Array
+    poses: Array
+    equations: tuple[ViewEquations, ...]
+    cost: float
+    scale: float
+    present: float
+    step: Array | None
+
+
+def _gain(here: _Linearised, there: _Linearised) -> float:
+    """A cost that grows by rounding alone does not count as grown."""
+    return here.cost * (1 + 1e-12) - there.cost if np.isfinite(there.cost) else -math.inf
+
+
+def _settles(here: _Linearised, there: _Linearised) -> bool:
+    if _gain(here, there) < 0 or there.step is None:
+        return False
+    relative = np.abs(there.step / np.maximum(np.abs(here.theta), 1e-3)).max()
+    return bool(relative < 1e-9 or here.cost - there.cost < 1e-13 * here.cost)
 
 
 def linearised(boards: Array, points: Array, camera: CameraModel, parameters: int) -> Adjustment:

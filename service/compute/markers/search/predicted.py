@@ -9,15 +9,15 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
+from service.compute.descent import gauss_newton
 from service.compute.markers.cones import Cone, cone_of_sphere, ransac_cone
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.outlines.edges import envelope_edges, profiles, sample
 from service.compute.markers.outlines.refine import Approached, approach_outlines, measure_outlines, refine_outline
 from service.compute.markers.records import DEFAULTS, DetectionOptions, SphereOutline
-from service.core.geometry import Array, Transform, apply, skew, transform
+from service.core.geometry import Array, Transform, apply, increment, skew
 
 # Lengths below are fractions of a sphere's apparent radius, unless the name has a unit.
 NEAR = 0.08  # a prediction this good is refined directly; its region is searched only if that fails
@@ -338,24 +338,29 @@ def fit_pose(
         start: initial T_camera_scan.
         iterations: largest number.
     """
-    pose = start
-    for _ in range(iterations):
-        step = _pose_step(pose, axes, half_angles, centres_m, radius_m)
-        if step is None:
-            return start
-        pose = transform(Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3], pose[:3, 3] + step[:3])
-        if float(np.abs(step).max()) < 1e-9:
-            break
-    return pose
+    try:
+        return gauss_newton(
+            start,
+            lambda pose: _pose_step(pose, axes, half_angles, centres_m, radius_m),
+            lambda pose, step: increment(pose, step[:3], step[3:]),
+            most=iterations,
+            settled=1e-9,
+        )
+    except _InsideSphereError:
+        return start
 
 
-def _pose_step(pose: Transform, axes: Array, half_angles: Array, centres_m: Array, radius_m: float) -> Array | None:
-    """One Gauss–Newton step (6,) of translation and rotation; None if the camera would be inside a sphere."""
+class _InsideSphereError(Exception):
+    """The camera would be inside a sphere."""
+
+
+def _pose_step(pose: Transform, axes: Array, half_angles: Array, centres_m: Array, radius_m: float) -> Array:
+    """One Gauss–Newton step (6,) of translation and rotation. Raises _InsideSphereError."""
     rotated = centres_m @ pose[:3, :3].T
     c = rotated + pose[:3, 3]
     distance = np.linalg.norm(c, axis=1)
     if np.any(distance < 1.5 * radius_m):
-        return None
+        raise _InsideSphereError
     u = c / distance[:, None]
     place = (u - axes) / half_angles[:, None]
     size = np.arcsin(radius_m / distance) / half_angles - 1

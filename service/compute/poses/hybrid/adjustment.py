@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 
+from service.compute.descent import Damping, levenberg_marquardt
 from service.compute.poses.hybrid.bundle import Data, Normal, Rows, Sigmas, State, linearise, moved, normal_equations
 from service.core.errors import ComputeError
 from service.core.geometry import Array
@@ -18,6 +19,7 @@ _CAUCHY = {"tracks": 2.4, "spheres": 3.0, "robot_position": 3.0, "robot_rotation
 _SETTLED = 0.2  # change of the cost, which is a chi square of all residuals, at which an adjustment has converged
 _NEARLY = 5.0  # the same while the variances are still being estimated
 _MOST_STEPS = 40
+_DAMPING = Damping(1e-6, down=10, up=30, least=1e-9)
 _LEAST = Sigmas(track_px=0.02, sphere=0.3, robot_m=1e-5, robot_rad=1e-5)  # no measurement is better than this
 
 
@@ -91,32 +93,39 @@ def first_guess(state: State, data: Data, sigmas: Sigmas) -> Sigmas:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Linearised:
+    state: State
+    rows: dict[str, Rows]
+    cost: float
+
+
 def _descend(state: State, data: Data, sigmas: Sigmas, settled: float) -> tuple[State, dict[str, Rows], int]:
-    damping = 1e-6
-    rows = linearise(state, data, sigmas)
-    cost = _cost(rows)
-    for step in range(1, _MOST_STEPS + 1):
-        weights = _weights(rows)
-        normal = normal_equations([r.weighted(weights[name]) for name, r in rows.items()], damping)
-        candidate = moved(state, data, *normal.step(damping))
+    def at(there: State) -> _Linearised:
+        rows = linearise(there, data, sigmas)
+        cost = _cost(rows)
+        return _Linearised(there, rows, cost if math.isfinite(cost) else math.inf)
+
+    def candidate(here: _Linearised, damping: float) -> _Linearised:
+        weights = _weights(here.rows)
+        normal = normal_equations([r.weighted(weights[name]) for name, r in here.rows.items()], damping)
+        there = moved(here.state, data, *normal.step(damping))
         with np.errstate(all="ignore"):  # a step that leads nowhere is not taken
-            after = linearise(candidate, data, sigmas)
-            new = _cost(after)
-        new = new if math.isfinite(new) else math.inf
-        if new <= cost:
-            enough = cost - new <= settled
-            state, rows, cost, damping = candidate, after, new, max(damping / 10, 1e-9)
-            if enough:
-                return state, rows, step
-        elif new - cost <= settled:
-            return state, rows, step
-        else:
-            damping *= 30
-            if damping > 1e6:
-                raise ComputeError(
-                    "the bundle adjustment does not converge", remedy="check the camera, the poses and the spheres"
-                )
-    return state, rows, _MOST_STEPS
+            return at(there)
+
+    found = levenberg_marquardt(
+        at(state),
+        candidate,
+        lambda here, there: here.cost - there.cost,
+        lambda here, there: abs(here.cost - there.cost) <= settled,
+        damping=_DAMPING,
+        most=_MOST_STEPS,
+    )
+    if found.stuck:
+        raise ComputeError(
+            "the bundle adjustment does not converge", remedy="check the camera, the poses and the spheres"
+        )
+    return found.state.state, found.state.rows, found.steps
 
 
 def _weights(rows: dict[str, Rows]) -> dict[str, Array]:
