@@ -1,8 +1,8 @@
 """Processes each new image during the capture: finds its spheres and registers all images so far.
 
 The first images of a station are searched whole; from then on the registration predicts the spheres, and only their
-regions are searched (markers/search/predicted.py). Each station is an independent problem, since its robot poses are in
-a base frame of its own, so only the new image's station is solved again.
+regions are searched (markers/search/predicted.py). Each station is an independent problem, since its robot poses are
+in a base frame of its own, so only the new image's station is solved again.
 """
 
 from __future__ import annotations
