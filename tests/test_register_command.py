@@ -29,6 +29,8 @@ from simulators.scan_formats import encode
 from simulators.scan_station import scan_scene
 from simulators.world import NOMINAL_LUX, RADIUS_M, SCENE_CENTRE_M, Scene
 
+pytestmark = pytest.mark.slow  # photographs are rendered and registered
+
 Array = NDArray[np.float64]
 
 WIDTH, N_IMAGES, SEED = 720, 6, 7

@@ -20,6 +20,7 @@ FOUND = Path(__file__).parent / "data" / "fuzz"  # by target: inputs that once s
 INPUTS = 24  # per target, times its pace
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_parser_refuses_bad_input_as_people_can_understand(group: str, tmp_path: Path) -> None:
     outcomes = Sweep(group, "hypothesis", tmp_path).run_each(inputs=INPUTS, seconds=20.0)

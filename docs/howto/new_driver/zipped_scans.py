@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from importlib.metadata import version
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from pydantic import Field
 
@@ -47,10 +47,6 @@ class ZippedScans:
         whole = [one for one in self._archives() if _is_whole(one)]
         return tuple(self._unpacked(one) for one in sorted(whole, key=lambda one: one.stat().st_mtime_ns))
 
-    def pending(self) -> tuple[str, ...]:
-        """One sentence for each archive that cannot be used yet."""
-        return self.report().problems
-
     def read(self, export: ScanExport) -> ScannedMesh:
         """The mesh, in metres. Raises UnreadableFileError, IncompleteExportError."""
         return read_mesh_file(export.files[0], self._config.unit, export=export)
@@ -74,7 +70,7 @@ class ZippedScans:
             raise IncompleteExportError(
                 f"the archive cannot be unpacked ({error})", where=str(archive), remedy="Export the scan again"
             ) from error
-        meshes = [one for one in sorted(target.rglob("*")) if PurePosixPath(one).suffix.lower() in MESH_SUFFIXES]
+        meshes = [one for one in sorted(target.rglob("*")) if one.suffix.lower() in MESH_SUFFIXES]
         if len(meshes) != 1:
             raise UnreadableFileError(
                 f"{len(meshes)} meshes in one archive", where=str(archive), remedy="Export one scan at a time"
