@@ -1,1 +1,1 @@
-"""COLMAP: its model files, its convention, and the child process in which it works."""
+"""COLMAP: its model files, its conventions, and the child process in which it runs."""

@@ -1,4 +1,4 @@
-"""The one place where our conventions and COLMAP's meet: half a pixel, and the direction of poses."""
+"""The only conversion between our conventions and COLMAP's: half a pixel, and the direction of poses."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse, transform
 
-HALF_PIXEL = 0.5  # COLMAP's first pixel spans 0..1, so its centre lies at 0.5; ours lies at 0
+HALF_PIXEL = 0.5  # COLMAP's first pixel spans 0..1 with its centre at 0.5; ours is centred at 0
 
 
 def to_colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera:
-    """COLMAP's OPENCV camera of our calibrated one; FULL_OPENCV where it has more than k1, k2, p1, p2."""
+    """COLMAP's camera for our calibrated one: OPENCV, or FULL_OPENCV if it has more than k1, k2, p1, p2."""
     more = [camera.k3, camera.k4, camera.k5, camera.k6]
     return pycolmap.Camera(
         camera_id=camera_id,
@@ -35,10 +35,10 @@ def to_colmap_camera(camera: CameraModel, camera_id: int = 1) -> pycolmap.Camera
 
 
 def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
-    """Our camera of a COLMAP camera.
+    """Our camera from a COLMAP camera.
 
     Raises:
-        DataError: its model has distortion terms that ours does not.
+        DataError: its model has distortion terms that ours lacks.
     """
     p = [float(v) for v in camera.params]
     size = (int(camera.width), int(camera.height))
@@ -62,22 +62,22 @@ def from_colmap_camera(camera: pycolmap.Camera) -> CameraModel:
 
 
 def to_colmap_pose(T_world_camera: Transform) -> pycolmap.Rigid3d:
-    """COLMAP's cam_from_world of our pose."""
+    """COLMAP's cam_from_world for our T_world_camera (4, 4)."""
     T_camera_world = inverse(T_world_camera)
     return pycolmap.Rigid3d(pycolmap.Rotation3d(T_camera_world[:3, :3]), T_camera_world[:3, 3])
 
 
 def from_colmap_pose(cam_from_world: pycolmap.Rigid3d) -> Transform:
-    """T_world_camera of COLMAP's cam_from_world."""
+    """T_world_camera (4, 4) from COLMAP's cam_from_world."""
     rotation = np.asarray(cam_from_world.rotation.matrix(), dtype=np.float64)
     return inverse(transform(rotation, np.asarray(cam_from_world.translation, dtype=np.float64)))
 
 
 def from_colmap_pixels(points: Array) -> Array:
-    """Our pixels (N, 2) of COLMAP's image coordinates (N, 2)."""
+    """Our pixels (N, 2) from COLMAP's image coordinates (N, 2)."""
     return points - HALF_PIXEL
 
 
 def to_colmap_pixels(pixels: Array) -> Array:
-    """COLMAP's image coordinates (N, 2) of our pixels (N, 2)."""
+    """COLMAP's image coordinates (N, 2) from our pixels (N, 2)."""
     return pixels + HALF_PIXEL

@@ -1,4 +1,4 @@
-"""COLMAP model folders through pycolmap, in a child process: it takes over signal handlers and may crash."""
+"""COLMAP model folders through pycolmap, in a child process, because it takes over signal handlers and may crash."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from service.compute.camera_model import CameraModel
 from service.core.errors import DataError
 from service.core.geometry import Transform
 
-_SPARE_BYTES = 1 << 30  # beyond what the library itself takes
-_SPARE_S, _BYTES_PER_S = 3.0, 1e6  # text is read at sixty times that
-_PER_BYTE = 40  # of a model's files, once read: observations are 24 bytes in a file and some 60 in memory
+_SPARE_BYTES = 1 << 30  # beyond what the library itself needs
+_SPARE_S, _BYTES_PER_S = 3.0, 1e6  # text is read sixty times as fast
+_PER_BYTE = 40  # memory per byte of a model's files: an observation takes 24 bytes in a file and about 60 in memory
 
 
 def read_model(folder: Path) -> dict[str, Transform]:
-    """T_world_camera by image name of the model in `folder`.
+    """T_world_camera (4, 4) by image name from the model in `folder`.
 
     Raises:
         DataError: the model cannot be read.
@@ -34,7 +34,7 @@ def read_model(folder: Path) -> dict[str, Transform]:
 
 
 def write_model(folder: Path, camera: CameraModel, T_world_camera: dict[str, Transform]) -> None:
-    """Write a text model without points into an existing folder."""
+    """Write a text model without points into an existing folder. Raises DataError if it cannot be written."""
     _in_child(_write, folder, str(folder), camera, T_world_camera)
 
 
@@ -57,9 +57,9 @@ def _in_child(work: Callable[..., Any], folder: Path, *arguments: object) -> obj
 
 
 def _bound(folder: str) -> None:
-    """Counts in a damaged file may ask for any amount: this process gets what a sound model of these files takes.
+    """Limit this process's memory and processor time to what an intact model of these files needs.
 
-    Of memory and of processor time; beyond that the system ends it.
+    Counts in a damaged file may request any amount; beyond the limits, the system ends the process.
     """
     importlib.import_module("pycolmap")
     mapped_bytes = psutil.Process().memory_info().vms
@@ -84,7 +84,7 @@ def _read(folder: str) -> dict[str, Transform] | str:
         return {image.name: convention.from_colmap_pose(image.cam_from_world()) for image in images}
     except UnicodeDecodeError:
         return "the name of an image is not UTF-8"
-    except (RuntimeError, ValueError, IndexError, OSError) as error:  # what else pycolmap raises
+    except (RuntimeError, ValueError, IndexError, OSError) as error:  # everything that pycolmap raises
         return (str(error).strip().splitlines() or [type(error).__name__])[-1]
 
 

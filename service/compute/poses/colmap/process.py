@@ -1,4 +1,4 @@
-"""A child process in which COLMAP works: it takes over signal handlers and may crash, which must not be ours."""
+"""A child process for COLMAP, which takes over signal handlers and may crash without affecting ours."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def _child(log: str, seed: int, pipe: Connection) -> None:
 
 
 class ColmapProcess:
-    """Runs one task after another in a child, started with the first one, that is kept until `close`.
+    """Runs tasks one after another in a child process, which starts with the first task and lives until `close`.
 
-    Not for several threads at once.
+    Not thread-safe.
     """
 
     def __init__(self, *, seed: int, log: Path | None = None) -> None:
-        """COLMAP's output goes to `log`; None: to a temporary file."""
+        """Write COLMAP's output to `log`; None: to a temporary file."""
         self._seed = seed
         self._temporary = log is None
         self._log = log
@@ -46,11 +46,11 @@ class ColmapProcess:
         self.close()
 
     def run(self, task: str, job: dict[str, Any], *, timeout_s: float, progress: Progress | None = None) -> Any:
-        """What `task` (see sfm_process) makes of the job.
+        """Run `task` (see poses.sfm.child) on the job and return its result.
 
         Raises:
-            ComputeError: COLMAP failed or crashed, or it takes too long.
-            OrthocaptureError: whatever the task itself raises.
+            ComputeError: COLMAP failed, crashed or took too long.
+            OrthocaptureError: raised by the task itself.
         """
         try:
             answer = self._answer(task, job, time.monotonic() + timeout_s, progress)
@@ -61,7 +61,7 @@ class ColmapProcess:
                 f"COLMAP crashed during {task}: {tail}", where=str(self._log), remedy="see its log"
             ) from None
         except BaseException:
-            self.close()  # a task that was left half way must not answer the next one
+            self.close()  # otherwise a late answer could be taken for the next task's
             raise
         if answer is None:
             self.close()
@@ -76,7 +76,7 @@ class ColmapProcess:
     def _answer(
         self, task: str, job: dict[str, Any], deadline: float, progress: Progress | None
     ) -> tuple[str, Any] | None:
-        """The child's last word on the task; None: it took too long."""
+        """The child's answer to the task; None if it took too long."""
         pipe = self._started()
         pipe.send((task, job))
         while pipe.poll(max(0.0, deadline - time.monotonic())):
@@ -88,7 +88,7 @@ class ColmapProcess:
         return None
 
     def close(self) -> None:
-        """End the child; the next task starts another."""
+        """End the child; the next task starts a new one."""
         if self._process is None:
             return
         assert self._pipe is not None
@@ -109,7 +109,7 @@ class ColmapProcess:
                 handle, name = tempfile.mkstemp(prefix="orthocapture-colmap-", suffix=".log")
                 os.close(handle)
                 self._log = Path(name)
-                weakref.finalize(self, self._log.unlink, missing_ok=True)  # also where nobody closes it
+                weakref.finalize(self, self._log.unlink, missing_ok=True)  # in case nobody closes it
             context = multiprocessing.get_context("spawn")
             self._pipe, theirs = context.Pipe()
             self._process = context.Process(

@@ -21,18 +21,18 @@ from service.core.geometry import Array
 def similarity_covariance(
     T_world_camera: Array, tracks: Tracks, camera: CameraModel, known: CameraCovariance | None = None
 ) -> Array:
-    """Joint covariance (6 N, 6 N) of poses at the solution of a bundle adjustment, the camera held.
+    """Joint covariance (6 N, 6 N) of poses at the solution of a bundle adjustment with the camera fixed.
 
-    From the normal equations with the points eliminated, robust weights, and errors that are common to a track
-    allowed for. Frame and scale are free: the covariance is that of the poses after their positions were laid over
-    the true ones by a similarity (inner constraints; Triggs et al., "Bundle adjustment", 2000, 9.2.2).
+    From the normal equations with the points eliminated and robust weights, allowing for errors shared within a
+    track. Frame and scale are free: the covariance is that of the poses after a similarity has aligned their
+    positions with the true ones (inner constraints; Triggs et al., "Bundle adjustment", 2000, 9.2.2).
 
     Args:
         T_world_camera: (N, 4, 4), any unit.
         tracks: of the same images, in the same frame.
         camera: intrinsics.
-        known: how well they are known, where they were held: their error moves all poses together, whatever the
-            number of images. None: as if exactly.
+        known: covariance of the camera that was fixed; its error moves all poses together, however many images there
+            are. None: the camera is taken as exact.
 
     Returns:
         (6 N, 6 N) of increments (d in the model's unit, w in radians) of exp(w) R, t + d in the model's axes.
@@ -45,7 +45,7 @@ def similarity_covariance(
     data = Data(tracks)
     rows = robust_rows(state, data, first_guess(state, data, Sigmas()))
     bread, meat = clustered_information(rows["tracks"], 6 * n)
-    # Seven directions change nothing in the images: shifts, turns, and the scale.
+    # The images do not determine seven directions: translation, rotation and scale.
     positions = T_world_camera[:, :3, 3] - T_world_camera[:, :3, 3].mean(axis=0)
     spread = float(np.sqrt(np.mean(np.sum(positions**2, axis=1))))
     gauge = np.zeros((n, 6, 7))
@@ -62,7 +62,7 @@ def similarity_covariance(
     if not np.all(np.isfinite(inverse)):
         raise ComputeError("the poses of structure from motion are not determined by its tracks")
     fixed = gauge.copy()
-    fixed[:, 3:] = 0.0  # the positions alone carry the alignment
+    fixed[:, 3:] = 0.0  # only positions define the alignment
     E = fixed.reshape(6 * n, 7)
     S = np.eye(6 * n) - G @ np.linalg.solve(E.T @ G, E.T)
     half = S @ inverse
@@ -74,9 +74,9 @@ def similarity_covariance(
 
 
 def _pulls(state: State, data: Data, tracks: Rows, bread: Array, known: CameraCovariance) -> Iterator[Array]:
-    """(6 N,) what each deviation of the camera adds to the gradient of the poses, the points free to follow."""
+    """(6 N,) change of the poses' gradient for each deviation of the camera, with the points adjusted."""
     plain = linearise(state, data, Sigmas())["tracks"]
-    # The square roots of the robust weights, and of the sigma that they were found with.
+    # The square roots of the robust weights, over the sigma that they were found with.
     root = np.sqrt(_row_squares(tracks) / np.maximum(_row_squares(plain), 1e-300))
     for camera in known.deviations(state.camera):
         off = linearise(dataclasses.replace(state, camera=camera), data, Sigmas())["tracks"].residual - plain.residual
@@ -90,13 +90,13 @@ def _row_squares(rows: Rows) -> Array:
 
 
 def blocks(covariance: Array) -> Array:
-    """(N, 6, 6) of the poses one by one, of a joint covariance (6 N, 6 N)."""
+    """(N, 6, 6) covariance of each pose, from a joint covariance (6 N, 6 N)."""
     n = len(covariance) // 6
     return np.array([covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(n)])
 
 
 def write_pose_covariance(path: Path, names: Sequence[str], pose_covariance: Array, unit: str) -> None:
-    """Write (N, 6, 6) beside a model. `unit` of the positions: "m" or "model"."""
+    """Write (N, 6, 6) beside a model; `unit` is that of the positions: "m" or "model"."""
     document = {
         "order": ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"],
         "increment": "T_world_camera: exp(w) R, t + d, in the axes of the world",

@@ -23,7 +23,7 @@ from service.core.text.json_text import parse_json
 from service.core.units import metres
 
 _HEADER = ("image", "x", "y", "z", "qx", "qy", "qz", "qw")
-_UNIT = 1e-3  # how far a quaternion's length may be from 1: files with four decimals pass
+_UNIT = 1e-3  # tolerance of a quaternion's length from 1, so that files with four decimals pass
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # T_camera_openglcamera: x right, y up, z backward
 _CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 _DISTORTION = (
@@ -35,8 +35,8 @@ _DISTORTION = (
     "k4",
     "k5",
     "k6",
-)  # what is not there is zero: a pinhole camera without any
-#: What `calibrate intrinsics` writes beside the camera into the same file.
+)  # missing ones are zero
+#: Keys that `calibrate intrinsics` writes into the same file beside the camera.
 _CALIBRATION_KEYS = (
     "model", "board", "n_views", "images", "rms_px", "per_view_rms_px", "excluded", "sigma", "sigma_independent",
     "sigma_by_image", "sigma_corner_px", "inflation", "covariance", "coverage", "tilt", "cross_validation",
@@ -46,12 +46,12 @@ _CALIBRATION_KEYS = (
 
 @dataclass(frozen=True, slots=True)
 class SphereFile:
-    """Sphere positions that were measured elsewhere, in the scan's frame.
+    """Sphere centres measured elsewhere, in the scan frame.
 
     Attributes:
-        radius_m: of all spheres.
+        radius_m: radius of all spheres.
         registration_m: (M, 3).
-        control_m: (K, 3), possibly none.
+        control_m: (K, 3); K may be 0.
     """
 
     radius_m: float
@@ -63,9 +63,9 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
     """T_world_camera by image name from a CSV, a transforms.json or a COLMAP model folder.
 
     Args:
-        path: file or folder; the format follows from what it is.
-        images: names that must have a pose, matched by file name if need be; only these are returned. None
-            returns all.
+        path: file or folder; its kind determines the format.
+        images: names that must have a pose, matched by file name if necessary; only these are returned. None returns
+            all.
 
     Raises:
         DataError: unknown format, malformed content (with file:line), or an image without a pose.
@@ -91,10 +91,10 @@ def read_poses(path: Path, images: Sequence[str] | None = None) -> dict[str, Tra
 def posed_images(
     path: Path, images: ImageFolder, folder: Path, *, strict: bool = False
 ) -> tuple[dict[str, Transform], ImageFolder]:
-    """T_world_camera of the images that have one, by name, and these images; the others are left out.
+    """T_world_camera by name for the images that have a pose, and these images; the others are left out.
 
     Raises:
-        DataError: as `read_poses`; no image has a pose; or one has none where `strict`.
+        DataError: as `read_poses`; no image has a pose; or, with `strict`, one has none.
     """
     names = [file.name for file in images.files]
     chosen, missing = _matched(read_poses(path), names)
@@ -114,7 +114,7 @@ def _select(poses: Mapping[str, Transform], images: Sequence[str], path: Path) -
 
 
 def _matched(poses: Mapping[str, Transform], images: Sequence[str]) -> tuple[dict[str, Transform], list[str]]:
-    """Poses by image, and the images without one."""
+    """Poses by image, and the names of the images without one."""
     by_file_name: dict[str, list[str]] = {}
     for name in poses:
         by_file_name.setdefault(Path(name).name, []).append(name)
@@ -146,7 +146,7 @@ def read_poses_csv(path: Path) -> dict[str, Transform]:
     """T_world_camera from a CSV with the header image,x,y,z,qx,qy,qz,qw (metres, scalar last).
 
     Raises:
-        DataError: anything else, with file:line.
+        DataError: the file has another form; the message names file:line.
     """
     poses: dict[str, Transform] = {}
     rows = csv_rows(path)
@@ -182,7 +182,7 @@ def read_poses_csv(path: Path) -> dict[str, Transform]:
 
 
 def write_poses_csv(path: Path, T_world_camera: Mapping[str, Transform]) -> None:
-    """Write poses as `read_poses_csv` reads them."""
+    """Write poses in the form that `read_poses_csv` reads."""
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(_HEADER)
@@ -200,7 +200,7 @@ def read_transforms_json(path: Path) -> dict[str, Transform]:
     Names are the frames' file_path without a leading "./".
 
     Raises:
-        DataError: not such a file, a matrix that is not rigid, or a duplicate.
+        DataError: another kind of file, a matrix that is not rigid, or a duplicate image.
     """
     frames = _object(path).get("frames")
     if not isinstance(frames, list) or not frames:
@@ -252,7 +252,7 @@ def write_transforms_json(path: Path, camera: CameraModel, T_world_camera: Mappi
         "h": camera.height,
         "fl_x": camera.fx,
         "fl_y": camera.fy,
-        # nerfstudio counts from the corner of the first pixel, as COLMAP does
+        # nerfstudio, like COLMAP, has the first pixel's corner at 0
         "cx": camera.cx + 0.5,
         "cy": camera.cy + 0.5,
         "k1": camera.k1,
@@ -274,7 +274,7 @@ def read_colmap_model(folder: Path) -> dict[str, Transform]:
     """T_world_camera from a COLMAP model (cameras, images, points3D as .bin or .txt), or a folder above it.
 
     Raises:
-        DataError: no model in the folder, or an unreadable one.
+        DataError: the folder has no model, or it cannot be read.
     """
     for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "0"):
         if any((place / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
@@ -290,7 +290,7 @@ def write_colmap_text(folder: Path, camera: CameraModel, T_world_camera: Mapping
     """Write poses and camera as a COLMAP text model without points.
 
     Raises:
-        DataError: an image name with spaces, which that format cannot hold, or the folder cannot be written.
+        DataError: an image name has spaces, which that format cannot hold, or the folder cannot be written.
     """
     spaced = [name for name in T_world_camera if name.split() != [name]]
     if spaced:
@@ -305,10 +305,10 @@ def write_colmap_text(folder: Path, camera: CameraModel, T_world_camera: Mapping
 
 
 def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> CameraModel:
-    """Camera from {"width","height","fx","fy","cx","cy"} and, where not zero, "k1" … "k6", "p1", "p2" (as in OpenCV).
+    """Camera from {"width","height","fx","fy","cx","cy"} and, if not zero, "k1" … "k6", "p1", "p2" (as in OpenCV).
 
-    A file that `calibrate intrinsics` wrote holds what it knows of the calibration beside these; any other key is
-    refused, since it may change what the numbers mean.
+    A file written by `calibrate intrinsics` also holds the calibration's results. Any other key is refused, since it
+    could change the meaning of the numbers.
 
     Raises:
         DataError: a key is missing, unknown or not a number, or the size is not the images' (width, height).
@@ -336,17 +336,17 @@ def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> C
 
 
 def write_camera_json(path: Path, camera: CameraModel) -> None:
-    """Write a camera as `read_camera_json` reads it."""
+    """Write a camera in the form that `read_camera_json` reads."""
     path.write_text(json.dumps(camera.record(), indent=2) + "\n", encoding="utf-8")
 
 
 def read_spheres_json(path: Path) -> SphereFile:
     """Spheres from {"radius_mm": 15, "registration_mm": [[x,y,z],…], "control_mm": [[x,y,z],…]}.
 
-    `details`, what the `spheres` command knows of each besides, is passed over.
+    `details`, which the `spheres` command adds for each sphere, is ignored.
 
     Raises:
-        DataError: a key is missing or unknown, no registration sphere, or malformed numbers.
+        DataError: a key is missing or unknown, there is no registration sphere, or numbers are malformed.
     """
     document = _object(path)
     _check_keys(document, {"radius_mm", "registration_mm"}, {"control_mm", "details"}, path)

@@ -1,4 +1,4 @@
-"""Reads what goes with a robot's poses: T_flange_camera of a hand_eye.json, and the station of each image."""
+"""Reads files beside a robot's poses: T_flange_camera from hand_eye.json, and the station of each image."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _REMEDY = "Give the file that `orthocapture calibrate hand-eye` wrote"
 
 
 def read_hand_eye(path: Path) -> Transform:
-    """T_flange_camera (4, 4), metres.
+    """T_flange_camera (4, 4), metres, from a hand_eye.json.
 
     Raises:
-        DataError: the file does not hold it.
+        DataError: the file holds no valid T_flange_camera.
     """
     document = parse_json(file_text(path), name=str(path), remedy=_REMEDY)
     try:
@@ -35,7 +35,7 @@ def read_stations(path: Path, images: Iterable[str]) -> dict[str, str]:
     """Station by image name, from a CSV with the columns image and station.
 
     Raises:
-        DataError: the file has no such columns, or an image has no station.
+        DataError: the columns are missing, or an image has no station.
     """
     rows = csv_rows(path)
     header = [cell.strip() for cell in next(rows, (1, []))[1]]

@@ -1,4 +1,4 @@
-"""Solves a bundle adjustment robustly, estimates its variance components, and gives the covariance of its poses."""
+"""Robust solution of a bundle adjustment, with variance components and the covariance of its poses."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array
 
 _CAUCHY = {"tracks": 2.4, "spheres": 3.0, "robot_position": 3.0, "robot_rotation": 3.0}  # scale, in sigmas
-_SETTLED = 0.2  # change of the cost, which is a chi square of all residuals, at which an adjustment has converged
+_SETTLED = 0.2  # change of the cost (a chi square of all residuals) below which an adjustment has converged
 _NEARLY = 5.0  # the same while the variances are still being estimated
 _MOST_STEPS = 40
 _DAMPING = Damping(1e-6, down=10, up=30, least=1e-9)
-_LEAST = Sigmas(track_px=0.02, sphere=0.3, robot_m=1e-5, robot_rad=1e-5)  # no measurement is better than this
+_LEAST = Sigmas(track_px=0.02, sphere=0.3, robot_m=1e-5, robot_rad=1e-5)  # lower bounds of the estimates
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +32,9 @@ class Solution:
         sigmas: of the components, estimated.
         weights: robust weight of each measurement, by component.
         covariance: (n, n) of the frame parameters, points eliminated.
-        chi2: reduced chi square of each component, robust weights applied, by its own redundancy.
-        redundancy: of each component; all of them and the number of parameters add up to the number of rows.
-        steps: linearisations that it took.
+        chi2: reduced chi square of each component, with robust weights and its own redundancy.
+        redundancy: of each component; their sum plus the number of parameters is the number of rows.
+        steps: number of linearisations.
     """
 
     state: State
@@ -47,13 +47,13 @@ class Solution:
 
 
 def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solution:
-    """Levenberg–Marquardt with Cauchy weights, the components' variances estimated between rounds.
+    """Levenberg–Marquardt with Cauchy weights; the components' variances are estimated between rounds.
 
-    Variances by Förstner's estimate: each component's weighted squares over its redundancy (Koch, Parameter
-    Estimation and Hypothesis Testing in Linear Models, 3.6).
+    The variances are Förstner's estimates: each component's weighted sum of squares over its redundancy (Koch,
+    Parameter Estimation and Hypothesis Testing in Linear Models, 3.6).
 
     Raises:
-        ComputeError: it does not converge, or something is not determined by the data.
+        ComputeError: no convergence, or the data leave something undetermined.
     """
     steps = 0
     sigmas = first_guess(state, data, sigmas)
@@ -83,7 +83,7 @@ def solve(state: State, data: Data, sigmas: Sigmas, *, rounds: int = 3) -> Solut
 
 
 def first_guess(state: State, data: Data, sigmas: Sigmas) -> Sigmas:
-    """The tracks' sigma from the median of their residuals, so that robust weights mean something from the start."""
+    """Sigmas with the tracks' from the median of their residuals, so that robust weights work from the start."""
     squares = linearise(state, dataclasses.replace(data, sightings=None, robot=None, lens_covariance=None), sigmas)[
         "tracks"
     ].squares
@@ -110,7 +110,7 @@ def _descend(state: State, data: Data, sigmas: Sigmas, settled: float) -> tuple[
         weights = _weights(here.rows)
         normal = normal_equations([r.weighted(weights[name]) for name, r in here.rows.items()], damping)
         there = moved(here.state, data, *normal.step(damping))
-        with np.errstate(all="ignore"):  # a step that leads nowhere is not taken
+        with np.errstate(all="ignore"):  # a step to invalid values has infinite cost and is rejected
             return at(there)
 
     found = levenberg_marquardt(
@@ -129,7 +129,7 @@ def _descend(state: State, data: Data, sigmas: Sigmas, settled: float) -> tuple[
 
 
 def _weights(rows: dict[str, Rows]) -> dict[str, Array]:
-    """Cauchy weights of the measurements of each component; prior knowledge is not doubted."""
+    """Cauchy weights of the measurements of each component; priors have weight one."""
     return {
         name: 1 / (1 + r.squares / _CAUCHY[name] ** 2) if name in _CAUCHY else np.ones(len(r.squares))
         for name, r in rows.items()
@@ -163,7 +163,7 @@ def _inverse(schur: Array) -> Array:
 
 
 def _redundancy(weighted: dict[str, Rows], normal: Normal, covariance: Array) -> dict[str, float]:
-    """Rows of each component less the parameters that they determine."""
+    """Redundancy of each component: its rows less the parameters that they determine."""
     out: dict[str, float] = {}
     cross = normal.cross
     left = float(sum(len(r.residual) for r in weighted.values()) - len(covariance) - cross.shape[1])
@@ -172,7 +172,7 @@ def _redundancy(weighted: dict[str, Rows], normal: Normal, covariance: Array) ->
             continue
         J = r.frame.toarray()
         if r.point.nnz:
-            # A point's increment is -V^-1 W^T of the cameras' increment, plus what its own rows allow.
+            # A point's increment is -V^-1 W^T of the cameras' increment, plus the part from its own rows.
             used = np.unique(r.point.indices // 3)
             columns = (3 * used[:, None] + np.arange(3)).ravel()
             inverse = block_diag(*normal.inverse_blocks[used])
@@ -188,7 +188,7 @@ def _redundancy(weighted: dict[str, Rows], normal: Normal, covariance: Array) ->
 
 
 def _estimated(sigmas: Sigmas, chi2: dict[str, float], redundancy: dict[str, float]) -> Sigmas:
-    """Sigmas for the next round; a component with next to no redundancy keeps its own."""
+    """Sigmas for the next round; a component with almost no redundancy keeps its own."""
 
     def factor(name: str) -> float:
         return math.sqrt(chi2[name]) if redundancy.get(name, 0) >= 6 and chi2[name] > 0 else 1.0
@@ -210,10 +210,10 @@ def robust_rows(state: State, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
 
 
 def clustered_information(tracks: Rows, n: int) -> tuple[Array, Array]:
-    """H and M (n, n) of weighted tracks, points eliminated: the covariance H^-1 M H^-1 of the frame parameters.
+    """H and M (n, n) of weighted tracks, points eliminated, for the covariance H^-1 M H^-1 of the frame parameters.
 
-    It stays honest where the errors of one track are alike: M sums the squared scores of whole tracks. Source: the
-    sandwich of robust estimation (Huber, Robust Statistics, 6.3) with clusters.
+    It holds even if the errors within a track are correlated: M sums the squared scores of whole tracks. Source: the
+    sandwich estimator of robust estimation (Huber, Robust Statistics, 6.3) with clusters.
     """
     point = tracks.point.indices[tracks.point.indptr[:-1]] // 3
     n_rows, n_points = len(tracks.residual), int(point.max()) + 1
@@ -226,7 +226,7 @@ def clustered_information(tracks: Rows, n: int) -> tuple[Array, Array]:
 
 
 def _honest(weighted: dict[str, Rows], normal: Normal) -> Array:
-    """Covariance of the frame parameters; tracks by their clustered scores, the other components at their word."""
+    """Covariance of the frame parameters; tracks by clustered scores, the other components by their stated sigmas."""
     bread, meat = clustered_information(weighted["tracks"], len(normal.schur))
     _, weight, slope = _EXPECTED["tracks"]
     rest = normal.schur - bread * weight / slope
@@ -235,7 +235,7 @@ def _honest(weighted: dict[str, Rows], normal: Normal) -> Array:
 
 
 def _expectations(scale: float, dimensions: int) -> tuple[float, float, float]:
-    """Per dimension, of Gaussian residuals under Cauchy weights w: E[w s], E[w], and the mean slope of w r."""
+    """E[w s], E[w] and the mean slope of w r, per dimension, for Gaussian residuals r under Cauchy weights w."""
     s = np.linspace(0.0, 80.0, 20001)[1:]
     density = s ** (dimensions / 2 - 1) * np.exp(-s / 2)
     density /= density.sum()

@@ -29,13 +29,13 @@ _CHUNK = 2000  # points eliminated at a time
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What is estimated. Points are those of the tracks followed by the spheres' centres."""
+    """The estimated quantities. `points` are those of the tracks, followed by the spheres' centres."""
 
     cameras: Array  # (N, 4, 4) T_frame_camera
     points: Array  # (P + M, 3) in the frame
     bases: Array  # (G, 4, 4) T_frame_base
     camera: CameraModel
-    common: Array = field(default_factory=lambda: np.zeros(len(COMMON)))  # px, errors that all outlines share
+    common: Array = field(default_factory=lambda: np.zeros(len(COMMON)))  # px, errors shared by all outlines
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,24 +52,24 @@ class SphereSightings:
 
 @dataclass(frozen=True, slots=True)
 class Data:
-    """What was measured. Sigmas: px for tracks, (m, rad) for the robot, metres for the spheres' positions."""
+    """The measurements. Sigmas: px for tracks, (m, rad) for the robot, metres for the spheres' positions."""
 
     tracks: Tracks
     sightings: SphereSightings | None = None
     centres: Array | None = None  # (M, 3) spheres in the frame
     centre_whitening: Array | None = None  # (M, 3, 3) W with W C W^T = I for the covariance C of a centre
     common_sigma_px: Array | None = None  # (6,) of COMMON
-    light_unit_m: float = 0.0  # displacement of the spheres in space for a pixel of light
+    light_unit_m: float = 0.0  # displacement of the spheres in space per pixel of light error
     radius_m: float = 0.0
-    robot: Array | None = None  # (N, 4, 4) T_base_camera; NaN where there is none
-    group: Index | None = None  # (N,) position in the bases
-    calibrated: CameraModel | None = None  # the camera that the cones were made with
-    lens_covariance: Array | None = None  # (4, 4) of its fx, fy, cx, cy; None: the camera is held
+    robot: Array | None = None  # (N, 4, 4) T_base_camera; NaN for images without one
+    group: Index | None = None  # (N,) index into the bases
+    calibrated: CameraModel | None = None  # the camera with which the cones were made
+    lens_covariance: Array | None = None  # (4, 4) of its fx, fy, cx, cy; None: the camera is fixed
 
 
 @dataclass(frozen=True, slots=True)
 class Sigmas:
-    """Standard deviations of the components, and the factor on the outlines' own covariances."""
+    """Standard deviations of the components; `sphere` is a factor on the outlines' own."""
 
     track_px: float = 0.4
     sphere: float = 1.0
@@ -84,10 +84,10 @@ class Rows:
     residual: Array  # (R,)
     frame: csr_matrix  # (R, n)
     point: csr_matrix  # (R, 3 (P + M))
-    size: int  # rows that belong to one measurement: a robust weight is common to them
+    size: int  # rows per measurement, which share a robust weight
 
     def weighted(self, weights: Array) -> Rows:
-        """Each measurement's rows multiplied by the square root of its weight (R / size,)."""
+        """The rows multiplied by the square root of their measurement's weight (R / size,)."""
         root = np.repeat(np.sqrt(weights), self.size)
         scale = coo_matrix((root, (np.arange(len(root)), np.arange(len(root))))).tocsr()
         return Rows(self.residual * root, (scale @ self.frame).tocsr(), (scale @ self.point).tocsr(), self.size)
@@ -99,7 +99,7 @@ class Rows:
 
 
 def width(state: State, data: Data) -> int:
-    """Number of frame parameters: six a camera, six a base, what the outlines share, and the lens."""
+    """Number of frame parameters: six per camera, six per base, the errors shared by outlines, and the lens."""
     return _lens_column(state, data) + (len(LENS) if data.lens_covariance is not None else 0)
 
 
@@ -112,7 +112,7 @@ def _lens_column(state: State, data: Data) -> int:
 
 
 def linearise(state: State, data: Data, sigmas: Sigmas) -> dict[str, Rows]:
-    """Rows of every component that the data have: tracks, spheres, centres, common, robot_position …, lens."""
+    """Rows of every component in the data: tracks, spheres, centres, common, robot_position …, lens."""
     out = {"tracks": _track_rows(state, data, sigmas)}
     if data.sightings is not None:
         out["spheres"] = _sphere_rows(state, data, sigmas)
@@ -146,7 +146,7 @@ class Normal:
 
 
 def normal_equations(rows: list[Rows], damping: float = 0.0) -> Normal:
-    """Sum of all rows, points eliminated.
+    """Normal equations of all rows, with the points eliminated.
 
     Raises:
         ComputeError: a point is not determined by its observations.
@@ -167,7 +167,7 @@ def normal_equations(rows: list[Rows], damping: float = 0.0) -> Normal:
     point_gradient = (B.T @ r).reshape(-1, 3)
     schur = (A.T @ A).toarray()
     half = np.linalg.cholesky(inverse)
-    for first in range(0, n_points, _CHUNK):  # dense pieces: far faster than products of sparse matrices
+    for first in range(0, n_points, _CHUNK):  # dense blocks are much faster than sparse matrix products
         mine = slice(first, min(first + _CHUNK, n_points))
         piece = W[:, 3 * mine.start : 3 * mine.stop].toarray().reshape(len(schur), -1, 3)
         piece = np.einsum("npi,pij->npj", piece, half[mine]).reshape(len(schur), -1)
@@ -205,7 +205,7 @@ def _turned(poses: Array, steps: Array) -> Array:
 
 
 def _seen(cameras: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Points in their cameras (O, 3), and the derivatives (O, 3, 6) by the pose and (O, 3, 3) by the point."""
+    """Points in their camera frames (O, 3), and derivatives (O, 3, 6) by the pose and (O, 3, 3) by the point."""
     R, t = cameras[:, :3, :3], cameras[:, :3, 3]
     v = points - t
     Rt = np.swapaxes(R, 1, 2)
@@ -244,13 +244,13 @@ def _sphere_rows(state: State, data: Data, sigmas: Sigmas) -> Rows:
         plane = state.camera.normalise(pixels)
         axes = np.column_stack([plane, np.ones(len(plane))])
         axes /= np.linalg.norm(axes, axis=1)[:, None]
-        # A change of the focal length also changes the half angle, by far less than its sigma.
+        # The focal length also changes the half angle, but by far less than its sigma.
         lift = np.zeros((len(c), 3, len(LENS)))
         lift[:, :2] = _lens_derivative(state.camera, pixels, plane) * axes[:, 2, None, None]
         lens = np.zeros((len(c), 3, len(LENS)))
         lens[:, :2] = -np.swapaxes(e, 1, 2) @ lift
     focal = 0.5 * (state.camera.fx + state.camera.fy)
-    shift = np.zeros((len(c), 3, len(COMMON)))  # what the detector adds to a cone
+    shift = np.zeros((len(c), 3, len(COMMON)))  # the common errors of the detector
     shift[:, :2, :2] = np.swapaxes(e[:, :2], 1, 2) * (axes[:, 2] / focal)[:, None, None]
     shift[:, 2, 2] = axes[:, 2] ** 2 / focal
     seen, d = cone_residuals(axes, e, s.half_angles, c, data.radius_m)
@@ -285,7 +285,7 @@ def _rows(
     d_point: Array,
     more: tuple[int, Array] | None,
 ) -> Rows:
-    """`more`: derivatives by further frame parameters, from a column on."""
+    """Rows from dense derivatives; `more` holds derivatives by further frame parameters and their first column."""
     n_obs, k = residual.shape
     row = np.arange(n_obs * k).reshape(n_obs, k, 1)
     columns, values = [np.broadcast_to(6 * image[:, None, None] + np.arange(6), d_pose.shape)], [d_pose]
@@ -308,7 +308,7 @@ def _sparse(row: NDArray[Any], column: NDArray[Any], values: NDArray[Any], shape
 
 
 def _centre_rows(state: State, data: Data) -> Rows:
-    """The spheres' places in the scan."""
+    """Rows of the spheres' measured positions in the scan."""
     assert data.centres is not None
     assert data.centre_whitening is not None
     m, first = len(data.centres), len(data.tracks.points)
@@ -320,7 +320,7 @@ def _centre_rows(state: State, data: Data) -> Rows:
 
 
 def _common_rows(state: State, data: Data) -> Rows:
-    """How large errors are that all outlines share."""
+    """Rows of the prior of the errors that all outlines share."""
     assert data.common_sigma_px is not None
     count = len(COMMON)
     row, column = np.arange(count)[:, None], _common_column(state) + np.arange(count)[:, None]
@@ -361,7 +361,7 @@ def _robot_rows(state: State, data: Data, sigmas: Sigmas) -> tuple[Rows, Rows]:
 
 
 def _lens_rows(state: State, data: Data) -> Rows:
-    """The calibration as an observation of the lens."""
+    """Rows of the lens calibration, as an observation of the lens."""
     assert data.calibrated is not None
     assert data.lens_covariance is not None
     whitening = whitening_of(data.lens_covariance)

@@ -1,4 +1,4 @@
-"""What is not known of a camera that was held does to hybrid poses: its error is common to tracks and outlines."""
+"""Effect of a fixed camera's calibration error on hybrid poses; the error is common to tracks and outlines."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from service.compute.poses.hybrid.adjustment import Solution
 from service.compute.poses.hybrid.bundle import Data, SphereSightings, linearise, normal_equations
 from service.core.geometry import Array
 
-_RIM = 12  # rays of an outline that are read anew
+_RIM = 12  # rays of an outline that are recomputed
 
 
 def camera_share(solution: Solution, data: Data, known: CameraCovariance) -> Array:
-    """Covariance (n, n) of the frame parameters that comes from the camera's own, to be added to the solution's.
+    """Covariance (n, n) of the frame parameters due to the camera's covariance, to be added to the solution's.
 
-    For each way in which the camera may be off, the step that the adjustment would take with that camera: robust
-    weights held, points free to follow, the outlines read from their pixels anew.
+    For each deviation of the camera, this takes the step that the adjustment would make with that camera: robust
+        weights
+    fixed, points adjusted, cones recomputed from the outlines' pixels.
     """
     plain = linearise(solution.state, data, solution.sigmas)
     weighted = {name: rows.weighted(solution.weights[name]) for name, rows in plain.items()}
@@ -42,7 +43,7 @@ def camera_share(solution: Solution, data: Data, known: CameraCovariance) -> Arr
 
 
 def _read_by(sightings: SphereSightings | None, held: CameraModel, other: CameraModel) -> SphereSightings | None:
-    """The outlines as another camera's model reads the same pixels."""
+    """The outlines' cones recomputed from the same pixels with another camera model."""
     if sightings is None:
         return None
     azimuth = np.linspace(0.0, 2 * np.pi, _RIM, endpoint=False)

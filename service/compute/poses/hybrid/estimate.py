@@ -1,8 +1,8 @@
-"""Hybrid camera poses: tracks, robot poses and spheres of known place in one bundle adjustment.
+"""Hybrid camera poses: tracks, robot poses and measured spheres in one bundle adjustment.
 
 Structure from motion gives the cameras' relative poses to hundredths of a millimetre but no scale; the spheres give
-scale and the scan's frame; the robot gives each station's base. One adjustment weighs all three by the variances
-that the data themselves show.
+the scale and the scan's frame; the robot gives each station's base. One adjustment weights all three by variance
+components estimated from the data.
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ class HybridOptions:
     """Settings of the adjustment.
 
     Attributes:
-        sphere_sigma_m: standard deviation of a sphere's position in the scan, for each coordinate, where no
-            covariance of it is given.
-        common_errors: sizes of what all outlines have in common, solved for; None: `EXPECTED_COMMON_ERRORS`.
-        most_observations: of tracks that take part; more gain next to nothing and cost time and memory.
-        robot_sigma_m: of the robot's positions, to begin with; estimated from the data.
-        robot_sigma_rad: of its orientations, likewise.
-        track_sigma_px: of the tracks, likewise.
+        sphere_sigma_m: standard deviation per coordinate of a sphere's position in the scan, used if no covariance is
+            given.
+        common_errors: prior sizes of the errors that all outlines share, which are estimated; None:
+            `EXPECTED_COMMON_ERRORS`.
+        most_observations: of tracks used; more gain almost nothing and cost time and memory.
+        robot_sigma_m: initial sigma of the robot's positions; estimated from the data.
+        robot_sigma_rad: initial sigma of its orientations; estimated from the data.
+        track_sigma_px: initial sigma of the tracks; estimated from the data.
     """
 
     sphere_sigma_m: float = 5e-6
@@ -52,9 +53,9 @@ class HybridOptions:
 
 @dataclass(frozen=True, slots=True)
 class HybridPoses:
-    """Metric camera poses and everything that came out with them.
+    """Metric camera poses with their covariance and diagnostics.
 
-    World is the base frame of the first group, or the scan frame where no robot pose was given. Increments (d, w) of
+    World is the base frame of the first group, or the scan frame if no robot pose was given. Increments (d, w) of
     covariances are exp(w) R, t + d in the axes of the outer frame, metres and radians.
 
     Attributes:
@@ -62,16 +63,17 @@ class HybridPoses:
         T_world_camera: (N, 4, 4).
         T_world_scan: the registration.
         T_world_group: base of each group.
-        points_scan: (P, 3) scene points that took part.
-        covariance: (6 (N + G), 6 (N + G)) joint, of T_scan_camera of every image, then T_scan_base of every group.
-        camera_share: what of it is the camera's own uncertainty; zero where that was not given.
+        points_scan: (P, 3) scene points used.
+        covariance: (6 (N + G), 6 (N + G)) joint, of every image's T_scan_camera, then of every group's T_scan_base.
+        camera_share: part of it due to the camera's own uncertainty; zero if that was not given.
         camera: as given, or refined.
         sigma_track_px: of one observation of a track.
         sphere_factor: of the outlines' residuals over their own sigmas.
-        sigma_robot_m, sigma_robot_rad: of the robot's poses for each axis, systematic errors included; None without.
+        sigma_robot_m, sigma_robot_rad: of the robot's poses per axis, including systematic errors; None without a
+            robot.
         chi2: reduced chi square of each component: tracks, spheres, centres, robot_position, robot_rotation, lens.
-        registration: of the scan to the poses of structure from motion, where the adjustment began.
-        centre_scan_m: (3,) the middle of the spheres.
+        registration: of the scan to the poses of structure from motion, from which the adjustment started.
+        centre_scan_m: (3,) mean of the spheres.
     """
 
     T_scan_camera: Array
@@ -92,18 +94,18 @@ class HybridPoses:
 
     @property
     def scan_pose_covariance(self) -> Array:
-        """(N, 6, 6) of T_scan_camera, axes of the scan: how well each image is placed against the scan."""
+        """(N, 6, 6) of T_scan_camera in the scan's axes: how well each image is placed relative to the scan."""
         n = len(self.T_scan_camera)
         return np.array([self.covariance[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(n)])
 
     @property
     def pose_covariance(self) -> Array:
-        """(N, 6, 6) of T_world_camera, axes of the world: the robot's noise is in it, common to all images."""
+        """(N, 6, 6) of T_world_camera in world axes; includes the robot's noise, which is common to all images."""
         joint = self.joint_world_covariance()
         return np.array([joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(self.T_world_camera))])
 
     def joint_world_covariance(self) -> Array:
-        """(6 N + 6, 6 N + 6) of T_world_camera of every image and, last, of T_world_scan."""
+        """(6 N + 6, 6 N + 6) of every image's T_world_camera and, last, of T_world_scan."""
         n = len(self.T_scan_camera)
         J = np.zeros((6 * n + 6, len(self.covariance)))
         R = self.T_world_scan[:3, :3]
@@ -121,20 +123,21 @@ class HybridPoses:
 
     @property
     def scan_covariance(self) -> Array:
-        """(6, 6) of T_world_scan; zero where the world is the scan frame."""
+        """(6, 6) of T_world_scan; zero if the world is the scan frame."""
         return self.joint_world_covariance()[-6:, -6:]
 
     def sigma_at_m(self, point_scan_m: Array) -> float:
         """Predicted target registration error at a point (3,) of the scan: 3D standard deviation, metres.
 
-        Of the set of images as a whole, laid over the true one by its camera positions: errors of single images
-        average out, what all of them have in common remains.
+        For the set of images as a whole, aligned to the true one by its camera positions: errors of single images
+            average
+        out, common errors remain.
         """
         n = len(self.T_scan_camera)
         v = point_scan_m - self.T_scan_camera[:, :3, 3]
         centred = self.T_scan_camera[:, :3, 3] - self.T_scan_camera[:, :3, 3].mean(axis=0)
         inertia = np.sum(centred**2) * np.eye(3) - centred.T @ centred
-        # The rigid fit of the displaced positions: mean displacement, and rotation I^-1 sum r x d.
+        # Rigid fit of the displaced positions: mean displacement, and rotation I^-1 sum r x d.
         arm = point_scan_m - self.T_scan_camera[:, :3, 3].mean(axis=0)
         J = np.zeros((3, len(self.covariance)))
         for i in range(len(v)):
@@ -162,26 +165,25 @@ def hybrid_poses(
     """Adjust tracks, spheres and robot poses together.
 
     Args:
-        poses: (N, 4, 4) T_world_camera of structure from motion, in any frame and scale.
-        tracks: its tracks.
-        outlines: per image, what the detector found.
-        camera: intrinsics of all images, that the outlines were made with.
+        poses: (N, 4, 4) T_world_camera from structure from motion, in any frame and scale.
+        tracks: of the same model.
+        outlines: per image, from the detector.
+        camera: intrinsics of all images, with which the outlines were made.
         centres_scan_m: (M, 3) registration spheres in the scan frame, metres.
-        radius_m: of the spheres.
-        T_base_camera: (N, 4, 4) from the robot and the hand-eye calibration, each in the frame of its group; NaN for
-            an image without. None: the spheres alone give the metric frame.
-        groups: (N,) station of each image; None: all one.
-        lens_covariance: (4, 4) of fx, fy, cx, cy as calibrated, to refine them with the calibration as a prior; None
-            holds the camera.
-        known_camera: how well a camera that is held is known, which the poses' covariance then carries on. None: as
-            if exactly.
+        radius_m: radius of the spheres.
+        T_base_camera: (N, 4, 4) from the robot and the hand-eye calibration, each in its group's base frame; NaN for
+            images without a robot pose. None: only the spheres give the metric frame.
+        groups: (N,) station of each image; None: all the same.
+        lens_covariance: (4, 4) of the calibrated fx, fy, cx, cy, to refine them with the calibration as a prior;
+            None: the camera is fixed.
+        known_camera: covariance of a fixed camera, which is propagated to the poses. None: taken as exact.
         sphere_covariance_m2: (M, 3, 3) of the centres; None: options.sphere_sigma_m.
         names: of the images, for messages.
         options: settings.
 
     Raises:
         DataError: lengths do not agree.
-        ComputeError: the spheres cannot be identified, the registration fails, or the adjustment is not determined.
+        ComputeError: the spheres cannot be identified, the registration fails, or the adjustment is undetermined.
     """
     settings = options or HybridOptions()
     n = len(poses)
@@ -192,7 +194,7 @@ def hybrid_poses(
     assignments = identify(
         outlines, centres_scan_m, camera, poses, radius_m=radius_m, groups=one, metric=False, names=names
     )
-    # Only to begin with and to find wrong outlines: the adjustment itself knows the errors of the poses.
+    # Only for initial values and to find wrong outlines: the adjustment itself models the errors of the poses.
     start = register(
         outlines,
         assignments,
@@ -266,7 +268,7 @@ def _answer(
 
 
 def _sightings(outlines: Sequence[Sequence[SphereOutline]], start: RegistrationResult) -> SphereSightings:
-    """The outlines that the registration used; a marker that it never used keeps its place in the scan."""
+    """The outlines that the registration used; a marker that it never used keeps its position in the scan."""
     used = [r for r in start.residuals if not r.excluded]
     found = [outlines[r.image][r.outline] for r in used]
     whitening = whitening_of(np.array([o.cone_covariance for o in found]))
@@ -283,7 +285,7 @@ def _sightings(outlines: Sequence[Sequence[SphereOutline]], start: RegistrationR
 def _bases(
     T_scan_camera: Array, T_base_camera: Array | None, stations: NDArray[np.int64]
 ) -> tuple[Array, list[int], NDArray[np.int64]]:
-    """(G, 4, 4) T_scan_base to begin with, the groups in order, and each image's position among them."""
+    """Initial T_scan_base (G, 4, 4), the groups in order, and each image's index among them."""
     if T_base_camera is None:
         return np.empty((0, 4, 4)), [], np.zeros(len(stations), dtype=np.int64)
     known = np.isfinite(T_base_camera).all(axis=(1, 2))
@@ -309,7 +311,7 @@ def _block(a: Array, b: Array) -> Array:
 
 
 def _relative(R_world_scan: Array, lever_scan: Array) -> Array:
-    """(6, 6) derivative of T_world_x = T_scan_base^-1 T_scan_x by T_scan_base, lever = x's origin less the base's."""
+    """(6, 6) derivative of T_world_x = T_scan_base^-1 T_scan_x by T_scan_base; lever: x's origin minus the base's."""
     out = _block(-R_world_scan, -R_world_scan)
     out[:3, 3:] = R_world_scan @ skew(lever_scan)
     return out

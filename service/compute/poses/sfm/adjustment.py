@@ -1,4 +1,4 @@
-"""Triangulates all tracks from known poses and adjusts poses and points with pycolmap, in the child process."""
+"""Triangulates all tracks from initial poses and adjusts poses and points with pycolmap, in the child process."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from service.compute.poses.sfm.options import Progress, reduction
 from service.compute.poses.sfm.track_building import Index, Sightings, triangulate, wide_enough
 from service.core.geometry import Array
 
-_LEAST = 30  # observations below which an image's pose is not believed
-_TRIES = 4  # adjustments of few tracks that bring rough poses into reach of the final limit
-_MEDIAN = np.sqrt(2 * np.log(2))  # of the length of a two-dimensional Gaussian error, in sigmas
+_LEAST = 30  # observations below which an image's pose is dropped
+_TRIES = 4  # adjustments of few tracks that bring rough poses within the final limit
+_MEDIAN = np.sqrt(2 * np.log(2))  # median length of a two-dimensional Gaussian error, in sigmas
 
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """Pixels (n, 2) of the features of every image, and the camera."""
+    """Pixels (n, 2) of every image's features, and the camera."""
 
     pixels: list[Array] = field(repr=False)
     camera: CameraModel
@@ -48,18 +48,18 @@ def adjust(
     settings: Mapping[str, Any],
     progress: Progress,
 ) -> pycolmap.Reconstruction | None:
-    """The model of the images that have a pose to begin with; None where hardly anything fits.
+    """The adjusted model of the images with an initial pose; None if hardly any observation fits.
 
-    Few tracks first, until the poses are good to the limit of the final adjustment, which all tracks take part in;
-    observations are chosen anew from all of them before each adjustment, so none is lost to a rough start.
+    A few tracks are adjusted first, until the poses are within the limit of the final adjustment, in which all tracks
+    take part. Observations are selected anew from all of them before each adjustment, so a rough start loses none.
 
     Args:
-        start: T_world_camera by index of the image.
+        start: initial T_world_camera by image index.
         features: of all images.
         sightings: all tracks.
         few: numbers of the tracks that are adjusted first.
         settings: SfmOptions as a dictionary.
-        progress: told ("adjust", done, total).
+        progress: called with ("adjust", done, total).
     """
     camera = features.camera
     scale = reduction(settings["max_image_size"], camera.width, camera.height)
@@ -91,17 +91,17 @@ def adjust(
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """One choice of observations and adjustment: of which tracks, within which limit, to which change of the cost."""
+    """One adjustment: its tracks, the limit for observations, and the change of cost at which it stops."""
 
     sightings: Sightings
     limit_px: float
-    rough: bool  # the limit is widened to what the poses themselves show as their error
+    rough: bool  # whether the limit is widened to the poses' own error
     tolerance: float
 
 
 @dataclass(frozen=True, slots=True)
 class _Fitting:
-    """Observations within the limit and their points."""
+    """The observations within the limit, and their points."""
 
     poses: dict[int, Array]
     sightings: Sightings
@@ -113,7 +113,7 @@ class _Fitting:
 def _fitting(
     poses: Mapping[int, Array], features: Features, camera: CameraModel, step: _Step, settings: Mapping[str, Any]
 ) -> _Fitting | None:
-    """What agrees with the poses; None where hardly anything does."""
+    """The observations that agree with the poses; None if hardly any do."""
     sightings, limit_px = step.sightings, step.limit_px
     focal = 0.5 * (camera.fx + camera.fy)
     known = np.zeros(len(features.pixels), dtype=np.bool_)
@@ -140,7 +140,7 @@ def _fitting(
 
 
 def _model(found: _Fitting, features: Features, camera: CameraModel) -> pycolmap.Reconstruction:
-    """COLMAP's model of poses, points and observations; image k has the number k + 1."""
+    """COLMAP's model of poses, points and observations; image k gets the id k + 1."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(to_colmap_camera(camera))
     for k in sorted(found.poses):
@@ -165,9 +165,9 @@ def _poses(model: pycolmap.Reconstruction) -> dict[int, Array]:
 
 
 def _bundle(model: pycolmap.Reconstruction, settings: Mapping[str, Any], loss_px: float, tolerance: float) -> None:
-    """Adjust poses and points, and the camera if wanted, to a relative change of the cost."""
+    """Adjust poses and points, and the camera if configured, until the relative change of the cost is `tolerance`."""
     options = pycolmap.BundleAdjustmentOptions()
-    # A principal point that is held wrong turns the cameras by its angle, so intrinsics are refined with it or not.
+    # A wrong principal point rotates the cameras by its angle, so the focal length is refined only together with it.
     options.refine_focal_length = settings["refine"] == "intrinsics"
     options.refine_principal_point = settings["refine"] != "nothing"
     options.refine_extra_params = settings["refine"] == "intrinsics"

@@ -1,4 +1,4 @@
-"""What the child process of structure from motion does: drives pycolmap, its output going to a log file."""
+"""The child process of structure from motion: runs pycolmap, with its output in a log file."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from service.core.geometry import Array
 
 
 def main(log: str, seed: int, pipe: Connection) -> None:
-    """Entry point: take (task, job) until the other end is closed.
+    """Entry point: process (task, job) messages until the other end is closed.
 
-    Answers ("progress", (stage, done, total)) meanwhile, and ("result", value) or ("error", what) at the end of each.
+    Sends ("progress", (stage, done, total)) in between, and ("result", value) or ("error", what) at the end of each.
     """
     handle = os.open(Path(log), os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
     os.dup2(handle, 1)
@@ -52,7 +52,7 @@ def main(log: str, seed: int, pipe: Connection) -> None:
             answer = ("result", tasks[task](job, progress))
         except OrthocaptureError as error:
             answer = ("error", error)
-        except (RuntimeError, ValueError, OSError) as error:  # what pycolmap raises
+        except (RuntimeError, ValueError, OSError) as error:  # raised by pycolmap
             answer = ("error", str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__)
         pipe.send(answer)
 
@@ -80,7 +80,7 @@ def _extract(job: dict[str, Any], _progress: Progress) -> dict[str, Any]:
     extraction.sift.first_octave = options["first_octave"]
     extractor = pycolmap.FeatureExtractor.create(extraction, pycolmap.Device.cpu)
     keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(image))
-    # Columns x, y, scale, orientation; COLMAP keeps whole levels of scale, so there are more than asked for.
+    # Columns x, y, scale, orientation; COLMAP keeps whole scale levels, so there are more than requested.
     found = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float64).reshape(-1, 4)
     kept = np.sort(np.argsort(-found[:, 2], kind="stable")[: options["max_features"]])
     return {
@@ -93,7 +93,7 @@ def _extract(job: dict[str, Any], _progress: Progress) -> dict[str, Any]:
 
 
 def _match(job: dict[str, Any], _progress: Progress) -> dict[str, Any]:
-    """Matches by appearance alone, then those that agree with one epipolar geometry."""
+    """Matches by descriptor, then those consistent with one epipolar geometry."""
     options = job["options"]
     matches = match_descriptors(*job["descriptors"])
     verification = pycolmap.TwoViewGeometryOptions()

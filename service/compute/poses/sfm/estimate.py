@@ -1,4 +1,4 @@
-"""Structure from motion with the calibrated camera held: features once, then incremental or global mapping."""
+"""Structure from motion with the calibrated camera fixed: features once, then incremental or global mapping."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from service.core.geometry import Array, Transform
 
 logger = logging.getLogger(__name__)
 
-_FEW = 50  # features below which an image has hardly any texture
+_FEW = 50  # features below which an image counts as hardly textured
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,17 +37,17 @@ class SfmModel:
     """The largest reconstructed model, in its own frame `world` and its own unit (not metric).
 
     Attributes:
-        mapper: which mapper made it; that of `triangulated` is in metres, in the frame of the poses given.
+        mapper: the mapper used; a model by `triangulated` is in metres, in the frame of the given poses.
         T_world_camera: pose of each registered image.
         tracks: triangulated points and their observations; images in the order of T_world_camera.
         camera: as given, or refined.
-        mean_reprojection_error_px: mean distance of all observations.
-        mean_track_length: observations for each point.
-        n_registered: images in the model.
-        missing: images that are not in it.
-        n_models: models that the mapper ended with; more than one means that the scene fell apart.
+        mean_reprojection_error_px: mean over all observations.
+        mean_track_length: mean number of observations per point.
+        n_registered: number of images in the model.
+        missing: images not in it.
+        n_models: number of models that the mapper produced; more than one means that the scene fell apart.
         folder: COLMAP's binary model, with the images' own names.
-        seconds: wall time of each stage that was run (none for features that were there already).
+        seconds: wall time of each stage that was run; stages whose results were kept are absent.
     """
 
     mapper: Mapper
@@ -68,15 +68,15 @@ class SfmModel:
         return self.tracks.points
 
     def joint_pose_covariance(self, known: CameraCovariance | None = None) -> Array:
-        """(6 N, 6 N) of the poses after the positions were laid over the true ones by a similarity; the model's unit.
+        """(6 N, 6 N) covariance of the poses after a similarity has aligned their positions; in the model's unit.
 
-        Increments (d, w) of exp(w) R, t + d in the model's axes. `known` is how well the camera was, where it was
-        held. Takes a second or so.
+        Increments (d, w) of exp(w) R, t + d in the model's axes. `known` is the covariance of a camera that was
+        fixed. Takes about a second.
         """
         return similarity_covariance(np.array(list(self.T_world_camera.values())), self.tracks, self.camera, known)
 
     def pose_covariance(self, known: CameraCovariance | None = None) -> Array:
-        """(N, 6, 6) the same of each pose alone."""
+        """(N, 6, 6) covariance of each pose alone, as in `joint_pose_covariance`."""
         return blocks(self.joint_pose_covariance(known))
 
 
@@ -91,22 +91,23 @@ def reconstruct(
     options: SfmOptions | None = None,
     progress: Progress | None = None,
 ) -> SfmModel:
-    """Estimate the poses of images of one calibrated camera, up to a similarity: all pieces in one call.
+    """Estimate the poses of images of one calibrated camera, up to a similarity: all stages in one call.
 
-    The same as `FrontEnd` for every image and pair, then `reconstruct_from`. Features and matches are kept in the
-    workspace and shared by later calls, whatever the mapper; only what is missing is made. COLMAP runs in child
-    processes, so that its crash is an error of this call and nothing more.
+    Equivalent to `FrontEnd` for every image and pair, then `reconstruct_from`. Features and matches are kept in the
+    workspace and shared by later calls, whatever the mapper; only missing ones are computed. COLMAP runs in child
+    processes, so a crash of COLMAP only fails this call.
 
     Args:
-        images: file of each image by name, or files whose names are unique.
-        camera: calibrated at the images' size; held fixed unless the options refine it.
-        workspace: folder for features, matches, the models and COLMAP's logs; made if missing.
+        images: file of each image by name, or files with unique names.
+        camera: calibrated at the images' size; fixed unless the options refine it.
+        workspace: folder for features, matches, the models and COLMAP's logs; created if missing.
         mapper: COLMAP's incremental mapper, the global one (GLOMAP), or `triangulated` from the prior.
-        T_world_camera_prior: rough poses in one frame (from the robot) that choose the pairs to match; images
-            that it misses are matched with all others. Not used for anything else, but where `triangulated` starts.
-        stations: where poses of the prior are in several frames, the frame of each image.
+        T_world_camera_prior: rough poses in one frame (from the robot) that select the pairs to match; images without
+            one are matched with all others. Otherwise used only by `triangulated`, which starts from them.
+        stations: frame of each image's prior, if there are several.
         options: settings.
-        progress: told (stage, done, total) now and then; stages extract, match and those of `reconstruct_from`.
+        progress: called now and then with (stage, done, total); stages extract, match and those of
+            `reconstruct_from`.
 
     Raises:
         DataError: an image is missing, unreadable or of another size than the camera.
@@ -145,29 +146,30 @@ def reconstruct_from(
     options: SfmOptions | None = None,
     progress: Progress | None = None,
 ) -> SfmModel:
-    """Poses of images whose features and matches are there already (see `FrontEnd`), in one child process.
+    """Estimate poses from existing features and matches (see `FrontEnd`), in one child process.
 
-    Images and pairs are taken in the order of their names: in which order they arrived, or which process made them,
-    changes no bit of the model. Two mappers may work side by side in one workspace.
+    Images and pairs are processed in the order of their names, so neither their order of arrival nor the processes
+    that made them change a single bit of the model. Two mappers may run in parallel in one workspace.
 
     Args:
         features: of every image, by name.
-        matches: of the pairs that count (`pairs_of` the images); pairs of images without features are left out.
-        camera: calibrated at the images' size; held fixed unless the options refine it.
-        workspace: folder for the model and COLMAP's log; made if missing.
-        mapper: where the poses to begin with come from: COLMAP's incremental mapper or the global one (GLOMAP), both
-            from the images alone; or `triangulated`, T_world_camera_start. All tracks are triangulated from these
-            poses, and poses and points adjusted together.
+        matches: of the pairs to use (`pairs_of` the images); pairs with images without features are dropped.
+        camera: calibrated at the images' size; fixed unless the options refine it.
+        workspace: folder for the model and COLMAP's log; created if missing.
+        mapper: source of the initial poses: COLMAP's incremental mapper or the global one (GLOMAP), both from the
+            images alone; or `triangulated`, from T_world_camera_start. All tracks are triangulated from these poses,
+            and poses and points are adjusted together.
         T_world_camera_start: for `triangulated`: metric poses of the images in one frame, from the corrected robot,
-            good to a few millimetres and a degree. They are where the adjustment begins, and give the model its frame
-            and scale: a similarity lays the adjusted camera positions over these. They do not hold single poses, so
-            their noise does not come back. Images without a pose, or that share nothing with the others, are missing.
+            good to a few millimetres and a degree. They are the initial values and give the model its frame and
+            scale: the adjusted camera positions are aligned to them by a similarity. They do not constrain single
+            poses, so their noise does not return. Images without a pose, or without common features with others, are
+            missing.
         options: settings.
-        progress: told ("map", done, total) and ("adjust", done, total) now and then; total 0 where COLMAP does not
-            tell how far it is.
+        progress: called now and then with ("map", done, total) and ("adjust", done, total); total is 0 if COLMAP does
+            not report it.
 
     Raises:
-        DataError: an image's features are those of another size than the camera's.
+        DataError: an image's features are from another image size than the camera's.
         ComputeError: too few images, no model, or COLMAP failed.
     """
     settings = options or SfmOptions()
@@ -218,7 +220,7 @@ def _features(
     seconds: dict[str, float],
     progress: Progress | None,
 ) -> dict[str, ImageFeatures]:
-    """Features of every image, those of the workspace where file, camera and settings are the same."""
+    """Features of every image; those in the workspace are used if file, camera and settings are the same."""
     folder = workspace / "features"
     folder.mkdir(exist_ok=True)
     kept = {name: folder / f"{_key(file, camera, settings)}.npz" for name, file in files.items()}
@@ -245,7 +247,7 @@ def _matches(
     seconds: dict[str, float],
     progress: Progress | None,
 ) -> list[PairMatches]:
-    """Matches of exactly the pairs; those that the workspace has of the same features are not made again."""
+    """Matches of exactly these pairs; those in the workspace are used if the features are the same."""
     kept = workspace / "matches.npz"
     stamp = workspace / "matches.json"
     recipe = json.dumps([dataclasses.asdict(camera), settings.verification_error_px, settings.seed, _hash(features)])

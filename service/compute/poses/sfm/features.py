@@ -1,7 +1,7 @@
-"""Features of one image and verified matches of a pair: the pieces that structure from motion is built from.
+"""Features of one image and verified matches of a pair: the inputs of structure from motion.
 
-Both are pure functions of the images: of which other images there are, and of the order in which they came, they
-know nothing. So they can be made as images arrive, in any process, and kept.
+Both are pure functions of their images and depend neither on other images nor on their order. So they can be computed
+as images arrive, in any process, and stored.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from numpy.typing import NDArray
 from service.core.errors import DataError
 from service.core.geometry import Array
 
-_NORM = 512.0  # length of a descriptor of unsigned bytes
-_ROWS = 512  # descriptors compared at a time: the products stay in the processor's cache
+_NORM = 512.0  # length of a descriptor in unsigned bytes
+_ROWS = 512  # descriptors compared at a time, so that the products stay in the processor's cache
 _MOST_ANGLE_RAD = 0.7  # between descriptors of one scene point
-_MOST_RATIO = 0.8  # of the nearest descriptor's angle and the second nearest's (Lowe, 2004, 7.1)
+_MOST_RATIO = 0.8  # angle to the nearest descriptor over that to the second nearest (Lowe, 2004, 7.1)
 
 
-# What NumPy and the archive below it raise for bytes that are not theirs.
+# What NumPy and the archive format raise for invalid bytes.
 _DAMAGED = (ValueError, KeyError, TypeError, IndexError, OSError, EOFError, RuntimeError, zipfile.BadZipFile,
             zlib.error)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageFeatures:
-    """SIFT features of one image, the largest scales first to be kept.
+    """SIFT features of one image, those with the largest scales.
 
     Attributes:
         width, height: of the image as captured, px.
@@ -61,10 +61,10 @@ class ImageFeatures:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> ImageFeatures:
-        """The features again.
+        """Rebuild the features from `to_bytes`'s archive.
 
         Raises:
-            DataError: the bytes are no such archive.
+            DataError: the bytes are not such an archive.
         """
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as archive:
@@ -76,14 +76,14 @@ class ImageFeatures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairMatches:
-    """Matches of two images that agree with one epipolar geometry; none where the pair shares nothing.
+    """Matches of two images that agree with one epipolar geometry; empty if the images have nothing in common.
 
     Attributes:
         first, second: names of the images, first < second.
-        features: (m, 2) uint32 indices of the features of the first and the second image.
+        features: (m, 2) uint32 feature indices in the first and the second image.
         configuration: COLMAP's kind of two-view geometry.
-        matrices: (3, 3, 3) essential, fundamental and homography matrix of the second image by the first; zero where
-            there is none.
+        matrices: (3, 3, 3) essential, fundamental and homography matrix from the first to the second image; zero if
+            absent.
     """
 
     first: str
@@ -99,7 +99,7 @@ class PairMatches:
 
 
 def pack_matches(matches: Sequence[PairMatches]) -> bytes:
-    """Matches of any number of pairs as a NumPy archive (.npz), sorted by pair: the order given does not matter."""
+    """Matches of any number of pairs as a NumPy archive (.npz), sorted by pair, whatever the given order."""
     ordered = sorted(matches, key=lambda m: m.pair)
     buffer = io.BytesIO()
     np.savez_compressed(
@@ -114,10 +114,10 @@ def pack_matches(matches: Sequence[PairMatches]) -> bytes:
 
 
 def unpack_matches(data: bytes) -> list[PairMatches]:
-    """The matches again, sorted by pair.
+    """Rebuild the matches from `pack_matches`'s archive, sorted by pair.
 
     Raises:
-        DataError: the bytes are no such archive.
+        DataError: the bytes are not such an archive.
     """
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
@@ -134,10 +134,10 @@ def unpack_matches(data: bytes) -> list[PairMatches]:
 
 
 def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """(m, 2) indices of descriptors (n, 128) and (k, 128) that are each other's nearest, and clearly so.
+    """(m, 2) indices of descriptors (n, 128) and (k, 128) that are mutual nearest neighbours and pass the ratio test.
 
-    Products of unsigned bytes are whole numbers below 2^24, exact in single precision in whatever order they are
-    added: the same descriptors give the same matches on every machine.
+    Products of unsigned bytes are integers below 2^24, which single precision adds exactly in any order: the same
+    descriptors give the same matches on every machine.
     """
     if len(first) < 2 or len(second) < 2:
         return np.empty((0, 2), dtype=np.uint32)
@@ -153,7 +153,7 @@ def match_descriptors(first: NDArray[np.uint8], second: NDArray[np.uint8]) -> ND
 
 
 def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """For each descriptor of a the nearest of b, and whether it is near and clearly nearer than the second."""
+    """For each descriptor of a, the nearest of b, and whether it is near and clearly nearer than the second."""
     index = np.empty(len(a), dtype=np.int64)
     clear = np.empty(len(a), dtype=np.bool_)
     turned = np.ascontiguousarray(b.T)

@@ -23,18 +23,17 @@ Answer = TypeVar("Answer")
 
 
 class FrontEnd:
-    """Extracts and matches in child processes that stay alive from one image to the next; close it, or use `with`.
+    """Extracts and matches in child processes that live from one image to the next; close it, or use `with`.
 
-    What comes out depends on the images, the camera and the options alone: bit for bit the same whichever image
-    came first and however many processes work. As images arrive:
+    The results depend only on the images, the camera and the options: bit for bit the same, whatever the order of the
+    images and the number of processes. As images arrive:
 
         with FrontEnd(camera, options) as front:
             features[name] = front.extract_features(file)
             matches += front.match_pairs(features, pairs_with(name, features, planned))
 
-    where `planned = pairs_of(…)` of the poses at which the images are to be taken. When all are there, the pairs of
-    the images that are there count: those of them that were matched are taken, `missing_pairs` of them are matched,
-    and `reconstruct_from` maps.
+    with `planned = pairs_of(…)` of the planned poses. At the end, the pairs of the images that did arrive are used:
+    already matched ones are kept, `missing_pairs` of them are matched, and `reconstruct_from` maps.
     """
 
     def __init__(
@@ -46,14 +45,14 @@ class FrontEnd:
         log: Path | None = None,
         child: ColmapProcess | None = None,
     ) -> None:
-        """No process is started before there is something to do.
+        """Prepare the front end; processes are started with the first work.
 
         Args:
             camera: calibrated at the images' size.
             options: settings.
-            processes: children that work side by side, each on one core.
+            processes: number of children working in parallel, each on one core.
             log: file for COLMAP's output; None: a temporary one. Further processes write beside it.
-            child: works instead of children of its own, and is left alive for whoever comes next.
+            child: used instead of own children, and left running.
         """
         self._camera = camera
         self._options = options or SfmOptions()
@@ -79,7 +78,7 @@ class FrontEnd:
         self.close()
 
     def close(self) -> None:
-        """End the child processes, but for one that was lent."""
+        """End the child processes, except a borrowed one."""
         for child in [] if self._lent else self._children:
             child.close()
 
@@ -93,7 +92,7 @@ class FrontEnd:
         return self._extracted(self._children[0], file)
 
     def extract_all(self, files: Mapping[str, Path], progress: Progress | None = None) -> dict[str, ImageFeatures]:
-        """Features of several images by name, side by side; `progress` is told ("extract", done, total).
+        """Features of several images by name, in parallel; `progress` is called with ("extract", done, total).
 
         Raises:
             DataError, ComputeError: as `extract_features`; the message names the image.
@@ -114,9 +113,9 @@ class FrontEnd:
         pairs: Iterable[tuple[str, str]],
         progress: Progress | None = None,
     ) -> list[PairMatches]:
-        """Verified matches of each pair of names, sorted by pair; `progress` is told ("match", done, total).
+        """Verified matches of each pair of names, sorted by pair; `progress` is called with ("match", done, total).
 
-        A pair is matched in the order of its names, so (a, b) and (b, a) give the same.
+        A pair is matched in the order of its names, so (a, b) and (b, a) give the same result.
 
         Raises:
             ComputeError: COLMAP failed.
@@ -148,7 +147,7 @@ class FrontEnd:
         stage: str,
         progress: Progress | None,
     ) -> list[Answer]:
-        """Answers in the order of the items, the children side by side."""
+        """Answers in the order of the items, computed by the children in parallel."""
         free: SimpleQueue[ColmapProcess] = SimpleQueue()
         for child in self._children:
             free.put(child)
@@ -182,10 +181,10 @@ def pairs_of(
     *,
     stations: Mapping[str, str] | None = None,
 ) -> list[tuple[str, str]]:
-    """Pairs of names worth matching (see `choose_pairs`): a function of the set of images and their poses alone.
+    """Pairs of names worth matching (see `choose_pairs`): a function only of the set of images and their poses.
 
-    Before the images are taken, the poses at which they are to be taken give the pairs with which matching can begin;
-    when all are there, the pairs of those that are there are the ones that count.
+    Before the images are taken, the planned poses give the pairs with which matching can begin; at the end, the pairs
+    of the images that were taken are the ones used.
     """
     order = sorted(names)
     chosen = choose_pairs(order, T_world_camera_prior, options.neighbours, options.max_angle_deg, stations=stations)
@@ -193,12 +192,12 @@ def pairs_of(
 
 
 def pairs_with(name: str, arrived: Iterable[str], pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Those of the pairs that join the image `name` with one that has arrived: what can be matched now."""
+    """The pairs that join the image `name` with one that has arrived, so that they can be matched now."""
     there = set(arrived)
     return sorted((min(pair), max(pair)) for pair in pairs if name in pair and there >= set(pair) - {name})
 
 
 def missing_pairs(pairs: Iterable[tuple[str, str]], matches: Iterable[PairMatches]) -> list[tuple[str, str]]:
-    """Those of the pairs that have not been matched yet."""
+    """The pairs that have not been matched yet."""
     done = {m.pair for m in matches}
     return sorted({(min(pair), max(pair)) for pair in pairs} - done)

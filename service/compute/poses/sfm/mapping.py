@@ -1,8 +1,8 @@
-"""Maps features and matches with pycolmap, in the child process: poses to begin with, then one final adjustment.
+"""Maps features and matches with pycolmap, in the child process: initial poses, then one final adjustment.
 
-A mapper need not see everything: for each image it gets some hundreds of the longest tracks, spread over the image,
-which gives poses in a fraction of the time. All tracks are then triangulated from these poses and adjusted with them
-(sfm_adjustment), so the accuracy is that of all features, whichever source the poses came from.
+A mapper need not see everything: it gets some hundreds of the longest tracks per image, spread over the image, which
+gives poses in a fraction of the time. All tracks are then triangulated from these poses and adjusted with them
+(poses.sfm.adjustment), so the accuracy is that of all features, whatever the source of the initial poses.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from service.compute.poses.sfm.options import Progress
 from service.compute.poses.sfm.track_building import Index, Sightings, build_tracks, thinned
 from service.core.geometry import Array, align_points
 
-_VERIFIED = 15  # matches below which a pair is no pair; COLMAP's own limit
-_SHARE = 600  # tracks of each image that a mapper sees
-_PAIR_SHARE = 60  # and of each pair that has as many
+_VERIFIED = 15  # least number of matches of a pair; COLMAP's own limit
+_SHARE = 600  # tracks per image for the mapper
+_PAIR_SHARE = 60  # tracks per pair, if it has as many
 
 
 def map_images(job: dict[str, Any], progress: Progress) -> dict[str, Any]:
-    """Poses and tracks of the largest model of the images of a job, adjusted; written into its workspace."""
+    """Poses and tracks of the largest model of a job's images, adjusted and written into its workspace."""
     camera = CameraModel(**job["camera"])
     features = Features([np.asarray(pixels, dtype=np.float64) for pixels in job["pixels"]], camera)
     matches = [m for m in job["matches"] if len(m[2]) >= _VERIFIED]
@@ -58,7 +58,7 @@ def map_images(job: dict[str, Any], progress: Progress) -> dict[str, Any]:
 
 
 def _laid_over(model: pycolmap.Reconstruction, start: dict[int, Array]) -> None:
-    """Lay the model over the poses that it began with: they gave it frame and scale."""
+    """Align the model by a similarity to its initial poses, which define frame and scale."""
     ids = sorted(model.reg_image_ids())
     found = np.array([from_colmap_pose(model.image(k).cam_from_world())[:3, 3] for k in ids])
     T, scale = align_points(np.array([start[k - 1][:3, 3] for k in ids]), found, with_scale=True)
@@ -66,7 +66,7 @@ def _laid_over(model: pycolmap.Reconstruction, start: dict[int, Array]) -> None:
 
 
 def _written(model: pycolmap.Reconstruction, job: dict[str, Any]) -> dict[str, Any]:
-    """The model as plain data, and as COLMAP's files with the images' own names."""
+    """The model as plain data, and written as COLMAP's files with the images' own names."""
     poses: dict[int, Any] = {}
     for image_id in sorted(model.reg_image_ids()):
         image = model.image(image_id)
@@ -88,7 +88,7 @@ def _written(model: pycolmap.Reconstruction, job: dict[str, Any]) -> dict[str, A
 def _mapped(
     job: dict[str, Any], sightings: Sightings, few: Index, matches: list[Any], progress: Progress
 ) -> tuple[dict[int, Array], int]:
-    """Poses of the images of the mapper's largest model, by index, and how many models it made."""
+    """Poses by image index from the mapper's largest model, and the number of models it produced."""
     workspace = Path(job["workspace"])
     database = workspace / f"{job['mapper']}.db"  # one for each mapper: two may work side by side
     _write_database(job, database, _matches_of(sightings, few, matches, job["pixels"]))
@@ -105,7 +105,7 @@ def _mapped(
 
 
 def _matches_of(sightings: Sightings, few: Index, matches: list[Any], pixels: list[Any]) -> list[Any]:
-    """The matches between features of the chosen tracks."""
+    """The matches between features of the selected tracks."""
     chosen = np.zeros(sightings.count, dtype=np.bool_)
     chosen[few] = True
     rows = chosen[sightings.track]
@@ -120,7 +120,7 @@ def _matches_of(sightings: Sightings, few: Index, matches: list[Any], pixels: li
 
 
 def _write_database(job: dict[str, Any], path: Path, matches: list[Any]) -> None:
-    """COLMAP's database of the pieces; images and pairs in the order of their names, numbered from 1."""
+    """Write COLMAP's database; images and pairs in the order of their names, numbered from 1."""
     path.unlink(missing_ok=True)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         camera = to_colmap_camera(CameraModel(**job["camera"]))
@@ -149,7 +149,7 @@ def _write_database(job: dict[str, Any], path: Path, matches: list[Any]) -> None
 
 
 def _tracks(model: pycolmap.Reconstruction) -> dict[str, Any]:
-    """Points (P, 3), and image index, point index and our pixels of every observation."""
+    """Points (P, 3), and image index, point index and pixels (our convention) of every observation."""
     number = {point_id: k for k, point_id in enumerate(model.points3D)}
     image_index: list[int] = []
     points: list[int] = []
@@ -203,7 +203,7 @@ def _global(job: dict[str, Any], database: Path, raw: Path, progress: Progress) 
     mapper = options.mapper
     mapper.num_threads = job["options"]["mapping_threads"]
     mapper.random_seed = job["options"]["seed"]
-    # Global positioning starts at random and is slow on many tracks; retriangulation brings the others back.
+    # Global positioning starts at random and is slow with many tracks; retriangulation restores the others.
     mapper.keep_max_num_tracks = max(1500, 100 * len(job["names"]))
     mapper.global_positioning.use_gpu = False
     adjustment = mapper.bundle_adjustment

@@ -21,18 +21,18 @@ class SfmOptions:
         max_image_size: longer side to which images are reduced for feature extraction; 0 keeps the full size.
         max_features: per image, the largest scales first.
         first_octave: -1 doubles the image first (finer and four times slower), 0 does not.
-        neighbours: how many images, nearest in viewing direction, each image is matched with (needs a prior).
-        max_angle_deg: views further apart than this, as seen from the scene, are not matched.
-        verification_error_px: epipolar distance up to which a match is an inlier, at extraction size.
-        filter_error_px: observations beyond this are dropped before the final bundle adjustment.
-        min_track: views a point needs to take part in the final bundle adjustment.
+        neighbours: number of images, nearest in viewing direction, with which each image is matched (needs a prior).
+        max_angle_deg: largest angle between two matched views, as seen from the scene.
+        verification_error_px: largest epipolar distance of an inlier match, at extraction size.
+        filter_error_px: observations with larger errors are dropped before the final bundle adjustment.
+        min_track: least number of views of a point in the final bundle adjustment.
         loss_px: scale of the final bundle adjustment's robust (Cauchy) loss.
         threads: of extraction and matching.
         mapping_threads: of mapping and bundle adjustment. With one, the same features give the same model bit for
-            bit; with more, sums are added up in the order in which threads finish.
-        refine: what the final bundle adjustment may change in the calibrated camera.
-        seed: of every random choice.
-        timeout_s: after which one stage is given up.
+            bit; with more, sums depend on the order in which threads finish.
+        refine: intrinsics that the final bundle adjustment may change.
+        seed: of all random choices.
+        timeout_s: time limit of one stage.
     """
 
     max_image_size: int = 3200
@@ -58,7 +58,7 @@ def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothin
     """Settings for images of this camera.
 
     Camera positions were off by 0.017–0.028 mm (normal) and 0.013 mm (quality) on 20 rendered images 1920 px wide of
-    a scene 0.65 m away (bench/sfm.py); the errors are noise, so more features are what makes them smaller.
+    a scene 0.65 m away (bench/sfm.py); the errors are noise, so more features reduce them.
     """
     longer = max(camera.width, camera.height)
     if effort == "quick":
@@ -67,7 +67,7 @@ def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothin
         return SfmOptions(
             max_image_size=min(longer, 2400), max_features=4000, neighbours=8, refine=refine, threads=threads
         )
-    # Small images are doubled first; large ones have the pixels themselves.
+    # Small images are doubled first; large ones have enough pixels.
     small = longer <= 2400
     return SfmOptions(
         max_image_size=min(longer, 4000),
@@ -80,5 +80,5 @@ def options_for(effort: Effort, camera: CameraModel, *, refine: Refine = "nothin
 
 
 def reduction(max_image_size: int, width: int, height: int) -> float:
-    """Pixels of the image for each pixel at which features are extracted."""
+    """Image pixels per pixel at which features are extracted."""
     return max(1.0, max(width, height) / max_image_size) if max_image_size else 1.0

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from service.core.geometry import Array, Transform
 
-_ROWS = 2000  # of angles that are in memory at a time
+_ROWS = 2000  # rows of angles in memory at a time
 
 
 def choose_pairs(
@@ -29,10 +29,10 @@ def choose_pairs(
     Args:
         names: of the images.
         prior: T_world_camera of images; None pairs all with all.
-        neighbours: how many images each one is paired with, at least.
-        max_angle_deg: between viewing directions, beyond which images are not paired.
-        stations: frame of each image's prior pose where there are several: all pairs across them are kept, since
-            nothing is known of them.
+        neighbours: least number of images that each one is paired with.
+        max_angle_deg: largest angle between the viewing directions of a pair.
+        stations: frame of each image's prior pose, if there are several; all pairs across frames are kept, since
+            nothing is known about them.
     """
     if stations is not None and len({stations.get(name) for name in names}) > 1:
         return _by_station(names, prior, neighbours, max_angle_deg, stations)
@@ -85,7 +85,7 @@ def _ordered(i: int, j: int) -> tuple[int, int]:
 
 
 def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int) -> set[tuple[int, int]]:
-    """The nearest pairs between parts of the graph that are not connected: several for each, one may not match."""
+    """The nearest pairs between unconnected parts of the graph: several for each, since one may not match."""
     added: set[tuple[int, int]] = set()
     while True:
         edges = np.array(sorted(chosen | added)).reshape(-1, 2)
@@ -97,7 +97,7 @@ def _bridges(chosen: set[tuple[int, int]], known: list[int], rays: Array, n: int
         rows, columns = np.flatnonzero(inside), np.flatnonzero(~inside)
         if len(columns) == 0:
             return added
-        if len(rays) <= _ROWS:  # to the last bit as they were chosen above: of equal angles the first one counts
+        if len(rays) <= _ROWS:  # bit-identical to the choice above: of equal angles, the first counts
             block = _angles_deg(rays, rays)[np.ix_(rows, columns)]
         else:
             block = _angles_deg(rays[rows], rays[columns])

@@ -1,4 +1,4 @@
-"""Tracks of matched features, and their scene points from known camera poses, in NumPy alone."""
+"""Builds tracks of matched features and triangulates them from known camera poses, in NumPy alone."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from scipy.sparse.csgraph import connected_components
 from service.core.geometry import Array
 
 Index = NDArray[np.int64]
-_LEAST_ANGLE_RAD = np.radians(1.5)  # between the rays to a point, below which its depth means nothing
+_LEAST_ANGLE_RAD = np.radians(1.5)  # between the rays to a point; below it, the depth is meaningless
 _ROUNDS = 6  # of reweighting in a triangulation
 
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """Which feature of which image belongs to which track.
+    """Assignment of features of images to tracks.
 
     Attributes:
         image: (O,) index of the image.
         feature: (O,) index of the feature in the image.
-        track: (O,) index of the track, 0 … count - 1; every track is seen by two images at least, each once.
+        track: (O,) index of the track, 0 … count - 1; every track is seen in at least two images, once in each.
         count: number of tracks.
     """
 
@@ -34,7 +34,7 @@ class Sightings:
     count: int
 
     def kept(self, observations: NDArray[np.bool_], least: int = 2) -> tuple[Sightings, Index]:
-        """Those observations alone, tracks that are left with at least `least` of them; and these tracks' numbers."""
+        """The selected observations of tracks that still have at least `least` of them, and these tracks' numbers."""
         length = np.bincount(self.track[observations], minlength=self.count)
         tracks = np.flatnonzero(length >= least)
         number = np.full(self.count, -1, dtype=np.int64)
@@ -46,7 +46,7 @@ class Sightings:
 def build_tracks(
     counts: Sequence[int], pairs: Sequence[tuple[int, int]], matches: Sequence[NDArray[np.uint32]]
 ) -> Sightings:
-    """Features that matches join, directly or by way of others. An image that a track meets twice leaves it.
+    """Join features by matches, directly or indirectly. An image that a track meets twice is removed from it.
 
     Args:
         counts: number of features of each image.
@@ -77,8 +77,8 @@ def thinned(sightings: Sightings, pixels: Array, share: int, pair_share: int, si
     Args:
         sightings: all tracks.
         pixels: (O, 2) of the observations.
-        share: tracks that each image keeps, spread over a grid of cells.
-        pair_share: tracks that each two images keep that have as many in common.
+        share: tracks kept per image, spread over a grid of cells.
+        pair_share: tracks kept per pair of images, if it has as many.
         size: width and height of the images, px.
     """
     length = np.bincount(sightings.track, minlength=sightings.count)
@@ -91,10 +91,10 @@ def thinned(sightings: Sightings, pixels: Array, share: int, pair_share: int, si
     n_images = int(sightings.image.max(initial=-1)) + 1
     for i in range(n_images):
         mine = order[sightings.image[order] == i]
-        by_cell = mine[np.argsort(cell[mine], kind="stable")]  # of each cell the longest tracks first
+        by_cell = mine[np.argsort(cell[mine], kind="stable")]  # in each cell the longest tracks first
         _, first = np.unique(cell[by_cell], return_index=True)
         place = np.arange(len(by_cell)) - np.repeat(first, np.diff([*first, len(by_cell)]))
-        chosen = by_cell[np.argsort(place, kind="stable")][:share]  # in turn from each cell
+        chosen = by_cell[np.argsort(place, kind="stable")][:share]  # taken from each cell in turn
         keep[sightings.track[chosen]] = True
     return np.flatnonzero(keep | _of_pairs(sightings, rank, keep, pair_share, n_images))
 
@@ -102,7 +102,7 @@ def thinned(sightings: Sightings, pixels: Array, share: int, pair_share: int, si
 def _of_pairs(
     sightings: Sightings, rank: Index, keep: NDArray[np.bool_], share: int, n_images: int
 ) -> NDArray[np.bool_]:
-    """Tracks that pairs of images need beyond those that are kept, so that no weak tie is cut."""
+    """Tracks that pairs of images need beyond those already kept, so that no weak connection is lost."""
     seen = np.zeros((n_images, sightings.count), dtype=np.bool_)
     seen[sightings.image, sightings.track] = True
     order = np.argsort(rank, kind="stable")
@@ -121,10 +121,10 @@ def _of_pairs(
 
 
 def triangulate(poses: Array, plane: Array, sightings: Sightings, sigma: float) -> tuple[Array, Array]:
-    """Scene points (P, 3) from known poses, robustly, and the error of each observation.
+    """Scene points (P, 3) by robust triangulation from known poses, and the error of each observation.
 
-    First the point nearest to all rays, then Gauss–Newton steps on the reprojection errors; in both, Cauchy weights
-    take the part of what most observations of a track agree on.
+    First the point nearest to all rays, then Gauss–Newton steps on the reprojection errors; both use Cauchy weights,
+    which favour the position on which most observations of a track agree.
 
     Args:
         poses: (N, 4, 4) T_world_camera.
@@ -133,7 +133,7 @@ def triangulate(poses: Array, plane: Array, sightings: Sightings, sigma: float) 
         sigma: scale of the weights, normalised coordinates.
 
     Returns:
-        points (P, 3), and errors (O,) in normalised coordinates, infinite behind a camera.
+        Points (P, 3), and errors (O,) in normalised coordinates, infinite behind a camera.
     """
     R, centre = poses[sightings.image, :3, :3], poses[sightings.image, :3, 3]
     ray = np.einsum("oij,oj->oi", R, np.column_stack([plane, np.ones(len(plane))]))
@@ -174,7 +174,7 @@ def reprojection(poses: Array, points: Array, plane: Array, sightings: Sightings
 
 
 def wide_enough(poses: Array, points: Array, sightings: Sightings) -> NDArray[np.bool_]:
-    """(P,) whether the rays to a point differ enough in direction."""
+    """(P,) whether the angle between the rays to a point is large enough."""
     ray = points[sightings.track] - poses[sightings.image, :3, 3]
     ray /= np.linalg.norm(ray, axis=1)[:, None]
     mean = _summed(ray, sightings)
@@ -193,7 +193,7 @@ def _summed(values: Array, sightings: Sightings) -> Array:
 
 
 def _solved(A: Array, b: Array) -> Array:
-    """x (P, 3) of A x = b with a little damping, so that a point without parallax stays finite."""
+    """Solutions x (P, 3) of A x = b with slight damping, so that a point without parallax stays finite."""
     trace = np.trace(A, axis1=1, axis2=2)
     damped: Array = A + (1e-9 * trace + 1e-300)[:, None, None] * np.eye(3)
     return np.asarray(np.linalg.solve(damped, b[:, :, None])[:, :, 0], dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Tracks of structure from motion: which image saw which scene point where."""
+"""Tracks of structure from motion: the observations of scene points in images."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Tracks:
     points: Array = field(repr=False)
 
     def thinned(self, most: int) -> Tracks:
-        """At most about `most` observations: the longest tracks that see every image best, nothing if few enough.
+        """Reduce to about `most` observations, keeping the longest tracks; unchanged if there are few enough.
 
-        Tracks are taken in the order of their length, but each image keeps its share first.
+        Tracks are taken in the order of their length, after each image has got its share.
         """
         if len(self.image) <= most:
             return self
@@ -38,7 +38,7 @@ class Tracks:
         keep = np.zeros(len(self.points), dtype=bool)
         share = max(1, most // n_images // 2)
         order = np.argsort(-length[self.point], kind="stable")
-        for i in range(n_images):  # the least connected image must not lose its few points
+        for i in range(n_images):  # so that a weakly connected image keeps its few points
             mine = order[self.image[order] == i][:share]
             keep[self.point[mine]] = True
         for p in np.argsort(-length, kind="stable"):
