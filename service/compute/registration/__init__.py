@@ -1,1 +1,1 @@
-"""From outlines and camera poses to the pose of the scan: identity, solution, evaluation."""
+"""From outlines and camera poses to the pose of the scan: identification and registration."""

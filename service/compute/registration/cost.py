@@ -1,4 +1,4 @@
-"""What an outline says against a projected sphere: the cone's three numbers, or the paper's x^T E x of its points."""
+"""Residuals of an outline against a projected sphere: its cone's three parameters, or the paper's x^T E x."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ Cost = Literal["cone", "sampson", "algebraic"]
 def cone_residuals(
     axes: Array, frames: Array, half_angles_rad: Array, centres_camera_m: Array, radius_m: float
 ) -> tuple[Array, Array]:
-    """Residuals (O, 3) in radians of seen cones against spheres, and their derivative (O, 3, 3) by the centres.
+    """Residuals (O, 3) in radians of observed cones against spheres, and their derivative (O, 3, 3) by the centres.
 
     Args:
-        axes: (O, 3) unit vectors to the centres as seen.
-        frames: (O, 3, 2) the first two columns of each cone's `frame()`.
-        half_angles_rad: (O,) as seen.
+        axes: (O, 3) observed unit vectors to the centres.
+        frames: (O, 3, 2) first two columns of each cone's `frame()`.
+        half_angles_rad: (O,) observed half angles.
         centres_camera_m: (O, 3) predicted centres in the camera frame.
-        radius_m: of the spheres.
+        radius_m: radius of the spheres.
 
-    A sphere at c is seen as the cone with the axis u = c / |c| and sin(a) = r / |c|: the residual is the tilt of u
-    along the two columns of the frame, and a minus the half angle seen. These three numbers are all that an outline
-    holds, and nearly linear in c.
+    A sphere at c appears as the cone with the axis u = c / |c| and sin(a) = r / |c|. The residual is the tilt of u
+    along the two columns of the frame, and a minus the observed half angle. These three numbers hold all the
+    information of an outline and are nearly linear in c.
     """
     distance = np.linalg.norm(centres_camera_m, axis=1)
     u = centres_camera_m / distance[:, None]
@@ -39,7 +39,7 @@ def cone_residuals(
 
 
 def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: PointCost) -> Array:
-    """Signed residuals (N,) of points (N, 3) normalised, z = 1, against spheres at (N, 3) in the camera frame.
+    """Signed residuals (N,) of normalised points (N, 3), z = 1, against spheres at (N, 3) in the camera frame.
 
     The outline of a sphere is x^T E x = 0 with E^-1 = P Q^-1 P^T. In the camera frame P = [I | 0] and
     Q^-1 ~ [[r^2 I - c c^T, -c], [-c^T, -1]], hence E ~ (|c|^2 - r^2) I - c c^T.
@@ -53,7 +53,7 @@ def residuals(points: Array, centres_camera_m: Array, radius_m: float, cost: Poi
 def residuals_and_derivative(
     points: Array, centres_camera_m: Array, radius_m: float, cost: PointCost
 ) -> tuple[Array, Array]:
-    """Residuals (N,) and their derivative (N, 3) with respect to the centres."""
+    """Residuals (N,) as from `residuals`, and their derivative (N, 3) by the centres."""
     return _value_and_gradient(points, centres_camera_m, radius_m, cost, derivative=True)
 
 

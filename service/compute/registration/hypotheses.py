@@ -1,4 +1,4 @@
-"""Which image sphere is which marker, in one image: all triples the sizes allow, verified against the rest."""
+"""Identifies markers in one image: all triples that the sizes allow, verified against the other outlines."""
 
 from __future__ import annotations
 
@@ -16,42 +16,40 @@ from service.compute.registration.cost import cone_residuals
 from service.compute.registration.pairing import Gate, Sightings, match, sightings
 from service.core.geometry import Array, Transform, apply, skew, transform
 
-_MOST_DETECTIONS = 18  # of one image, the best ones: triples grow with the cube
+_MOST_DETECTIONS = 18  # per image, the best ones: the number of triples grows with the cube
 _MOST_REFINED = 150
 _CLOSE = Gate(0.1, 0.03)  # of a pose solved from several outlines
 _CHUNK = 4000  # triples refined at a time
 _TRIPLE_CHI2 = 30.0  # 3 degrees of freedom
 _OUTLINE_CHI2 = 30.0  # 3 degrees of freedom
-_EVIDENCE = (
-    14.0  # log of how much rarer a stranger is where a sphere is expected, than a sphere; kept on the low side
-)
-_MARGIN = 9.0  # log of the odds at which a reading counts as the only one
+_EVIDENCE = 14.0  # log likelihood ratio of a marker to a false detection at an expected place; a low estimate
+_MARGIN = 9.0  # log odds at which an assignment counts as unique
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """One reading of an image."""
+    """One possible assignment of markers in an image."""
 
     markers: dict[int, int]  # detection → marker
     T_camera_scan: Transform
     rms_px: float
-    score: float = 0.0  # log odds against chance
+    score: float = 0.0  # log odds against a chance match
 
     @property
     def count(self) -> int:
-        """How many detections it explains."""
+        """Number of detections that it explains."""
         return len(self.markers)
 
 
 def image_hypotheses(
     outlines: Sequence[SphereOutline], centres_scan_m: Array, radius_m: float, camera: CameraModel
 ) -> list[Hypothesis]:
-    """Readings of an image that explain at least four detections, the best first; distinct ones only.
+    """Distinct assignments that explain at least four detections of an image, the best first.
 
-    Triples of detections are paired with all ordered triples of markers whose mutual distances the known radius
-    allows (size gives depth to about a hundredth). Each gives a pose, solved from the nine numbers of its three
-    outlines; those that fit must find a fourth and every further detection where they predict it. Survivors are
-    solved from all their outlines and judged by their residuals in standard deviations.
+    Triples of detections are paired with all ordered triples of markers whose mutual distances fit (the known radius
+    and the apparent size give depth to about one per cent). Each pair gives a pose from the nine parameters of its
+    three outlines. Poses that fit must predict a fourth detection, and all further ones. The survivors are solved
+    from all their outlines and judged by their residuals in standard deviations.
     """
     seen = sightings(outlines, radius_m, camera)
     D = min(len(seen.axes), _MOST_DETECTIONS)
@@ -77,7 +75,7 @@ def image_hypotheses(
         if refined is not None:
             results.setdefault(frozenset(refined.markers.items()), refined)
     found = sorted(results.values(), key=lambda r: -r.score)
-    # A reading contained in a better one adds nothing.
+    # An assignment contained in a better one adds nothing.
     kept: list[Hypothesis] = []
     for r in found:
         if not any(set(r.markers.items()) <= set(k.markers.items()) for k in kept):
@@ -86,7 +84,7 @@ def image_hypotheses(
 
 
 def rivals(readings: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Of readings, best first: those that contradict the best and are not much less likely."""
+    """Of assignments, best first: the best and those that contradict it and are not much less likely."""
     if not readings:
         return []
     best = readings[0]
@@ -135,7 +133,7 @@ _LOOSE = Gate(0.4, 0.06)  # of a triple's pose
 def _fitting(
     seen: Sightings, model: NDArray[np.int64], image: NDArray[np.int64], centres: Array, radius_m: float
 ) -> tuple[Array, Array]:
-    """Poses (K, 3, 3), (K, 3) of the triples whose nine numbers fit one."""
+    """Poses (K, 3, 3), (K, 3) of the triples whose nine parameters fit one pose."""
     rotations: list[Array] = []
     places: list[Array] = []
     for start in range(0, len(model), _CHUNK):
@@ -158,7 +156,7 @@ def _pose_steps(
     for step in range(steps + 1):
         turned = np.einsum("kij,knj->kni", rotation, points)
         c = (turned + t[:, None]).reshape(-1, 3)
-        # A wild pose is not worth a derivative; it will not fit.
+        # Keep wrong poses in front of the camera, so that the derivative exists; they will not fit anyway.
         c[:, 2] = np.maximum(c[:, 2], 2 * radius_m)
         r, slope = cone_residuals(seen.axes[flat], seen.frames[flat], seen.half_angles[flat], c, radius_m)
         r = r / seen.sigma_rad[flat]
@@ -174,7 +172,7 @@ def _pose_steps(
 
 
 def _damped_steps(J: Array, r: Array) -> Array:
-    """Gauss–Newton steps (K, 6) from J (K, N, 6) and residuals (K, N); turns are kept small."""
+    """Gauss–Newton steps (K, 6) from J (K, N, 6) and residuals (K, N), with limited rotations."""
     JJ = J.transpose(0, 2, 1) @ J
     H = JJ + 1e-9 * np.trace(JJ, axis1=1, axis2=2)[:, None, None] * np.eye(6)
     dx = -np.linalg.solve(H, np.einsum("kni,kn->ki", J, r)[:, :, None])[:, :, 0]
@@ -183,7 +181,7 @@ def _damped_steps(J: Array, r: Array) -> Array:
 
 
 def _support(seen: Sightings, R: Array, t: Array, centres: Array, radius_m: float) -> tuple[NDArray[np.int64], Array]:
-    """Detections explained (K,) by each pose, loosely, and their mean angle in radii."""
+    """Number of detections (K,) that each pose explains within loose gates, and their mean angle in radii."""
     counts = np.zeros(len(R), dtype=np.int64)
     error = np.zeros(len(R))
     for start in range(0, len(R), 2000):
@@ -211,7 +209,7 @@ def _refine(
     radius_m: float,
     focal_px: float,
 ) -> Hypothesis | None:
-    """The reading solved from all its outlines; those that do not fit are dropped, those that do are added."""
+    """The assignment solved from all its outlines, without those that do not fit and with further ones that do."""
     for _ in range(6):
         pick, chosen = np.array(list(markers)), np.array(list(markers.values()))
         new_R, new_t, _ = _pose_steps(seen, pick[None], centres[chosen][None], rotation[None], t[None], radius_m, 5)
@@ -237,7 +235,7 @@ def _refine(
             more = {int(d): more[int(d)] for d in fresh[fits]}
         if not more:
             chi2 = float(own.sum())
-            # Six of the numbers went into the pose: what is left must look like noise.
+            # Six of the parameters determine the pose: the remaining residuals must look like noise.
             free = 3 * len(markers) - 6
             if chi2 > free + 4.5 * np.sqrt(2 * free) + 6:
                 return None

@@ -1,4 +1,4 @@
-"""Which image sphere is which marker, over the whole image set: hypotheses of images, verified by all the poses."""
+"""Identifies markers over the whole image set: assignments of single images, verified with all camera poses."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _MOST_TRIED = 80
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """The reading of one image: outline index → marker index, and the pose it implies (None: not known)."""
+    """The assignment of one image: outline index → marker index, and the pose that it implies (None: unknown)."""
 
     markers: dict[int, int] = field(default_factory=dict)
     T_camera_scan: Transform | None = None
-    scale: float | None = None  # of the camera positions, where it was found
+    scale: float | None = None  # of the camera positions, if it was estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,16 +56,16 @@ def identify(
 
     Args:
         outlines: per image.
-        sphere_centres_m: (M, 3) registration spheres in the scan frame; other detections are left unassigned.
+        sphere_centres_m: (M, 3) registration spheres in the scan frame; other detections stay unassigned.
         camera: intrinsics.
-        poses: (N, 4, 4) T_world_camera, each in the frame of its group; None: every image by itself.
-        radius_m: of the spheres.
+        poses: (N, 4, 4) T_world_camera, each in the frame of its group; None: every image is identified on its own.
+        radius_m: radius of the spheres.
         groups: (N,) station of each image.
-        metric: whether the positions of the poses are in metres; if not, the scale is found too.
+        metric: whether the poses' positions are in metres; otherwise the scale is estimated too.
         names: of the images, for messages.
 
     Raises:
-        ComputeError: too few spheres are visible, more than one reading fits, or none fits all poses.
+        ComputeError: too few spheres are visible, more than one assignment fits, or none fits all poses.
     """
     names = list(names) or [f"image {i}" for i in range(len(outlines))]
     centres = np.asarray(sphere_centres_m, dtype=np.float64)
@@ -109,7 +109,7 @@ def _require_any(
 
 
 def _each_alone(readings: Sequence[list[Hypothesis]], names: Sequence[str]) -> tuple[Assignment, ...]:
-    """The readings of images without poses; an image that can be read in two ways is left unread beside others."""
+    """Assignments of images without poses; among several images, an ambiguous one stays unassigned."""
     unclear = [k for k, r in enumerate(readings) if rivals(r)]
     if unclear and len(unclear) == sum(bool(r) for r in readings):
         k = unclear[0]
@@ -127,7 +127,7 @@ def _each_alone(readings: Sequence[list[Hypothesis]], names: Sequence[str]) -> t
 
 
 def _named(markers: dict[int, int]) -> str:
-    """A reading in words: outline = sphere, counted from 0."""
+    """An assignment in words: outline = sphere, counted from 0."""
     return "{" + ", ".join(f"{d}={m}" for d, m in sorted(markers.items())) + "}"
 
 
@@ -200,7 +200,7 @@ def _scale_unknown(where: str, counts: str) -> ComputeError:
 
 
 def _agreeing(best: _Reading, readings: Sequence[list[Hypothesis]]) -> int:
-    """Images whose own hypotheses include the reading."""
+    """Number of images whose own hypotheses include the assignment."""
     return sum(
         any(len(set(h.markers.items()) & set(m.items())) >= min(4, h.count) for h in r)
         for m, r in zip(best.markers, readings, strict=True)
@@ -215,7 +215,7 @@ def _differ(a: _Reading, b: _Reading) -> bool:
 
 
 def _first_difference(a: _Reading, b: _Reading) -> tuple[dict[int, int], dict[int, int]]:
-    """The markers of the first image that two readings read differently."""
+    """The markers of the first image in which two solutions differ."""
     return next(
         (x, y) for x, y in zip(a.markers, b.markers, strict=True) if any(d in y and y[d] != m for d, m in x.items())
     )
@@ -230,7 +230,7 @@ def _metric_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[t
 
 
 def _similarity_starts(readings: Sequence[list[Hypothesis]], poses: Array) -> list[tuple[Transform, float]]:
-    """From pairs of images: their rotations must agree, their distance gives the scale."""
+    """Initial similarities from pairs of images: their rotations must agree, their distance gives the scale."""
     ranked = sorted(
         ((h.score, -h.rms_px, k, n) for k, r in enumerate(readings) for n, h in enumerate(r[:_HYPOTHESES_PER_IMAGE])),
         reverse=True,
@@ -282,7 +282,7 @@ def _read(
 def _polish(
     reading: _Reading, seen: Sequence[Sightings], poses: Array, centres: Array, radius_m: float, *, metric: bool
 ) -> _Reading:
-    """Least squares on the directions of all matched spheres, then matching again, until nothing changes."""
+    """Least squares on the directions of all matched spheres, alternating with matching until nothing changes."""
     for _ in range(4):
         index = [(k, d, m) for k, r in enumerate(reading.markers) for d, m in r.items()]
         image = np.array([k for k, _, _ in index])
@@ -310,7 +310,7 @@ def _polish(
             size = (np.arcsin(np.minimum(radius_m / distance, 0.9)) / half - 1)[:, None]
             return np.hstack([(c / distance[:, None] - axes) / half[:, None], size]).ravel()
 
-        # A tenth of a radius is where a match begins to be doubtful.
+        # From a tenth of a radius on, a match is doubtful.
         fit = least_squares(fun, np.zeros(6 if metric else 7), loss="soft_l1", f_scale=0.1, x_scale="jac")
         T, s = unpack(np.asarray(fit.x))
         new = _read(T, s, seen, poses, centres, radius_m)

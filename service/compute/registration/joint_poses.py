@@ -1,4 +1,4 @@
-"""What errors of camera poses that hang together (structure from motion) do to a registration."""
+"""Registration covariance for camera poses with correlated errors (structure from motion)."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from service.core.geometry import Array
 
 
 def with_joint_pose_covariance(registration: RegistrationResult, covariance: Array) -> RegistrationResult:
-    """The same solution with its covariance for poses whose errors are those of one adjustment.
+    """The same solution with its covariance for poses whose errors come from one joint adjustment.
 
-    Errors of neighbouring images of a reconstruction are alike, and do not average out as independent ones do. The
-    estimate is linear in them: with H the information on the common unknowns x and xi the poses' errors,
-    dx = -H^-1 sum_i J' R_i^-1 A_i xi_i, hence their part of the covariance is K C K'. It replaces the component
-    "poses". With a scale, the result is of the scan's place against the cameras laid over the true ones by their
-    positions: what a scale that is too large moves away with all cameras is no error.
+    Errors of neighbouring images in a reconstruction are correlated, so they do not average out like independent
+    ones. The estimate is linear in them: with H the information on the common unknowns x, and xi the poses' errors,
+    dx = -H^-1 sum_i J' R_i^-1 A_i xi_i, so their part of the covariance is K C K'. It replaces the component "poses".
+    With a scale, the result is the covariance of the scan's position relative to the cameras, aligned to the true
+    ones by their positions: a scale error that moves the scan with all cameras does not count.
 
     Args:
-        registration: of all images that `covariance` is of, in the same order.
+        registration: of all images in `covariance`, in the same order.
         covariance: (6 N, 6 N) of the poses given to `register` (positions in their unit, rotation vectors), from
             `similarity_covariance`.
 
     Raises:
-        DataError: of another number of images.
+        DataError: the covariance is for another number of images.
     """
     s = registration.solution
     n = len(s.blocks.JA)

@@ -1,8 +1,8 @@
-"""Normal equations of the registration, compressed image by image, with the errors of the images' poses marginalised.
+"""Normal equations of the registration, compressed per image, with the errors of the images' poses marginalised.
 
-The model, linearised: rows r (3 an outline, whitened) + J x + A_i xi_i = noise of variance `factor`, where x are the
-unknowns common to all images and xi_i ~ N(0, P_i) the error of the pose of image i, which moves all its spheres
-together. What is needed of an image are the products of [J A r], a few kilobytes, however many points or outlines.
+The linearised model: rows r (three per outline, whitened) + J x + A_i xi_i = noise of variance `factor`, with x the
+unknowns common to all images and xi_i ~ N(0, P_i) the pose error of image i, which moves all its spheres together. Of
+each image only the products of [J A r] are needed: a few kilobytes, however many points or outlines it has.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from service.core.geometry import Array
 
 @dataclass(frozen=True, slots=True)
 class Blocks:
-    """Products of the whitened rows of each of N images; n common unknowns."""
+    """Products of the whitened rows for each of N images; n common unknowns."""
 
     JJ: Array  # (N, n, n)
     JA: Array  # (N, n, 6)
@@ -25,11 +25,11 @@ class Blocks:
     Jr: Array  # (N, n)
     Ar: Array  # (N, 6)
     rr: Array  # (N,)
-    rows: Array  # (N,) number of rows, those of weights below one in part
+    rows: Array  # (N,) number of rows; those with weights below one count in part
 
 
 def compress(J: Array, A: Array, r: Array, image: NDArray[np.int64], n_images: int, weights: Array) -> Blocks:
-    """Blocks of outlines (O, 3, n), (O, 3, 6), (O, 3), each in `image` (O,) and of weight (O,)."""
+    """Blocks from outlines' J (O, 3, n), A (O, 3, 6) and r (O, 3), each in `image` (O,) and with a weight (O,)."""
     n = J.shape[2]
     root = np.sqrt(weights)[:, None, None]
     F = np.concatenate([J, A, r[:, :, None]], axis=2) * root
@@ -50,13 +50,13 @@ def compress(J: Array, A: Array, r: Array, image: NDArray[np.int64], n_images: i
 
 @dataclass(frozen=True, slots=True)
 class Marginal:
-    """Normal equations of the common unknowns alone: H dx = -g."""
+    """Normal equations of the common unknowns only: H dx = -g."""
 
     H: Array  # (n, n)
     g: Array  # (n,)
     quadratic: float  # weighted sum of squares at dx = 0
     log_determinant: float  # of the covariance of all rows
-    Q: Array  # (N, 6, 6) covariance of a pose's error, the common unknowns given
+    Q: Array  # (N, 6, 6) covariance of a pose error, given the common unknowns
 
 
 def marginalise(blocks: Blocks, root: Array, factor: float) -> Marginal:
@@ -79,7 +79,7 @@ def pose_errors(blocks: Blocks, marginal: Marginal, dx: Array, factor: float) ->
 
 
 def outline_and_pose_shares(blocks: Blocks, marginal: Marginal, root: Array, factor: float) -> tuple[Array, Array]:
-    """Parts (n, n) of H due to the noise of the outlines and to that of the poses, which sum to H.
+    """Parts (n, n) of H due to the noise of the outlines and to that of the poses; they sum to H.
 
     With R = C + A P A' they are J' R^-1 C R^-1 J and J' R^-1 A P A' R^-1 J.
     """
@@ -92,13 +92,13 @@ def outline_and_pose_shares(blocks: Blocks, marginal: Marginal, root: Array, fac
 
 
 def solve_symmetric(H: Array, b: Array) -> Array:
-    """H^-1 b for a positive semi-definite H whose unknowns have unlike units."""
+    """H^-1 b for a positive semi-definite H, scaled first because the unknowns' units differ."""
     d = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     scaled = H * np.outer(d, d)
     return d * np.linalg.lstsq(scaled, d * b, rcond=1e-14)[0]
 
 
 def inverse_symmetric(H: Array) -> Array:
-    """H^-1 (pseudo-inverse) for unknowns of unlike units."""
+    """H^-1 (pseudo-inverse), scaled first because the unknowns' units differ."""
     d = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     return np.linalg.pinv(H * np.outer(d, d), rcond=1e-14, hermitian=True) * np.outer(d, d)

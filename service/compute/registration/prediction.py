@@ -1,4 +1,4 @@
-"""What a solved registration predicts of outlines that took no part in it, and how far they are from it."""
+"""Predictions of a registration for outlines that were not used in it, and their errors."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from service.core.geometry import Array
 
 @dataclass(frozen=True, slots=True)
 class Foreign:
-    """Whitened rows of O outlines that are not in the solution: r + J dx + A xi."""
+    """Whitened rows of O outlines outside the solution: r + J dx + A xi."""
 
     image: NDArray[np.int64]
     J: Array  # (O, 3, n)
     A: Array  # (O, 3, 6)
-    r: Array  # (O, 3) at the solution, the pose as given
+    r: Array  # (O, 3) at the solution, with the pose as given
     whiten: Array  # (O, 3, 3)
     by_centre: Array | None = (
-        None  # (O, 3, 3) by a displacement of the sphere in the scan frame, if that has an error
+        None  # (O, 3, 3) by a displacement of the sphere in the scan frame, if its centre is uncertain
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """How well an outline was predicted, and how well it could be."""
+    """Error of an outline's prediction, and the predicted size of that error."""
 
-    normalised: float  # rms of the outline's three numbers in the standard deviations of their prediction
-    sigma_rad: float  # predicted rms over the outline of its distance from the prediction
+    normalised: float  # rms of the outline's three residuals over their predicted standard deviations
+    sigma_rad: float  # predicted rms distance of the outline's points from the prediction
 
 
 def foreign_rows(
@@ -59,12 +59,12 @@ def foreign_rows(
 def predict(
     solution: Solution, rows: Foreign, *, refined: bool, centre_covariance_m2: Array | None = None
 ) -> list[Prediction]:
-    """Residuals of outlines against their predicted covariance.
+    """Residuals of outlines, compared with their predicted covariance.
 
     Args:
         solution: without these outlines.
         rows: linearised at the solution.
-        refined: the prediction uses the pose with its found error taken off, not the pose as given.
+        refined: whether the prediction uses the pose corrected by its estimated error, or the pose as given.
         centre_covariance_m2: (O, 3, 3) of each outline's sphere, scan frame.
     """
     gain, Q = solution.pose_gain()[rows.image], solution.marginal.Q[rows.image]
@@ -74,7 +74,7 @@ def predict(
         both = rows.J + rows.A @ gain
         predicted = both @ spread @ both.transpose(0, 2, 1) + rows.A @ Q @ rows.A.transpose(0, 2, 1)
     else:
-        # The pose's error counts with its whole size, less what the solution has followed of it.
+        # The pose's full error counts, except the part that the solution has absorbed.
         r = rows.r
         root = solution.pose_root[rows.image]
         cross = rows.J @ spread @ gain.transpose(0, 2, 1) @ rows.A.transpose(0, 2, 1)

@@ -1,4 +1,4 @@
-"""The registration as a problem of least squares: outlines of posed images as rows, three an outline, linearised."""
+"""The registration as a least-squares problem: outlines of posed images, linearised as three rows each."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _CHUNK = 500  # outlines whose points are expanded at a time
 
 @dataclass(frozen=True, slots=True)
 class CommonErrors:
-    """Standard deviations, in px, of what all outlines of a capture have in common.
+    """Standard deviations, in px, of errors shared by all outlines of a capture.
 
-    `shift_px`: in x and in y of the image; `growth_px`: of the radius; both are told apart from the registration by
-    views from different sides, hence solved for. `light_px`: displacement of all spheres in one direction of space,
-    for each of its three coordinates, at their mean distance: light from one side makes the edge of the lit limb err
-    otherwise than that of the dark one. No view tells it from a displacement of the scan, hence it is what remains of
-    the predicted error however many images are taken.
+    `shift_px`: in x and in y of the image; `growth_px`: of the radius. Views from different sides separate both from
+    the registration, so they are estimated. `light_px`: displacement of all spheres in one direction of space, per
+    coordinate, at their mean distance: under light from one side, the detected edge is biased differently on the lit
+    and on the dark limb. No view separates it from a displacement of the scan, so this part of the predicted error
+    remains however many images are taken.
     """
 
     shift_px: float
@@ -35,26 +35,26 @@ class CommonErrors:
     light_px: float
 
 
-# Light from one side makes the edge of the lit limb err otherwise than that of the dark one; the mean of such a
-# bias round the outline is growth, its difference between the sides light, and both are about as large. The truth
-# on ten rendered scenes with outlines of 60 px radius: growth -0.020…-0.031 px, light 0.016 px rms a coordinate,
-# shift 0.003 px in x and 0.008 px in y rms; on three with 150 px radius: growth -0.008 px, light 0.017 px
-# (bench/accuracy.py, bench/registration_sigma.py). Other lights, colours and a renderer of another kind
-# (bench/outlines.py) gave growth of -0.04 px and displacements of single images of 0.05 px rms: light is taken
-# above what the first renderer asks for.
+# Under light from one side, the detected edge is biased differently on the lit and on the dark limb. The mean of this
+# bias around the outline is growth, the difference between the sides is light; both are similar in size. Truth on ten
+# rendered scenes with outlines of 60 px radius: growth -0.020…-0.031 px, light 0.016 px rms per coordinate, shift
+# 0.003 px in x and 0.008 px in y rms; on three with 150 px radius: growth -0.008 px, light 0.017 px
+# (bench/accuracy.py, bench/registration_sigma.py). Other lights, colours and another renderer (bench/outlines.py)
+# gave growth of -0.04 px and displacements of single images of 0.05 px rms, so light is set above what the first
+# renderer requires.
 EXPECTED_COMMON_ERRORS = CommonErrors(shift_px=0.015, growth_px=0.03, light_px=0.02)
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Outlines O of N images of G stations; what is known before the solution."""
+    """O outlines of N images from G stations, and everything known before the solution."""
 
     members: list[tuple[int, int, int]]  # image, outline, marker
     image: NDArray[np.int64]
     marker: NDArray[np.int64]
-    group: NDArray[np.int64]  # position in `groups`
+    group: NDArray[np.int64]  # index into `groups`
     groups: list[int]
-    station: NDArray[np.int64]  # (N,) position in `groups`, -1 for a group without outlines
+    station: NDArray[np.int64]  # (N,) index into `groups`, -1 for a group without outlines
     T_base_camera: Array  # (N, 4, 4)
     centres: Array  # (M, 3)
     radius_m: float
@@ -64,12 +64,12 @@ class Problem:
     frames: Array  # (O, 3, 2)
     half_angles: Array  # (O,)
     whiten: Array  # (O, 3, 3): whiten @ residual has unit covariance
-    points: list[Array] = field(repr=False)  # (L, 2) normalised; used by the costs of points only
-    point_sigma: Array = field(repr=False)  # (O,) of one of the L points as an independent measurement
-    common: Array = field(repr=False)  # (O, 3, K) displacement of a cone by each error of the image common to all
+    points: list[Array] = field(repr=False)  # (L, 2) normalised; only for costs on points
+    point_sigma: Array = field(repr=False)  # (O,) of each of the L points if they were independent
+    common: Array = field(repr=False)  # (O, 3, K) displacement of a cone by each common error of the images
     common_prior: Array = field(repr=False)  # (K, K) information
     sphere_prior: Array | None = field(repr=False)  # (3 M, 3 M) information; None: centres taken as exact
-    light_unit_m: float  # displacement of a sphere that is seen as one px
+    light_unit_m: float  # displacement of a sphere that appears as one px
     with_scale: bool
 
     @property
@@ -79,17 +79,17 @@ class Problem:
 
     @property
     def scale_column(self) -> int:
-        """Where ln scale is, if it is solved for."""
+        """Column of ln scale, if it is estimated."""
         return 6 * len(self.groups)
 
     @property
     def sphere_column(self) -> int:
-        """Where the displacements of the spheres begin, if they are solved for."""
+        """First column of the spheres' displacements, if they are estimated."""
         return self.scale_column + int(self.with_scale)
 
     @property
     def common_column(self) -> int:
-        """Where the common errors begin."""
+        """First column of the common errors."""
         return self.sphere_column + (0 if self.sphere_prior is None else 3 * len(self.centres))
 
     @property
@@ -98,7 +98,7 @@ class Problem:
         return self.common_column + 3 + self.common.shape[2]
 
     def prior(self) -> Array:
-        """(n, n) information on the common unknowns."""
+        """(n, n) prior information on the common unknowns."""
         out = np.zeros((self.size, self.size))
         if self.sphere_prior is not None:
             out[self.sphere_column : self.common_column, self.sphere_column : self.common_column] = self.sphere_prior
@@ -108,16 +108,16 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """A solution: values of the unknowns."""
+    """Values of the unknowns."""
 
     bases: Array  # (G, 4, 4) T_base_scan of each station
     scale: float
     spheres: Array  # (M, 3) displacements of the centres, scan frame
-    common: Array  # (3 + K,) px: displacement in space (scan frame), shift, growth, and of the intrinsics
+    common: Array  # (3 + K,) px: displacement in space (scan frame), shift, growth, and errors of the intrinsics
     poses: Array  # (N, 6) errors of the poses: position (m), rotation vector, base axes
 
     def moved(self, problem: Problem, dx: Array, poses: Array) -> State:
-        """After a step of the common unknowns, with the pose errors that go with it."""
+        """The state after a step of the common unknowns, with the pose errors that belong to it."""
         bases = self.bases.copy()
         for k in range(len(bases)):
             d = dx[6 * k : 6 * k + 6]
@@ -130,7 +130,7 @@ class State:
         return State(bases, scale, spheres, self.common + dx[problem.common_column :], poses)
 
     def prior_values(self, problem: Problem) -> Array:
-        """(n,) present values of the unknowns that have a prior, zero for the others."""
+        """(n,) current values of the unknowns with a prior, zero for the others."""
         out = np.zeros(problem.size)
         if problem.sphere_prior is not None:
             out[problem.sphere_column : problem.common_column] = self.spheres.ravel()
@@ -138,7 +138,7 @@ class State:
         return out
 
     def cameras(self, problem: Problem, *, refined: bool) -> Array:
-        """(N, 4, 4) T_base_camera, metric; `refined` by the errors found."""
+        """(N, 4, 4) T_base_camera, metric; `refined`: corrected by the estimated pose errors."""
         T = problem.T_base_camera.copy()
         T[:, :3, 3] *= self.scale
         if refined:
@@ -149,7 +149,7 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class Linearised:
-    """Rows of the outlines: r + J dx + A xi, xi the whole error of the image's pose (not a step of it)."""
+    """Rows of the outlines: r + J dx + A xi, where xi is the whole error of the image's pose (not a step of it)."""
 
     J: Array  # (O, 3, n)
     A: Array  # (O, 3, 6)
@@ -170,7 +170,7 @@ def assemble(
     common_errors: CommonErrors | None,
     intrinsics_covariance: Array | None,
 ) -> Problem:
-    """The problem of `register`; its arguments.
+    """Assemble the problem from the arguments of `register`.
 
     Raises:
         ComputeError: too few outlines or markers.
@@ -225,7 +225,7 @@ def assemble(
 def with_outlines(
     problem: Problem, outlines: Sequence[Sequence[SphereOutline]], members: list[tuple[int, int, int]]
 ) -> Problem:
-    """The problem with these outlines (image, outline, marker) in place of its own."""
+    """The problem with these outlines (image, outline, marker) instead of its own."""
     used = [outlines[i][j] for i, j, _ in members]
     camera, image = problem.camera, np.array([i for i, _, _ in members], dtype=np.int64)
     axes = np.array([o.cone.axis for o in used])
@@ -257,8 +257,8 @@ def _whitening(covariance: Array) -> Array:
 
 
 def _point_sigma(o: SphereOutline) -> float:
-    # L points on a fitted conic carry the information of its n edge points, no more.
-    # Beyond it an outline errs as a whole; two of its parameters share each such error.
+    # L points on a fitted conic have the information of its n edge points, no more. In addition the outline has a
+    # systematic error as a whole, shared by two of its parameters.
     variance = max(o.sigma_px, 0.03) ** 2 / max(o.n_edges, 12) + o.systematic_px**2 / 2
     return float(np.sqrt(variance * len(o.points)))
 
@@ -272,7 +272,7 @@ def _block_inverse(covariances: Array) -> Array:
 
 
 def _common_displacements(axes: Array, frames: Array, camera: CameraModel) -> Array:
-    """Displacement (O, 3, 3) of cones when all outlines shift by a pixel in x, in y, or grow by one."""
+    """Displacement (O, 3, 3) of cones if all outlines shift by a pixel in x, in y, or grow by one."""
     z = axes[:, 2]
     out = np.zeros((len(axes), 3, 3))
     for k, f in enumerate((camera.fx, camera.fy)):
@@ -282,7 +282,7 @@ def _common_displacements(axes: Array, frames: Array, camera: CameraModel) -> Ar
 
 
 def _intrinsics_errors(axes: Array, frames: Array, half: Array, camera: CameraModel) -> Array:
-    """Displacement (O, 3, 8) of cones by errors of fx, fy, cx, cy, k1, k2, p1, p2, the image being given."""
+    """Displacement (O, 3, 8) of cones by errors of fx, fy, cx, cy, k1, k2, p1, p2, with the image pixels fixed."""
     x, y, z = axes[:, 0] / axes[:, 2], axes[:, 1] / axes[:, 2], axes[:, 2]
     r2, zero = x**2 + y**2, np.zeros(len(axes))
     plane = -np.stack(
@@ -301,7 +301,7 @@ def _intrinsics_errors(axes: Array, frames: Array, half: Array, camera: CameraMo
 
 
 def linearise(problem: Problem, state: State, cost: Cost) -> Linearised:
-    """Whitened rows of the outlines at a state."""
+    """Whitened rows of the outlines at a state, for any of the costs."""
     T = state.cameras(problem, refined=True)[problem.image]
     origin = (problem.T_base_camera[problem.image, :3, 3]) * state.scale
     centres = problem.centres + state.spheres + problem.light_unit_m * state.common[:3]
@@ -315,7 +315,7 @@ def linearise(problem: Problem, state: State, cost: Cost) -> Linearised:
         r = np.einsum("oij,oj->oi", problem.whiten, seen)
         by_centre, by_common = problem.whiten @ slope, problem.whiten @ problem.common
     else:
-        equivalent = np.linalg.solve(slope, problem.common)  # a common error as a displacement of the centre
+        equivalent = np.linalg.solve(slope, problem.common)  # the common errors as displacements of the centre
         by_centre, r = _point_rows(problem, c + equivalent @ in_image, cost)
         by_common = by_centre @ equivalent
     S = by_centre @ T[:, :3, :3].transpose(0, 2, 1)  # by a displacement in base axes
@@ -333,12 +333,12 @@ def linearise(problem: Problem, state: State, cost: Cost) -> Linearised:
     J[:, :, problem.common_column : problem.common_column + 3] = problem.light_unit_m * turned
     J[:, :, problem.common_column + 3 :] = by_common
     A = np.concatenate([-S, S @ skew(place - T[:, :3, 3])], axis=2)
-    # The present pose errors are in r already; the rows are those of their whole size.
+    # r already includes the current pose errors, but the rows are for their full values.
     return Linearised(J, A, r - np.einsum("okj,oj->ok", A, state.poses[problem.image]))
 
 
 def _point_rows(problem: Problem, centres: Array, cost: PointCost) -> tuple[Array, Array]:
-    """Three rows an outline with the normal equations of all its points: derivative (O, 3, 3) and residual (O, 3)."""
+    """Three rows per outline with the normal equations of its points: derivative (O, 3, 3) and residual (O, 3)."""
     n = len(centres)
     N, b = np.zeros((n, 3, 3)), np.zeros((n, 3))
     for start in range(0, n, _CHUNK):
@@ -354,7 +354,7 @@ def _point_rows(problem: Problem, centres: Array, cost: PointCost) -> tuple[Arra
     if cost == "sampson":
         weight = 1 / problem.point_sigma**2
     else:
-        # The paper's cost weights all points alike; only a common factor makes its rows of the order of one.
+        # The paper's cost weights all points equally; a common factor brings its rows to the order of one.
         length = np.trace(N, axis1=1, axis2=2)
         inside = np.einsum("oij,oij->o", problem.whiten, problem.whiten) / np.sum(centres**2, axis=1)
         weight = np.full(n, float(np.median(inside) / np.median(length)))

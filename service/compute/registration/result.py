@@ -1,4 +1,4 @@
-"""The registration's answer: pose of the scan, how well it is known and why, and what it predicts elsewhere."""
+"""The result of a registration: the scan's pose, its covariance by source, and predictions from it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.core.geometry import Array, Transform, skew
 
 @dataclass(frozen=True, slots=True)
 class OutlineResidual:
-    """One outline against the solution."""
+    """The residual of one outline at the solution."""
 
     image: int
     outline: int  # index in the image's outlines
@@ -21,38 +21,38 @@ class OutlineResidual:
     rms_px: float  # with the camera pose as given
     excluded: bool
     reason: str = ""
-    refined_rms_px: float = 0.0  # with the error found of the camera pose taken off
+    refined_rms_px: float = 0.0  # with the camera pose corrected by its estimated error
 
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """The solved least-squares problem, for what is derived from it without solving again."""
+    """The solved least-squares problem, from which further results follow without solving it again."""
 
     problem: Problem
     state: State
-    weights: Array  # (O,) of the outlines, 0 for those left out
+    weights: Array  # (O,) of the outlines, 0 for excluded ones
     blocks: Blocks
     marginal: Marginal
-    linearised: Linearised  # of cones
+    linearised: Linearised  # with the cone cost
     covariance: Array  # (n, n) of all common unknowns
     pose_root: Array  # (N, 6, 6)
     outline_factor: float
 
     def pose_gain(self) -> Array:
-        """(N, 6, n) K with xi = K dx + own error of covariance Q: how a pose's error follows the common unknowns."""
+        """(N, 6, n) K with xi = K dx + own error of covariance Q: how pose errors follow the common unknowns."""
         return -(self.marginal.Q @ self.blocks.JA.transpose(0, 2, 1)) / self.outline_factor
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationResult:
-    """The solution.
+    """The result of `register`.
 
-    `T_world_scan` with world = the base frame of the first group, in metres; camera positions given are multiplied
-    by `scale` first. `T_world_group[g]` maps base frame g to the world. `covariance` is (6, 6), or (7, 7) with
+    `T_world_scan` with world = the base frame of the first group, in metres; given camera positions are first
+    multiplied by `scale`. `T_world_group[g]` maps base frame g to the world. `covariance` is (6, 6), or (7, 7) with
     scale, of (x, y, z in metres, rotation vector in radians[, ln scale]) of a perturbation exp(w) R, t + d in world
-    axes. It is the sum of `components`: "outlines" (their own noise), "common" (what all outlines have in common, and
-    the intrinsics where their covariance was given), "poses", "spheres" (the errors of the scan's centres).
-    `rms_px` is over the outlines that were not excluded, with the camera poses as given.
+    axes. It is the sum of `components`: "outlines" (their own noise), "common" (errors shared by all outlines, and
+    the intrinsics if their covariance was given), "poses", "spheres" (errors of the scan's centres). `rms_px` is over
+    the outlines that were not excluded, with the camera poses as given.
     """
 
     T_world_scan: Transform
@@ -61,39 +61,39 @@ class RegistrationResult:
     covariance: Array
     rms_px: float
     residuals: tuple[OutlineResidual, ...]
-    T_scan_camera: Array = field(repr=False)  # (N, 4, 4) metric, every image through its own group, poses as given
+    T_scan_camera: Array = field(repr=False)  # (N, 4, 4) metric, each image through its own group, poses as given
     chi2_reduced: (
-        float  # of the outlines with their stated covariances, a degree of freedom; near 1 if those are right
+        float  # of the outlines with their stated covariances, per degree of freedom; near 1 if those are right
     )
     n_images: int
     cost: str
     components: dict[str, Array] = field(repr=False)
     group_covariance: dict[int, Array] = field(repr=False)  # (6, 6) of T_group_scan, axes of that group's base
-    T_scan_camera_refined: Array = field(repr=False)  # (N, 4, 4) with the errors found of the poses taken off
-    pose_sigma: tuple[float, float]  # m and rad, rms a coordinate, of the errors of single poses; 0 if taken as exact
-    outline_factor: float  # by which the residuals multiply the outlines' stated variances
-    sphere_offsets_m: Array = field(repr=False)  # (M, 3) found displacements of the centres, scan frame
+    T_scan_camera_refined: Array = field(repr=False)  # (N, 4, 4) corrected by the estimated pose errors
+    pose_sigma: tuple[float, float]  # m and rad, rms per coordinate, of single poses' errors; 0 if taken as exact
+    outline_factor: float  # factor on the outlines' stated variances, estimated from the residuals
+    sphere_offsets_m: Array = field(repr=False)  # (M, 3) estimated displacements of the centres, scan frame
     common_px: Array = field(
         repr=False
-    )  # (6,) found displacement in space, shift in x, y, growth common to all outlines
+    )  # (6,) estimated displacement in space, shift in x and y, growth, shared by all outlines
     solution: Solution = field(repr=False)
 
     @property
     def excluded(self) -> tuple[OutlineResidual, ...]:
-        """Outlines left out, with the reason."""
+        """Excluded outlines, with reasons."""
         return tuple(r for r in self.residuals if r.excluded)
 
     @property
     def refined_covariance(self) -> Array:
-        """(6, 6) of the scan's place against `T_scan_camera_refined`, of all images with outlines on the average.
+        """(6, 6) covariance of the scan relative to `T_scan_camera_refined`, averaged over all images with outlines.
 
-        Of (d, w) of exp(w) R, t + d in world axes, R that of T_world_scan. Through the refined cameras the errors of
-        the poses matter as far as the outlines could not tell them; `covariance` is that through the poses as given.
+        Of (d, w) of exp(w) R, t + d in world axes, R that of T_world_scan. With refined cameras, pose errors matter
+        only as far as the outlines do not determine them; `covariance` is for the poses as given.
         """
         return np.sum(list(self.refined_components().values()), axis=0)
 
     def refined_components(self) -> dict[str, Array]:
-        """Parts of `refined_covariance`; noise of outlines and of poses, which cannot be parted any more, are one."""
+        """Parts of `refined_covariance`; the noise of outlines and poses is inseparable and one part."""
         s = self.solution
         problem, gain = s.problem, s.pose_gain()
         seen = np.unique(problem.image)
@@ -102,7 +102,7 @@ class RegistrationResult:
         for i in seen:
             k = int(problem.station[i])
             base = s.state.bases[k]
-            # A point X of base axes moves by d + w x (X - t_base); the camera's error takes off d' + w' x (X - t_i).
+            # A point X in base axes moves by d + w x (X - t_base); the camera's error subtracts d' + w' x (X - t_i).
             by_pose = np.eye(6)
             by_pose[:3, 3:] = -skew(base[:3, 3] - T_base_camera[i, :3, 3])
             to_world = np.kron(np.eye(2), self.T_world_scan[:3, :3] @ base[:3, :3].T) / len(seen)
@@ -119,27 +119,27 @@ class RegistrationResult:
         return {"outlines and poses": noise, "common": common, "spheres": spheres}
 
     def sigma_map_m(self, points_scan_m: Array) -> Array:
-        """Predicted standard deviation (N,) in m, 3D, of points (N, 3) of the scan: target registration error."""
+        """Target registration error: predicted standard deviation (N,) in m, 3D, at points (N, 3) of the scan."""
         return np.sqrt(_variance_m2(points_scan_m @ self.T_world_scan[:3, :3].T, self.covariance))
 
     def sigma_at_m(self, point_scan_m: Array) -> float:
-        """Predicted standard deviation (3D) of a point (3,) of the scan: the target registration error, in metres."""
+        """Target registration error: predicted standard deviation (3D) in metres at a point (3,) of the scan."""
         return float(self.sigma_map_m(np.asarray(point_scan_m)[None])[0])
 
     def sigma_components_m(self, point_scan_m: Array) -> dict[str, float]:
-        """What each source contributes to `sigma_at_m`; their squares sum to its square."""
+        """Contribution of each source to `sigma_at_m`; the squares sum to its square."""
         at = (self.T_world_scan[:3, :3] @ point_scan_m)[None]
         return {name: float(np.sqrt(_variance_m2(at, c)[0])) for name, c in self.components.items()}
 
     def covariance_at_m2(self, point_scan_m: Array) -> Array:
-        """(3, 3) in m², world axes, of the place of a point (3,) of the scan."""
+        """(3, 3) covariance in m², world axes, of the position of a point (3,) of the scan."""
         J = np.hstack([np.eye(3), -skew(self.T_world_scan[:3, :3] @ point_scan_m)])
         return np.asarray(J @ self.covariance[:6, :6] @ J.T, dtype=np.float64)
 
 
 def _variance_m2(turned: Array, covariance: Array) -> Array:
-    """Trace (N,) of the covariance of the places of points `turned` (N, 3), relative to the scan's origin."""
-    # |d + w x v|^2 expected: tr D + 2 v . E[d x w] + |v|^2 tr W - v' W v
+    """Trace (N,) of the position covariance of points `turned` (N, 3): rotated, relative to the scan's origin."""
+    # The expectation of |d + w x v|^2: tr D + 2 v . E[d x w] + |v|^2 tr W - v' W v
     D, X, W = covariance[:3, :3], covariance[:3, 3:6], covariance[3:6, 3:6]
     twist = np.array([X[1, 2] - X[2, 1], X[2, 0] - X[0, 2], X[0, 1] - X[1, 0]])
     square = np.sum(turned**2, axis=1)

@@ -1,4 +1,4 @@
-"""The pose of the scan in the world from sphere outlines in posed images, over all images, markers and stations."""
+"""Registration: the pose of the scan in the world from sphere outlines in posed images of all stations."""
 
 from __future__ import annotations
 
@@ -58,35 +58,35 @@ def register(
     intrinsics_covariance: Array | None = None,
     common_errors: CommonErrors | None = None,
 ) -> RegistrationResult:
-    """Solve T_world_scan (and scale, and every station's base) by Gauss–Newton over all outlines.
+    """Estimate T_world_scan (and scale, and every station's base) by Gauss–Newton over all outlines.
 
-    An outline counts as the three numbers that it determines, weighted by its covariance. The errors of the camera
-    poses, which move all spheres of an image together, are integrated out with the size that is stated or that the
-    residuals show; errors of the spheres, of the intrinsics and those that all outlines share are solved for, held
-    by their stated sizes.
+    An outline contributes its three parameters, weighted by their covariance. Errors of the camera poses, which move
+    all spheres of an image together, are marginalised, with their size as stated or estimated from the residuals.
+    Errors of the spheres, of the intrinsics and those shared by all outlines are estimated, with their stated sizes
+    as priors.
 
     Args:
-        outlines: per image, what the detector found.
-        assignments: per image, outline index → marker index, and a starting pose (from `identify`).
-        poses: (N, 4, 4) T_world_camera; for groups, T_base_camera of the image's own base.
+        outlines: per image, from the detector.
+        assignments: per image, outline index → marker index, and an initial pose (from `identify`).
+        poses: (N, 4, 4) T_world_camera; with groups, T_base_camera in the base frame of the image's group.
         groups: (N,) station of each image; images of one group share a base frame.
         centres_scan_m: (M, 3) sphere centres in the scan frame, metres.
-        radius_m: of the spheres.
+        radius_m: radius of the spheres.
         camera: intrinsics of all images.
-        estimate_scale: the camera positions are not metric (structure from motion).
-        cost: `cone` takes the three numbers and their covariance; `sampson` the geometric distances of the points;
+        estimate_scale: whether to estimate a scale, for camera positions that are not metric (structure from motion).
+        cost: `cone` uses the three parameters and their covariance; `sampson` the points' geometric distances;
             `algebraic` is the paper's plain x^T E x.
-        robust: weights per outline and exclusion of outlines that contradict the rest.
+        robust: whether to weight outlines robustly and exclude outliers.
         pose_covariance: (N, 6, 6) of each pose's (position in the unit of the poses, rotation vector in radians) in
-            the axes of its base, errors of different images taken as independent; "estimate": isotropic, its size
-            from the residuals; "exact".
+            the axes of its base, independent between images; "estimate": isotropic, estimated from the residuals;
+            "exact": no pose errors.
         sphere_covariance_m2: (M, 3, 3) of the centres; None takes them as exact.
-        intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only where the errors
-            of the poses do not depend on those of the intrinsics. None leaves them to the error budget.
-        common_errors: sizes of what all outlines of a capture have in common; None: `EXPECTED_COMMON_ERRORS`.
+        intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for poses whose
+            errors do not depend on the intrinsics'. None leaves them to the error budget.
+        common_errors: prior sizes of errors shared by all outlines of a capture; None: `EXPECTED_COMMON_ERRORS`.
 
     Raises:
-        ComputeError: too few outlines to determine the answer, or no convergence.
+        ComputeError: the outlines do not determine the answer, or no convergence.
         DataError: a covariance has the wrong shape.
     """
     problem = assemble(
@@ -122,7 +122,7 @@ def _require(problem: Problem, keep: NDArray[np.bool_]) -> None:
 
 
 def _start(problem: Problem, assignments: Sequence[Assignment], poses: Array, groups: NDArray[np.int64]) -> State:
-    """Bases and scale from the assignments' poses: the median image of each group."""
+    """Initial bases and scale from the assignments' poses: the median image of each group."""
     scale = 1.0
     if problem.with_scale:
         scales = [a.scale for a in assignments if a.scale is not None]
@@ -154,7 +154,7 @@ def _start(problem: Problem, assignments: Sequence[Assignment], poses: Array, gr
 
 
 def _scale(problem: Problem, assignments: Sequence[Assignment], poses: Array, groups: NDArray[np.int64]) -> float:
-    """Of the camera positions p, from the assignments' own poses: R_i c_i + scale p_i is the same place for all i."""
+    """Initial scale from the assignments' poses: R_i c_i + scale p_i (positions p_i) is equal for all i."""
     middle = problem.centres.mean(axis=0)
     upper, lower = 0.0, 0.0
     for g in problem.groups:
@@ -179,7 +179,7 @@ def _scale(problem: Problem, assignments: Sequence[Assignment], poses: Array, gr
 
 @dataclass(frozen=True, slots=True)
 class _Weighting:
-    """How rows are weighted at present."""
+    """The current weighting of the rows."""
 
     outlines: Array  # (O,)
     pose_root: Array  # (N, 6, 6)
@@ -191,7 +191,7 @@ def _blocks(problem: Problem, rows: Linearised, weights: Array) -> Blocks:
 
 
 def _descend(problem: Problem, state: State, weighting: _Weighting, cost: Cost) -> State:
-    """Gauss–Newton with halved steps where the objective would grow."""
+    """Gauss–Newton; a step that would increase the objective is halved."""
     prior = problem.prior()
     previous, best, dx, poses = np.inf, state, np.zeros(problem.size), state.poses
     share = 1.0
@@ -212,7 +212,7 @@ def _descend(problem: Problem, state: State, weighting: _Weighting, cost: Cost) 
         dx = -solve_symmetric(m.H + prior, g)
         poses = pose_errors(blocks, m, dx, weighting.factor)
         state = state.moved(problem, dx, poses)
-        # A step of a hundred-thousandth of a standard deviation changes nothing.
+        # A hundred-thousandth of a standard deviation: converged.
         if float(-g @ dx) < 1e-10:
             return state
     return state
@@ -231,7 +231,7 @@ def _solve(problem: Problem, start: State, noise: PoseNoise, *, robust: bool, co
         if robust:
             d, px = _distances(problem, rows, blocks, state, root, factor)
             typical = float(np.median(px[keep]))
-            typical_d = float(np.median(d[keep])) / 1.54  # the median of the norm of three standard normals
+            typical_d = float(np.median(d[keep])) / 1.54  # the median norm of three standard normals
             new_keep = px < max(5.0 * typical, 0.8)
             new_weights = np.where(new_keep, np.minimum(1.0, 3.0 * typical_d / np.maximum(d, 1e-12)), 0.0)
             settled = turn > 1 and np.array_equal(new_keep, keep) and np.abs(new_weights - weights).max() < 0.02
@@ -258,12 +258,12 @@ def _solve(problem: Problem, start: State, noise: PoseNoise, *, robust: bool, co
 
 
 def _begin(problem: Problem, start: State) -> State:
-    """From the assignments' poses to the neighbourhood of the answer, outlines equal and softly limited."""
+    """From the assignments' poses to the neighbourhood of the answer, outlines weighted equally but robustly."""
     state, none = start, np.zeros((problem.n_images, 6, 6))
     for _ in range(4):
         rows = linearise(problem, state, "cone")
         seen = np.linalg.norm(np.linalg.solve(problem.whiten, rows.r[:, :, None])[:, :2, 0], axis=1)
-        # A tenth of a radius is where an outline begins to be doubtful; stated covariances are left out of this.
+        # From a tenth of a radius on, an outline is doubtful; stated covariances are not used here.
         soft = 1 / (1 + (seen / problem.half_angles / 0.1) ** 2)
         size = np.einsum("oij,oij->o", problem.whiten, problem.whiten)
         weights = soft / size * float(np.median(size))
@@ -274,7 +274,7 @@ def _begin(problem: Problem, start: State) -> State:
 def _distances(
     problem: Problem, rows: Linearised, blocks: Blocks, state: State, root: Array, factor: float
 ) -> tuple[Array, Array]:
-    """Each outline's residual (O,), in its standard deviations and in px, the errors found of the poses taken off."""
+    """Norm of each outline's residual (O,), in its standard deviations and in px, with pose errors removed."""
     m = marginalise(blocks, root, factor)
     xi = pose_errors(blocks, m, np.zeros(problem.size), factor)
     r = rows.r + np.einsum("okj,oj->ok", rows.A, xi[problem.image])
@@ -282,9 +282,9 @@ def _distances(
 
 
 def rms_px(problem: Problem, whitened: Array) -> Array:
-    """Rms (O,) over an outline in px of a displacement of its cone, given as whitened rows (O, 3)."""
+    """RMS (O,) in px, over an outline, of its cone's displacement, given as whitened rows (O, 3)."""
     r = np.linalg.solve(problem.whiten, whitened[:, :, None])[:, :, 0]
-    # Angles grow in the image plane by 1 / cos^2 along the radius and by 1 / cos across it.
+    # Angles are stretched in the image plane by 1 / cos^2 in the radial direction and by 1 / cos across it.
     stretch = problem.focal_px / problem.axes[:, 2] ** 1.5
     return stretch * np.sqrt(np.sum(r[:, :2] ** 2, axis=1) / 2 + r[:, 2] ** 2)
 
@@ -346,7 +346,7 @@ def _result(s: Solution, groups: NDArray[np.int64], cost: Cost) -> RegistrationR
 
 
 def _components(s: Solution) -> dict[str, Array]:
-    """(n, n) parts of the covariance of the common unknowns: the share of each source in the information."""
+    """(n, n) parts of the common unknowns' covariance by source, from each source's share of the information."""
     outline, pose = outline_and_pose_shares(s.blocks, s.marginal, s.pose_root, s.outline_factor)
     prior, p = s.problem.prior(), s.problem
     spheres, common = np.zeros_like(prior), np.zeros_like(prior)

@@ -1,4 +1,4 @@
-"""Variance components: how noisy outlines and poses are, told from the residuals themselves."""
+"""Variance components: the noise of outlines and poses, estimated from the residuals."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from scipy.optimize import minimize
 from service.compute.registration.normal_equations import Blocks, marginalise
 from service.core.geometry import Array
 
-_FACTOR = (0.02, 1e4)  # of the outlines' variance
-_POSE = (1e-3, 1e3)  # of the square roots below
-_GROWTH = 5.0  # of the square roots of the pose noise in one estimate
+_FACTOR = (0.02, 1e4)  # range for the outlines' variance
+_POSE = (1e-3, 1e3)  # range for the square roots below
+_GROWTH = 5.0  # largest growth of the square roots of the pose noise in one estimate
 
 
 @dataclass(frozen=True, slots=True)
 class PoseNoise:
-    """Square roots of the covariances of the pose errors as a sum of parts with a factor each.
+    """Square roots of the covariances of the pose errors, as a sum of parts with one factor each.
 
-    `parts` (K, N, 6, 6) must act on different rows (translation, rotation), or be one; `least` is the smallest
-    factor allowed, `free` whether they are estimated.
+    `parts` (K, N, 6, 6) must act on different rows (translation, rotation), or there is only one; `least` is the
+    smallest allowed factor; `free` tells whether the factors are estimated.
     """
 
     parts: Array
@@ -28,17 +28,17 @@ class PoseNoise:
     free: bool
 
     def root(self, factors: Array) -> Array:
-        """(N, 6, 6) with root @ root.T the covariance."""
+        """(N, 6, 6) such that root @ root.T is the covariance."""
         return np.einsum("k,knij->nij", factors, self.parts)
 
 
 def no_pose_noise(n_images: int) -> PoseNoise:
-    """Poses taken as exact."""
+    """No pose errors: poses taken as exact."""
     return PoseNoise(np.zeros((1, n_images, 6, 6)), 1.0, free=False)
 
 
 def unknown_pose_noise(n_images: int) -> PoseNoise:
-    """Isotropic noise of position and of orientation, alike for all images, in units of 0.1 mm and 0.1 mrad."""
+    """Isotropic noise of position and of orientation, equal for all images, in units of 0.1 mm and 0.1 mrad."""
     parts = np.zeros((2, n_images, 6, 6))
     parts[0, :, :3, :3] = 1e-4 * np.eye(3)
     parts[1, :, 3:, 3:] = 1e-4 * np.eye(3)
@@ -46,7 +46,7 @@ def unknown_pose_noise(n_images: int) -> PoseNoise:
 
 
 def given_pose_noise(covariance: Array) -> PoseNoise:
-    """The stated covariances (N, 6, 6); the residuals may show them to be too small, never too large."""
+    """The stated covariances (N, 6, 6); the residuals can increase them, never decrease them."""
     values, vectors = np.linalg.eigh((covariance + covariance.transpose(0, 2, 1)) / 2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     return PoseNoise(root[None], 1.0, free=True)
@@ -58,17 +58,17 @@ def estimate(
     """Factor of the outlines' variance and factors (K,) of the pose noise, by restricted maximum likelihood.
 
     Args:
-        blocks: linearised at the present solution.
+        blocks: linearised at the current solution.
         noise: the form of the pose noise.
-        prior: (n, n) information on the common unknowns from elsewhere.
-        prior_gradient: (n,) of that information at the present solution.
-        start: present values.
+        prior: (n, n) prior information on the common unknowns.
+        prior_gradient: (n,) gradient of the prior at the current solution.
+        start: current values.
 
     Source: Patterson and Thompson, "Recovery of inter-block information when block sizes are unequal",
-    Biometrika 58(3), 1971. A wide prior on each logarithm keeps few residuals from saying much.
+    Biometrika 58(3), 1971. A wide prior on each logarithm limits the influence of few residuals.
 
-    The pose noise grows at most fivefold at a time: residuals far larger than stated send the first step of the
-    minimiser to poses that are known by nothing, from where neither it nor the solution comes back.
+    The pose noise grows at most fivefold at a time. If residuals are far larger than stated, the minimiser's first
+    step would otherwise make the poses carry no information, from which neither it nor the solution recovers.
     """
     n_free = len(start[1]) if noise.free else 0
     most = np.log(np.clip(_GROWTH * start[1][:n_free], max(noise.least, _POSE[0]) * _GROWTH, _POSE[1]))
@@ -80,7 +80,7 @@ def estimate(
         scales = np.exp(y[1:]) if n_free else start[1]
         m = marginalise(blocks, noise.root(scales), factor)
         H, g = m.H + prior, m.g + prior_gradient
-        # A common unknown of which these poses tell nothing, but for rounding, takes no part.
+        # A common unknown on which these poses have no information, except by rounding, is left out.
         told = np.diag(H) > 0
         d = np.where(told, 1 / np.sqrt(np.where(told, np.diag(H), 1.0)), 0.0)
         values, vectors = np.linalg.eigh(H * np.outer(d, d))
