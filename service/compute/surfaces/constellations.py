@@ -1,4 +1,4 @@
-"""Registers two sets of sphere centres (two meshes of one scene) without known correspondences."""
+"""Registers two sets of sphere centres (from two meshes of one scene) without known correspondences."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _MIRROR = np.array([-1.0, 1.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class ConstellationMatch:
-    """Two constellations in register.
+    """Registration of two constellations.
 
     Attributes:
         T_a_b: maps frame b to frame a.
         pairs: (index in a, index in b), sorted.
         residuals_m: (P,) distance of each pair after registration.
-        missing_a: indices of a without a partner in b.
-        missing_b: indices of b without a partner in a.
+        missing_a: indices in a without a partner in b.
+        missing_b: indices in b without a partner in a.
     """
 
     T_a_b: Transform
@@ -34,20 +34,20 @@ class ConstellationMatch:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square of the residuals."""
+        """Root mean square of the residuals, metres."""
         return float(np.sqrt(np.mean(self.residuals_m**2)))
 
 
 def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> ConstellationMatch:
-    """Rigid T_a_b between sphere centres a (M, 3) and b (N, 3) in metres, whatever their order.
+    """Rigid T_a_b between sphere centres a (M, 3) and b (N, 3) in metres, in any order.
 
-    Triangles whose sides agree propose a pose, the pose that brings most spheres within `tolerance_m` wins.
-    Spheres missing from either set are reported. Handedness is checked: a mirrored copy (an axis negated by a
-    DICOM tool) must not be explained away.
+    Triangles with equal sides propose poses; the pose that brings most spheres within `tolerance_m` wins. Spheres
+    missing from either set are reported. Handedness is checked, so that a mirrored copy (an axis negated by a DICOM
+    tool) is detected.
 
     Raises:
         ComputeError: fewer than four spheres agree, all of them lie in a plane (so that a mirror image cannot be
-            told), the sets are mirror images, or two different assignments fit equally well.
+            recognised), the sets are mirror images, or two different assignments fit equally well.
     """
     proper = _best(a, b, tolerance_m)
     mirrored = _best(a, b * _MIRROR, tolerance_m)
@@ -95,7 +95,7 @@ def _count(solutions: list[Pairs]) -> int:
 
 
 def _best(a: Array, b: Array, tolerance: float) -> list[Pairs]:
-    """The largest consistent assignment, and every different one that is as large (maximal ones only)."""
+    """The largest consistent assignment, and all different ones of the same size."""
     found: dict[Pairs, float] = {}
     size = 3
     for ta, tb in _triangles(a, b, tolerance):
@@ -103,7 +103,7 @@ def _best(a: Array, b: Array, tolerance: float) -> list[Pairs]:
         pairs, _ = _assign(a, apply(T, b), 2 * tolerance)
         if len(pairs) < max(size, 4):
             continue
-        # The proposing triangle's noise is levered over the whole scene: refit before judging.
+        # The proposing triangle's noise is amplified over the whole scene: refit before judging.
         rows, columns = (np.array(side) for side in zip(*pairs, strict=True))
         refitted, _ = align_points(a[rows], b[columns])
         pairs, error = _assign(a, apply(refitted, b), tolerance)
@@ -126,7 +126,7 @@ def _assign(a: Array, b_in_a: Array, tolerance: float) -> tuple[Pairs, float]:
 
 
 def _triangles(a: Array, b: Array, tolerance: float) -> list[tuple[list[int], list[int]]]:
-    """Index triples of a and b whose three sides agree; triples of a are taken in one order only."""
+    """Index triples of a and b with three equal sides; triples of a are taken in one order only."""
     da = np.linalg.norm(a[:, None] - a[None], axis=2)
     db = np.linalg.norm(b[:, None] - b[None], axis=2)
     out: list[tuple[list[int], list[int]]] = []

@@ -1,4 +1,4 @@
-"""Surface of a CT volume at a threshold: marching cubes, in slabs when the volume is large."""
+"""Isosurface of a CT volume by marching cubes, in slabs if the volume is large."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ def surface(
     *,
     slab_voxels: int = SLAB_VOXELS,
 ) -> tuple[Array, NDArray[np.int32]]:
-    """Triangles where the volume crosses a threshold; what is denser is inside.
+    """Triangles where the volume crosses a threshold; denser material is inside.
 
     Args:
         volume_hu: (K, J, I) Hounsfield units.
         T_ct_voxel: (4, 4) affine from voxel indices (i, j, k) to metres in the CT frame.
-        threshold_hu: e.g. the middle between air and plastic.
-        slab_voxels: at most about so many voxels are worked on at a time.
+        threshold_hu: for example, the middle between air and plastic.
+        slab_voxels: approximate limit of voxels processed at a time.
 
     Returns:
-        vertices (V, 3) in metres in the CT frame, and faces (F, 3), counter-clockwise seen from outside. The surface
-        is open where the object reaches the border of the volume.
+        Vertices (V, 3) in metres in the CT frame, and faces (F, 3), counter-clockwise as seen from outside. The
+        surface is open where the object reaches the border of the volume.
 
     Raises:
-        ComputeError: the volume is not three-dimensional or nowhere crosses the threshold.
+        ComputeError: the volume is not three-dimensional, or never crosses the threshold.
 
     Source: Lewiner et al., "Efficient implementation of Marching Cubes' cases with topological guarantees", 2003
     (scikit-image).
@@ -40,7 +40,7 @@ def surface(
     if volume_hu.ndim != 3 or min(volume_hu.shape) < 2:
         raise ComputeError(f"a volume of shape {volume_hu.shape} has no surface", remedy="Check the CT series")
     low, high = int(volume_hu.min()), int(volume_hu.max())
-    # Off the integers: a voxel that equals the level exactly would give triangles without area.
+    # Avoid integers: a voxel exactly at the level would give triangles without area.
     level = threshold_hu + 0.25 if float(threshold_hu).is_integer() else float(threshold_hu)
     if not low < level < high:
         raise ComputeError(
@@ -54,7 +54,7 @@ def surface(
     count = 0
     last = volume_hu.shape[0] - 1
     for first in range(0, last, depth):
-        # Neighbouring slabs share one slice, so that their surfaces meet in it.
+        # Neighbouring slabs share one slice, in which their surfaces meet.
         end = min(first + depth, last)
         slab = volume_hu[first : end + 1]
         if not slab.min() < level < slab.max():
@@ -68,18 +68,18 @@ def surface(
         faces.append(triangles.astype(np.int64) + count)
         count += len(ijk)
     if not vertices:
-        # Only possible where two neighbouring slices lie on either side of the level and none crosses it within.
+        # Only possible if neighbouring slices are on opposite sides of the level and none crosses it within.
         raise ComputeError(f"no surface at {threshold_hu:g} HU", remedy="Choose another threshold")
     points, triangles = _sewn(np.concatenate(vertices), np.concatenate(faces), np.concatenate(seams))
-    # scikit-image winds its faces for (k, j, i) clockwise seen from outside; the change to (i, j, k) mirrors them,
-    # and a left-handed T_ct_voxel mirrors them back.
+    # scikit-image's faces for (k, j, i) are clockwise as seen from outside; the change to (i, j, k) mirrors them, and
+    # a left-handed T_ct_voxel mirrors them back.
     if np.linalg.det(T_ct_voxel[:3, :3]) < 0:
         triangles = triangles[:, ::-1]
     return apply(T_ct_voxel, points), np.ascontiguousarray(triangles, dtype=np.int32)
 
 
 def _sewn(points: Array, faces: NDArray[np.int64], on_seam: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64]]:
-    """Merge the vertices (voxel units) that two slabs have in common; drop faces that collapse."""
+    """Merge the vertices (voxel units) that two slabs share; drop faces that collapse."""
     seam = np.flatnonzero(on_seam)
     if len(seam):
         _, first, index = np.unique(np.round(points[seam], 3), axis=0, return_index=True, return_inverse=True)

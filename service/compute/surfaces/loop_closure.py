@@ -1,4 +1,4 @@
-"""Did spheres move between two measurements: differences against their uncertainties, sphere by sphere."""
+"""Detects spheres that moved between two measurements, from differences and their uncertainties."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from service.compute.surfaces.constellations import ConstellationMatch
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, place_jacobian, transform
 
-SYSTEMATIC_SIGMA_M = 2.0e-5  # of each coordinate: what two instruments differ by beyond their noise (scale, warmth)
-MOVED_PROBABILITY = 1.0e-3  # of calling any sphere moved when none did
-_LEAST = 4  # spheres that must stay to refer the others to
+SYSTEMATIC_SIGMA_M = 2.0e-5  # per coordinate: difference of two instruments beyond their noise (scale, temperature)
+MOVED_PROBABILITY = 1.0e-3  # of a false alarm: some sphere is reported as moved though none did
+_LEAST = 4  # unmoved spheres needed as the reference for the others
 
 
 @dataclass(frozen=True, slots=True)
 class SphereDifference:
-    """One sphere in both measurements, the frames brought together by the spheres that did not move.
+    """One sphere in both measurements, in a common frame defined by the spheres that did not move.
 
     Attributes:
         pair: (index in a, index in b).
         difference_m: (3,) position in b minus position in a, in frame a.
-        sigma_m: standard deviation of the difference's length along its direction, the registration's included.
+        sigma_m: standard deviation of the difference along its direction, including the registration's.
         z: Mahalanobis length of the difference.
-        probability: of such a z when the sphere did not move.
-        moved: whether it is called moved.
+        probability: of such a z if the sphere did not move.
+        moved: whether the sphere counts as moved.
     """
 
     pair: tuple[int, int]
@@ -42,14 +42,14 @@ class SphereDifference:
 
 @dataclass(frozen=True, slots=True)
 class LoopClosure:
-    """Two measurements of one scene, compared.
+    """Comparison of two measurements of one scene.
 
     Attributes:
-        T_a_b: rigid, weighted by the covariances, by the spheres that did not move.
+        T_a_b: rigid, from the spheres that did not move, weighted by the covariances.
         spheres: in the order of the match's pairs.
-        chi2_per_dof: of the spheres that did not move; near 1 when the stated uncertainties are true.
+        chi2_per_dof: of the spheres that did not move; near 1 if the stated uncertainties are right.
         rms_m: of the differences of the spheres that did not move.
-        sigma_rms_m: what that rms should be by the stated uncertainties.
+        sigma_rms_m: predicted rms from the stated uncertainties.
     """
 
     T_a_b: Transform
@@ -74,19 +74,19 @@ def close_loop(
 ) -> LoopClosure:
     """Compare the matched spheres of two measurements and name those that moved.
 
-    Each sphere is predicted from the others; the one that departs most from its prediction is set aside if chance
-    does not explain it, and the rest is judged again.
+    Each sphere is predicted from the others. The one farthest from its prediction is set aside if chance does not
+    explain it, and the rest are judged again.
 
     Args:
         a: (M, 3) centres, metres.
         covariances_a: (M, 3, 3), m².
-        b: (N, 3) centres in another frame.
-        covariances_b: (N, 3, 3).
-        match: which is which.
+        b: (N, 3) centres in another frame, metres.
+        covariances_b: (N, 3, 3), m².
+        match: correspondence of the spheres.
         systematic_sigma_m: added to every coordinate of a difference.
 
     Raises:
-        ComputeError: fewer than four spheres in common.
+        ComputeError: fewer than four common spheres.
     """
     if len(match.pairs) < _LEAST:
         raise ComputeError(f"{len(match.pairs)} spheres in common do not close a loop", remedy="scan all spheres")
@@ -127,7 +127,7 @@ def close_loop(
 def _against_others(
     a: Array, b: Array, C: Array, staying: NDArray[np.bool_], i: int, start: Transform
 ) -> tuple[Array, float, float]:
-    """Difference (3,) of sphere i from where the others put it, its squared Mahalanobis length, and its sigma."""
+    """Difference (3,) of sphere i from its prediction by the others, squared Mahalanobis length, and sigma."""
     others = staying.copy()
     others[i] = False
     T, covariance = _weighted(a[others], b[others], C[others], start)

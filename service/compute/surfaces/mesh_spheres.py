@@ -19,14 +19,14 @@ from service.core.geometry import Array
 from service.core.units import deg, mm
 
 _SURFEL = 0.2  # surface cell over which normals are averaged, in radii
-_HOOD = 1.3  # radii around a centre in which its sphere's surface lies
-_MOST_SAMPLES = 5000  # of one sphere: beyond, neighbours repeat each other's noise
+_HOOD = 1.3  # radius around a centre that contains its sphere's surface, in radii
+_MOST_SAMPLES = 5000  # per sphere; further neighbours share their noise
 _NEAR_MISSES = 6
-_MIXED = 0.2  # |orientation| below which the normals say nothing
-_MAX_RADIUS_SIGMA = 0.15  # in radii; a radius that is known less is no evidence of a sphere
-_FEWEST_PATCHES = 5  # cells of surface: centre, radius, and one to contradict them
-_ROUGHER = 2.0  # times the rms of the best covered spheres: noise of one mesh is not so different between spheres
-_SEED_REACH = 1.6  # a seed is a rough centre or a point on the surface: the centre is within so many radii
+_MIXED = 0.2  # |orientation| below which the normals are inconclusive
+_MAX_RADIUS_SIGMA = 0.15  # in radii; a less certain radius is no evidence of a sphere
+_FEWEST_PATCHES = 5  # cells of surface: enough for centre and radius, plus one for redundancy
+_ROUGHER = 2.0  # times the rms of the best covered spheres; noise within one mesh varies less
+_SEED_REACH = 1.6  # radii between a seed (a rough centre or a point on the surface) and the centre
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +35,12 @@ class MeshSphere:
 
     Attributes:
         centre_m: (3,) in the mesh's frame.
-        covariance: (3, 3) of the centre, m²; accounts for errors that neighbouring vertices share.
-        rms_m: weighted root mean square distance of the inlying vertices from the surface.
+        covariance: (3, 3) of the centre, m²; allows for errors that neighbouring vertices share.
+        rms_m: weighted root mean square distance of the inliers from the surface.
         radius_residual_m: radius of a free sphere fit to the same vertices, minus the known radius.
-        radius_sigma_m: standard deviation of that.
-        coverage: solid angle of the inlying surface, as a fraction of the whole sphere.
-        n: number of inlying vertices (of a dense mesh, of those that served).
+        radius_sigma_m: standard deviation of `radius_residual_m`.
+        coverage: solid angle of the inlier surface, as a fraction of the whole sphere.
+        n: number of inlier vertices (for a dense mesh, of those sampled).
     """
 
     centre_m: Array
@@ -54,15 +54,17 @@ class MeshSphere:
 
 @dataclass(frozen=True, slots=True)
 class SphereLimits:
-    """What a sphere must satisfy to be accepted; lengths as fractions of the radius.
+    """Acceptance limits for a sphere; lengths as fractions of the radius.
 
-    A cap of half angle a covers (1 - cos a) / 2 of its sphere: 0.067 at 30°, 0.15 at 45°, 0.25 at 60°.
-    The radius may also miss the known one by three of its sigmas, up to `most_radius_residual`: a small cap
-    determines it badly, but what fits no better than that is a fillet or an edge.
+    A cap of half angle a covers (1 - cos a) / 2 of its sphere: 0.067 at 30°, 0.15 at 45°, 0.25 at 60°. The radius may
+    also differ from the known one by three of its sigmas, up to `most_radius_residual`, because a small cap
+    determines it poorly; a larger difference indicates a fillet or an edge.
     """
 
     min_coverage: float = 0.05
-    min_cap_deg: float = 50.0  # opening of the seen cap across its narrow side: 60° of a cap, with its ragged rim
+    min_cap_deg: float = (
+        50.0  # opening of the visible cap in its narrow direction; a 60° cap with a ragged rim has this
+    )
     min_vertices: int = 20
     max_rms: float = 0.025
     max_radius_residual: float = 0.04
@@ -74,7 +76,7 @@ class SphereLimits:
 @dataclass(frozen=True, slots=True)
 class _Candidate:
     fit: SphereFit
-    reasons: tuple[str, ...]  # why it is refused; none: accepted
+    reasons: tuple[str, ...]  # why it is refused; empty if accepted
 
 
 def locate_spheres(
@@ -89,26 +91,26 @@ def locate_spheres(
 ) -> tuple[MeshSphere, ...]:
     """Locate every sphere of radius `radius_m` in a mesh or point cloud, best covered first.
 
-    Cells of surface vote for a centre one radius away; each peak of votes is fitted by a robust known-radius fit and
-    accepted by its coverage, its residuals (also against the other spheres'), the radius of a free fit, and that the
-    surface ends with the sphere instead of going on smoothly, as a cylinder's or an ellipsoid's does. Caps of 30°
-    half angle suffice where noise lets them. Winding may be inverted as a whole or for single spheres; a dent is
-    told from a sphere by the majority's winding, in a cloud without normals not at all.
+    Cells of surface vote for a centre one radius away, and each peak of votes is refined by a robust known-radius
+    fit. It is accepted by its coverage, its residuals (also relative to the other spheres'), the radius of a free
+    fit, and by the surface ending with the sphere instead of continuing smoothly as on a cylinder or an ellipsoid.
+    Caps of 30° half angle suffice if the noise is low. The winding may be inverted, as a whole or for single spheres;
+    dents are recognised by the majority's winding, and not at all in a cloud without normals.
 
     Args:
         vertices_m: (V, 3); vertices may be repeated, as in STL.
         faces: (F, 3) vertex indices; (0, 3) for a point cloud, whose points are then measured.
         radius_m: the spheres' radius.
-        expected: how many there must be; None accepts any number from one on.
-        limits: what an accepted sphere must satisfy.
-        normals: (V, 3) unit normals of a point cloud's points, if it has them.
-        seeds_m: (K, 3) points at or near each sphere (rough centre or a point picked on it): only these are
+        expected: the required number of spheres; None accepts any number from one on.
+        limits: acceptance limits; None: the defaults.
+        normals: (V, 3) unit normals of a point cloud's points, if known.
+        seeds_m: (K, 3) points at or near each sphere (a rough centre or a point picked on it): only these are
             searched, and the result is in their order.
 
     Raises:
-        DataError: not a mesh, indices out of range or vertices that are not finite.
-        ComputeError: no sphere, another number than expected, or a seed without a sphere; the message names what
-            was found, and the near misses with what speaks against each.
+        DataError: not a mesh, indices out of range, or vertices that are not finite.
+        ComputeError: no sphere, not the expected number, or a seed without a sphere; the message lists the spheres
+            found and the near misses with reasons.
     """
     bounds = limits or SphereLimits()
     vertices, triangles = _checked(vertices_m, faces, normals)
@@ -131,7 +133,7 @@ def _checked(vertices_m: Array, faces: NDArray[np.integer], normals: Array | Non
     vertices = np.ascontiguousarray(vertices_m, dtype=np.float64)
     triangles = cast(
         "IntArray", np.asarray(faces)
-    )  # of whatever integers: a copy of 20 million faces has half a gigabyte
+    )  # without a copy of other integer types: 20 million faces have half a gigabyte
     if triangles.size == 0:
         triangles = np.empty((0, 3), dtype=np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
@@ -156,7 +158,7 @@ def _checked(vertices_m: Array, faces: NDArray[np.integer], normals: Array | Non
 def _fits(
     starts: Array, vertices: Array, faces: IntArray, patches: Surfels, tree: cKDTree, radius: float
 ) -> list[SphereFit]:
-    """The final fit from each coarse centre (K, 3), without those that dissolve."""
+    """The final fit from each coarse centre (K, 3), without those that fail."""
     if len(starts) == 0:
         return []
     points, weight = _surroundings(starts, vertices, faces, radius)
@@ -172,7 +174,7 @@ def _fits(
         if len(near) == 0:
             continue
         own = weight[near] if len(faces) else sample_weights(points[near], 0.15 * radius)
-        own = np.minimum(own, 2 * float(np.median(own)))  # long facets of a post end in vertices near the sphere
+        own = np.minimum(own, 2 * float(np.median(own)))  # a post's long facets have vertices near the sphere
         nearest = tree.query(points[near])[1]
         samples = Samples(points[near], patches.normal[nearest], patches.outward[nearest], own)
         fit = fit_sphere(samples, start, radius, 0.1 * radius)
@@ -182,7 +184,7 @@ def _fits(
 
 
 def _surroundings(starts: Array, vertices: Array, faces: IntArray, radius: float) -> tuple[Array, Array]:
-    """Vertices (N, 3) near any of the centres, and the area that each stands for: one pass, whatever their number."""
+    """Vertices (N, 3) near any of the centres, and the area that each represents; one pass for any number of centres."""
     low, high = starts.min(axis=0) - 2 * radius, starts.max(axis=0) + 2 * radius
     cell = max(0.5 * radius, float(np.max(high - low)) / 300)
     size = np.ceil((high - low) / cell).astype(np.int64) + 1
@@ -234,11 +236,11 @@ def _shape_reasons(fit: SphereFit, radius: float, limits: SphereLimits) -> list[
 
 
 def _cap_deg(fit: SphereFit) -> float:
-    """Opening of the cap that scatters as the inlying surface does across its narrow side: a strip is a small one."""
+    """Opening in degrees of a cap with the same scatter as the inlier surface in its narrow direction."""
     unit, weight = fit.patches.unit, fit.patches.weight / fit.patches.weight.sum()
     middle = weight @ unit
     off = unit - middle
-    # In the plane across the middle direction: half the sine of the half angle is the deviation of an even cap.
+    # In the plane perpendicular to the middle direction, half the sine of the half angle is an even cap's deviation.
     plane = np.linalg.svd(middle[None])[2][1:]
     across = float(np.sqrt(max(float(np.linalg.eigvalsh(plane @ (off.T @ (off * weight[:, None])) @ plane.T)[0]), 0)))
     return 2 * deg(np.arcsin(min(1.0, 2 * across)))
@@ -297,13 +299,13 @@ def _judge(
 
 
 def _apart(a: SphereFit, b: SphereFit, radius: float) -> bool:
-    # Two solid spheres are two radii apart; several candidates may have run into the same one.
+    # Two solid spheres are two radii apart; several candidates may have converged to the same one.
     return float(np.linalg.norm(a.centre - b.centre)) > radius
 
 
 def _oriented(fits: list[SphereFit], expected: int | None) -> list[SphereFit]:
-    """Spheres without the dents: by the winding of the most, unless only single spheres wound differently fit the
-    expected number."""
+    """Spheres without dents: those with the majority's winding, unless only fits of either winding give the expected
+    number."""
     outward = [f for f in fits if f.orientation > -_MIXED]
     inward = [f for f in fits if f.orientation < _MIXED]
     for choice in (outward, inward, fits):
@@ -355,7 +357,7 @@ def _at_seeds(
     radius: float,
     limits: SphereLimits,
 ) -> tuple[MeshSphere, ...]:
-    """The sphere at each seed, in their order."""
+    """The sphere at each seed, in the seeds' order."""
     if seeds.ndim != 2 or seeds.shape[1] != 3 or not np.isfinite(seeds).all():
         raise DataError(f"seeds {seeds.shape} are not points (K, 3)", remedy="give x, y, z of a point at each sphere")
     peaks = vote_peaks(patches, radius)

@@ -1,4 +1,4 @@
-"""Where no sphere of the radius given is in a mesh: which other radius its spheres have."""
+"""If a mesh has no sphere of the given radius: the radius that its spheres do have."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from service.compute.surfaces.mesh_spheres import MeshSphere, SphereLimits, loca
 from service.core.errors import ComputeError
 from service.core.geometry import Array
 
-# A search finds radii within 4 %. Half and twice: the diameter was given, or half of the radius.
+# A search finds radii within 4 %. Half and twice: radius and diameter were confused.
 _TRIED = (0.95, 1.05, 0.9, 1.1, 0.85, 1.15, 0.8, 1.2, 0.75, 1.25, 0.7, 1.3, 0.5, 2.0)
-_LEAST_COVERAGE = 0.15  # of a sphere; smaller caps of any radius are on everything
+_LEAST_COVERAGE = 0.15  # of a sphere; smaller caps of any radius occur everywhere
 
 
 @dataclass(frozen=True, slots=True)
 class SeenRadius:
-    """The radius that spheres of a mesh have, and those spheres."""
+    """The radius of the spheres in a mesh, and those spheres."""
 
     radius_m: float
     spheres: tuple[MeshSphere, ...]
@@ -32,9 +32,9 @@ def seen_radius(
     *,
     normals: Array | None = None,
 ) -> SeenRadius | None:
-    """The radius between 0.7 and 1.3 times `radius_m`, or half or twice it, of which the mesh has most spheres.
+    """The radius with the most spheres in the mesh: from 0.7 to 1.3 times `radius_m`, half or twice it.
 
-    Takes as long as a dozen searches. Arguments as `locate_spheres`; None where no such spheres are either.
+    Takes as long as a dozen searches. Arguments as for `locate_spheres`; None if there are no such spheres.
 
     Raises:
         DataError: as `locate_spheres`.
@@ -47,7 +47,7 @@ def seen_radius(
             best, nearest = found, factor * radius_m
     if not best:
         return None
-    for _ in range(2):  # the residual of a radius that is nearly right is nearly all of what is missing
+    for _ in range(2):  # the residual at a nearly correct radius is nearly the whole difference
         nearest = nearest + float(np.median([sphere.radius_residual_m for sphere in best]))
         again = _located(vertices_m, faces, nearest, limits, normals)
         best = again if len(again) >= len(best) else best

@@ -1,4 +1,4 @@
-"""Where spheres of a radius may be: surface elements vote for centres, and a coarse fit sieves the candidates."""
+"""Candidate spheres of a given radius: surfels vote for centres, and a coarse fit filters the candidates."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _VOTE = 1 / 6  # cell of the voting grid, in radii
 _MIN_VOTE = 0.025  # votes a candidate needs, as a fraction of the whole sphere
 _MAX_CANDIDATES = 600
 _APART = 0.4  # of candidates, in radii
-_HOOD = 1.35  # radii around a candidate in which the sphere's surface is looked for
-_MIN_COSINE = 0.7  # between normal and radius; below it a surfel is not the sphere's
+_HOOD = 1.35  # radius around a candidate in which the sphere's surface is searched for, in radii
+_MIN_COSINE = 0.7  # between normal and radius; below it, a surfel is not on the sphere
 _BAND = 0.05  # of the coarse fit, in radii; surfels have little noise left
-_FLANK = 0.12  # in radii beyond that: where another shape goes on smoothly
+_FLANK = 0.12  # in radii beyond that, where another shape would continue smoothly
 _FLANK_COSINE = 0.88
 _ROUGH_RMS = 0.013  # of the coarse fit, in radii
-_WELL_COVERED = 0.3  # then it is fitted whatever its rms: the operator wants to know why it is refused
-_MOST_FLANK = 0.6  # of its area over that of the inliers
+_WELL_COVERED = 0.3  # above it, fitted whatever its rms, so that the operator is told why it is refused
+_MOST_FLANK = 0.6  # area of the flank over that of the inliers
 
 
 def candidates(patches: Surfels, tree: cKDTree, radius: float, min_coverage: float) -> Array:
@@ -73,7 +73,7 @@ def vote_peaks(patches: Surfels, radius: float) -> Array:
 
 
 def rough_centre(patches: Surfels, tree: cKDTree, start: Array, radius: float, min_coverage: float) -> Array | None:
-    """Known-radius fit to the surfels near `start`; None where they are not a sphere."""
+    """Known-radius fit to the surfels near `start`, as a centre (3,); None if they are not a sphere."""
     hood = np.asarray(tree.query_ball_point(start, _HOOD * radius), dtype=np.int64)
     if len(hood) < 5:
         return None

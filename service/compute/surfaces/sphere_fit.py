@@ -1,4 +1,4 @@
-"""Robust fit of a sphere of known radius to the vertices of a mesh or the points of a cloud, and what it is worth."""
+"""Robust fit of a sphere of known radius to mesh vertices or cloud points, with measures of its quality."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from service.core.geometry import Array
 IntArray = NDArray[np.int64]
 
 MIN_SAMPLES = 12
-_MIN_COSINE = 0.85  # between normal and radius; below it a sample is not the sphere's
-_FLANK = 0.12  # beyond the inliers, in radii: where a surface of another shape goes on
+_MIN_COSINE = 0.85  # between normal and radius; below it, a sample is not on the sphere
+_FLANK = 0.12  # beyond the inliers, in radii, where a surface of another shape would continue
 _FLANK_COSINE = 0.88
 _PATCH = 0.27  # cell over which residuals are averaged, in radii
 _MOST_PATCHES = 70
@@ -24,14 +24,15 @@ _MOST_PATCHES = 70
 class Samples:
     """Points on the surface near one candidate.
 
-    Vertices, not facets, carry the measurement: a facet of a sphere of edge e lies up to e²/(8 R) inside of it, which
-    moves the centre of a cap by as much, while its vertices lie on it.
+    Vertices are measured, not facets: a facet with edge e on a sphere lies up to e²/(8 R) inside it, which would move
+        a
+    cap's centre by as much, while its vertices lie on the sphere.
 
     Attributes:
         points: (N, 3).
         normals: (N, 3) unit, of either sign, averaged over the neighbourhood.
-        outward: (N, 3) the normals that the data state (0 where none), averaged over the neighbourhood.
-        weight: (N,) area that each stands for; of points without faces, relative.
+        outward: (N, 3) normals stated by the data (0 if none), averaged over the neighbourhood.
+        weight: (N,) area that each point represents; relative for points without faces.
     """
 
     points: Array
@@ -42,13 +43,14 @@ class Samples:
 
 @dataclass(frozen=True, slots=True)
 class Patches:
-    """Residuals of one fit, averaged over cells of surface: what the noise model sees.
+    """Residuals of one fit, averaged over cells of surface, as input of the noise model.
 
     Attributes:
         unit: (P, 3) directions from the centre.
-        residual: (P,) distance from the surface, m, outward positive, free of what Tukey's weights hide of it.
+        residual: (P,) distance from the surface, m, outward positive, corrected for the attenuation by Tukey's
+            weights.
         weight: (P,) sums of the samples' weights.
-        white: (P,) variance of the average when the samples' variance is 1 and they are independent.
+        white: (P,) variance of the average for independent samples of unit variance.
     """
 
     unit: Array
@@ -62,16 +64,16 @@ class SphereFit:
     """A finished fit.
 
     Attributes:
-        centre: (3,).
+        centre: (3,), m.
         band: residual beyond which a sample has no weight, m.
         rms: weighted root mean square distance of the inliers, m.
-        radius_residual: radius of a free fit minus the known one, m; NaN when the inliers do not determine it.
+        radius_residual: radius of a free fit minus the known one, m; NaN if the inliers do not determine it.
         coverage: solid angle of the inliers, as a fraction of the whole sphere.
-        orientation: 1 when the stated normals point away from the centre, -1 towards it, 0 when they contradict
-            one another or there are none.
-        flank: area of the surface that goes on smoothly beyond the inliers, over theirs: a sphere ends, or meets
-            something at an angle.
-        form: rms of the averaged residuals from a free sphere, m: shape that is not a sphere's.
+        orientation: 1 if the stated normals point away from the centre, -1 if towards it, 0 if they disagree or there
+            are none.
+        flank: area of the surface that continues smoothly beyond the inliers, over their area: a sphere's surface
+            ends or meets something at an angle.
+        form: rms of the averaged residuals from a free sphere, m: deviation from a sphere's shape.
         n: number of inliers.
         patches: averaged residuals.
     """
@@ -89,7 +91,7 @@ class SphereFit:
 
 
 def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> SphereFit | None:
-    """Tukey fit of a known radius from a centre that is right to `band`; None when the candidate dissolves."""
+    """Tukey fit with known radius from a centre that is good to `band`; None if too few inliers remain."""
     points, area = samples.points, samples.weight
     centre = start.copy()
     weights = np.zeros(len(points))
@@ -141,8 +143,8 @@ def fit_sphere(samples: Samples, start: Array, radius: float, band: float) -> Sp
 
 
 def _tukey_gain(residual: Array, band: float, area: Array) -> float:
-    """How much weighted means of residuals understate them: a shift of the surface moves the mean by the sum of the
-    influence function's slopes, not of the weights."""
+    """Attenuation of weighted mean residuals: a shift of the surface moves the mean by the sum of the influence
+    function's slopes, not by that of the weights."""
     inside = (np.abs(residual) < band) & (area > 0)
     x2 = (residual[inside] / band) ** 2
     weights = float(np.sum(area[inside] * (1 - x2) ** 2))
@@ -151,7 +153,7 @@ def _tukey_gain(residual: Array, band: float, area: Array) -> float:
 
 
 def _free_radius(u: Array, r: Array, w: Array) -> float:
-    # One linearised step in centre and radius is exact enough this close to the solution.
+    # Close to the solution, one linearised step in centre and radius is accurate enough.
     J = np.concatenate([u, np.ones((len(u), 1))], axis=1)
     H = (J * w[:, None]).T @ J
     if np.linalg.eigvalsh(H)[0] < 1e-7 * np.trace(H):
@@ -188,8 +190,8 @@ def _patches(u: Array, r: Array, w: Array) -> Patches:
 
 
 def coverage(u: Array) -> float:
-    """Fraction of the whole sphere that directions (N, 3) occupy: counted in cells of a cube's faces, so that a
-    density that varies or a shell that is there twice makes no difference."""
+    """Fraction of the whole sphere covered by directions (N, 3): counted in cells of a cube's faces, so that neither
+    uneven density nor a duplicate shell matters."""
     n = int(np.clip(np.sqrt(len(u) / 24), 2, 20))
     axis = np.abs(u).argmax(axis=1)
     rows = np.arange(len(u))
@@ -205,9 +207,9 @@ def coverage(u: Array) -> float:
 
 
 def sample_weights(points: Array, cell: float) -> Array:
-    """Weights (N,) of points without faces: a cell of surface counts once, however many points lie in it."""
+    """Weights (N,) of points without faces: a cell of surface counts once, however many points are in it."""
     index = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     key = (index[:, 0] * (1 << 20) + index[:, 1]) * (1 << 20) + index[:, 2]
     _, group, count = np.unique(key, return_inverse=True, return_counts=True)
-    # A cell that the surface only grazes holds few points: half of the median density at least.
+    # A cell that the surface only grazes has few points: use at least half of the median density.
     return 1.0 / np.maximum(count[group], 0.5 * float(np.median(count)))

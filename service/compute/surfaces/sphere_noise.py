@@ -1,4 +1,4 @@
-"""Covariance of fitted sphere centres under noise that neighbouring points share, estimated from all residuals."""
+"""Covariance of fitted sphere centres with noise correlated between neighbours, estimated from all residuals."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from service.core.geometry import Array
 
 LENGTHS = (0.08, 0.16, 0.28, 0.45, 0.75)  # correlation lengths that are tried, in radii
 RATIOS = (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)  # correlated over white variance of a patch
-_SHARED_DOF = 12.0  # weight, in degrees of freedom, of all spheres' common variance against one sphere's own
-_FLOOR = 5e-5  # sigma of a perfect mesh, in radii: that of coordinates in single precision
+_SHARED_DOF = 12.0  # weight, in degrees of freedom, of the variance common to all spheres against a sphere's own
+_FLOOR = 5e-5  # sigma of a perfect mesh, in radii: rounding of single-precision coordinates
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Noise of a surface: V = s² (diag(white) + ratio · mean(white) · G), G the Matérn 5/2 correlation of a length.
+    """Noise of a surface: V = s² (diag(white) + ratio · mean(white) · G), with G a Matérn 5/2 correlation.
 
     Attributes:
-        length: of the correlation, in radii.
+        length: correlation length, in radii.
         ratio: correlated over white variance of a patch's mean.
         scale: (K,) s² of each sphere, m².
     """
@@ -35,7 +35,7 @@ class NoiseModel:
 
 @dataclass(frozen=True, slots=True)
 class CentreUncertainty:
-    """What a fit is worth.
+    """Uncertainty of a sphere fit.
 
     Attributes:
         covariance: (3, 3) of the centre, m².
@@ -49,7 +49,7 @@ class CentreUncertainty:
 def estimate_noise(spheres: Sequence[Patches]) -> NoiseModel:
     """Restricted maximum likelihood over a grid of lengths and ratios, from the residuals of all spheres together.
 
-    Centre and radius of each sphere are projected out first, so that what the fit absorbed is not missed.
+    Centre and radius of each sphere are projected out first, so that the part absorbed by the fit is accounted for.
 
     Source: Patterson & Thompson, "Recovery of inter-block information when block sizes are unequal",
     Biometrika 58(3), 1971.
@@ -106,8 +106,8 @@ def _spectrum(p: Patches, K: Array, length: float) -> tuple[Array, Array]:
 def centre_uncertainties(
     spheres: Sequence[Patches], radius_residuals: Sequence[float], radius: float
 ) -> tuple[CentreUncertainty, ...]:
-    """Covariances of the weighted known-radius fits; radii that all miss the known one by more than noise explains
-    add what that does to the centres."""
+    """Covariances of the weighted known-radius fits; if the free radii deviate by more than noise explains, the
+    effect on the centres is added."""
     noise = estimate_noise(spheres)
     parts: list[tuple[Array, Array, float]] = []
     for p, scale in zip(spheres, noise.scale, strict=True):

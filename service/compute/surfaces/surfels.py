@@ -1,4 +1,4 @@
-"""A mesh or point cloud of any density as surface elements of one size: position, normal and area of each cell."""
+"""Reduces a mesh or point cloud of any density to surfels: position, normal and area of equal cells."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from service.core.geometry import Array
 
 IntArray = NDArray[np.int64]
 
-CHUNK = 1_000_000  # faces or points worked on at a time: bounds the memory
-MOST_SAMPLES = 3_000_000  # of a denser mesh every n-th face serves: a cell still holds dozens of them
-_PLANAR = 0.3  # smallest over middle variance of a cell's samples, above which they are no sheet of surface
-_STEADY = 0.5  # length of the sum of the area vectors over the sum of their lengths, below which they do not agree
+CHUNK = 1_000_000  # faces or points processed at a time, which limits the memory
+MOST_SAMPLES = 3_000_000  # of a denser mesh, every n-th face is used; a cell still holds dozens of them
+_PLANAR = 0.3  # smallest over middle variance of a cell's samples, above which they are not planar
+_STEADY = 0.5  # length of the sum of the area vectors over the sum of their lengths, below which they disagree
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Surfels:
         position: (N, 3) centroids.
         normal: (N, 3) unit normals of either sign.
         area: (N,) m².
-        outward: (N, 3) mean of the unit normals that the data state, weighted by area; 0 where they state none.
+        outward: (N, 3) area-weighted mean of the unit normals stated by the data; 0 if there are none.
     """
 
     position: Array
@@ -35,10 +35,10 @@ class Surfels:
 
 
 def surfels(vertices: Array, faces: IntArray, normals: Array | None, cell: float) -> Surfels:
-    """Reduce a mesh (V, 3), (F, 3), or a point cloud (no faces), to surfels of cubic cells of this edge.
+    """Reduce a mesh (V, 3), (F, 3), or a point cloud (no faces), to surfels of cubic cells with edge `cell`.
 
-    Normals come from the spread of the samples in a cell, so that neither noise in single faces nor their winding
-    matters; where a cell holds too few samples, from the faces' areas or the points' normals (V, 3).
+    Normals come from the spread of the samples in a cell, so that neither noise of single faces nor their winding
+    matters; in cells with too few samples, from the faces' areas or the points' normals (V, 3).
     """
     low = vertices.min(axis=0)
     size = np.floor((vertices.max(axis=0) - low) / cell).astype(np.int64) + 2
@@ -85,7 +85,7 @@ def _from_sums(cells: Array, low: Array, cell: float, *, is_mesh: bool) -> Surfe
     by_vector = ~by_spread & (length > _STEADY)
     by_few = ~by_spread & ~by_vector & planar & (count >= 5)
     normal = np.where(by_vector[:, None], vector / np.maximum(length, 1e-300)[:, None], axes[:, :, 0])
-    # A plane cuts so much area out of a cell on average; crumpled and duplicate faces have more.
+    # The average area of a plane in a cell; crumpled and duplicate faces have more.
     usual = cell**2 / np.abs(normal).sum(axis=1)
     area = np.minimum(weight, 2 * usual) if is_mesh else usual
     kept = by_spread | by_vector | by_few
@@ -98,6 +98,6 @@ def summed(group: IntArray, columns: list[Array], n: int) -> Array:
 
 
 def grid_keys(points: Array, low: Array, size: IntArray, cell: float) -> IntArray:
-    """Keys (N,) of the cells of points (N, 3), in a grid of `size` cells (3,) that begins one before `low`."""
+    """Keys (N,) of the cells of points (N, 3), in a grid of `size` cells (3,) that begins one cell before `low`."""
     index = np.floor((points - low) / cell).astype(np.int64) + 1
     return (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]
