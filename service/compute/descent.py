@@ -1,6 +1,6 @@
-"""The loops of nonlinear least squares: Gauss–Newton, and Levenberg–Marquardt with its damping.
+"""The loops of nonlinear least squares: Gauss–Newton and Levenberg–Marquardt.
 
-The problems differ in what they weigh and eliminate, not in the loop. Source: Nocedal and Wright, Numerical
+The problems differ in their weights and in what they eliminate, but share the loop. Source: Nocedal and Wright, Numerical
 Optimization, 10.3.
 """
 
@@ -18,7 +18,7 @@ StateT = TypeVar("StateT")
 
 
 def largest(step: Array) -> float:
-    """The largest coordinate of a step, without its sign."""
+    """Largest absolute coordinate of a step."""
     return float(np.abs(step).max())
 
 
@@ -31,15 +31,15 @@ def gauss_newton(
     settled: float,
     size: Callable[[Array], float] = largest,
 ) -> StateT:
-    """The state after at most `most` steps; none follows one whose size is below `settled`.
+    """Gauss–Newton: stop after a step smaller than `settled`, or after `most` steps, and return the state.
 
     Args:
-        start: where to begin, near the minimum.
+        start: initial state, near the minimum.
         step_at: the step (n,) that minimises the problem linearised at a state.
         moved: the state after a step.
-        most: number of steps.
-        settled: in the unit of `size`.
-        size: of a step.
+        most: largest number of steps.
+        settled: size of a step at convergence, in the unit of `size`.
+        size: norm of a step.
     """
     state = start
     for _ in range(most):
@@ -52,23 +52,23 @@ def gauss_newton(
 
 @dataclass(frozen=True, slots=True)
 class Damping:
-    """How the damping of Levenberg–Marquardt changes."""
+    """Damping schedule of Levenberg–Marquardt."""
 
     first: float
-    down: float = 10.0  # divides it after a step that was taken
-    up: float = 10.0  # multiplies it after one that was not
+    down: float = 10.0  # divisor after an accepted step
+    up: float = 10.0  # factor after a rejected step
     least: float = 0.0
-    most: float = 1e6  # beyond, no step helps
+    most: float = 1e6  # above it, no step helps
 
 
 @dataclass(frozen=True, slots=True)
 class Descent(Generic[StateT]):
-    """Where a descent ended.
+    """Result of a descent.
 
     Attributes:
-        state: the best one.
-        steps: tried.
-        stuck: the damping went beyond its limit: no step helped any more.
+        state: the best state found.
+        steps: number of steps tried.
+        stuck: whether the damping exceeded its limit, because no step helped any more.
     """
 
     state: StateT
@@ -86,16 +86,16 @@ def levenberg_marquardt(
     most: int,
     renewed: Callable[[StateT], StateT] | None = None,
 ) -> Descent[StateT]:
-    """Damped steps until one settles; a step is taken where it gains something, or loses nothing.
+    """Take damped steps until one settles; a step is accepted unless it increases the cost.
 
     Args:
-        start: a state with its linearisation and cost.
-        candidate_of: the state, linearised, after the step from a state with a damping.
-        gain_of: by how much a candidate's cost is below that of the state; minus infinity where it is no number.
-        settles: whether the step from a state to a candidate, taken or not, is the last.
-        damping: its course.
-        most: number of steps tried.
-        renewed: a state that was reached, with what its cost depends on chosen anew; None: nothing is.
+        start: initial state, with its linearisation and cost.
+        candidate_of: the linearised state after a step from a state with a given damping.
+        gain_of: decrease of the cost from a state to a candidate; minus infinity if it is not a number.
+        settles: whether the step from a state to a candidate, accepted or not, is the last.
+        damping: its schedule.
+        most: largest number of steps tried.
+        renewed: updates an accepted state's weights or other parts of its cost; None: nothing is updated.
     """
     state, value = start, damping.first
     for step in range(1, most + 1):

@@ -1,4 +1,4 @@
-"""Which outline is which sphere where the camera's pose is known well enough: the nearest one, within a gate."""
+"""Matches outlines to spheres if the camera pose is known well enough: the nearest one, within a gate."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.core.geometry import Array, Transform, apply
 
-_FLOOR_RAD = 1.2e-4  # what the sphere list and the lens add to an outline's own error: 0.1 mm at a metre and less
+_FLOOR_RAD = 1.2e-4  # error from sphere list and lens, added to an outline's own: 0.1 mm at a metre and less
 
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """How far an outline may be from a predicted sphere to be taken for it."""
+    """Largest deviation of an outline from the predicted sphere that it is matched to."""
 
-    place: float  # of the sphere's radius as the image shows it
+    place: float  # in units of the sphere's apparent radius
     size: float  # relative
 
 
@@ -28,18 +28,18 @@ CONTROL_GATE = Gate(0.5, 0.15)  # if a control sphere is farther from its predic
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """The detections of one image as geometry: directions, sizes, and positions from the known radius."""
+    """The geometry of one image's detections: directions, sizes, and positions from the known radius."""
 
-    axes: Array  # (D, 3) unit vectors to the centres: not the ellipses' centres
+    axes: Array  # (D, 3) unit vectors to the centres, which are not the ellipses' centres
     half_angles: Array  # (D,)
-    positions_m: Array  # (D, 3) in the camera frame, good across the ray, weak along it
+    positions_m: Array  # (D, 3) in the camera frame, precise across the ray, imprecise along it
     depth_sigma_m: Array  # (D,)
     frames: Array  # (D, 3, 2) first columns of the cones' frames
     sigma_rad: Array  # (D, 3) of tilt, tilt and half angle
 
 
 def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: CameraModel) -> Sightings:
-    """Geometry of the outlines of one image."""
+    """The geometry of one image's outlines."""
     if not outlines:
         return Sightings(
             np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3, 2)), np.zeros((0, 3))
@@ -47,7 +47,7 @@ def sightings(outlines: Sequence[SphereOutline], radius_m: float, camera: Camera
     axes = np.array([o.cone.axis for o in outlines])
     half = np.array([o.cone.half_angle_rad for o in outlines])
     distance = radius_m / np.sin(half)
-    # Half a pixel of the radius covers the systematic error of an outline, more where only a part is seen.
+    # Half a pixel of the radius covers an outline's systematic error; more if only a part is visible.
     sigma = 0.5 / camera.fx / np.array([max(o.coverage, 0.2) for o in outlines])
     own = np.array([np.diag(o.cone_covariance) for o in outlines])
     return Sightings(

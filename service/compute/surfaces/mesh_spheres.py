@@ -184,7 +184,7 @@ def _fits(
 
 
 def _surroundings(starts: Array, vertices: Array, faces: IntArray, radius: float) -> tuple[Array, Array]:
-    """Vertices (N, 3) near any of the centres, and the area that each represents; one pass for any number of centres."""
+    """Vertices (N, 3) near any of the centres, and the area each represents; one pass for all centres."""
     low, high = starts.min(axis=0) - 2 * radius, starts.max(axis=0) + 2 * radius
     cell = max(0.5 * radius, float(np.max(high - low)) / 300)
     size = np.ceil((high - low) / cell).astype(np.int64) + 1
