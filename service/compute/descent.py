@@ -1,7 +1,7 @@
 """The loops of nonlinear least squares: Gauss–Newton and Levenberg–Marquardt.
 
-The problems differ in their weights and in what they eliminate, but share the loop. Source: Nocedal and Wright, Numerical
-Optimization, 10.3.
+The problems differ in their weights and in what they eliminate, but share the loop.
+Source: Nocedal and Wright, Numerical Optimization, 10.3.
 """
 
 from __future__ import annotations
