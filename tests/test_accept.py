@@ -120,22 +120,22 @@ def test_it_is_refused_where_the_protocol_does_not_say_so() -> None:
     log = at_failed_capture(TOY)
     assert "accept" not in log.question.options
     accept(log)
-    assert "lets nobody accept views" in last_refusal(log)
+    assert "allows nobody to accept views" in last_refusal(log)
     half = at_failed_capture(TOY_ACCEPTING.replace(", accept_by: another_supervisor", ""), sharp=3.0)
     accept(half)
-    assert "lets nobody accept sharp" in last_refusal(half)
+    assert "allows nobody to accept sharp" in last_refusal(half)
 
 
 @pytest.mark.parametrize(
     ("fields", "why"),
     [
         ({"reason": " "}, "needs a reason"),
-        ({"role": ""}, "accepted by a supervisor"),
-        ({"role": "technician"}, "accepted by a supervisor"),
-        ({"signed_sha256": "0" * 64}, "other figures"),
+        ({"role": ""}, "only a supervisor may accept"),
+        ({"role": "technician"}, "only a supervisor may accept"),
+        ({"signed_sha256": "0" * 64}, "figures other than"),
         ({"automatic": True}, "only a person"),
         ({"via": "pedal"}, "only a person"),
-        ({"actor": " "}, "accepted by a supervisor"),
+        ({"actor": " "}, "only a supervisor may accept"),
         ({"step": "spray"}, "not the current one"),
     ],
 )
@@ -152,7 +152,7 @@ def test_it_needs_a_person_a_role_a_reason_and_the_figures(fields: dict[str, obj
 def test_another_supervisor_is_another_one(actor: str) -> None:
     log = at_failed_capture(sharp=3.0)
     accept(log, actor)
-    assert "somebody else" in last_refusal(log)
+    assert "somebody other than" in last_refusal(log)
     accept(log, "Emmy")
     assert log.state.step.accepted is not None
     at_ease = at_failed_capture()  # `supervisor` alone: the operator may, if that is the required role
@@ -330,7 +330,7 @@ def test_whoever_acts_in_the_name_of_an_account_gives_its_password(web: WebSite)
 
 def test_without_accounts_a_name_is_a_claim_and_the_record_says_so(tmp_path: Path) -> None:
     run = record_reported_run(tmp_path, error_mm=0.9)
-    assert act(tmp_path, run, "Emmy").exit_code == 1  # this protocol lets nobody accept it
+    assert act(tmp_path, run, "Emmy").exit_code == 1  # this protocol allows nobody to accept it
     other = tmp_path / "other"
     other.mkdir()
     with Store.open(other / "data") as store:

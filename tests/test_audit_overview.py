@@ -150,7 +150,7 @@ def test_what_a_clock_offset_means_stands_beside_it(tmp_path: Path) -> None:
     run_id = record_reported_run(tmp_path, person="grace", serials=(PTP, EXIF))
     with web_site(tmp_path) as site:
         page = read((site, run_id), "/devices")
-    assert "counts from when it was switched on: only its change matters" in page
+    assert "counts from when it was switched on: only its drift matters" in page
     assert "1279.000 s behind this machine's" in page
-    assert "Beyond The time written in its files is its own. Order and times of the record do not rest on it." in page
+    assert "Beyond It sets the times in the device's own files. Order and times of the record do not depend" in page
     assert "a large or negative one is no fault" in page

@@ -170,8 +170,8 @@ def test_a_camera_has_one_serial_number_and_clocks_are_explained(tmp_path: Path)
     assert html.count("3282933005318008") == 1
     assert "which ends with the same digits: it is one and the same body" in html
     assert "1279.000 s behind this machine's" in html
-    assert "✗ beyond The time written in its files is its own" in html
-    assert "so how far it is from this machine's says nothing" in html
+    assert "✗ beyond It sets the times in the device's own files" in html
+    assert "so its distance from this machine's clock means nothing" in html
 
 
 def test_counts_are_in_the_singular_where_there_is_one(tmp_path: Path) -> None:

@@ -265,11 +265,11 @@ def test_what_is_refused(tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyP
         start_run(store)
     refused = {
         ("backup", data / "copy", "--data", data): "within its own data folder",
-        ("backup", tmp_path / "full", "--data", data): "something else than backups",
+        ("backup", tmp_path / "full", "--data", data): "something other than backups",
         ("backup", tmp_path / "backup", "--data", other): "another data folder",
         ("backup", tmp_path / "new", "--data", tmp_path / "nowhere"): "no run data",
         ("restore", tmp_path / "backup", tmp_path / "full"): "not empty",
-        ("restore", tmp_path / "full", tmp_path / "new"): "not a folder of backups",
+        ("restore", tmp_path / "full", tmp_path / "new"): "not a folder of orthocapture backups",
         ("restore", tmp_path / "backup", tmp_path / "new", "--state", "x"): "no backup 'x'",
     }
     for words, why in refused.items():

@@ -35,4 +35,4 @@ def test_a_worker_that_is_killed_is_replaced_and_the_run_gets_its_answer(tmp_pat
             another = worker_of(tmp_path)
         assert another.pid != worker.pid
         assert not another.is_running()
-    assert told == ["the worker, which computes, has ended (status -9); another one is started"]
+    assert told == ["the worker process has ended (status -9); another one is started"]

@@ -99,7 +99,7 @@ def test_our_protocols_are_sound(name: str) -> None:
     file = ROOT / "protocols" / f"{name}.yaml"
     result = invoke("protocol", "check", file)
     assert result.exit_code == 0
-    assert "is sound" in result.output
+    assert "is valid" in result.output
     record = answer_of(invoke("protocol", "check", file, "--json"))
     assert record["id"] == name
     irreversible = [step["id"] for step in record["steps"] if step["irreversible"]]

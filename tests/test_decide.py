@@ -347,7 +347,7 @@ def test_signatures_need_name_meaning_and_the_record() -> None:
     log.begin()
     log.measure(**GOOD)
     target = log.question.sign_sha256
-    refused(log, "another record", action="sign", meaning="ok", signed_sha256="0" * 64)
+    refused(log, "a record other than", action="sign", meaning="ok", signed_sha256="0" * 64)
     refused(log, "a name and a meaning", action="sign", meaning=" ", signed_sha256=target)
     refused(log, "pedal cannot sign", action="sign", meaning="ok", signed_sha256=target, via="pedal")
     with pytest.raises(IllegalTransitionError, match="a name"):
@@ -510,14 +510,14 @@ def test_nothing_before_it_can_be_redone_once_it_has_begun() -> None:
     log = at_spray()
     assert redoable_steps(log.protocol, log.state) == ("fix_it", "capture")
     log.begin()
-    refused(log, "the scene changed with 'spray'", action="redo", step="capture", reason="blurred")
+    refused(log, "'spray' has changed the scene", action="redo", step="capture", reason="blurred")
     log.append(failure(log, "SafetyStopError", "ask"))  # half of it counts
     log.act("redo", reason="can was empty")
     assert log.question.for_ == "sign"  # released again
-    refused(log, "the scene changed", action="redo", step="capture", reason="blurred")
+    refused(log, "has changed the scene", action="redo", step="capture", reason="blurred")
     log.do()
     log.do(rms_mm=0.01)
-    refused(log, "the scene changed", action="redo", step="fix_it", reason="x")
+    refused(log, "has changed the scene", action="redo", step="fix_it", reason="x")
     assert redoable_steps(log.protocol, log.state) == ("spray", "scan")
     log.act("redo", step="scan", reason="holes")
     assert log.state.current == "scan"

@@ -92,7 +92,7 @@ def test_the_report_shows_bounds_and_says_what_they_are(undecided: tuple[Path, s
     assert "gate not decided" in page
     assert "? not decided" in page
     assert page.count("0.030 px, 0.023 to 0.037") == 2  # steps and gates, certificate
-    assert "each held with 99 %" in page
+    assert "each one-sided with 99 % confidence" in page
 
 
 def test_an_accepted_figure_is_said_to_be_accepted_not_failed(tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def test_one_whole_series_is_the_ct(folder: Path) -> None:
     slices = sorted((folder / "ct").glob("*.dcm"))
     assert [file.path for file in listed(folder).files["ct"]] == [f"ct/{path.name}" for path in slices]
     slices[len(slices) // 2].unlink()
-    assert "no CT series that is whole" in refusal(str(folder), "--dry-run")
+    assert "no complete CT series" in refusal(str(folder), "--dry-run")
 
 
 def test_a_file_that_changed_since_it_was_listed_is_refused(folder: Path) -> None:

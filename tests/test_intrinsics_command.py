@@ -96,7 +96,7 @@ def test_a_focus_motor_that_moved_is_named_and_a_body_that_does_not_tell_is_said
     near = [Optics("a.jpg", focus_position=117), Optics("b.jpg", focus_position=118)]
     assert not compare_optics(near, near).departures
     done = _run(folder, tmp_path / "camera.json")
-    assert "do not say where the lens was focused: a changed focus would go unseen" in done.output
+    assert "do not state the focus distance: a change of focus would go unnoticed" in done.output
 
 
 def test_a_zoom_that_moved_after_the_calibration_is_named(folder: Path, tmp_path: Path) -> None:

@@ -185,7 +185,7 @@ def test_command_says_where_and_by_how_much_with_status_1(folder: Path, monkeypa
     assert answer.exit_code == 1, answer.output
     assert "result.spheres_m" in answer.output
     assert "0.1 mm" in answer.output
-    assert "1 come out otherwise" in answer.output
+    assert "these differ (1)" in answer.output
     plain = json.loads(invoke(folder, "--jobs", "locate_spheres", "--json").stdout)
     assert plain["verdict"] == "different"
     assert any(d["path"].startswith("result.spheres_m") for d in plain["jobs"][0]["differences"])

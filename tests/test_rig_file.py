@@ -49,7 +49,7 @@ stations:
         ("devices: " + "[" * 100_000, r"nested more than 50 deep \[.*rig.yaml:1\]"),
         ("name: a: b\n", r"not valid YAML.* \[.*rig.yaml:1\]"),
         ('{"name": ', "not valid JSON"),
-        ("- a\n", "holds no mapping"),
+        ("- a\n", "is not a mapping of fields"),
         ("name: \xe9\n", "not UTF-8"),
     ],
 )

@@ -199,7 +199,7 @@ def test_a_photograph_that_is_altered_afterwards_is_found(web: WebSite) -> None:
         (b"<svg xmlns='http://www.w3.org/2000/svg'/>", "neither a JPEG nor a PNG"),
         (jpeg()[:2000], "ends before its picture is complete"),
         (b"\x89PNG\r\n\x1a\n" + b"\0" * 8 + (10**6).to_bytes(4, "big") * 2 + b"\0" * 99, "1000000 × 1000000"),
-        (jpeg() + b"\0" * 16_000_000, "16 MB at most"),
+        (jpeg() + b"\0" * 16_000_000, "at most 16 MB"),
     ],
 )
 def test_what_is_no_photograph_or_too_large_is_refused(web: WebSite, content: bytes, why: str) -> None:
@@ -304,7 +304,7 @@ def test_the_command_line_enters_notes_and_finds_the_same(tmp_path: Path) -> Non
         "specimen": "Spine 9", "purpose": "teaching", "site": "room 4", "operator": "", "text": "thawed",
     }  # fmt: skip
     assert "Spine 9" in typed("runs", *data).stdout
-    assert typed("runs", "--search", "knee", *data).stdout.strip() == "No run fits."
+    assert typed("runs", "--search", "knee", *data).stdout.strip() == "No run matches."
     assert typed("runs", "--since", "yesterday", *data).exit_code == 2
     late = typed("note", "too late", "--operator", "A. Name", *data)
     assert late.exit_code == 1

@@ -110,7 +110,7 @@ def test_a_run_pauses_with_a_question_before_the_disk_is_full_and_goes_on(bench:
     (failed,) = bench.payloads(StepFailed)
     assert (failed.error, failed.recovery) == ("SpaceShortError", "ask")
     assert "The disk of the data folder is nearly full" in asked[0]
-    assert "exports, once they were taken away: 3 MB" in asked[0]
+    assert "exports that were copied elsewhere: 3 MB" in asked[0]
     assert len(set(bench.captured())) == len(bench.captured()) == 4
     (note,) = [note.data for note in bench.payloads(StepNote) if note.note == "disk_space"]
     assert (note["verdict"], note["free_bytes"]) == ("stop", LEAST_FREE_BYTES + 100)
@@ -124,8 +124,8 @@ def test_a_run_that_will_not_fit_says_so_once_with_the_figures(tmp_path: Path, s
         assert bench.run().status == "completed"  # they are smaller than estimated
         notes = [note.data for note in bench.payloads(StepNote) if note.note == "disk_space"]
         assert [(note["verdict"], note["views_left"]) for note in notes] == [("short", 20)]
-        (told,) = [words for words in bench.operator.told if "The disk will not do" in words]
-        assert "the run needs about 80 MB more (20 views of 4 MB each, by a guess)" in told
+        (told,) = [words for words in bench.operator.told if "The disk is too small" in words]
+        assert "the run needs about 80 MB more (20 views of 4 MB each, from a guess)" in told
 
 
 def test_a_run_is_refused_where_nothing_could_be_captured(tmp_path: Path, bench: Bench, set_free: SetFree) -> None:
@@ -152,7 +152,7 @@ def test_doctor_and_pages_say_it_before_a_run(tmp_path: Path, set_free: SetFree)
         text = PROTOCOL.replace("count: 4", "count: 1000")
         (site.site.protocols / "large.yaml").write_text(text)
         page = site.browser("technician").get("/").text
-        assert page.count("The disk will not do") == 1
+        assert page.count("The disk is too small") == 1
         bench = site.begin_run()
         page = site.browser("technician").get(f"/runs/{bench.run_id}").text
         assert "2.0 GB free" in page
@@ -161,7 +161,7 @@ def test_doctor_and_pages_say_it_before_a_run(tmp_path: Path, set_free: SetFree)
     words += ["--protocol", str(tmp_path / "protocols" / "large.yaml")]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 1
-    assert "The disk will not do: 2.0 GB are free, and the run needs about 4.0 GB more" in done.stdout
+    assert "The disk is too small: 2.0 GB are free, and the run needs about 4.0 GB more" in done.stdout
     found = json.loads(CliRunner().invoke(app, [*words, "--json"]).stdout)["data"]["forecast"]
     assert (found["verdict"], found["views_left"]) == ("short", 1000)
 

@@ -87,7 +87,7 @@ def test_what_failed_is_told_with_the_remedy(web: WebSite) -> None:
     web.store.record(run.run_id, [StepStarted(step="capture", attempt=1), failed], actor="runner")
     with driven(web, run):
         home = plain(web.browser("auditor").get("/").text)
-    assert "Stopped: No link to the arm → look whether the device is switched on" in home
+    assert "Stopped: No link to the arm → check that the device is switched on" in home
 
 
 def test_what_waits_and_what_nobody_drives_is_told_apart(web: WebSite) -> None:

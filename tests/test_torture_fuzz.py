@@ -51,7 +51,7 @@ def test_what_was_found_once_stays_mended(path: Path, tmp_path: Path) -> None:
 )
 def test_a_cell_longer_than_tables_have_is_told_with_its_line(name: str, head: str, tmp_path: Path) -> None:
     (target,) = [one for one in targets_of(GROUPS[0]) if one.name == name]
-    with pytest.raises(DataError, match=r"no row of a table .*csv:2\]"):
+    with pytest.raises(DataError, match=r"not a valid CSV row .*csv:2\]"):
         target.parse(f"{head}\n{'a' * 200_000}\n".encode(), tmp_path)
 
 

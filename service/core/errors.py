@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from typing import Any
 
-# What a terminal or a page would obey rather than show, and what cannot be encoded: quoted from files it stays text.
+# Control characters, which a terminal or page would act on, and lone surrogates. Quoted files may hold them.
 _UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
-_LONGEST, _LONGEST_LINE = 20_000, 4_000  # characters: a file may hold a word of a megabyte
+_LONGEST, _LONGEST_LINE = 20_000, 4_000  # characters: a quoted file may hold a megabyte without a space
 
 
 class OrthocaptureError(Exception):
@@ -15,8 +15,8 @@ class OrthocaptureError(Exception):
 
     Args:
         what: what is wrong, one sentence without a full stop.
-        where: file, line, field, device or record that it concerns.
-        remedy: what the person should do about it.
+        where: the file, line, field, device or record concerned.
+        remedy: what the reader should do about it.
     """
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
@@ -31,7 +31,7 @@ class OrthocaptureError(Exception):
         return f"{self.what}{place}{advice}"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Keyword arguments are lost by the default reduction; errors cross process borders in drivers.host.
+        # Default pickling loses keyword arguments, and drivers.host sends errors between processes.
         return _rebuild, (type(self), self.what, self.where, self.remedy)
 
 
@@ -49,7 +49,7 @@ def _rebuild(cls: type[OrthocaptureError], what: str, where: str, remedy: str) -
 
 
 class ProtocolError(OrthocaptureError):
-    """A protocol file is wrong; `where` is file:line and field."""
+    """A protocol file is wrong; `where` names file:line and field."""
 
 
 class ConfigurationError(OrthocaptureError):
@@ -65,11 +65,11 @@ class StoreError(OrthocaptureError):
 
 
 class IntegrityError(StoreError):
-    """Evidence does not verify: a hash, a chain link or a file is wrong."""
+    """Evidence does not verify: a hash, a link of the chain or a file is wrong."""
 
 
 class SpaceShortError(StoreError):
-    """The disk will soon be full: nothing more is begun, so that what was begun can be recorded."""
+    """The disk is nearly full: no new work begins, so that work in progress can still be recorded."""
 
 
 class DataError(OrthocaptureError):
@@ -77,8 +77,8 @@ class DataError(OrthocaptureError):
 
 
 class ImagesSpoiltError(OrthocaptureError):
-    """Several images in a row are blurred or black: a person looks at the camera before more are taken."""
+    """Several images in a row are blurred or black: a person must check the camera before more are taken."""
 
 
 class ComputeError(OrthocaptureError):
-    """A computation has no trustworthy answer on this data, and says why."""
+    """A computation has no trustworthy answer for this data; the message says why."""

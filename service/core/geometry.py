@@ -19,7 +19,7 @@ def transform(rotation: Array | Rotation, translation_m: Array) -> Transform:
 
 
 def inverse(T_a_b: Transform) -> Transform:
-    """T_b_a, exactly rigid (no general matrix inverse)."""
+    """T_b_a (4, 4), from the transposed rotation, so that it stays exactly rigid."""
     R = T_a_b[:3, :3]
     return transform(R.T, -R.T @ T_a_b[:3, 3])
 
@@ -30,12 +30,12 @@ def apply(T_a_b: Transform, points_b: Array) -> Array:
 
 
 def from_rotation_vector(pose: Array) -> Transform:
-    """T_a_b from (6,) x, y, z in metres and rotation vector in radians: Universal Robots' pose."""
+    """T_a_b from a Universal Robots pose: (6,) x, y, z in metres and rotation vector in radians."""
     return transform(Rotation.from_rotvec(pose[3:]), pose[:3])
 
 
 def to_rotation_vector(T_a_b: Transform) -> Array:
-    """(6,) x, y, z, rx, ry, rz of T_a_b."""
+    """The (6,) pose x, y, z in metres and rotation vector in radians of T_a_b."""
     return np.concatenate([T_a_b[:3, 3], Rotation.from_matrix(T_a_b[:3, :3]).as_rotvec()])
 
 
@@ -72,7 +72,7 @@ def look_at(eye: Array, target: Array, up: Array) -> Transform:
 
 
 def rotation_angle_rad(T: Transform) -> float:
-    """Angle of the rotation part, 0..pi."""
+    """Angle of the rotation part in radians, 0 to pi."""
     return float(Rotation.from_matrix(T[:3, :3]).magnitude())
 
 

@@ -1,4 +1,4 @@
-"""The texts of docs/reference/protocol.schema.json and of the lifecycle page, generated; the caller writes them."""
+"""Generates the texts of docs/reference/protocol.schema.json and of the lifecycle page; the caller writes them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from service.core.run.lifecycle import ABORTED, COMPLETED, PAUSED, PHASES, SEPAR
 
 
 def schema_text(params_models: Mapping[str, type[BaseModel]]) -> str:
-    """docs/reference/protocol.schema.json."""
+    """The text of docs/reference/protocol.schema.json; `params_models` maps each step kind to its Params."""
     return json.dumps(protocol_json_schema(params_models), indent=2, ensure_ascii=False) + "\n"
 
 
 def lifecycle_text(protocol: Protocol) -> str:
-    """A Markdown page: the state machine of a protocol, what happens within each step, and a table of its steps."""
+    """A Markdown page: a protocol's state machine, the phases of a step, and a table of the steps."""
     yes = {True: "yes", False: ""}
     rows = [
         f"| {step.id} | {step.kind} | {step.title} | {yes[step.sign]} | {yes[step.skippable]} "
@@ -35,15 +35,15 @@ def lifecycle_text(protocol: Protocol) -> str:
             "",
             *_mermaid(run_diagram(protocol.steps)),
             "",
-            "A redo leads from any step back to itself or to an earlier one. It and every later step begin afresh;",
+            "A redo goes from any step back to itself or to an earlier one. It and every later step start afresh;",
             "what they had captured stays in the record as superseded. A redo is refused across an irreversible step",
-            "that has begun. The state after a restart is the fold of the recorded events: a crash is no state.",
+            "that has begun. After a restart the state is the fold of the recorded events: a crash is not a state.",
             "",
             "## Within each step",
             "",
             *_mermaid(step_diagram()),
             "",
-            "While a run is paused the same rules hold, so that work in flight can still report; nothing moves.",
+            "The same rules hold while a run is paused, so that work in progress can still report; nothing moves.",
             "",
             "## The steps",
             "",
@@ -56,13 +56,13 @@ def lifecycle_text(protocol: Protocol) -> str:
 
 
 def run_diagram(steps: Iterable[Step]) -> list[str]:
-    """Mermaid lines: the steps in their order inside the run, pause and end around it."""
+    """Lines of a Mermaid diagram: the steps in order inside the run, with pause and end around it."""
     known = {step.id: step for step in steps}
-    inside, around = dict[str, None](), dict[str, None]()  # sets that keep their order
+    inside, around = dict[str, None](), dict[str, None]()  # ordered sets
     for trigger, source, target in transition_table(tuple(known)):
         origin, end = source.split(SEPARATOR)[0], target.split(SEPARATOR)[0]
         if trigger.startswith("redo_") or origin == end:
-            continue  # a redo leads back from everywhere: said in words
+            continue  # redo arrows from every step would hide the rest; the page says it in words
         if origin in known and end in known:
             inside[f"        {origin} --> {end}: {trigger}"] = None
         elif not (origin == PAUSED and end == COMPLETED):
@@ -82,7 +82,7 @@ def run_diagram(steps: Iterable[Step]) -> list[str]:
 
 
 def step_diagram() -> list[str]:
-    """Mermaid lines: the phases of a step."""
+    """Lines of a Mermaid diagram: the phases of a step."""
     return [
         "stateDiagram-v2",
         f"    [*] --> {PHASES[0]}",

@@ -1,4 +1,4 @@
-"""The text of docs/reference/ways_on.md: what can be done about every failure of every step, as the code answers."""
+"""Generates the text of docs/reference/ways_on.md: the ways on after every failure of every kind of step."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _BEGAN, _ENDED = "2026-01-01T08:00:00Z", "2026-01-01T08:05:00Z"
 
 
 def ways_text(protocol: Protocol) -> str:
-    """A Markdown page: step kind × failure × choices × cost × loss, for the first step of each kind."""
+    """A Markdown page of choices by step kind and failure, with cost and loss, for the first step of each kind."""
     shown: dict[str, Step] = {}
     for step in protocol.steps:
         shown.setdefault(step.kind, step)
@@ -29,14 +29,14 @@ def ways_text(protocol: Protocol) -> str:
     lines = [
         "# Ways on",
         "",
-        "What a person can do when a step falls short, fails or cannot begin, made from the code for"
+        "What a person can do when a step is outside its limits, fails or cannot begin. Generated from the code for"
         f" `{protocol.id}`.",
-        f"Costs are examples: a view takes {_VIEW_S:.0f} s here, a step without views {_STEP_S / 60:.0f} min.",
-        "In a run they are as that run has measured them.",
+        f"The times are examples: {_VIEW_S:.0f} s for a view, {_STEP_S / 60:.0f} min for a step without views.",
+        "A run shows the times that it has measured itself.",
         "The first choice is the recommended one. A choice that is not possible says why.",
         "",
-        "Besides, a run can be paused at any time, and any step that has begun can be done again as long as nothing",
-        "irreversible lies between.",
+        "A run can also be paused at any time, and any step that has begun can be done again unless an irreversible",
+        "step has begun since.",
     ]
     for step in shown.values():
         lines += ["", f"## {step.kind}", "", f"Here: {step.id} ({step.title}).", "", *_TABLE_HEAD]
@@ -47,11 +47,11 @@ def ways_text(protocol: Protocol) -> str:
         lines += _TABLE_HEAD
         for failure, changed, state in _requirements(protocol, requiring):
             lines += _rows(failure, ways_on(changed, state))
-    lines += ["", "## Errors", "", "What helps comes first in the words of the choice `confirm`.", "", *_errors(), ""]
+    lines += ["", "## Errors", "", "The words of the choice `confirm` begin with what helps.", "", *_errors(), ""]
     return "\n".join(lines)
 
 
-_TABLE_HEAD = ("| failure | choice | what it is | takes | loses |", "|---|---|---|---|---|")
+_TABLE_HEAD = ("| failure | choice | what it does | takes | loses |", "|---|---|---|---|---|")
 
 
 def _rows(failure: str, ways: tuple[WayOn, ...]) -> Iterator[str]:
@@ -64,7 +64,7 @@ def _rows(failure: str, ways: tuple[WayOn, ...]) -> Iterator[str]:
 
 
 def _errors() -> Iterator[str]:
-    yield "| error | what helps | before anybody is asked |"
+    yield "| error | what helps | before the operator is asked |"
     yield "|---|---|---|"
     fields = Step.model_fields["recovery"].get_default()
     for name, remedy in REMEDIES.items():
@@ -110,7 +110,7 @@ def _failed(gate: Gate) -> GateVerdict:
 
 
 def _at(protocol: Protocol, step: Step, phase: Literal["ready", "recovering"]) -> RunState:
-    """The run at a step, everything before it passed."""
+    """The state of a run that is at `step`, with every earlier step passed."""
     steps = {
         s.id: StepState(
             s.id,

@@ -1,4 +1,4 @@
-"""One serial number for one camera: its connection states one, its photographs another, of the same body. Pure."""
+"""One serial number for each camera body, though connection and photographs may state different ones. Pure."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ class Bodies:
     """The serial numbers of a run's cameras.
 
     Attributes:
-        wires: as cameras state them over their connections, by which device; over USB a camera may put digits of its
-            model before those of the body.
-        stated: as photographs state them, each once.
+        wires: serial number that a camera states over its connection → device name in rig.yaml. Over USB a camera may
+            put digits of its model before those of the body.
+        stated: the distinct serial numbers that the photographs state.
     """
 
     wires: Mapping[str, str]
     stated: tuple[str, ...]
 
     def shown(self, identity: Mapping[str, Any]) -> str:
-        """The one number to show for a device: a camera's is the body's own, as photographs state it."""
+        """The serial number to show for a device: for a camera that of the body, as its photographs state it."""
         wire = str(identity.get("serial") or "")
         return self._own(wire) if identity.get("kind") == "camera" else wire
 
@@ -32,7 +32,7 @@ class Bodies:
 
     @property
     def explained(self) -> tuple[str, ...]:
-        """Why a number is not the one that a camera states over its connection, a sentence each."""
+        """One sentence for each camera that is shown under another number than it states over its connection."""
         return tuple(
             f"The serial number of {device} is {self._own(wire)}, as every photograph of it states. Over its "
             f"connection it states {wire}, which ends with the same digits: it is one and the same body"
@@ -42,7 +42,7 @@ class Bodies:
 
     @property
     def strange(self) -> str:
-        """Photographs that state another body than any camera that was opened; "" where there are none."""
+        """A sentence on photographs whose serial number belongs to none of the opened cameras; "" without any."""
         known = [wire for wire in self.wires if wire]
         others = [number for number in self.stated if not any(_same(wire, number) for wire in known)]
         if not known or not others:
@@ -54,7 +54,7 @@ class Bodies:
 
 
 def bodies(events: Sequence[Event]) -> Bodies:
-    """Of a run's events."""
+    """The serial numbers in a run's events."""
     opened = [event.payload for event in events if isinstance(event.payload, DeviceOpened)]
     stated = (event.payload.camera.get("body_serial") for event in events if isinstance(event.payload, View))
     identities = ((payload.device, payload.report.get("identity") or {}) for payload in opened)
@@ -62,7 +62,12 @@ def bodies(events: Sequence[Event]) -> Bodies:
 
 
 def bodies_of(identities: Iterable[tuple[str, Mapping[str, Any]]], stated: Iterable[str]) -> Bodies:
-    """Of the identities that devices gave, each with its name in rig.yaml, and the numbers of the photographs."""
+    """The serial numbers of cameras.
+
+    Args:
+        identities: (name in rig.yaml, identity in its DeviceReport) of each opened device.
+        stated: serial numbers in the photographs; "" is ignored.
+    """
     wires = {
         str(identity.get("serial") or ""): name for name, identity in identities if identity.get("kind") == "camera"
     }

@@ -1,4 +1,4 @@
-"""How the clocks of devices and host stood against each other, by the record, and whether that will do: pure."""
+"""Offsets between the clocks of devices, host and network as recorded, and whether they are within limits. Pure."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from service.core.records.events import DeviceOpened, Event, SessionStarted, ViewpointCaptured
 
-#: Limits. EXIF gives whole seconds, and a release takes part of one; of a network's time a host is a few ms off; two
-#: good crystals go apart by up to 0.1 ms in a second, and the robot's messages come a few ms later or earlier.
+#: Limits. EXIF times may be whole seconds, and a release takes part of one. A host synchronised over the network is a
+#: few ms off. Two good crystals drift apart by up to 0.1 ms per second, and robot messages jitter by a few ms.
 DEVICE_LIMIT_S = 5.0
 HOST_LIMIT_S = 1.0
 _DRIFT_LIMIT_S, _DRIFT_LIMIT_RATE = 0.02, 2e-4
@@ -21,15 +21,16 @@ Against = Literal["host UTC", "host since it was opened", "NTP"]
 
 @dataclass(frozen=True, slots=True)
 class ClockReading:
-    """One clock against another.
+    """The offset of one clock from another.
 
     Attributes:
         device: name in rig.yaml, or "host".
-        against: with what it was compared. Where both count from power-on only the change since the opening counts.
-        offset_s: how far it is ahead; None: not known.
-        limit_s: that will do, either way.
+        against: the clock it was compared with. For a device that counts from power-on only the change of the offset
+            since the device was opened is given.
+        offset_s: how far it is ahead; None if not known.
+        limit_s: largest acceptable absolute offset.
         at_utc: when it was compared.
-        note: what else is known of it.
+        note: what else is known about it.
     """
 
     device: str
@@ -41,69 +42,69 @@ class ClockReading:
 
     @property
     def within(self) -> bool | None:
-        """Whether it will do; None: not known."""
+        """Whether the offset is within its limit; None if the offset is not known."""
         return None if self.offset_s is None else abs(self.offset_s) <= self.limit_s
 
     @property
     def name(self) -> str:
-        """Whose clock it is, for people."""
+        """Whose clock it is, in words."""
         return "this machine" if self.device == "host" else self.device
 
     @property
     def other(self) -> str:
-        """What it was compared with, for people."""
+        """What it was compared with, in words."""
         return {"host UTC": "this machine", "NTP": "the network's time"}.get(self.against, "this machine, its change")
 
     @property
     def difference(self) -> str:
-        """`1.250 s behind`; "–" where it is not known."""
+        """The offset in words, such as `1.250 s behind`; "–" if it is not known."""
         if self.offset_s is None:
             return "–"
         return f"{abs(self.offset_s):.3f} s {'ahead' if self.offset_s > 0 else 'behind'}"
 
     @property
     def meaning(self) -> str:
-        """What its difference says and what rests on it, for whoever audits a run."""
+        """What the offset means and what depends on it, for the auditor of a run."""
         if self.against == "NTP":
-            return "Every time in the record is this machine's: it is true as far as this clock is"
+            return "Every time in the record is from this machine's clock and is as true as this clock"
         if self.against == "host UTC":
-            return "The time written in its files is its own. Order and times of the record do not rest on it"
+            return "It sets the times in the device's own files. Order and times of the record do not depend on it"
         return (
-            "It counts seconds from when the device was switched on, so how far it is from this machine's says "
-            "nothing. Its change matters: by it the pose of the arm is found for the moment of each exposure"
+            "It counts seconds since the device was switched on, so its distance from this machine's clock means "
+            "nothing. Its drift matters: the arm's pose at the moment of each exposure is found with it"
         )
 
     @property
     def words(self) -> str:
-        """For people, of a clock beyond its limit."""
+        """A sentence for people on a clock beyond its limit, with what to do."""
         ahead = "ahead of" if (self.offset_s or 0.0) > 0 else "behind"
         other = "the network's" if self.against == "NTP" else "this machine's"
         what = f"The clock of {self.name} is {abs(self.offset_s or 0.0):.2f} s {ahead} {other}"
         if self.against == "host since it was opened":
-            return f"{what}, counted from the first image: more than {self.limit_s:.2f} s. Look at its controller"
-        return f"{what}: more than {self.limit_s:g} s. Set it, for the record's times are compared with it"
+            return f"{what}, counted from the first image: more than {self.limit_s:.2f} s. Check its controller"
+        return f"{what}: more than {self.limit_s:g} s. Set it: times in the record are compared with it"
 
 
 def offset_told(offset_s: float | None, clock: str) -> str:
-    """A clock offset as a device reported it when it was opened. `clock`: utc, or uptime."""
+    """The clock offset in words that a device reported when it was opened; `clock` is "utc" or "uptime"."""
     if clock == "uptime":
-        return "counts from when it was switched on: only its change matters"
+        return "counts from when it was switched on: only its drift matters"
     if offset_s is None:
-        return "not told"
+        return "not reported"
     return f"{abs(offset_s):.3f} s {'ahead of' if offset_s > 0 else 'behind'} this machine's"
 
 
 def clock_of(report: Mapping[str, Any]) -> str:
-    """Which clock a recorded DeviceReport tells of, utc or uptime; an old record does not say: by the device."""
+    """The clock of a recorded DeviceReport, "utc" or "uptime"; in old records the device's kind decides."""
     kind = str((report.get("identity") or {}).get("kind", ""))
     return str(report.get("clock") or ("uptime" if kind == "robot" else "utc"))
 
 
 def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
-    """The newest of each clock that a run has recorded: the host's first, then in the order of the openings."""
+    """The newest reading of every clock in a run's record: the host's first, then devices in the order of opening."""
     host: list[ClockReading] = []
     opened: dict[str, Event] = {}
-    # The first image since the last opening of a device, and the newest: a run may have ten thousand.
+    # Only the first image since a device was last opened, and the newest: a run may have ten thousand.
     first: dict[str, Event] = {}
     newest: Event | None = None
     for event in events:
@@ -120,7 +121,7 @@ def clock_readings(events: Sequence[Event]) -> tuple[ClockReading, ...]:
             note = "" if clock.synchronised else "not set by the network"
             host = [ClockReading("host", "NTP", clock.offset_s, HOST_LIMIT_S, event.at_utc, note)]
     kinds = Counter(_kind(event) for event in opened.values())
-    # An event does not say which of several cameras or arms it is of.
+    # A capture does not say which of several cameras or arms it came from.
     of_captures = {name for name, event in opened.items() if kinds[_kind(event)] == 1}
     found: list[ClockReading] = []
     for name, event in opened.items():
@@ -135,7 +136,7 @@ def _kind(opened: Event) -> str:
 
 
 def _readings(name: str, opened: Event, captures: tuple[Event, Event] | None) -> list[ClockReading]:
-    """Of one device, of its last opening and the first and newest image since."""
+    """The readings of one device from its last opening and the first and newest image since."""
     assert isinstance(opened.payload, DeviceOpened)
     kind, report = _kind(opened), opened.payload.report
     if clock_of(report) == "uptime":
@@ -162,7 +163,7 @@ def _drift(name: str, opened: Event, captures: tuple[Event, Event] | None) -> Cl
 
 
 def _exif_offset_s(event: Event) -> float | None:
-    """Camera clock minus host UTC at the release; None where EXIF does not say its distance from UTC."""
+    """Camera clock minus host UTC at the release, in seconds; None if EXIF lacks the offset from UTC."""
     payload = event.payload
     assert isinstance(payload, ViewpointCaptured)
     try:

@@ -1,6 +1,6 @@
-"""Will the disk do for a run? A forecast from what is planned and what was written, and what follows from it: pure.
+"""Forecast whether the disk has room for a run, from what is planned and what was written. Pure.
 
-What is left below the least is for the evidence alone: no log, no new photograph.
+The last LEAST_FREE_BYTES are kept for the evidence: no logs and no new photographs are written into them.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from service.core.recovery.ways_on import planned_views
 from service.core.run.state import RunState
 
 LEAST_FREE_BYTES = 1 << 30
-_VIEWS_UNDER_WAY = 5  # for which there must be room above the least: in the camera, on its way, being computed
-_ENOUGH_VIEWS = 3  # from so many on a run's own figures count
-_MANUAL_VIEWS = 60  # a person takes as many as it needs; this is usual
-# Where no run has been recorded yet: JPEG and RAW of 60 MP with what is computed of them; of a simulated rig less.
+_VIEWS_UNDER_WAY = 5  # need room above LEAST_FREE_BYTES: in the camera, in transfer or being computed
+_ENOUGH_VIEWS = 3  # with this many, a run's own figures are used
+_MANUAL_VIEWS = 60  # typical number of a manual capture, which plans none
+# Used when no run has been recorded yet: JPEG and RAW of 60 MP with what is computed from them; less when simulated.
 _GUESSED_VIEW_BYTES, _GUESSED_SIMULATED_BYTES = 100_000_000, 4_000_000
 _GUESSED_OTHER_BYTES = 1_000_000_000  # CT, scans, registered data
 
@@ -25,7 +25,7 @@ Verdict = Literal["enough", "short", "stop"]
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What the files of a run take, as recorded."""
+    """Recorded sizes of a run's files."""
 
     views: int = 0
     view_bytes: int = 0  # photographs, with RAW and pose logs
@@ -35,10 +35,10 @@ class Usage:
 
 @dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a run will still write, against what is free."""
+    """What a run will still write, and what is free."""
 
     views_left: int
-    view_bytes: int  # a view, with what is computed of it
+    view_bytes: int  # one view, with what is computed from it
     needed_bytes: int  # to the end of the run
     free_bytes: int
     known_from: Literal["this run", "an earlier run", "a guess"]
@@ -50,43 +50,43 @@ class Forecast:
 
     @property
     def verdict(self) -> Verdict:
-        """`stop`: nothing more is begun. `short`: it will come to that before the end of the run."""
+        """`stop`: no new work begins. `short`: the space will run out before the end of the run."""
         if self.free_bytes < min(self.stop_below_bytes, LEAST_FREE_BYTES + self.needed_bytes):
             return "stop"
         return "short" if self.free_bytes - self.needed_bytes < LEAST_FREE_BYTES else "enough"
 
     @property
     def words(self) -> str:
-        """For people: the figures and what they mean."""
-        views = f"{self.views_left} views of {self.view_bytes / 1e6:.0f} MB each, by {self.known_from}"
+        """The figures and what they mean, in a sentence."""
+        views = f"{self.views_left} views of {self.view_bytes / 1e6:.0f} MB each, from {self.known_from}"
         figures = f"{size_words(self.free_bytes)} are free, and the run needs about {size_words(self.needed_bytes)}"
         figures += f" more ({views})" if self.views_left else " more"
         if self.verdict == "enough":
             return f"Disk: {figures}"
         if self.verdict == "short":
-            return f"The disk will not do: {figures}; the last {size_words(LEAST_FREE_BYTES)} are kept free"
-        return f"The disk of the data folder is nearly full: {figures}. Nothing is begun before there is more room"
+            return f"The disk is too small: {figures}; the last {size_words(LEAST_FREE_BYTES)} are kept free"
+        return f"The disk of the data folder is nearly full: {figures}. Nothing begins until there is more room"
 
 
 def forecast(
     protocol: Protocol, state: RunState | None, here: Usage, before: Usage | None, free_bytes: int, *, simulated: bool
 ) -> Forecast:
-    """What a run will still write.
+    """Forecast what a run will still write.
 
     Args:
-        protocol: of the run.
-        state: of the run; None before it begins.
-        here: what its files take by now.
-        before: what those of an earlier run of the same protocol took in all; None: there was none.
-        free_bytes: on the disk of the data folder.
-        simulated: whether the rig is.
+        protocol: the run's protocol.
+        state: the run's state; None before it begins.
+        here: sizes of its files so far.
+        before: sizes of all files of an earlier run of the same protocol; None if there was none.
+        free_bytes: free space on the disk of the data folder.
+        simulated: whether the rig is simulated.
     """
     known = before if before is not None and before.views >= _ENOUGH_VIEWS else None
     own = here if here.views >= _ENOUGH_VIEWS else None
     guess = _GUESSED_SIMULATED_BYTES if simulated else _GUESSED_VIEW_BYTES
     source = own or known
     photograph = guess if source is None else source.view_bytes / source.views
-    # Jobs come after their views: early in a run what they wrote says too little.
+    # Jobs lag behind their views, so early in a run what they wrote is too small an estimate.
     computed = max((u.computed_bytes / u.views for u in (own, known) if u is not None), default=0.0)
     other = known.other_bytes if known is not None else (0 if simulated else _GUESSED_OTHER_BYTES)
     left = views_left(protocol, state)
@@ -102,7 +102,7 @@ def forecast(
 
 
 def views_left(protocol: Protocol, state: RunState | None) -> int:
-    """How many photographs the protocol plans that are not taken yet."""
+    """Number of photographs that the protocol plans and that are not taken yet."""
     left = 0
     for step in protocol.steps:
         now = None if state is None else state.steps[step.id]
@@ -114,5 +114,5 @@ def views_left(protocol: Protocol, state: RunState | None) -> int:
 
 
 def size_words(size_bytes: float) -> str:
-    """`850 MB`, `12.3 GB`: for people."""
+    """A size in words, such as `850 MB` or `12.3 GB`."""
     return f"{size_bytes / 1e9:.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.0f} MB"

@@ -1,4 +1,4 @@
-"""Accepting a gate outside its limits: who may, who may not, and in what words."""
+"""Accepting a measure outside its limits: who may, who may not, and the words for it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ ROLE_OF: Mapping[AcceptedBy, str] = {"supervisor": "supervisor", "another_superv
 
 
 def failed_gates(step: StepState) -> tuple[GateVerdict, ...]:
-    """The figures of a step that are outside their limits."""
+    """The verdicts of a step that did not pass: outside the limits, undecided or not measured."""
     return tuple(verdict for verdict in step.verdicts if not verdict.passed)
 
 
 def acceptors(protocol: Protocol, state: RunState) -> frozenset[AcceptedBy]:
-    """Who the protocol asks for to accept the failed gates of the current step; empty when there are none."""
+    """Who may accept the failed gates of the current step by the protocol; empty when none failed."""
     by: dict[str, AcceptedBy | None] = {g.measure: g.accept_by for g in protocol.step(state.current).gates}
     found: set[AcceptedBy] = set()
     for verdict in failed_gates(state.step):
@@ -30,24 +30,24 @@ def acceptors(protocol: Protocol, state: RunState) -> frozenset[AcceptedBy]:
 
 
 def demanded_role(protocol: Protocol, state: RunState) -> str:
-    """The role that accepts the figures of the current step; "" when nobody may."""
+    """The role that may accept the figures of the current step; "" when nobody may."""
     roles = sorted({ROLE_OF[by] for by in acceptors(protocol, state)})
     return roles[0] if roles and acceptance_refusal(protocol, state) is None else ""
 
 
 def acceptance_refusal(protocol: Protocol, state: RunState) -> IllegalTransitionError | None:
-    """Why nobody at all may accept the figures of the current step, or None."""
+    """The reason why nobody at all may accept the figures of the current step, or None."""
     step, now = protocol.step(state.current), state.step
     failed = failed_gates(now)
     if state.phase != "recovering" or now.failure is not None or not failed:
-        return IllegalTransitionError("no figure of this step waits outside its limits", where=step.id)
+        return IllegalTransitionError("no figure of this step needs acceptance", where=step.id)
     if now.retry_granted:
         return IllegalTransitionError("the step is about to be tried again", where=step.id, remedy="Wait for it")
     by = {gate.measure: gate.accept_by for gate in step.gates}
     forbidden = [verdict.measure for verdict in failed if by.get(verdict.measure) is None]
     if forbidden:
         return IllegalTransitionError(
-            f"the protocol lets nobody accept {', '.join(forbidden)} outside the limits",
+            f"the protocol allows nobody to accept {', '.join(forbidden)} outside the limits",
             where=step.id,
             remedy="Mend it, do the step again, or end the run here",
         )
@@ -64,22 +64,22 @@ def acceptance_refusal(protocol: Protocol, state: RunState) -> IllegalTransition
 def acceptor_refusal(
     protocol: Protocol, state: RunState, action: OperatorAction, actor: str
 ) -> IllegalTransitionError | None:
-    """Why this person may not accept the figures of the current step, or None."""
+    """The reason why this person may not accept the figures of the current step, or None."""
     if action.automatic or action.via in ("pedal", "auto"):
         return IllegalTransitionError(
-            "only a person accepts figures outside their limits, by a signature", where=state.current
+            "only a person may accept figures outside their limits, by a signature", where=state.current
         )
     asked = acceptors(protocol, state)
     role = demanded_role(protocol, state)
     if action.role != role or not actor.strip():
         return IllegalTransitionError(
-            f"these figures are accepted by a {role}, with name and password",
+            f"only a {role} may accept these figures, with name and password",
             where=state.current,
             remedy="Call one; nothing is lost by waiting",
         )
     if "another_supervisor" in asked and actor in (state.operator, state.step.confirmed_by):
         return IllegalTransitionError(
-            "the protocol asks for somebody else than who began the run or confirmed this step",
+            "the protocol asks for somebody other than the person who began the run or confirmed this step",
             where=state.current,
             remedy="Call another supervisor; nothing is lost by waiting",
         )
@@ -87,7 +87,7 @@ def acceptor_refusal(
 
 
 def describe_accepted(accepted: Accepted) -> str:
-    """`coverage 0.896, allowed ≥ 0.9; accepted by Emmy (supervisor): the corners are not used`: for every reader."""
+    """One line on an acceptance: `coverage 0.896, allowed ≥ 0.9; accepted by Emmy (supervisor): the reason`."""
     figures = "; ".join(describe_judged(verdict) for verdict in accepted.verdicts)
     how = {"claimed": ", by claim", "pin": ", by PIN", "badge": ", by badge"}.get(accepted.identified, "")
     return f"{figures}; accepted by {accepted.by} ({accepted.role}{how}): {accepted.reason}"

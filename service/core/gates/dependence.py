@@ -1,4 +1,4 @@
-"""Which steps rest on a step that passed with figures outside their limits, accepted by a person."""
+"""Which steps depend on a step that passed because a person accepted figures outside their limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.core.run.state import Accepted, RunState
 
 @dataclass(frozen=True, slots=True)
 class AcceptedGate:
-    """An acceptance that a result rests on."""
+    """An acceptance that a result depends on."""
 
     step: str
     title: str
@@ -26,19 +26,19 @@ class AcceptedGate:
 
 
 def used_steps(protocol: Protocol, step: Step) -> frozenset[str]:
-    """The earlier steps that a step's params name, directly."""
+    """The earlier steps that a step's params name directly."""
     earlier = frozenset(protocol.step_ids[: protocol.index(step.id)])
     return earlier.intersection(_texts(step.params.model_dump(mode="json")))
 
 
 def accepted_gates(protocol: Protocol, state: RunState) -> tuple[AcceptedGate, ...]:
-    """Every acceptance that holds in a run, in the protocol's order."""
+    """Every acceptance in force in a run, in the protocol's order."""
     found = ((step, state.steps[step.id].accepted) for step in protocol.steps)
     return tuple(AcceptedGate(step.id, step.title, accepted) for step, accepted in found if accepted is not None)
 
 
 def depends_on(protocol: Protocol, state: RunState, step_id: str) -> tuple[AcceptedGate, ...]:
-    """The acceptances that a step's result rests on: its own, and those of the steps that it uses, transitively."""
+    """The acceptances that a step's result depends on: its own and, transitively, those of the steps it uses."""
     reached: set[str] = set()
     waiting = [step_id]
     while waiting:
@@ -50,7 +50,7 @@ def depends_on(protocol: Protocol, state: RunState, step_id: str) -> tuple[Accep
 
 
 def dependent_steps(protocol: Protocol, step_id: str) -> tuple[str, ...]:
-    """The later steps that would rest on this one, in the protocol's order."""
+    """The later steps that depend on this one, directly or not, in the protocol's order."""
     rests = {step_id}
     for step in protocol.steps[protocol.index(step_id) + 1 :]:
         if used_steps(protocol, step) & rests:

@@ -1,4 +1,4 @@
-"""When a completed run may leave the system: its release by a second person."""
+"""When a completed run may be exported: its release by a second person."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from service.core.run.state import RunState
 
 
 def refuse_release(state: RunState, actor: str, signed_sha256: str) -> IllegalTransitionError | None:
-    """Why this person cannot release the run by signing this hash, or None."""
+    """The reason why this person cannot release the run by signing this hash, or None."""
     if state.status != "completed":
         return IllegalTransitionError(
             f"the run is {state.status}", where="release", remedy="Only a completed run can be released"
@@ -21,7 +21,7 @@ def refuse_release(state: RunState, actor: str, signed_sha256: str) -> IllegalTr
         )
     if signed_sha256 != state.completed_sha256:
         return IllegalTransitionError(
-            "the signature is for another record than the end of this run",
+            "the signature is for a record other than the end of this run",
             where="release",
             remedy="Read the run again and sign it as it is now",
         )
@@ -29,7 +29,7 @@ def refuse_release(state: RunState, actor: str, signed_sha256: str) -> IllegalTr
 
 
 def refuse_export(protocol: Protocol, state: RunState) -> IllegalTransitionError | None:
-    """Why nothing of the run may be exported yet as far as people are concerned, or None."""
+    """The reason why the run may not be exported yet, for want of a release, or None."""
     if protocol.release == "second_person" and not state.released_by:
         return IllegalTransitionError(
             "the protocol asks for a second person's release before anything is exported",

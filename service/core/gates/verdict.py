@@ -1,4 +1,4 @@
-"""Gates: measured numbers against their limits."""
+"""Gates: measured numbers judged against their limits."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from service.core.protocol.models import Gate, Step
 from service.core.records.events import GatesEvaluated, GateVerdict, Uncertainty
 
 BOUNDS_HOLD = (
-    "Two numbers behind a value are the bounds that its own uncertainty leaves, each held with 99 %. It is within "
-    "its limits when both bounds are, outside when all between them is, and not decided otherwise"
+    "The two numbers after a value are its lower and upper bound, each one-sided with 99 % confidence. The value is "
+    "within its limits when both bounds are, outside when everything between them is, and undecided otherwise"
 )
 _LARGEST_WHOLE = 1e7
-_UNITS_IN_S = ("s", "ms", "µs")  # the others that end with an s are plurals: images, views, spheres
+_UNITS_IN_S = ("s", "ms", "µs")  # other units that end in s are plurals: images, views, spheres
 
 
 def evaluate_gates(
@@ -26,13 +26,16 @@ def evaluate_gates(
 ) -> GatesEvaluated:
     """Judge every gate of a step. A measure that is missing or not a finite number fails.
 
-    A measure that states its uncertainty passes when all that it may be is within the limits, fails when nothing of
-    it is, and is undecided otherwise: the step has not passed then.
+    A measure with an uncertainty passes when its whole interval is within the limits, fails when its whole interval
+    is outside, and is undecided otherwise; a step with an undecided gate has not passed.
 
     Args:
-        skipped: identifiers of the skipped steps. A gate that names one of them in `unless_skipped` is not judged:
-            without that step there is no such number. The skip, with its reason, is in the record.
-        uncertainties: of those measures that state one.
+        step: the step with its gates.
+        attempt: the attempt that measured.
+        measures: measure → value, in the unit of its gate.
+        skipped: identifiers of skipped steps. A gate that names one in `unless_skipped` is not judged, because the
+            number does not exist without that step. The skip and its reason are in the record.
+        uncertainties: measure → uncertainty, where one is known.
     """
     gates = [gate for gate in step.gates if gate.unless_skipped is None or gate.unless_skipped not in skipped]
     verdicts = tuple(
@@ -68,7 +71,7 @@ Standing = Literal["within", "not_decided", "accepted", "outside"]
 
 
 def standing(verdict: GateVerdict, *, accepted: bool = False) -> Standing:
-    """How a gate came out, for every reader. `accepted`: a person let the step pass with its figures as they are."""
+    """The outcome of a gate; `accepted` says that a person let the step pass with its figures as they are."""
     if verdict.passed:
         return "within"
     if accepted:
@@ -77,7 +80,7 @@ def standing(verdict: GateVerdict, *, accepted: bool = False) -> Standing:
 
 
 def describe(verdict: GateVerdict) -> str:
-    """`rms 0.71 px, allowed ≤ 0.5`: a figure against its limit, in one line."""
+    """A figure and its limit in one line: `rms 0.71 px, allowed ≤ 0.5`."""
     text = (
         f"{verdict.measure} {figure(verdict)}" if verdict.value is not None else f"{verdict.measure} was not measured"
     )
@@ -85,25 +88,25 @@ def describe(verdict: GateVerdict) -> str:
 
 
 def describe_judged(verdict: GateVerdict) -> str:
-    """The same of a gate that did not pass, where the line stands alone: it says so of a gate that is not decided."""
+    """`describe`, with `: not decided` after an undecided verdict, for a line that stands alone."""
     return describe(verdict) + (": not decided" if verdict.undecided else "")
 
 
 def figure(verdict: GateVerdict) -> str:
-    """`0.71 px`, or `0.52 mm, 0.41 to 0.63` of a value that states its uncertainty (see BOUNDS_HOLD)."""
+    """A verdict's value: `0.71 px`, or with its 99 % bounds `0.52 mm, 0.41 to 0.63` (see BOUNDS_HOLD)."""
     if verdict.value is None or verdict.lower is None or verdict.upper is None:
         return quantity(verdict.value, verdict.unit)
     return uncertain(verdict.value, verdict.lower, verdict.upper, verdict.unit)
 
 
 def uncertain(value: float, lower: float, upper: float, unit: str = "") -> str:
-    """The same of any number with its bounds, with as many places as tell the bounds apart."""
+    """A value with its bounds, `0.52 mm, 0.41 to 0.63`, with enough decimal places to tell the bounds apart."""
     places = _places(upper - lower)
     return f"{value:.{places}f} {unit}".rstrip() + f", {lower:.{places}f} to {upper:.{places}f}"
 
 
 def quantity(value: float | None, unit: str = "") -> str:
-    """A number without bounds as people read it, with its unit: `8 images`, `1 image`, `0.71 px`, `not measured`."""
+    """A number with its unit, for people: `8 images`, `1 image`, `0.71 px`; `not measured` for None."""
     if value is None:
         return "not measured"
     if value == 1 and unit.endswith("s") and unit not in _UNITS_IN_S:
@@ -117,7 +120,7 @@ def _places(apart: float) -> int:
 
 
 def limits(minimum: float | None, maximum: float | None) -> str:
-    """`≥ 0.2 and ≤ 1`, or `= 0`."""
+    """Limits in words: `≥ 0.2 and ≤ 1`, or `= 0`; None means no limit on that side."""
     if minimum is not None and minimum == maximum:
         return f"= {minimum:g}"
     low = "" if minimum is None else f"≥ {minimum:g}"

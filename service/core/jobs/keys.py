@@ -1,4 +1,4 @@
-"""Names of jobs that are the same for the same work: after a restart or a retry its result is used again."""
+"""Idempotency keys of jobs: the same work has the same key, so a restart or retry reuses its result."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.core.run.state import JobState, RunState
 
 
 def arguments_name(arguments: Mapping[str, Any]) -> str:
-    """What tells these arguments from others."""
+    """A hash of the arguments, 16 hexadecimal digits: equal arguments have the same name."""
     return hashlib.sha256(json.dumps(arguments, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -23,7 +23,7 @@ def _stem(state: RunState, step: str, kind: str, name: str) -> str:
 def job_key(state: RunState, step: str, kind: str, name: str) -> str:
     """The key under which a job would be enqueued now.
 
-    A redo of the step begins a new generation; a job that has failed is tried anew under another key.
+    A redo of the step begins a new generation of keys; a failed job is tried again under a new key.
     """
     stem = _stem(state, step, kind, name)
     jobs = state.steps[step].jobs.values()
@@ -31,7 +31,7 @@ def job_key(state: RunState, step: str, kind: str, name: str) -> str:
 
 
 def newest_job(state: RunState, step: str, kind: str, name: str) -> JobState | None:
-    """The last job of this work that was enqueued since the step's last redo; None if it never was."""
+    """The last job for this work enqueued since the step's last redo, or None."""
     stem = _stem(state, step, kind, name)
     jobs = [job for job in state.steps[step].jobs.values() if job.idempotency_key.startswith(stem)]
     return max(jobs, key=lambda job: job.enqueued_seq, default=None)

@@ -1,1 +1,1 @@
-"""The lab procedure: the models of a protocol file, and what it must obey beyond them."""
+"""The lab procedure: the models of a protocol file, and the rules that go beyond types."""

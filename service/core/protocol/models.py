@@ -31,7 +31,7 @@ ParamsT = TypeVar("ParamsT", bound=BaseModel)
 
 
 def _fraction(value: Any) -> Any:
-    """Shutter speeds are written as photographers write them: `1/15`."""
+    """Read a shutter speed in seconds, also as a fraction such as `1/15`. Raises ValueError."""
     if not isinstance(value, str):
         return value
     numerator, slash, denominator = value.partition("/")
@@ -72,7 +72,7 @@ class Spheres(Record):
     radius_mm: Positive  # of each sphere
     registration: Annotated[int, Field(ge=4)]  # how many
     control: Annotated[int, Field(ge=0)] = 0  # how many control spheres; they take no part in the registration
-    # Where it is not told, the detector learns it from the clearest spheres of each image.
+    # If it is not given, the detector learns it from the clearest spheres of each image.
     colour: Annotated[str, Field(pattern=r"^(white|grey|green|orange|#[0-9a-fA-F]{6})$")] | None = None
 
 
@@ -99,60 +99,60 @@ class Motion(Record):
 
     speed_rad_s: Positive = 0.5  # of the fastest joint
     acceleration_rad_s2: Positive = 0.5  # of the fastest joint
-    dwell_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5  # after standing still, before the exposure
+    dwell_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.5  # between standing still and the exposure
 
 
 class Settle(Record):
     """When the arm counts as standing still, and how long to wait for it."""
 
     window_s: Positive = 0.5  # over which all limits must hold
-    joint_speed_rad_s: Positive = 0.001  # most of any joint
-    tcp_speed_m_s: Positive = 0.0002  # most of the flange
+    joint_speed_rad_s: Positive = 0.001  # largest of any joint
+    tcp_speed_m_s: Positive = 0.0002  # largest of the flange
     position_peak_to_peak_m: Positive = 0.00002  # range of the flange's position within the window
     rotation_peak_to_peak_rad: Positive = 0.0000873  # range of the flange's rotation within the window
     timeout_s: Positive = 20.0  # then the viewpoint fails
 
 
-# Who may accept a gate outside its limits; `another_supervisor`: who neither began the run nor confirmed the step.
+# Who may accept a gate outside its limits. `another_supervisor` neither began the run nor confirmed the step.
 AcceptedBy = Literal["supervisor", "another_supervisor"]
 
 
 class Gate(Record):
-    """A measured number and its limits; a step passes only within all of them, or as somebody accepts it."""
+    """A measured number and its limits; a step passes when all its gates are within limits or are accepted."""
 
     measure: Text  # name of a number that the step measures
-    min: Finite | None = None  # least value that passes
-    max: Finite | None = None  # greatest value that passes
+    min: Finite | None = None  # smallest value that passes
+    max: Finite | None = None  # largest value that passes
     unit: str = ""  # of the limits; checked against the unit of the measure
     why: str = ""  # the reason for the limit, for people
-    unless_skipped: str | None = None  # the earlier step without which there is no such number; skipped: no such gate
+    unless_skipped: str | None = None  # the earlier step that the number needs: if it is skipped, there is no gate
     accept_by: AcceptedBy | None = None  # None: nobody may; see service.core.gates.acceptance
 
 
 class Recovery(Record):
-    """What happens when the work of a step fails: see service.core.recovery.policy."""
+    """What happens when the work of a step fails (service.core.recovery.policy)."""
 
-    retries: Annotated[int, Field(ge=0, le=20)] = 2  # of passing troubles of a device, without progress in between
+    retries: Annotated[int, Field(ge=0, le=20)] = 2  # after transient device errors without progress in between
     wait_s: Annotated[float, Field(ge=0, le=600)] = 1.0  # before a retry
     on_failure: Literal["ask", "abort"] = "ask"  # when no retry is left: ask a person, or end the run
 
 
 class HandAction(Record):
-    """What the technician's hands do when confirming this step; a simulated rig does it by itself."""
+    """What the technician does by hand when confirming this step; a simulated rig does it by itself."""
 
     action: Text  # what the simulator is asked to do
     station: str | None = None  # where
 
 
 class StepFields(Record):
-    """Everything of a step but its params."""
+    """The fields of a step other than its params."""
 
     id: StepId  # name in the record, unique in the protocol
     kind: Text  # what the step does: one of the step kinds
     title: Text  # what people read
     why: str = ""  # the reason, for the technician
-    instructions: str = ""  # what the technician is to do
-    drawing: str = ""  # of service/web/run/drawings, beside the instructions; "": as the kind of step suggests
+    instructions: str = ""  # what the technician should do
+    drawing: str = ""  # in service/web/run/drawings, shown beside the instructions; "": that of the step kind
     checklist: tuple[Text, ...] = ()  # items to tick before the step can be confirmed
     gates: tuple[Gate, ...] = ()  # measured numbers with their limits
     sign: bool = False  # whether a person signs before the step passes
@@ -161,31 +161,31 @@ class StepFields(Record):
     irreversible: bool = False  # whether nothing before it can be done again afterwards
     requires: tuple[str, ...] = ()  # earlier steps that must not have been skipped
     recovery: Recovery = Recovery()  # what happens when the work fails
-    simulated_hands: tuple[HandAction, ...] = ()  # without effect on a real rig
+    simulated_hands: tuple[HandAction, ...] = ()  # ignored on a real rig
 
 
 class MovingParams(Record):
-    """Base of the params of a step kind whose work moves the robot: such work never begins by itself."""
+    """Base of the params of a step kind that moves the robot; such a step never begins without a person."""
 
     @property
     def moves_robot(self) -> bool:
-        """Whether it does so with these params."""
+        """Whether the step moves the robot with these params."""
         return True
 
 
 class Step(StepFields):
-    """One step of the procedure; `params` is of the step kind's own model."""
+    """One step of the procedure; `params` is an instance of its kind's Params model."""
 
     params: SerializeAsAny[BaseModel]
 
     @property
     def moves_robot(self) -> bool:
-        """Whether the robot moves while this step works: its confirmation is held, or the pedal pressed twice."""
+        """Whether the robot moves during this step; confirming it takes a held button or two pedal presses."""
         return isinstance(self.params, MovingParams) and self.params.moves_robot
 
     @property
     def begins_confirmed(self) -> bool:
-        """Whether a person lets it begin: what moves the robot always, whatever the protocol says."""
+        """Whether a person must let it begin; always so if it moves the robot, whatever the protocol says."""
         return self.confirm or self.moves_robot
 
     def params_as(self, model: type[ParamsT]) -> ParamsT:
@@ -196,7 +196,7 @@ class Step(StepFields):
 
 
 class ProtocolFields(Record):
-    """Everything of a protocol but its steps."""
+    """The fields of a protocol other than its steps."""
 
     id: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]  # name in the record and on the pages
     version: Text  # changes with the content
@@ -204,12 +204,12 @@ class ProtocolFields(Record):
     source: str = ""  # where the procedure comes from
     spheres: Spheres  # radius and number of the spheres
     board: Board | None = None  # the calibration board; needed by a step that calibrates
-    camera: CameraSection | None = None  # None: no settings are demanded, and no step of the protocol sets a camera
+    camera: CameraSection | None = None  # None: no settings are required, and no step sets a camera
     motion: Motion = Motion()  # speed and acceleration of the arm
     settle: Settle = Settle()  # when the arm counts as standing still
-    # Whether a person who took no part in the run must release it before anything of it is exported.
+    # Whether a person who took no part in the run must release it before anything is exported.
     release: Literal["none", "second_person"] = "none"
-    reasons: Reasons = Reasons()  # offered where a redo, a skip or an acceptance asks for one
+    reasons: Reasons = Reasons()  # presets for the reason of a redo, a skip or an acceptance
 
 
 class Protocol(ProtocolFields):
@@ -219,11 +219,11 @@ class Protocol(ProtocolFields):
 
     @property
     def step_ids(self) -> tuple[str, ...]:
-        """Identifiers in order."""
+        """Identifiers of the steps, in order."""
         return tuple(step.id for step in self.steps)
 
     def step(self, step_id: str) -> Step:
-        """The step of this identifier. Raises ProtocolError if there is none."""
+        """The step with this identifier. Raises ProtocolError if there is none."""
         return self.steps[self.index(step_id)]
 
     def index(self, step_id: str) -> int:
@@ -254,9 +254,10 @@ class _FileProtocol(ProtocolFields):
 
 
 def load_protocol(path: Path, params_models: Mapping[str, type[BaseModel]]) -> LoadedProtocol:
-    """Read a protocol file; `params_models` gives the Params of every known step kind.
+    """Read a protocol file; `params_models` maps every known step kind to its Params.
 
-    Raises ProtocolError naming file:line and field of everything that is wrong, all of it at once.
+    Raises:
+        ProtocolError: the file cannot be read or is wrong; the message lists every problem with file:line and field.
     """
     try:
         content = path.read_bytes()
@@ -268,7 +269,16 @@ def load_protocol(path: Path, params_models: Mapping[str, type[BaseModel]]) -> L
 
 
 def parse_protocol(content: bytes, params_models: Mapping[str, type[BaseModel]], *, name: str) -> LoadedProtocol:
-    """The same for a file's bytes (a recorded artefact, an editor's buffer); `name` stands for the file in errors."""
+    """Read a protocol from a file's bytes (a recorded artefact, an editor's buffer).
+
+    Args:
+        content: the file's bytes.
+        params_models: step kind → its Params.
+        name: the file's name in error messages.
+
+    Raises:
+        ProtocolError: the protocol is wrong; the message lists every problem with file:line and field.
+    """
     text = decoded(content, name=name, error=ProtocolError)
     tree = parse_yaml(text, name=name)
     problems = list(tree.problems)
@@ -293,7 +303,7 @@ def parse_protocol(content: bytes, params_models: Mapping[str, type[BaseModel]],
 def _validate_params(
     data: Mapping[str, Plain], models: Mapping[str, type[BaseModel]], tree: YamlTree, problems: list[Problem]
 ) -> dict[int, BaseModel]:
-    """The params of every step by its index, judged by the model of its kind; appends to `problems`."""
+    """The params of every valid step by its index; appends what is wrong with the others to `problems`."""
     params: dict[int, BaseModel] = {}
     steps = data.get("steps")
     for index, step in enumerate(steps if isinstance(steps, list) else []):
@@ -306,7 +316,7 @@ def _validate_params(
             continue
         given = step.get("params", {})
         if not isinstance(given, dict):
-            continue  # the structure's own check has said so
+            continue  # already reported by the check of the structure
         found, wrong = checked(given, models[kind], tree, (*at, "params"))
         problems += wrong
         if found is not None:
@@ -320,14 +330,14 @@ def _refuse(problems: list[Problem], name: str) -> NoReturn:
 
 
 def protocol_json_schema(params_models: Mapping[str, type[BaseModel]]) -> dict[str, Any]:
-    """JSON Schema (draft 2020-12) of a protocol file, with the params of every step kind; for editors."""
+    """JSON Schema (draft 2020-12) of a protocol file for editors, with the params of every step kind."""
     kinds: list[type[BaseModel]] = []
     for kind, model in sorted(params_models.items()):
         needed = any(field.is_required() for field in model.model_fields.values())
         default: Any = ... if needed else Field(default_factory=model)
         fields: dict[str, Any] = {"kind": (Literal[kind], ...), "params": (model, default)}
         kinds.append(create_model(f"Step_{kind}", __base__=StepFields, __doc__=f"A step of kind {kind}.", **fields))
-    # A union built at run time: the type checker cannot follow, pydantic can.
+    # A union built at run time, which pydantic understands and the type checker does not.
     step = cast(Any, Union)[tuple(kinds)]
     if len(kinds) > 1:
         step = Annotated[step, Field(discriminator="kind")]

@@ -1,4 +1,4 @@
-"""What a protocol must obey beyond the types of its fields; works on plain data, so that every fault is reported."""
+"""Rules for a protocol beyond the types of its fields; on plain data, so that all problems are reported at once."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import cast
 
 from service.core.text.yaml_tree import FieldPath, Plain
 
-# The one list of measures that no protocol may let anybody accept: outside their limits an image or the evidence
-# itself is invalid, which no judgement mends. Measure → what is wrong then.
+# Measures that no protocol may allow anybody to accept: outside their limits an image or the evidence itself is
+# invalid, and no judgement can change that. Measure → what is wrong then.
 NEVER_ACCEPTED: Mapping[str, str] = {
     "settings_departures": "means images taken with other settings than the calibration's",
     "optics_departures": "means images taken through other optics than the calibrated ones",
@@ -20,7 +20,7 @@ NEVER_ACCEPTED: Mapping[str, str] = {
 
 
 def rule_violations(data: dict[str, Plain]) -> Iterator[tuple[FieldPath, str]]:
-    """(field, what is wrong) for a protocol file's data, which may be malformed in any way."""
+    """Yield (field, what is wrong) for the data of a protocol file, which may be malformed in any way."""
     steps = data.get("steps")
     seen: dict[str, int] = {}
     for index, step in enumerate(steps if isinstance(steps, list) else []):

@@ -1,1 +1,1 @@
-"""Frozen records: what a run's events say, what people enter, and the list of an import."""
+"""Frozen records: the events of a run, what people enter, and the file list of an import."""

@@ -1,4 +1,4 @@
-"""What every record is made of: the frozen base, and a reference to a content-addressed file."""
+"""The frozen base class of all records, and the reference to a content-addressed file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class Record(BaseModel):
 
 
 class ArtefactRef(Record):
-    """A content-addressed file, as events refer to it."""
+    """A reference to a content-addressed file, as events hold it."""
 
     sha256: str
     kind: str  # image, raw, board_image, scan, ct_slice, ct_mesh, pose_log, result, report, protocol, rig …

@@ -1,4 +1,4 @@
-"""What people enter in their own words: what a run is for, and notes on its steps. Bounded, and plain text."""
+"""Free text that people enter: what a run is for, and notes on its steps. Plain text of bounded length."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _Text = Annotated[str, Field(max_length=TEXT_CHARACTERS)]
 
 
 class RunAbout(Record):
-    """What a run is of and for, as it was entered when it began; "" for what was not."""
+    """Specimen, purpose and remarks of a run as entered at its start; "" for fields left empty."""
 
     specimen: _Line = ""
     purpose: _Line = ""
     site: _Line = ""
-    operator: _Line = ""  # who works at the rig; who began the run, by account, is in its root
+    operator: _Line = ""  # who works at the rig; the account that began the run is in its first event
     text: _Text = ""
 
 
 class NoteTaken(Record):
-    """Somebody wrote something down on a step, took a photograph of it, or both. It has no effect on the run."""
+    """A person's note on a step: text, a photograph or both. It has no effect on the run."""
 
     kind: Literal["note_taken"] = "note_taken"
     step: str
@@ -38,7 +38,7 @@ class NoteTaken(Record):
     via: Literal["web", "cli"]
 
 
-# Field → what people call it, in the order in which it is shown.
+# Field → its label, in the order shown.
 ABOUT: Mapping[str, str] = {
     "specimen": "Specimen",
     "purpose": "Purpose",
@@ -51,7 +51,7 @@ ABOUT: Mapping[str, str] = {
 def about_run(
     *, specimen: str = "", purpose: str = "", site: str = "", operator: str = "", text: str = ""
 ) -> RunAbout:
-    """What was entered, put in order. Raises ConfigurationError, naming the field, for what is too long."""
+    """Clean up what was entered. Raises ConfigurationError, naming the field, if a text is too long."""
     return RunAbout(
         specimen=line(specimen, "the specimen"),
         purpose=line(purpose, "the purpose"),
@@ -62,25 +62,31 @@ def about_run(
 
 
 def about_rows(about: RunAbout | None) -> list[tuple[str, str]]:
-    """Name and text of each field that was filled in; empty for runs that were recorded without."""
+    """(label, text) of each field that was filled in; empty for a run without them."""
     if about is None:
         return []
     return [(name, value) for field, name in ABOUT.items() if (value := str(getattr(about, field)))]
 
 
 def line(entered: str, what: str) -> str:
-    """One line without control characters. Raises ConfigurationError where it is longer than LINE_CHARACTERS."""
+    """`entered` as one line without control characters.
+
+    Raises ConfigurationError, which calls the text `what`, if it is longer than LINE_CHARACTERS.
+    """
     return _bounded(" ".join(_plain(entered).split()), what, LINE_CHARACTERS)
 
 
 def paragraphs(entered: str, what: str) -> str:
-    """Lines without control characters. Raises ConfigurationError beyond TEXT_CHARACTERS."""
+    """`entered` without control characters, its line breaks kept.
+
+    Raises ConfigurationError, which calls the text `what`, if it is longer than TEXT_CHARACTERS.
+    """
     lines = (" ".join(each.split()) for each in _plain(entered).split("\n"))
     return _bounded("\n".join(lines).strip(), what, TEXT_CHARACTERS)
 
 
 def _plain(entered: str) -> str:
-    # Neither controls (a terminal would obey them) nor halves of characters, which have no canonical form.
+    # No control characters, which a terminal would act on, and no lone surrogates, which have no canonical form.
     lines = entered.replace("\r\n", "\n").replace("\r", "\n")
     return "".join(c if c == "\n" or unicodedata.category(c) not in ("Cc", "Cs") else " " for c in lines)
 
@@ -88,7 +94,7 @@ def _plain(entered: str) -> str:
 def _bounded(text: str, what: str, most: int) -> str:
     if len(text) > most:
         raise ConfigurationError(
-            f"{what} has {len(text)} characters, and {most} at most are recorded",
-            remedy="Say it in fewer words",
+            f"{what} has {len(text)} characters; at most {most} are recorded",
+            remedy="Use fewer words",
         )
     return text

@@ -14,7 +14,7 @@ Matrix4 = tuple[tuple[float, float, float, float], ...]  # T_a_b row-major, metr
 # --- operator ------------------------------------------------------------------------------------------
 
 OperatorVerb = Literal["confirm", "sign", "redo", "skip", "accept", "pause", "resume", "abort"]
-# How the program knows who acted: a secret of the account was asked, or it is a claim (a site without accounts).
+# How the person was identified: by a secret of the account, or only by claim (a site without accounts).
 Identified = Literal["", "claimed", "password", "pin", "badge"]
 
 
@@ -36,7 +36,7 @@ class OperatorAction(Record):
 
 
 class ActionRefused(Record):
-    """An action that the lifecycle or the protocol does not allow now; recorded, without effect."""
+    """An action that the lifecycle or the protocol did not allow; recorded without effect."""
 
     kind: Literal["action_refused"] = "action_refused"
     action: OperatorVerb
@@ -66,16 +66,16 @@ class RunStarted(Record):
 
 
 class HostClock(Record):
-    """How well the host's clock is set; None: not known."""
+    """How well the host's clock is set; None stands for not known."""
 
     source: Literal["chrony", "kernel", ""]
     synchronised: bool | None  # with the network's time
     offset_s: float | None  # host minus network
-    error_s: float | None = None  # at most, as the kernel states it
+    error_s: float | None = None  # the kernel's bound on the error
 
 
 class SessionStarted(Record):
-    """The runner's process started (first start or resume): versions again, and the clocks."""
+    """The runner's process started, for the first time or on resume; records versions and the host's clock."""
 
     kind: Literal["session_started"] = "session_started"
     resumed: bool
@@ -86,7 +86,7 @@ class SessionStarted(Record):
 
 
 class DeviceOpened(Record):
-    """A device answered; `report` is its DeviceReport as plain data."""
+    """A device was opened; `report` is its DeviceReport as plain data."""
 
     kind: Literal["device_opened"] = "device_opened"
     device: str  # name in rig.yaml
@@ -115,7 +115,7 @@ class StepStarted(Record):
 
 
 class StepNote(Record):
-    """Something that a step found out and that the record should hold (station entered, timer started, …)."""
+    """Something a step found out that belongs in the record (station entered, timer started, …)."""
 
     kind: Literal["step_note"] = "step_note"
     step: str
@@ -125,7 +125,7 @@ class StepNote(Record):
 
 
 class FilesKept(Record):
-    """Files that arrived from elsewhere (scanner, CT) or were decoded from such, now in the evidence."""
+    """Files that arrived from a scanner or CT, or were decoded from such files, and are now in the evidence."""
 
     kind: Literal["files_kept"] = "files_kept"
     step: str
@@ -136,12 +136,12 @@ class FilesKept(Record):
 
 
 class View(Record):
-    """What the record holds of every photograph, however it came to be."""
+    """What the record holds for every photograph, whether taken by robot, by hand or imported."""
 
     step: str
     attempt: int
     viewpoint: str  # name of the view, unique within its step
-    station: str  # where a robot stood; "" without one
+    station: str  # of the robot; "" without one
     artefacts: tuple[ArtefactRef, ...]  # the photograph first
     camera: dict[str, Any]  # EXIF settings, counter, time, lens
     environment: dict[str, float] = Field(default_factory=dict)  # light_lux, temperature_c
@@ -149,43 +149,43 @@ class View(Record):
 
 
 class ViewpointCaptured(View):
-    """One exposure of a camera that a robot carried, complete: files, pose, settings, environment."""
+    """One complete exposure of a camera carried by a robot: files, pose, settings, environment."""
 
     kind: Literal["viewpoint_captured"] = "viewpoint_captured"
     T_base_flange: Matrix4  # mean over the exposure
     pose_sigma_m: float  # standard deviation of the position over the exposure
-    pose_sigma_rad: float  # of the rotation vector; early runs recorded that of its length, which is less
+    pose_sigma_rad: float  # of the rotation vector; early runs recorded that of its length, which is smaller
     joints_rad: tuple[float, ...]
     pose_samples: int
     trigger_monotonic_s: float
     arrival_monotonic_s: float
     controller_time_s: float
     clock_offset_s: float  # controller time minus host monotonic
-    ringing_s: float = 0.0  # for which the arm swung after the commanded motion: a loose mount shows here
+    ringing_s: float = 0.0  # how long the arm swung after the commanded motion; a loose mount shows here
 
 
 class ViewImported(View):
-    """One photograph that was captured earlier. How is not in evidence: only when and by whom it was imported."""
+    """One photograph that was captured earlier. The record proves only when and by whom it was imported."""
 
     kind: Literal["view_imported"] = "view_imported"
     imported_by: str
     file_name: str  # within the imported folder
-    modified_utc: str  # of the file, as the file system has it
+    modified_utc: str  # modification time in the file system
 
 
 class ViewHeld(View):
-    """One exposure of a camera in a person's hands. Where it was the image itself tells, in the worker's answer."""
+    """One exposure of a hand-held camera. The worker estimates its pose from the image (its answer to the job)."""
 
     kind: Literal["view_held"] = "view_held"
-    # By the camera's own button, or by the software for a press on a screen or the pedal; or the image was found as a
-    # file: the software was not there, and knows no more than what the file says.
+    # `camera`: its own button; `screen`, `pedal`: the software released it. `elsewhere`: the image was found as a
+    # file, and only what the file says is known.
     released_by: Literal["camera", "screen", "pedal", "elsewhere"]
     found_at: str = ""  # path of that file
     arrival_monotonic_s: float
 
 
 class CaptureAsked(Record):
-    """A person at a screen asks the step that works for a release of the shutter, or to end with what it has."""
+    """A person at a screen asks the running step to release the shutter, or to finish with the images it has."""
 
     kind: Literal["capture_asked"] = "capture_asked"
     step: str
@@ -202,15 +202,15 @@ class ViewpointFailed(Record):
     viewpoint: str
     error: str
     message: str
-    skipped: bool = False  # given up, goes on with the next (a deviation)
+    skipped: bool = False  # given up, and the step continues with the next one (a deviation)
 
 
 class Uncertainty(Record):
     """How well a measured number is known, in the number's own unit."""
 
     sigma: float  # standard deviation
-    lower: float  # the true number is larger with 99 %
-    upper: float  # the true number is smaller with 99 %
+    lower: float  # the true value is above this with 99 % confidence (one-sided)
+    upper: float  # the true value is below this with 99 % confidence (one-sided)
 
 
 class StepMeasured(Record):
@@ -237,7 +237,7 @@ class StepFailed(Record):
 
 
 class StepRetried(Record):
-    """The recovery policy tries the step again without asking (recovering → running)."""
+    """A step is tried again, by the recovery policy or on the operator's confirmation (recovering → running)."""
 
     kind: Literal["step_retried"] = "step_retried"
     step: str
@@ -249,7 +249,7 @@ class GateVerdict(Record):
     """One measured number against its limit."""
 
     measure: str
-    value: float | None  # None when the step did not measure it: a fail
+    value: float | None  # None if the step did not measure it, which fails the gate
     minimum: float | None
     maximum: float | None
     unit: str
@@ -257,7 +257,7 @@ class GateVerdict(Record):
     sigma: float | None = None  # of the value, where it states its uncertainty
     lower: float | None = None
     upper: float | None = None
-    undecided: bool = False  # neither bound decides; `passed` is false then
+    undecided: bool = False  # a limit lies between the bounds; `passed` is then false
 
 
 class GatesEvaluated(Record):
@@ -307,7 +307,7 @@ class JobFinished(Record):
     artefacts: tuple[ArtefactRef, ...] = ()
     result: dict[str, Any] = Field(default_factory=dict)
     duration_s: float
-    late_s: float | None = None  # after the specimen's release, or the run's end where nothing is released
+    late_s: float | None = None  # after the specimen's release, or the run's end; None: in time
 
 
 class JobFailed(Record):
@@ -321,14 +321,14 @@ class JobFailed(Record):
     worker: str
     error: str
     message: str
-    traceback: str = ""  # of an error that nobody had foreseen
+    traceback: str = ""  # only of an unexpected error
 
 
 # --- people --------------------------------------------------------------------------------------------------
 
 
 class ItemTicked(Record):
-    """A checklist item marked done, or not done after all, on the screen; every screen shows the same."""
+    """A checklist item was ticked or unticked on a screen; all screens show the same ticks."""
 
     kind: Literal["item_ticked"] = "item_ticked"
     step: str
@@ -338,7 +338,7 @@ class ItemTicked(Record):
 
 
 class ControlTaken(Record):
-    """From here on one screen alone may act on the run; the others look on."""
+    """From now on only one screen may act on the run; the others may only watch."""
 
     kind: Literal["control_taken"] = "control_taken"
     screen: str  # name of the sign-in whose screen it is; "" when control was given back
@@ -348,7 +348,7 @@ class ControlTaken(Record):
 
 
 class RecordCorrected(Record):
-    """A value of an earlier event was wrong. The original stays; readers see both."""
+    """A value of an earlier event is corrected. The original stays, and readers see both."""
 
     kind: Literal["record_corrected"] = "record_corrected"
     of_seq: int
@@ -377,7 +377,7 @@ class EvidenceExported(Record):
     head_sha256: str  # of the chain when it was made
 
 
-# --- the site: what happens outside of runs, in a chain of its own -----------------------------------------------
+# --- the site: events outside runs, in a chain of their own -------------------------------------------------------
 
 
 class SiteOpened(Record):
@@ -388,7 +388,7 @@ class SiteOpened(Record):
 
 
 class ServiceStarted(Record):
-    """A web process came up: what changed since the last time, and what is open."""
+    """A web process started: what has changed since the last start, and which runs are open."""
 
     kind: Literal["service_started"] = "service_started"
     host: str
@@ -398,14 +398,14 @@ class ServiceStarted(Record):
     changed: dict[str, tuple[str, str]]  # distribution or file → before, now ("" for none)
     configuration: dict[str, str]  # rig and protocol files → SHA-256
     boot: str  # boot id, "" where the system has none
-    clock_jump_s: float | None  # UTC against monotonic since the last start of this boot; None: cannot be told
+    clock_jump_s: float | None  # UTC against monotonic since the last start of this boot; None: not known
     heads: dict[str, tuple[int, str]]  # run → number and hash of its last event, where it grew since the last start
     unsigned_runs: tuple[str, ...]  # with events after their last checkpoint
     open_runs: tuple[str, ...]
 
 
 class AccountChanged(Record):
-    """An account was made or changed; secrets are never in it."""
+    """An account was made or changed; the event never holds a secret."""
 
     kind: Literal["account_changed"] = "account_changed"
     account: str
@@ -413,8 +413,8 @@ class AccountChanged(Record):
     old: str
     new: str
     reason: str = ""
-    full_name: str = ""  # of an account that is made
-    # password_hash, pin_hash, badge_hash, token_sha256 → SHA-256 of it: a secret put in past the software shows.
+    full_name: str = ""  # of a new account
+    # password_hash, pin_hash, badge_hash, token_sha256 → its SHA-256, which shows a secret not set by the software.
     stored: dict[str, str] = Field(default_factory=dict)
 
 
@@ -426,11 +426,11 @@ class SignInRecorded(Record):
     outcome: Literal["signed_in", "refused", "locked_out", "signed_out", "screen_locked", "screen_unlocked", "ended"]
     screen: str = ""
     address: str = ""
-    session_sha256: str = ""  # of what is stored of the sign-in: one put in past the software shows
+    session_sha256: str = ""  # of the stored session, which shows one not made by the software
 
 
 class KeyChanged(Record):
-    """The key that signs checkpoints was made, or replaced by another."""
+    """The key that signs checkpoints was made or replaced."""
 
     kind: Literal["key_changed"] = "key_changed"
     key_id: str  # SHA-256 of the raw public key
@@ -440,14 +440,14 @@ class KeyChanged(Record):
 
 
 class LeftoversRemoved(Record):
-    """Files to which no record refers, left over from crashes, were removed."""
+    """Files left over from crashes, to which no record refers, were removed."""
 
     kind: Literal["leftovers_removed"] = "leftovers_removed"
     files: dict[str, int]  # path within the data folder → bytes
 
 
 class RunSigned(Record):
-    """A run's chain was signed up to an event: written down here as well, at once."""
+    """A run's chain was signed up to an event; recorded in the same transaction in the site's chain."""
 
     kind: Literal["run_signed"] = "run_signed"
     run: str
@@ -456,7 +456,7 @@ class RunSigned(Record):
 
 
 class TimeStampKept(Record):
-    """An authority elsewhere said when a checkpoint existed: one that is taken away is missed."""
+    """A time-stamp authority stamped a checkpoint; this event shows if the stamp is removed later."""
 
     kind: Literal["time_stamp_kept"] = "time_stamp_kept"
     run: str
@@ -467,7 +467,7 @@ class TimeStampKept(Record):
 
 
 class ActionAfterEnd(Record):
-    """Somebody wanted something of a run that had ended; without effect, and no part of the run, which is sealed."""
+    """An action on a run that had ended. It has no effect and is not in the run's own chain, which is sealed."""
 
     kind: Literal["action_after_end"] = "action_after_end"
     run: str
@@ -477,25 +477,25 @@ class ActionAfterEnd(Record):
 
 
 class ProtocolApproved(Record):
-    """A person lets runs be made by a protocol: by these bytes and no others."""
+    """A person approved a protocol for runs: exactly these bytes."""
 
     kind: Literal["protocol_approved"] = "protocol_approved"
     protocol: str  # its id
     version: str
     sha256: str
-    source: str  # the file's text: what another content under the same id and version is held against
-    instead_of: str = ""  # SHA-256 of such a content, approved before, whose place it takes
-    reason: str = ""  # needed for that
+    source: str  # the file's text, to compare with other content of the same id and version
+    instead_of: str = ""  # SHA-256 of the content approved before under this id and version, which it replaces
+    reason: str = ""  # required for a replacement
     identified: Identified = ""
 
 
 class DataRestored(Record):
-    """This data folder was made from a backup: what was recorded after it, in the folder of then, is not here."""
+    """This data folder was restored from a backup; what was recorded after the backup is not in it."""
 
     kind: Literal["data_restored"] = "data_restored"
     state: str  # name of the backup's state
     at_utc: str  # when the backup was made
-    folder: str  # of which it was made
+    folder: str  # the data folder that was backed up
     host: str
 
 
@@ -503,14 +503,14 @@ class DataRestored(Record):
 
 
 class RunCompleted(Record):
-    """Every step passed or was skipped by the protocol's leave."""
+    """Every step passed or was skipped."""
 
     kind: Literal["run_completed"] = "run_completed"
     deviations: int
 
 
 class RunAborted(Record):
-    """A person, or a step's recovery policy, ended the run; what was captured stays."""
+    """A person or a step's recovery policy ended the run early; what was captured stays."""
 
     kind: Literal["run_aborted"] = "run_aborted"
     reason: str
@@ -573,7 +573,7 @@ class Event(Record):
     run_id: str
     at_utc: str  # ISO 8601 with microseconds and Z
     monotonic_s: float
-    actor: str  # person, or device, or process
+    actor: str  # person, device or process
     payload: Payload
     previous_sha256: str  # 64 zeros for the root
     sha256: str

@@ -1,4 +1,4 @@
-"""The list of an import: every file that was brought, with its hash, and what was left out and why."""
+"""The file list of an import: every imported file with its hash, and what was left out and why."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FileRole = Literal["scan", "control_scan", "ct"]
 
 
 class ImportedFile(Record):
-    """One file as it was when it was listed. `path` is within the import's folder, or absolute outside of it."""
+    """One file as it was when listed. `path` is relative to the import's folder, or absolute if outside it."""
 
     path: str
     sha256: str
@@ -22,7 +22,7 @@ class ImportedFile(Record):
 
 
 class ImportedView(Record):
-    """One photograph with the raw files of the same exposure, and what it says of itself."""
+    """One photograph with the raw files of the same exposure and its metadata."""
 
     name: str
     role: PhotographRole
@@ -39,7 +39,7 @@ class LeftOutFile(Record):
 
 
 class ImportList(Record):
-    """What an import consists of. The same folder gives the same list: it names a run that was interrupted."""
+    """What an import consists of. The same folder gives the same list, which identifies an interrupted import."""
 
     folder: str
     views: tuple[ImportedView, ...]
@@ -47,11 +47,11 @@ class ImportList(Record):
     left_out: tuple[LeftOutFile, ...] = ()
 
     def of(self, role: PhotographRole) -> tuple[ImportedView, ...]:
-        """The photographs of one kind, in order."""
+        """The photographs with this role, in order."""
         return tuple(view for view in self.views if view.role == role)
 
     def holds(self, role: PhotographRole | FileRole) -> bool:
-        """Whether anything of this kind was brought."""
+        """Whether the list has anything with this role."""
         return any(view.role == role for view in self.views) or any(name == role for name in self.files)
 
     def all_files(self) -> tuple[ImportedFile, ...]:
@@ -60,9 +60,9 @@ class ImportList(Record):
         return (*photographs, *(file for files in self.files.values() for file in files))
 
     def check(self, path: str, sha256: str) -> ImportedFile:
-        """The list's entry of a file that is being imported.
+        """The list's entry for a file that is being imported.
 
-        Raises DataError when the list does not hold it, or when its bytes are not those that were listed.
+        Raises DataError if the file is not in the list, or if its bytes have changed since it was listed.
         """
         found = next((file for file in self.all_files() if self.absolute(file) == path), None)
         if found is None:
@@ -78,11 +78,11 @@ class ImportList(Record):
         return found
 
     def absolute(self, file: ImportedFile) -> str:
-        """Where a file lies."""
+        """The absolute path of a file."""
         return file.path if file.path.startswith("/") else f"{self.folder}/{file.path}"
 
 
 def imported_sentence(at_utc: str, by: str) -> str:
-    """What every reader of an imported run is told first."""
+    """The sentence with which every page and report on an imported run begins."""
     when = f"{at_utc[:16].replace('T', ' ')} UTC"
     return f"The photographs were imported on {when} by {by}; how the images were captured is not in evidence"

@@ -1,1 +1,1 @@
-"""What can be done about a failed step: the policy, the choices of a person, and their words."""
+"""What can be done about a failed step: the recovery policy, the operator's choices, and their words."""

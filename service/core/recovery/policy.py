@@ -8,11 +8,11 @@ from service.core.protocol.models import Recovery
 
 Policy = Literal["retry", "ask", "abort"]
 
-# Names, not classes: core does not know the drivers, and the events hold names.
-# Passing troubles: the same call may succeed in a moment. (A camera that stays busy has been waited for already.)
+# Names instead of classes, because core does not know the drivers and the events hold names.
+# Transient errors: the same call may succeed in a moment. (The driver has already waited for a busy camera.)
 PASSING = frozenset({"DeviceUnavailableError", "DeviceTimeoutError", "StaleImageError"})
-# Only a person at the table can put these right, whatever the protocol says.
-# (a damaged file of the evidence is put back from a copy; what is read again is checked against its hash again).
+# Only a person can put these right, whatever the protocol says. (A damaged file of the evidence is restored from a
+# copy; it is checked against its hash when it is read again.)
 NEEDS_A_PERSON = frozenset(
     {
         "SafetyStopError",
@@ -31,7 +31,7 @@ def recovery_policy(recovery: Recovery, error: str, failures: int) -> Policy:
     Args:
         recovery: the step's policy from the protocol.
         error: class name of the error that ended the work.
-        failures: how often the step has failed in a row, this failure included (StepState.failures + 1).
+        failures: consecutive failures of the step, including this one (StepState.failures + 1).
     """
     if error in NEEDS_A_PERSON:
         return "ask"

@@ -1,4 +1,4 @@
-"""Reasons that are offered where one is asked for: gloves write badly, and the same words can be counted later."""
+"""Preset reasons for a redo, a skip or an acceptance: typing in gloves is hard, and equal words can be counted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _Text = Annotated[str, Field(min_length=3, max_length=200)]
 
 
 class Reasons(Record):
-    """Of a protocol, by what is done; free words beside them are always possible. What is recorded is the text."""
+    """A protocol's preset reasons by action. Free text can always be added, and the full text is recorded."""
 
     # Offered for a redo.
     redo: tuple[_Text, ...] = (
@@ -38,5 +38,5 @@ class Reasons(Record):
 
 
 def full_reason(preset: str, own: str) -> str:
-    """What is recorded: the reason that was chosen, and what was written beside it."""
+    """The reason that is recorded: the chosen preset, then the operator's own words."""
     return ": ".join(part for part in (preset.strip(), own.strip()) if part)

@@ -1,4 +1,4 @@
-"""What can be done now about a step that fell short, failed or cannot begin: choices with their cost and loss."""
+"""The operator's choices when a step is outside its limits, failed or cannot begin, with their time and loss."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from service.core.run.actions import redo_refusal, skip_refusal, unmet_requireme
 from service.core.run.state import RunState, StepState
 from service.core.run.state_transitions import seconds_between
 
-_WITH_WHAT_IS_THERE = "Judge it again by the images that are there; single ones are taken again on the page Capture"
+_WITH_WHAT_IS_THERE = "Judge it again with the existing images; single images are taken again on the page Capture"
 Trouble = Literal["gates", "failure", "requirements"]
 
 
 @dataclass(frozen=True, slots=True)
 class WayOn:
-    """One choice. The first of a list that is available is the recommended one."""
+    """One choice. The first available one of a list is recommended."""
 
     verb: OperatorVerb
-    step: str  # that it is about
+    step: str  # the step concerned
     words: str
-    minutes: float | None  # what it takes; None: not known before it is done
-    loses: str
+    minutes: float | None  # how long it takes; None if not known in advance
+    loses: str  # what no longer counts afterwards, in words
     available: bool = True
     why_not: str = ""
 
 
 def trouble_of(protocol: Protocol, state: RunState) -> Trouble | None:
-    """What the current step is stopped by; None while nothing stops it."""
+    """What stops the current step; None while nothing does."""
     if not state.started or state.terminal:
         return None
     if state.phase == "recovering" and not state.step.retry_granted:
@@ -46,9 +46,9 @@ def trouble_of(protocol: Protocol, state: RunState) -> Trouble | None:
 
 
 def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
-    """Every way on from where the run is stopped, those that can be taken first; empty while nothing stops it.
+    """Every way on for a stopped run, the available ones first; empty while nothing stops it.
 
-    Ending the run is always among them and always last: what is recorded stays whole.
+    Ending the run is always available and is the last of the available ones.
     """
     trouble = trouble_of(protocol, state)
     if trouble is None:
@@ -69,19 +69,19 @@ def ways_on(protocol: Protocol, state: RunState) -> tuple[WayOn, ...]:
 
 
 def planned_views(step: Step) -> int:
-    """How many images the protocol plans in a step."""
+    """Number of images that the protocol plans for a step."""
     return sum(int(one.count) for one in planned_sets(step))
 
 
 def planned_sets(step: Step) -> tuple[Any, ...]:
-    """Sets of viewpoints, or the board poses that the software plans: each has a count and a station."""
+    """A step's sets of viewpoints and the board poses that the software plans; each has `count` and `station`."""
     planned = getattr(step.params, "board_poses", None)
     listed: tuple[Any, ...] = getattr(step.params, "viewpoints", ()) or ()
     return listed if planned is None else (*listed, planned)
 
 
 def view_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
-    """Seconds that one view takes: as this run's took, else as the arm's plan says; None: neither is known."""
+    """Seconds for one view: the median of this run's, else from the arm's plan; None if neither is known."""
     if state.view_gaps_s:
         return median(state.view_gaps_s)
     plans = [n.data for n in state.steps[step.id].notes if "estimated_s" in n.data and n.data.get("views")]
@@ -91,7 +91,7 @@ def view_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
 
 
 def takes_words(minutes: float | None) -> str:
-    """`about 12 min`: for people."""
+    """A duration in words, such as `about 12 min`."""
     if minutes is None:
         return "not known"
     if minutes == 0:
@@ -99,7 +99,7 @@ def takes_words(minutes: float | None) -> str:
     return "under a minute" if minutes < 1 else f"about {minutes:.0f} min"
 
 
-# --- one function a verb -----------------------------------------------------------------------------------
+# --- one function per verb ---------------------------------------------------------------------------------
 
 
 def _again(protocol: Protocol, state: RunState, trouble: Trouble) -> WayOn:
@@ -120,12 +120,12 @@ def _again(protocol: Protocol, state: RunState, trouble: Trouble) -> WayOn:
 
 
 def _computing(worked_s: float | None, views: int, each_s: float | None) -> float | None:
-    """Minutes of what is computed from the views once they are there."""
+    """Minutes of computing after the views are taken: the work so far less the time for `views`."""
     return None if worked_s is None or each_s is None else max(worked_s - views * each_s, each_s) / 60
 
 
 def _all_taken(step: Step, now: StepState) -> bool:
-    """Every view is there and the step knows no further one: trying again changes no figure."""
+    """Whether every planned view is taken and the step suggests no others: a retry would change no figure."""
     return not now.mend and 0 < planned_views(step) <= len(now.captured)
 
 
@@ -134,7 +134,7 @@ def _again_of(step: Step) -> Again:
 
 
 def _redos(protocol: Protocol, state: RunState, step: Step) -> list[WayOn]:
-    """This step afresh, and the earlier steps whose results it uses: what gives other figures first, the nearest."""
+    """Redo this step or an earlier one that it uses: first those that change the figures, then the nearest."""
     used = sorted(used_steps(protocol, step), key=protocol.index, reverse=True)
     used.sort(key=lambda name: _again_of(protocol.step(name)).same and not protocol.step(name).irreversible)
     begun = [name for name in used if state.steps[name].phase != "pending"]
@@ -143,7 +143,7 @@ def _redos(protocol: Protocol, state: RunState, step: Step) -> list[WayOn]:
 
 
 def _together(ways: Iterable[WayOn]) -> Iterator[WayOn]:
-    """What is refused for one and the same reason, as one line."""
+    """Merge neighbouring ways that are refused for the same reason into one."""
     for _, group in groupby(ways, key=lambda way: way.why_not):
         first, *others = group
         yield replace(first, words=", ".join([first.words, *(way.words.split(": ", 1)[-1] for way in others)]))
@@ -169,14 +169,14 @@ def _redo(protocol: Protocol, state: RunState, target: str) -> WayOn:
 def _accept(protocol: Protocol, state: RunState) -> WayOn:
     step, refusal = protocol.step(state.current), acceptance_refusal(protocol, state)
     rest = [protocol.step(name).title for name in dependent_steps(protocol, step.id)]
-    says = f" These say that they depend on it: {', '.join(rest)}." if rest else ""
+    says = f" The results of these will say that they depend on it: {', '.join(rest)}." if rest else ""
     role = demanded_role(protocol, state) or "supervisor"
     return WayOn(
         "accept",
         step.id,
         f"Accept the figures as they are: a {role} signs, with a reason",
         1.0,
-        f"The figures stay outside their limits, a deviation that every reader is told of first.{says}",
+        f"The figures stay outside their limits: a deviation that every report states first.{says}",
         refusal is None,
         "" if refusal is None else refusal.what,
     )
@@ -191,7 +191,7 @@ def _skip(protocol: Protocol, state: RunState) -> WayOn:
     lost = ["Its result does not count"]
     lost += [f"These cannot begin: {', '.join(blocked)}"] if blocked else []
     lost += [f"Not judged later: {', '.join(dict.fromkeys(unjudged))}"] if unjudged else []
-    lost += [f"These do without it, as far as they can: {', '.join(using)}"] if using else []
+    lost += [f"These go on without it, as far as they can: {', '.join(using)}"] if using else []
     why_not = "" if refusal is None else refusal.what
     return WayOn("skip", step.id, "Go on without this step", 0.0, ". ".join(lost) + ".", refusal is None, why_not)
 
@@ -200,17 +200,17 @@ def _end(protocol: Protocol, state: RunState) -> WayOn:
     left = [s.title for s in protocol.steps if state.steps[s.id].phase != "passed"]
     undone = f"{left[0]}, and {len(left) - 1} later steps" if len(left) > 2 else ", ".join(left)
     loses = (
-        "Nothing that is recorded: it is sealed, and can be read, verified, reported and given away. "
+        "Nothing that is recorded: it is sealed and can be read, verified, reported and exported. "
         f"Not done: {undone}. The run cannot go on."
     )
     return WayOn("abort", state.current, "End the run here and keep what there is", 0.0, loses)
 
 
-# --- what things take ------------------------------------------------------------------------------------------
+# --- durations -------------------------------------------------------------------------------------------------
 
 
 def _took_s(protocol: Protocol, state: RunState, step: Step) -> float | None:
-    """What a step took in this run; for views that are still to be taken, as long as one takes."""
+    """Seconds for doing a step: estimated from the time per view, else what it took in this run; None: not known."""
     now = state.steps[step.id]
     each_s, views = view_s(protocol, state, step), planned_views(step)
     if views and each_s is not None:

@@ -1,4 +1,4 @@
-"""The words of the ways on: what doing a kind of step again means, and what to do about each class of error."""
+"""Words for the ways on: what repeating each kind of step means, and what to do about each class of error."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Again:
-    """What trying a kind of step again does after its figures were outside their limits.
+    """What trying a kind of step again means after its figures were outside their limits.
 
     Attributes:
         words: what to do, and what happens then.
-        same: it gives the same figures as long as nothing that it rests on is done again.
-        device: whether a device can fail in it.
-        computes: whether a computation can fail in it.
+        same: whether it gives the same figures unless a step it depends on is done again.
+        device: whether a device can fail during the step.
+        computes: whether a computation can fail during the step.
     """
 
     words: str
@@ -25,44 +25,44 @@ class Again:
 
 OTHERWISE = Again("Put right what the figures show, then try this step again")
 AGAIN: Mapping[str, Again] = {
-    "checklist": Again("Do what is open, tick it, and confirm again", device=False, computes=False),
+    "checklist": Again("Do the open items, tick them, and confirm again", device=False, computes=False),
     "layout_check": Again("Move the spheres as it says, then take another photograph"),
-    "ct_import": Again("Put another series into the CT folder and import that"),
+    "ct_import": Again("Put another series into the CT folder and import it"),
     "calibration": Again("Take the board images that are missing and compute again; the others are kept"),
     "viewpoint_capture": Again("Take the views that are missing or would help; the others are kept"),
     "manual_capture": Again("Take the images that are missing or would help; the others are kept"),
-    "scan_import": Again("Scan again, export it, and import that"),
+    "scan_import": Again("Scan again, export the scan, and import it"),
     "timed_application": Again(
-        "Count it as it is; the clock of the coat runs on", same=True, device=False, computes=False
+        "Judge it again as it is; the time since the coating runs on", same=True, device=False, computes=False
     ),
     "registration": Again("Compute it again; the same images give the same figures", same=True, device=False),
     "evaluation": Again("Compute it again; the same registration gives the same figures", same=True, device=False),
 }
 
-# Class of an error → what a person does before trying again. Every class of drivers/errors.py has a line.
+# Error class → what a person does before trying again. Every class in drivers/errors.py has an entry.
 REMEDIES: Mapping[str, str] = {
-    "DeviceError": "Look at the device",
-    "DeviceUnavailableError": "Look whether the device is switched on and its cable or network is in place",
-    "DeviceTimeoutError": "Look whether the device is awake, or the file it waits for has arrived",
-    "DeviceBusyError": "Wait until the device has finished what it does",
+    "DeviceError": "Check the device",
+    "DeviceUnavailableError": "Check that the device is switched on and its cable or network is connected",
+    "DeviceTimeoutError": "Check that the device is awake, or that the expected file has arrived",
+    "DeviceBusyError": "Wait until the device has finished what it is doing",
     "DeviceRefusedError": "Set the device as the message says",
-    "DeviceFaultError": "Switch the device off and on; put another one in its place if it stays so",
-    "DeviceStorageFullError": "Make room where the device stores its data, or put in another card",
-    "SafetyStopError": "Look at the robot and the people around it, then clear the stop at the robot",
-    "LeaveNeededError": "Look whether the robot stands as it should and nobody is in reach",
-    "UnreachablePoseError": "Move what stands in the way, or the robot's foot, so that it reaches the pose",
+    "DeviceFaultError": "Switch the device off and on; replace it if the fault remains",
+    "DeviceStorageFullError": "Make room where the device stores its data, or insert another card",
+    "SafetyStopError": "Check the robot and the people around it, then clear the stop at the robot",
+    "LeaveNeededError": "Check that the robot stands as it should and nobody is within its reach",
+    "UnreachablePoseError": "Move the obstacle, or the robot's base, so that the robot can reach the pose",
     "ReleasedElsewhereError": "Press the camera's own button, or connect a camera that the software can release",
-    "StaleImageError": "Look at the camera: it delivered an earlier image instead of a new one",
-    "UnreadableFileError": "Export the file again, or another one",
-    "IncompleteExportError": "Wait until the export has ended, or export it again with all its files",
+    "StaleImageError": "Check the camera: it delivered an earlier image instead of a new one",
+    "UnreadableFileError": "Export the file again, or use another one",
+    "IncompleteExportError": "Wait until the export has ended, or export again with all files",
     "DriverMissingError": "Install the driver that the message names",
-    "DataError": "Put in another file; this one cannot be used",
-    "ImagesSpoiltError": "Clean the lens, and look whether its cap is off and the light is on",
+    "DataError": "Use another file; this one cannot be used",
+    "ImagesSpoiltError": "Clean the lens, and check that its cap is off and the light is on",
     "ComputeError": "Put right what the message names, or take what is missing",
     "ConfigurationError": "Put right what the message names",
     "ProtocolError": "Put right what the message names",
-    "StoreError": "Look at the disk that holds the evidence: room, cable, permissions",
+    "StoreError": "Check the disk that holds the evidence: free space, cable, permissions",
     "SpaceShortError": "Make room on the disk of the data folder, as the message says",
-    "IntegrityError": "Put the damaged file back from a copy: what is read is checked against its hash",
+    "IntegrityError": "Restore the damaged file from a copy; it is checked against its hash when it is read",
 }
 UNKNOWN_REMEDY = "Put right what the message names"

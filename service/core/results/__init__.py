@@ -1,1 +1,1 @@
-"""The registrations of a run: which it has, which is its own, and which came late."""
+"""The registrations of a run: which there are, which one is the run's own, and which arrived late."""

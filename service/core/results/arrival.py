@@ -1,4 +1,4 @@
-"""Which results came in time: a result may arrive after the specimen's release, and then says so."""
+"""Which results arrived in time; a result that arrives after the specimen's release says so."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from datetime import datetime
 from service.core.protocol.models import Protocol
 from service.core.run.state import RunState
 
-_ANSWERS = ("registration", "evaluation")  # kinds of the steps whose results a release rests on
+_ANSWERS = ("registration", "evaluation")  # kinds of the steps whose results a release depends on
 
 
 def released_utc(protocol: Protocol, state: RunState) -> str:
-    """When what the registration shows could no longer be measured again; "" before that.
+    """When the specimen was released, so that nothing can be measured again (ISO 8601, UTC); "" before that.
 
-    That is when the first irreversible step that requires a registration or an evaluation has passed, or else the
-    end of the run.
+    That is when the first irreversible step that requires a registration or an evaluation passed, or else the end of
+    the run.
     """
     for step in protocol.steps:
         rests = any(protocol.step(name).kind in _ANSWERS for name in step.requires)
@@ -24,7 +24,7 @@ def released_utc(protocol: Protocol, state: RunState) -> str:
 
 
 def late_s(protocol: Protocol, state: RunState, now_utc: str) -> float | None:
-    """How long after the release a result arrives; None: in time."""
+    """Seconds from the release to a result that arrives at `now_utc`; None if it is in time."""
     released = released_utc(protocol, state)
     if not released:
         return None
@@ -32,6 +32,6 @@ def late_s(protocol: Protocol, state: RunState, now_utc: str) -> float | None:
 
 
 def late_words(seconds: float) -> str:
-    """`arrived 12 min after the release`."""
+    """A delay in words, such as `arrived 12 min after the release`."""
     minutes = round(seconds / 60)
     return f"arrived {minutes} min after the release" if minutes else "arrived after the release"

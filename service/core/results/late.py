@@ -1,7 +1,7 @@
-"""Results that came after the evaluation was made, and what they changed in its table: for every reader of a run.
+"""Results that arrived after the evaluation, and what they add to its table.
 
-A registration that arrives later never takes the place of the run's own (registrations.py); that it came,
-when, and whether it is better is told all the same.
+A registration that arrives late never replaces the run's own (registrations.py). Every reader is still told that it
+arrived, when, and whether it is better.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from service.core.run.state import RunState
 
 @dataclass(frozen=True, slots=True)
 class LateResult:
-    """One row of the evaluation's table that was not there when the evaluation was made."""
+    """One row of the evaluation's table that arrived after the evaluation was made."""
 
-    seq: int  # of the event with which it came
+    seq: int  # of the event that brought it
     at_utc: str
     step: str
     name: str  # of the registration
@@ -26,7 +26,7 @@ class LateResult:
 
 
 def late_results(protocol: Protocol, state: RunState) -> list[LateResult]:
-    """All, in the order in which they came."""
+    """Every late result of a run, in order of arrival; empty before the evaluation."""
     own = own_registration(protocol, state)
     before = signed_rows(protocol, state)
     if own is None:

@@ -1,7 +1,7 @@
-"""The registrations of a run and their evaluations, whenever they arrived, and which of them is the run's own.
+"""The registrations of a run and their evaluations, early or late, and which of them is the run's own.
 
-The run's own registration is the one with the smallest error on the control spheres among those that the
-evaluation step judged: that is what was signed, and by what the specimen was released. One that arrives later may be
+The run's own registration has the smallest error on the control spheres among those that the evaluation step judged:
+it was signed, and the specimen was released on it. One that arrives later may be better; it is reported as well and
 better; it is reported beside it and does not take its place. Pages, report, exports and audit all go by this rule.
 Before the evaluation, what is shown goes by each registration's own prediction (`best_registration`).
 """
@@ -20,13 +20,13 @@ Row = Mapping[str, Any]
 
 
 def last_result(protocol: Protocol, state: RunState, kind: str) -> Mapping[str, Any]:
-    """The Result of the last step of a kind that has one; empty if there is none."""
+    """The Result, as plain data, of the last step of this kind that has one; empty if there is none."""
     results = (state.steps[step.id].result for step in reversed(protocol.steps) if step.kind == kind)
     return next((result for result in results if result), {})
 
 
 def registration_name(record: Mapping[str, Any]) -> str:
-    """`colmap`, or `colmap_1920x1080` of images reduced to that size."""
+    """The name of a registration record: `colmap`, or `colmap_1920x1080` for images reduced to that size."""
     if record.get("full_camera") is None:
         return str(record["poses"])
     camera = record["camera"]
@@ -34,7 +34,7 @@ def registration_name(record: Mapping[str, Any]) -> str:
 
 
 def registrations(protocol: Protocol, state: RunState) -> dict[str, Mapping[str, Any]]:
-    """Every registration by its name: those of the step's result, then those that came after it."""
+    """Every registration record by its name: those in the step's result, then those that arrived later."""
     found = dict(last_result(protocol, state, "registration").get("registrations", {}))
     for _, job in _finished(protocol, state, "registration", "register") if found else ():
         found.setdefault(registration_name(job.result), job.result)
@@ -42,7 +42,7 @@ def registrations(protocol: Protocol, state: RunState) -> dict[str, Mapping[str,
 
 
 def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
-    """The paper's table, whenever a row arrived; `late` of a row is "" where the evaluation itself had it."""
+    """All rows of the paper's table; `late` says when a late row arrived, and is "" for a row of the evaluation."""
     rows: list[Row] = [{**row, "late": ""} for row in signed_rows(protocol, state)]
     known = {row["poses"] for row in rows}
     for _, job in later_evaluations(protocol, state) if rows else ():
@@ -51,19 +51,19 @@ def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
 
 
 def arrived(job: JobState) -> str:
-    """`arrived 12 min after the release`, or `arrived after the evaluation` where nothing was released by then."""
+    """`arrived 12 min after the release`, or `arrived after the evaluation` if nothing had been released yet."""
     return "arrived after the evaluation" if job.late_s is None else late_words(job.late_s)
 
 
 def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:
-    """What the agreement of some rows of the table does not show; "" where no two of them have that in common.
+    """A note that some rows share one adjustment, so their agreement confirms nothing; "" without two such rows.
 
-    Incremental and global mapping and the triangulation each see a share of the tracks and give poses to begin with;
-    the model that counts is one adjustment of all tracks from there (service/compute/poses/sfm/mapping.py).
+    Incremental mapping, global mapping and triangulation each give initial poses from part of the tracks; the final
+    model is one bundle adjustment of all tracks from there (service/compute/poses/sfm/mapping.py).
     """
     if not any(
         job.kind == "structure_from_motion"
-        and "features" in job.arguments  # of runs that were recorded before: not so
+        and "features" in job.arguments  # absent in older runs, which shared nothing
         for step in state.steps.values()
         for job in step.jobs.values()
     ):
@@ -75,11 +75,11 @@ def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:
     if not shared:
         return ""
     return (
-        f"{'; '.join(shared)} come from the same features and matches and end in the same adjustment of all of them; "
-        "they differ in the poses that it begins with. That they agree shows that the result does not depend on "
-        "where it begins. They are one measurement, and do not confirm each other"
+        f"{'; '.join(shared)} come from the same features and matches and end in the same bundle adjustment; they "
+        "differ only in its initial poses. Their agreement shows that the result does not depend on them. They are "
+        "one measurement and do not confirm each other"
         + (
-            "; hybrid goes on from one of them, with the robot's poses and the spheres"
+            "; hybrid starts from one of them and adds the robot's poses and the spheres"
             if any(row["source"] == "hybrid" for row in rows)
             else ""
         )
@@ -95,7 +95,7 @@ def _sizes(rows: Iterable[Row]) -> list[str]:
 
 
 def budgets(protocol: Protocol, state: RunState) -> dict[str, Mapping[str, Any]]:
-    """The error budget of each registration."""
+    """The error budget of each registration, by its name, as plain data."""
     found = dict(last_result(protocol, state, "evaluation").get("budgets", {}))
     for _, job in later_evaluations(protocol, state):
         found = {**job.result["budgets"], **found}
@@ -103,7 +103,7 @@ def budgets(protocol: Protocol, state: RunState) -> dict[str, Mapping[str, Any]]
 
 
 def own_registration(protocol: Protocol, state: RunState) -> str | None:
-    """The name of the run's own registration (see above); None before the evaluation."""
+    """The name of the run's own registration (see the module's docstring); None before the evaluation."""
     rows = signed_rows(protocol, state)
     return str(best_row(rows)["poses"]) if rows else None
 
@@ -126,7 +126,7 @@ def best_row(rows: Sequence[Row]) -> Row:
 
 
 def better_later(protocol: Protocol, state: RunState) -> Row | None:
-    """The best of those that came after the evaluation, where it is better than the run's own."""
+    """The table's best row if it arrived after the evaluation and is better than the run's own; else None."""
     own = own_registration(protocol, state)
     rows = evaluated(protocol, state)
     best = best_row(rows) if rows else None
@@ -135,7 +135,7 @@ def better_later(protocol: Protocol, state: RunState) -> Row | None:
 
 
 def signed_rows(protocol: Protocol, state: RunState) -> list[Row]:
-    """The table as the evaluation step made it: what was judged and signed."""
+    """The rows of the table that the evaluation step made: those that were judged and signed."""
     return list(last_result(protocol, state, "evaluation").get("table", ()))
 
 
@@ -150,7 +150,7 @@ def _predicted_m2(record: Mapping[str, Any]) -> float:
 
 
 def later_evaluations(protocol: Protocol, state: RunState) -> list[tuple[str, JobState]]:
-    """The evaluations of registrations that came after the step's own evaluation, each with its step."""
+    """(step, job) of every evaluation of a registration that arrived after the evaluation step's own."""
     jobs = _finished(protocol, state, "evaluation", "evaluate")
     return [(step, job) for step, job in jobs if lane_of(job.priority) == "background"]
 

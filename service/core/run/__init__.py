@@ -1,1 +1,1 @@
-"""A run as a state machine: its state, the fold of its events, the next decision, and the operators' actions."""
+"""A run as a state machine: its state, the fold of its events, the next decision, and operator actions."""

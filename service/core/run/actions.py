@@ -1,4 +1,4 @@
-"""Which operator actions are allowed now, and why not: one set of rules for web, command line and fold."""
+"""Which operator actions are allowed now, or why not: one set of rules for web, command line and fold."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ VERBS: tuple[OperatorVerb, ...] = ("confirm", "sign", "redo", "skip", "accept", 
 
 
 def check_action(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> None:
-    """Raise IllegalTransitionError (what, why, remedy) unless `actor` may do this now."""
+    """Raise IllegalTransitionError, with the reason and a remedy, unless `actor` may do this now."""
     refusal = refuse(protocol, state, action, actor)
     if refusal is not None:
         raise refusal
 
 
-def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return a rule
+def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return per rule
     """The reason to refuse an action, or None; `check_action` and the fold share it."""
     if not state.started:
         return Refusal("the run has not started", where=action.action)
@@ -47,7 +47,7 @@ def refuse(protocol: Protocol, state: RunState, action: OperatorAction, actor: s
 
 
 def capture_refusal(protocol: Protocol, state: RunState, step: str, attempt: int) -> Refusal | None:
-    """Why nobody can ask a capture by hand now for a release of the shutter, or to end with what it has; or None."""
+    """The reason why nobody can ask a manual capture now to release the shutter or to finish, or None."""
     if state.terminal:
         return Refusal(f"the run is {state.status}", where=step, remedy="Start a new run")
     if state.paused:
@@ -64,46 +64,46 @@ def capture_refusal(protocol: Protocol, state: RunState, step: str, attempt: int
 
 
 def needs_leave(protocol: Protocol, state: RunState) -> bool:
-    """Whether a person must confirm anew before the robot moves: the program that drove it before has ended."""
+    """Whether a person must confirm again before the robot moves, because the runner was restarted."""
     return state.restarted and protocol.step(state.current).moves_robot
 
 
 def unmet_requirements(step: Step, state: RunState) -> tuple[str, ...]:
-    """Steps that `step` requires and that have not passed their gates (a skipped step has not)."""
+    """The steps required by `step` that have not passed their gates; a skipped step has not."""
     return tuple(name for name in step.requires if not state.steps[name].passed_its_gates)
 
 
 def stranded(protocol: Protocol, state: RunState) -> bool:
-    """Whether the current step can never begin: what it requires has not passed and cannot be done again.
+    """Whether the current step can never begin, because a required step has not passed and cannot be redone.
 
-    It may be left out then, whatever the protocol says: nothing else but the end of the run would be left.
+    It may then be skipped whatever the protocol says; otherwise the run could only be ended.
     """
     unmet = unmet_requirements(protocol.step(state.current), state) if state.phase == "ready" else ()
     return any(redo_refusal(protocol, state, name) is not None for name in unmet)
 
 
 def redo_refusal(protocol: Protocol, state: RunState, target: str) -> Refusal | None:
-    """Why a step cannot be done again now, or None."""
+    """The reason why a step cannot be done again now, or None."""
     return refuse(protocol, state, OperatorAction(action="redo", step=target, reason="asked"), "operator")
 
 
 def skip_refusal(protocol: Protocol, state: RunState) -> Refusal | None:
-    """Why the current step cannot be left out now, or None."""
+    """The reason why the current step cannot be skipped now, or None."""
     return refuse(protocol, state, OperatorAction(action="skip", step=state.current, reason="asked"), "operator")
 
 
 def needs_signature_now(protocol: Protocol, state: RunState) -> bool:
-    """Whether a signature is due: before an irreversible step begins; before any other step is accepted."""
+    """Whether a signature is due now: before an irreversible step begins, or before any other step passes."""
     step = protocol.step(state.current)
     due_phase = "ready" if step.irreversible else "awaiting_operator"
     return step.sign and not state.step.signed and state.phase == due_phase
 
 
 def record_to_sign(protocol: Protocol, state: RunState) -> str:
-    """SHA-256 of the event that a signature binds now, or "" when none is due.
+    """SHA-256 of the event that a signature must bind now, or "" when none is due.
 
-    The gates of the step; for the release of an irreversible step, the latest step_passed among those it requires
-    (the chain binds the earlier ones).
+    That is the step's gates_evaluated event. For the release of an irreversible step it is the latest step_passed
+    among the steps it requires; the chain binds the earlier ones.
     """
     if not needs_signature_now(protocol, state):
         return ""
@@ -116,7 +116,7 @@ def record_to_sign(protocol: Protocol, state: RunState) -> str:
 
 
 def allowed_actions(protocol: Protocol, state: RunState) -> tuple[OperatorVerb, ...]:
-    """The verbs that could be accepted now, given what they need (items ticked, a reason, a signature's fields)."""
+    """The verbs that would be allowed now, given what they need (ticked items, a reason, a signature)."""
     step = protocol.step(state.current)
     full = {
         "reason": "asked",
@@ -146,10 +146,10 @@ def redoable_steps(protocol: Protocol, state: RunState) -> tuple[str, ...]:
     return tuple(step for step in protocol.step_ids if redo_refusal(protocol, state, step) is None)
 
 
-# --- one rule a verb -------------------------------------------------------------------------------------
+# --- one rule per verb -----------------------------------------------------------------------------------
 
 
-def _confirm(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return a rule
+def _confirm(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return per rule
     step, now = protocol.step(state.current), state.step
     anew = needs_leave(protocol, state)
     if state.phase == "recovering":
@@ -191,7 +191,7 @@ def _sign(protocol: Protocol, state: RunState, action: OperatorAction, actor: st
         return Refusal("a signature needs a name and a meaning", where=step.id, remedy="Say who signs and for what")
     if action.signed_sha256 != record_to_sign(protocol, state):
         return Refusal(
-            "the signature is for another record than the one on which this step now stands",
+            "the signature is for a record other than the present one of this step",
             where=step.id,
             remedy="Read the figures again and sign them as they are now",
         )
@@ -213,7 +213,7 @@ def _skip(protocol: Protocol, state: RunState, action: OperatorAction, actor: st
     return _reason_refusal(action, step.id)
 
 
-def _redo(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return a rule
+def _redo(protocol: Protocol, state: RunState, action: OperatorAction, actor: str) -> Refusal | None:  # noqa: PLR0911 - one return per rule
     target = action.step or state.current
     there = state.steps[target]
     if there.phase == "pending":
@@ -235,7 +235,7 @@ def _redo(protocol: Protocol, state: RunState, action: OperatorAction, actor: st
     for later in protocol.steps[protocol.index(target) + 1 :]:
         if later.irreversible and _has_begun(state, later):
             return Refusal(
-                f"the scene changed with {later.id!r}: what was before it cannot be done again",
+                f"{later.id!r} has changed the scene: steps before it cannot be done again",
                 where=target,
                 remedy=f"Go on from the steps after {later.id}, or start a new run with a new scene",
             )
@@ -243,7 +243,7 @@ def _redo(protocol: Protocol, state: RunState, action: OperatorAction, actor: st
 
 
 def _has_begun(state: RunState, step: Step) -> bool:
-    """Whether the scene may have been changed by a step; half a spraying counts, a skipped one does not."""
+    """Whether a step may have changed the scene; one that began counts, a skipped one does not."""
     there = state.steps[step.id]
     return bool(there.started_utc) or any(past.step == step.id and past.began for past in state.superseded)
 
@@ -255,7 +255,7 @@ def _accept(protocol: Protocol, state: RunState, action: OperatorAction, actor: 
         return refusal
     if action.signed_sha256 != state.step.gates_sha256:
         return Refusal(
-            "the acceptance is for other figures than those on which this step now stands",
+            "the acceptance is for figures other than the present ones of this step",
             where=step.id,
             remedy="Read the figures again and decide on them as they are now",
         )

@@ -1,4 +1,4 @@
-"""RunState → what happens next, as a value. The runner executes it and appends the outcome; it decides nothing."""
+"""RunState → Decision, the next thing to do as a value. The runner executes it and appends the outcome."""
 
 from __future__ import annotations
 
@@ -54,20 +54,20 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class AskOperator:
-    """Wait for a person; `options` are the verbs that can be accepted now."""
+    """Wait for a person; `options` are the verbs that are allowed now."""
 
     step: str
     for_: Literal["confirm", "sign", "recovery"]
     text: str
-    checklist: tuple[str, ...]  # to be ticked with a confirm
+    checklist: tuple[str, ...]  # to be ticked with the confirmation
     options: tuple[OperatorVerb, ...]
     sign_sha256: str = ""  # what a signature binds (OperatorAction.signed_sha256)
-    ways: tuple[WayOn, ...] = ()  # where the step is stopped: the choices, the recommended one first
+    ways: tuple[WayOn, ...] = ()  # the choices when the step is stopped, the recommended one first
 
 
 @dataclass(frozen=True, slots=True)
 class RunStep:
-    """Do the work of a step, or go on with it. With `begin`, append StepStarted first."""
+    """Do the work of a step or continue it. With `begin`, append StepStarted first."""
 
     step: str
     attempt: int
@@ -76,7 +76,7 @@ class RunStep:
 
 @dataclass(frozen=True, slots=True)
 class EvaluateGates:
-    """Append evaluate_gates(step, attempt, measures, skipped steps, uncertainties)."""
+    """Append the verdicts of evaluate_gates(step, attempt, measures, skipped steps, uncertainties)."""
 
     step: str
     attempt: int
@@ -86,7 +86,7 @@ class EvaluateGates:
 
 @dataclass(frozen=True, slots=True)
 class Accept:
-    """Append StepPassed."""
+    """Let the step pass: append StepPassed."""
 
     step: str
     attempt: int
@@ -104,21 +104,21 @@ class Retry:
 
 @dataclass(frozen=True, slots=True)
 class FinishRun:
-    """Append RunCompleted."""
+    """The run is complete: append RunCompleted."""
 
     deviations: int
 
 
 @dataclass(frozen=True, slots=True)
 class AbortRun:
-    """Append RunAborted: the step's recovery policy ends the run."""
+    """The step's recovery policy ends the run: append RunAborted."""
 
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Halt:
-    """Nothing to do: no motion, no work, until an operator resumes (paused) or for good."""
+    """No motion and no work, until an operator resumes a paused run, or for good."""
 
     status: Literal["paused", "completed", "aborted"]
 
@@ -126,8 +126,8 @@ class Halt:
 Decision = AskOperator | RunStep | EvaluateGates | Accept | Retry | FinishRun | AbortRun | Halt
 
 
-def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - one return a phase
-    """What the runner does next. Raises IntegrityError for a run of which nothing is recorded."""
+def decide(protocol: Protocol, state: RunState) -> Decision:  # noqa: PLR0911 - one return per phase
+    """What the runner does next. Raises IntegrityError if nothing is recorded of the run."""
     if not state.started:
         raise IntegrityError("nothing is recorded of this run", remedy="Append run_started first")
     if state.status != "active":
@@ -157,7 +157,7 @@ def _what_goes_on(step: Step, now: StepState) -> str:
     images = kept.get(len(now.captured), f"its {len(now.captured)} images are kept")
     return (
         f"The program that drove the robot ended during this step ({step.title}); {images}. "
-        "Look whether anything has changed and nobody is in reach; the robot moves as soon as you confirm"
+        "Check that nothing has changed and nobody is within reach; the robot moves as soon as you confirm"
     )
 
 
@@ -189,10 +189,10 @@ def _decide_recovering(protocol: Protocol, state: RunState) -> Decision:
         return Retry(now.step, now.attempt + 1, "the operator asked for it", 0.0)
     if now.failure is None:
         outside = any(not verdict.passed and not verdict.undecided for verdict in now.verdicts)
-        say = describe_judged if outside else describe  # all of them are said to be undecided then
+        say = describe_judged if outside else describe  # else the heading says that all of them are undecided
         failed = "; ".join(say(verdict) for verdict in now.verdicts if not verdict.passed)
         found = "Outside its limits" if outside else "Not decided yet"
-        # What the step itself suggests, if it knows a way: further viewpoints that would bring the numbers within.
+        # The step may suggest a remedy, such as further viewpoints that would bring the figures within limits.
         advice = str(now.mend.get("advice", ""))
         return _ask(protocol, state, "recovery", f"{found}: {failed}" + (f". {advice}" if advice else ""))
     why = f"{now.failure.error}: {now.failure.message}"

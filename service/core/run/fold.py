@@ -1,4 +1,4 @@
-"""Events → RunState. A pure reduction: the same events always give the same state, after any restart."""
+"""Events → RunState, as a pure reduction: the same events always give the same state, also after a restart."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ from service.core.run.state import (
 )
 from service.core.run.state_transitions import UNMEASURED, change, deviate, go, pass_on, seconds_between, supersede
 
-_VIEWS_TIMED = 30  # the median of so many tells how long a view takes now
+_VIEWS_TIMED = 30  # number of latest views whose median gap estimates the time per view
 
 
 def initial_state(protocol: Protocol) -> RunState:
@@ -72,10 +72,10 @@ def initial_state(protocol: Protocol) -> RunState:
 
 
 def fold(protocol: Protocol, events: Iterable[Event]) -> RunState:
-    """The state of a run after these events, from the first on.
+    """The state of a run after all these events, which begin with the first.
 
-    Raises IntegrityError for a system event that cannot have happened (the evidence was tampered with, or a bug);
-    never for an operator's action: one that was not allowed is listed as refused and has no effect.
+    Raises IntegrityError for a system event that is impossible in its place (tampering, or a bug). An operator's
+    action that was not allowed raises nothing: it is listed as refused and has no effect.
     """
     state = initial_state(protocol)
     for event in events:
@@ -84,7 +84,7 @@ def fold(protocol: Protocol, events: Iterable[Event]) -> RunState:
 
 
 def advance(protocol: Protocol, state: RunState, event: Event) -> RunState:
-    """The state after one more event; `fold` is the reduction by this function."""
+    """The state after one more event. Raises IntegrityError as `fold` does, which applies this to every event."""
     if event.seq != state.seq + 1:
         raise _impossible(event, f"follows event {state.seq}: events are missing or repeated")
     if (event.seq == 1) != isinstance(event.payload, RunStarted):
@@ -120,12 +120,11 @@ def _void(state: RunState, event: Event) -> RunState:
 
 
 def _is_void(state: RunState, event: Event, step: str, attempt: int, *, when_completed: bool = False) -> bool:
-    """Whether an operator's redo, skip or abort came between the work and its record.
+    """Whether an operator's redo, skip or abort was recorded before the outcome of the work.
 
-    `when_completed`: work that may still be recorded when the run is completed.
-
-    The web and the command line append actions while the runner works, so such events are in order; they stay in
-    the evidence without effect. Raises IntegrityError for work that was never due.
+    The web and the command line append actions while the runner works, so such events are legitimate; they stay in
+    the evidence without effect. With `when_completed`, the work may still be recorded after the run was completed.
+    Raises IntegrityError for work that was never due.
     """
     if step not in state.steps:
         raise _impossible(event, f"the protocol has no step {step!r}")
@@ -139,7 +138,7 @@ def _is_void(state: RunState, event: Event, step: str, attempt: int, *, when_com
 
 
 def _is_void_now(state: RunState, event: Event, step: str, attempt: int) -> bool:
-    """The same for events that only the current step can produce."""
+    """`_is_void` for events that only the current step can produce. Raises IntegrityError for another step."""
     if _is_void(state, event, step, attempt):
         return True
     if step != state.current:
@@ -153,7 +152,7 @@ def _worked_s(state: RunState, event: Event) -> float | None:
 
 
 def _with_view(state: RunState, event: Event, step: str) -> RunState:
-    """Keep how long a view took, of the last ones."""
+    """Record the time since the step's previous view, for the latest views only."""
     there, at_utc = state.last_view
     gaps = state.view_gaps_s
     if there == step:
@@ -185,7 +184,7 @@ def _run_started(protocol: Protocol, state: RunState, event: Event, p: RunStarte
 
 def _session_started(protocol: Protocol, state: RunState, event: Event, p: SessionStarted) -> RunState:
     state = replace(state, sessions=state.sessions + 1, restarted=p.resumed, leave=None if p.resumed else state.leave)
-    # Who lets the robot move again looks again: what was ticked was true before the program ended.
+    # Whoever lets the robot move again must check again: the ticks were made before the program ended.
     return change(state, state.current, ticked=()) if needs_leave(protocol, state) else state
 
 
@@ -238,7 +237,7 @@ def _step_note(protocol: Protocol, state: RunState, event: Event, p: StepNote) -
 
 
 def _capture_asked(protocol: Protocol, state: RunState, event: Event, p: CaptureAsked) -> RunState:
-    """What comes too late has no effect."""
+    """Note what was asked of a manual capture; a request that comes too late has no effect."""
     if state.terminal or (p.step, p.attempt, "running") != (state.current, state.step.attempt, state.phase):
         return _void(state, event)
     return change(state, p.step, asked=(*state.step.asked, p.what))
@@ -264,7 +263,7 @@ def _view_added(protocol: Protocol, state: RunState, event: Event, p: View) -> R
 
 
 def _among_the_superseded(state: RunState, event: Event, p: View) -> RunState:
-    """The image of an attempt that was replaced while it was on its way is listed with the others of that attempt."""
+    """Add an image that arrived after its attempt was replaced to the superseded images of that attempt."""
     listed = [
         replace(past, captured=put(past.captured, p.viewpoint, event.seq))
         if (past.step, past.attempt, past.viewpoint) == (p.step, p.attempt, None)
@@ -313,7 +312,7 @@ def _step_failed(protocol: Protocol, state: RunState, event: Event, p: StepFaile
 
 
 def _step_retried(protocol: Protocol, state: RunState, event: Event, p: StepRetried) -> RunState:
-    if _is_void_now(state, event, p.step, p.attempt - 1):  # a retry opens the attempt that it names
+    if _is_void_now(state, event, p.step, p.attempt - 1):  # a retry names the attempt that it begins
         return _void(state, event)
     now = state.step
     if not (now.retry_granted or (now.failure is not None and now.failure.recovery == "retry")):
@@ -321,9 +320,9 @@ def _step_retried(protocol: Protocol, state: RunState, event: Event, p: StepRetr
     state = replace(state, last_view=("", ""))
     changes: dict[str, Any] = {**UNMEASURED, "attempt": p.attempt, "retry_granted": False}
     changes["work_began_utc"] = event.at_utc
-    if protocol.step(p.step).irreversible:  # its signature is the release to begin, and still holds
+    if protocol.step(p.step).irreversible:  # its signature released it to begin and remains valid
         changes |= {"signed": now.signed, "signed_by": now.signed_by}
-    if now.retry_granted:  # what was given up gets another chance
+    if now.retry_granted:  # viewpoints that were given up are tried again
         changes |= {"failures": 0, "viewpoint_failures": {}, "skipped_viewpoints": ()}
     return _system(protocol, state, event, "retry", **changes)
 
@@ -352,7 +351,7 @@ def _step_passed(protocol: Protocol, state: RunState, event: Event, p: StepPasse
 
 
 def _job_enqueued(protocol: Protocol, state: RunState, event: Event, p: JobEnqueued) -> RunState:
-    # What follows from a result that arrives after the run's end is computed all the same.
+    # A result that arrives after the run's end may still lead to further jobs.
     if _is_void(state, event, p.step, p.attempt, when_completed=True):
         return _void(state, event)
     jobs = state.steps[p.step].jobs
@@ -377,7 +376,7 @@ def _job_ended(protocol: Protocol, state: RunState, event: Event, p: JobFinished
         if _is_void(state, event, p.step, p.attempt):
             return _void(state, event)
         raise _impossible(event, f"job {p.job} was never enqueued")
-    if job.status == "finished":  # a second worker after a lost lease: the first answer counts
+    if job.status == "finished":  # a second worker answered after a lost lease: the first answer counts
         return _void(state, event)
     if isinstance(p, JobFinished):
         done = {"measures": p.measures, "artefacts": p.artefacts, "result": p.result}
@@ -396,7 +395,7 @@ def _action_refused(protocol: Protocol, state: RunState, event: Event, p: Action
 
 
 def _item_ticked(protocol: Protocol, state: RunState, event: Event, p: ItemTicked) -> RunState:
-    """A mark that comes too late, or for an item that the protocol does not have, has no effect."""
+    """Tick or untick an item; no effect if it comes too late or the protocol has no such item."""
     asked = state.phase in ("ready", "recovering") or needs_leave(protocol, state)
     open_now = asked and (p.step, p.attempt) == (state.current, state.step.attempt)
     if state.terminal or not open_now:

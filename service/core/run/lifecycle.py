@@ -1,7 +1,7 @@
 """The lifecycle of a run: a table of states and transitions generated from the protocol's steps.
 
-The only import of `transitions`. The hierarchical machine is built from data, checked by the library, and flattened
-once into the pure function (state, trigger) → state that the fold uses.
+This is the only module that imports `transitions`. The hierarchical machine is built from data, checked by the
+library, and flattened once into the pure function (state, trigger) → state that the fold uses.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ RESERVED_STEP_IDS = frozenset({PAUSED, COMPLETED, ABORTED})
 
 
 class Rule(NamedTuple):
-    """One row of the table: within a step, `trigger` leads from `source` to `target`."""
+    """One row of the table within a step: `trigger` leads from `source` to `target`."""
 
     trigger: str
     source: Phase
     target: Phase
 
 
-# Within every step. `advance`, `redo`, `pause`, `resume` and `abort` lead out of a step and are added below.
+# The rules within every step. `advance`, `redo`, `pause`, `resume` and `abort` lead out of a step; added below.
 STEP_RULES: tuple[Rule, ...] = (
     Rule("begin", "ready", "running"),
     Rule("measured", "running", "checking"),
@@ -48,7 +48,7 @@ STEP_RULES: tuple[Rule, ...] = (
 
 @dataclass(frozen=True)
 class Place:
-    """A state of the machine, taken apart."""
+    """A state of the machine by its parts: step, phase, and whether paused."""
 
     step: str
     phase: Phase
@@ -56,12 +56,12 @@ class Place:
 
 
 def redo(step: str) -> str:
-    """The trigger that leads back to `step`."""
+    """The name of the trigger that leads back to `step`."""
     return f"redo_{step}"
 
 
 def state_name(step: str, phase: Phase, *, paused: bool = False) -> str:
-    """The machine's name of a state."""
+    """The machine's name for a state, such as `calibration.ready` or `paused.calibration.ready`."""
     return SEPARATOR.join((*((PAUSED,) if paused else ()), step, phase))
 
 
@@ -87,7 +87,7 @@ class Lifecycle:
 
     @property
     def table(self) -> Mapping[tuple[str, str], str]:
-        """(state, trigger) → state, all of it."""
+        """The whole table, (state, trigger) → state."""
         return self._targets
 
     def may(self, state: str, trigger: str) -> bool:
@@ -95,7 +95,7 @@ class Lifecycle:
         return (state, trigger) in self._targets
 
     def next(self, state: str, trigger: str) -> str:
-        """The state after `trigger`. Raises IllegalTransitionError where the table has none."""
+        """The state after `trigger`. Raises IllegalTransitionError if the table has no such transition."""
         try:
             return self._targets[state, trigger]
         except KeyError:
@@ -127,10 +127,10 @@ class _Machine(HierarchicalMachine):
 
 
 class _Probe:
-    """The machine's model while the table is flattened.
+    """The machine's model while the table is flattened; only `_compile` uses it.
 
-    A throw-away: the library hangs its convenience methods on it (its `model_override` fails with nested states and
-    a separator other than "_" in 0.9.3), and nobody but `_compile` ever sees it.
+    The library adds convenience methods to its model. Its option `model_override` fails with nested states and a
+    separator other than "_" in version 0.9.3.
     """
 
     state: str
@@ -143,10 +143,10 @@ def lifecycle(steps: Iterable[str]) -> Lifecycle:
 
 
 def transition_table(steps: tuple[str, ...]) -> list[tuple[str, str, str]]:
-    """(trigger, source, target) as the machine is given them; a source may be a whole step or the whole pause."""
+    """The machine's rows (trigger, source, target); a source may also be a whole step or `paused` as a whole."""
     rows: list[tuple[str, str, str]] = []
     for index, step in enumerate(steps):
-        # Work in flight still reports while paused, and operators correct what they see: the same rules hold there.
+        # Work in progress still reports while paused, and operators may still redo: the same rules hold there.
         for paused in (False, True):
             rows += [
                 (
@@ -192,7 +192,7 @@ def _compile(steps: tuple[str, ...]) -> Lifecycle:
         for step in steps
         for phase in PHASES
     }
-    # Which triggers concern a state: those whose row starts at it or at a state around it.
+    # The triggers that concern a state are those of rows that start at it or at an enclosing state.
     sources: dict[str, list[str]] = {}
     for trigger, source, _ in rows:
         sources.setdefault(source, []).append(trigger)

@@ -14,8 +14,8 @@ from service.core.run.state import Accepted, DeviationKind, Leave, RunState, Ste
 from service.core.run.state_transitions import UNMEASURED, change, deviate, go, pass_on, supersede
 
 
-def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return a verb
-    """The state after an action; one that is not allowed is listed as refused and has no other effect."""
+def apply_action(protocol: Protocol, state: RunState, event: Event, p: OperatorAction) -> RunState:  # noqa: PLR0911 - one return per verb
+    """The state after an action; an action that is not allowed is listed as refused and has no other effect."""
     refusal = refuse(protocol, state, p, event.actor)
     if refusal is not None:
         return deviate(state, event, "refused", p.step, f"{p.action} had no effect: {refusal}")
@@ -56,7 +56,7 @@ def _let_move(state: RunState, event: Event) -> RunState:
 
 
 def _confirm(state: RunState, event: Event, p: OperatorAction) -> RunState:
-    ticked = p.checklist or state.step.ticked  # a list that was left open is ticked now
+    ticked = p.checklist or state.step.ticked  # items left open before may be ticked now
     there = change(state, state.current, confirmed_by=event.actor, ticked=ticked)
     match state.phase:
         case "running":  # after a restart: the work goes on
@@ -68,7 +68,7 @@ def _confirm(state: RunState, event: Event, p: OperatorAction) -> RunState:
 
 
 def _redo_step(protocol: Protocol, state: RunState, event: Event, target: str, reason: str) -> RunState:
-    """Back to `target`: it and every later step start afresh."""
+    """Go back to `target`: it and every later step start afresh."""
     for step in protocol.step_ids[protocol.index(target) :]:
         now = state.steps[step]
         if now.phase == "pending":
@@ -80,13 +80,13 @@ def _redo_step(protocol: Protocol, state: RunState, event: Event, target: str, r
             state = deviate(state, event, "reset_by_redo", step, f"reset because {target} is done again: {reason}")
         if began or now.skipped:
             state = supersede(state, event, step, reason, None, now.captured)
-        # The number rises even when nothing had begun, so that a record that is on its way is known to be void.
+        # Count up even if nothing had begun, so that an outcome recorded later is known to be void.
         state = replace(state, steps={**state.steps, step: StepState(step, attempt=now.attempt + 1)})
     return go(protocol, state, redo(target))
 
 
 def _redo_viewpoint(protocol: Protocol, state: RunState, event: Event, viewpoint: str, reason: str) -> RunState:
-    """Forget one viewpoint; a step that had finished its work becomes ready again with the others kept."""
+    """Forget one viewpoint; a step that had finished its work becomes ready again and keeps the others."""
     now = state.step
     state = deviate(state, event, "redo_viewpoint", state.current, f"{viewpoint}: {reason}")
     if viewpoint in now.captured:

@@ -1,4 +1,4 @@
-"""A mapping that is never changed but grows cheaply: what the fold of ten thousand events adds to, one by one."""
+"""An immutable mapping that grows cheaply: the fold of ten thousand events adds to it one item at a time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Value = TypeVar("Value")
 
 @dataclass(slots=True)
 class _Shared(Generic[Value]):
-    """What all versions of a mapping have in common: each key's values with the version that brought them."""
+    """What all versions of a mapping share: the values of each key, with the version that added each."""
 
     values: dict[str, list[tuple[int, Value]]] = field(default_factory=dict[str, list[tuple[int, Value]]])
     newest: int = 0
@@ -20,10 +20,10 @@ class _Shared(Generic[Value]):
 
 
 class PersistentMap(Mapping[str, Value]):
-    """As a dict whose items stay as they are; `put` gives the next version in constant time.
+    """An immutable dict; `put` returns the next version in constant time.
 
-    A dict that is copied for every event makes the fold of a run take the square of the run's length. Versions share
-    their items, and each sees those that were there when it was made. Only one that is not the newest is copied.
+    Copying a dict for every event would make the fold of a run quadratic in its length. Instead, versions share their
+    items, and each version sees those that existed when it was made. `put` copies only if called on an old version.
     """
 
     __slots__ = ("_length", "_shared", "_version")
@@ -35,7 +35,7 @@ class PersistentMap(Mapping[str, Value]):
         self._shared, self._version, self._length = shared, 0, len(shared.values)
 
     def put(self, key: str, value: Value) -> PersistentMap[Value]:
-        """The same with `value` under `key`: a new key comes last, a known one keeps its place."""
+        """A new version with `value` under `key`; a new key comes last, an existing one keeps its place."""
         shared = self._shared
         with shared.lock:
             if shared.newest == self._version:
@@ -51,29 +51,29 @@ class PersistentMap(Mapping[str, Value]):
         return following
 
     def __getitem__(self, key: str) -> Value:
-        """The value as of this version. Raises KeyError."""
+        """The value of `key` in this version. Raises KeyError."""
         for version, value in reversed(self._shared.values[key]):
             if version <= self._version:
                 return value
         raise KeyError(key)
 
     def __iter__(self) -> Iterator[str]:
-        """The keys of this version in the order in which they came."""
+        """The keys of this version in order of insertion."""
         return iter([key for key in list(self._shared.values) if key in self])
 
     def __len__(self) -> int:
-        """How many keys this version has."""
+        """The number of keys in this version."""
         return self._length
 
     def __repr__(self) -> str:
-        """As of a dict."""
+        """`PersistentMap({…})` with the items of this version."""
         return f"PersistentMap({dict(self)!r})"
 
     def __reduce__(self) -> tuple[type[PersistentMap[Value]], tuple[dict[str, Value]]]:
-        """A copy in another process is a mapping of its own."""
+        """Pickle as an independent mapping with the items of this version."""
         return PersistentMap, (dict(self),)
 
 
 def put(items: Mapping[str, Value], key: str, value: Value) -> PersistentMap[Value]:
-    """`items` with `value` under `key`; constant time where they grew so before."""
+    """`items` with `value` under `key`; in constant time if `items` is the newest version of a PersistentMap."""
     return (items if isinstance(items, PersistentMap) else PersistentMap(items)).put(key, value)

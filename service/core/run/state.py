@@ -1,4 +1,4 @@
-"""What a run's events add up to, as frozen records: RunState and its parts."""
+"""The state of a run that its events add up to, as frozen records: RunState and its parts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.core.records.events import ArtefactRef, GateVerdict, Identified, Un
 from service.core.run.lifecycle import Phase
 from service.core.text.counts import counted
 
-# What a step shows as its progress while a person takes the images: the camera is idle, and shows its live view.
+# The progress text of a step while a person takes the images: the camera is idle and shows its live view.
 WAITING_FOR_HAND = "waiting for the next image"
 StepPhase = Literal["pending", "ready", "running", "checking", "awaiting_operator", "recovering", "passed"]
 Status = Literal["active", "paused", "completed", "aborted"]
@@ -30,7 +30,7 @@ DeviationKind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class JobState:
-    """A job of the registration worker, as the events tell."""
+    """A job of the registration worker, as recorded in the events."""
 
     job: str
     kind: str
@@ -46,7 +46,7 @@ class JobState:
     message: str = ""
     priority: int = WAITED
     enqueued_utc: str = ""
-    ended_seq: int = 0  # of the event with which it finished or failed
+    ended_seq: int = 0  # of its job_finished or job_failed event
     ended_utc: str = ""
     duration_s: float = 0.0
     late_s: float | None = None  # after the specimen's release, or the run's end; None: in time
@@ -54,7 +54,7 @@ class JobState:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A StepNote with its time."""
+    """A recorded StepNote with its sequence number and time."""
 
     seq: int
     at_utc: str
@@ -75,9 +75,9 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """Figures outside their limits with which a person let a step pass."""
+    """A person's acceptance of a step's figures outside their limits."""
 
-    seq: int  # of the action
+    seq: int  # of the operator_action event
     by: str
     role: str
     identified: Identified
@@ -87,13 +87,13 @@ class Accepted:
 
 @dataclass(frozen=True, slots=True)
 class StepState:
-    """Where a step stands. `attempt` counts from 1 and is the one under way or to come next."""
+    """The state of a step. `attempt` counts from 1 and is the present or the next attempt."""
 
     step: str
     attempt: int = 1
     phase: StepPhase = "pending"
     confirmed: bool = False
-    confirmed_by: str = ""  # who let the present work begin: by the confirmation, or of a retry
+    confirmed_by: str = ""  # who let the present work begin, by confirming the step or its retry
     ticked: tuple[str, ...] = ()  # checklist items of the confirmation
     signed: bool = False
     signed_by: str = ""
@@ -106,17 +106,17 @@ class StepState:
     verdicts: tuple[GateVerdict, ...] = ()
     gates_passed: bool = False
     gates_sha256: str = ""  # of the gates_evaluated event: what a signature of this step binds
-    accepted: Accepted | None = None  # outside the limits, and yet to count as passed
+    accepted: Accepted | None = None  # set if a person accepted figures outside the limits
     passed_sha256: str = ""  # of the step_passed event: what the release of an irreversible step binds
     passed_seq: int = 0
     failure: Failure | None = None
-    failures: int = 0  # failures in a row without a viewpoint captured or an operator's leave in between
-    # Viewpoints, notes and jobs survive a retry and end with a redo.
+    failures: int = 0  # consecutive failures without a captured viewpoint or a confirmation in between
+    # Viewpoints, notes and jobs are kept by a retry and cleared by a redo.
     captured: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → seq of its event
     viewpoint_failures: Mapping[str, int] = field(default_factory=dict[str, int])  # viewpoint → times
     skipped_viewpoints: tuple[str, ...] = ()  # given up
     notes: tuple[Note, ...] = ()
-    asked: tuple[Literal["release", "finish"], ...] = ()  # by a person at a screen, of a capture by hand
+    asked: tuple[Literal["release", "finish"], ...] = ()  # requests of a person at a screen during a manual capture
     jobs: Mapping[str, JobState] = field(default_factory=dict[str, JobState])
     started_utc: str = ""
     ended_utc: str = ""
@@ -125,14 +125,14 @@ class StepState:
 
     @property
     def passed_its_gates(self) -> bool:
-        """Passed, by its figures or as they were accepted, and not merely skipped."""
+        """Whether the step passed with its figures within limits or accepted; a skipped step did not."""
         return self.phase == "passed" and (self.gates_passed or self.accepted is not None) and not self.skipped
 
     @property
     def mend(self) -> Mapping[str, Any]:
-        """What would mend this attempt, as it found out: data of its newest note with `advice`; empty without one.
+        """What would bring this attempt within limits: the data of its newest note with `advice`, else empty.
 
-        The `hands` are those of that note: nobody acts on advice that a later note has replaced.
+        Advice in earlier notes is out of date and is ignored, `hands` included.
         """
         advised = (
             note.data for note in reversed(self.notes) if note.attempt == self.attempt and "advice" in note.data
@@ -142,7 +142,7 @@ class StepState:
 
 @dataclass(frozen=True, slots=True)
 class Superseded:
-    """An attempt, or one viewpoint of it, that a later one replaces. Its evidence stays."""
+    """An attempt, or one viewpoint of it, that a later one replaced. Its evidence stays."""
 
     seq: int  # of the event that superseded it
     step: str
@@ -155,7 +155,7 @@ class Superseded:
 
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """Something that departed from the protocol; a note (automatic confirmation) is listed but not counted."""
+    """A departure from the protocol. An automatic confirmation is only a note: listed, but not counted."""
 
     seq: int
     kind: DeviationKind
@@ -171,7 +171,7 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """A DeviceTrouble."""
+    """A recorded DeviceTrouble with its sequence number."""
 
     seq: int
     device: str
@@ -181,7 +181,7 @@ class Trouble:
 
 @dataclass(frozen=True, slots=True)
 class Leave:
-    """Who has let the robot move, and in which event."""
+    """Who gave leave for the robot to move, and in which event."""
 
     seq: int
     by: str
@@ -189,7 +189,7 @@ class Leave:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A RecordCorrected with who and when."""
+    """A recorded RecordCorrected with its sequence number and the person who made it."""
 
     seq: int
     of_seq: int
@@ -205,7 +205,7 @@ class RunState:
     """The fold of a run's events."""
 
     machine_state: str  # of service.core.run.lifecycle
-    current: str  # identifier of the step that the run is at (of the last one, once it has ended)
+    current: str  # identifier of the step that the run is at, or was at when it ended
     steps: Mapping[str, StepState]
     status: Status = "active"
     seq: int = 0  # of the last event; 0: nothing recorded yet
@@ -215,22 +215,22 @@ class RunState:
     origin: Literal["captured", "imported"] = "captured"
     auto_confirm: bool = False
     sessions: int = 0
-    restarted: bool = False  # another process drives the run now, and nobody has let it go on since
+    restarted: bool = False  # a new process drives the run, and nobody has confirmed or resumed since
     leave: Leave | None = None  # the newest one in this session; each arm takes it once
     stop_reason: str = ""
     deviations: tuple[Deviation, ...] = ()
     superseded: tuple[Superseded, ...] = ()
-    overtaken: tuple[int, ...] = ()  # seq of events that arrived after an operator's action had made them void
+    overtaken: tuple[int, ...] = ()  # seq of events that an operator's action had already made void
     troubles: tuple[Trouble, ...] = ()
     last_redo_seq: int = 0
     people: frozenset[str] = frozenset()  # who took part: started it, controlled it, acted on it
-    controller: str = ""  # who has control of it on a screen
+    controller: str = ""  # person whose screen controls the run; "" for nobody
     corrections: tuple[Correction, ...] = ()
     ended_utc: str = ""  # of run_completed or run_aborted
     completed_sha256: str = ""  # of the run_completed event: what a release binds
     released_by: str = ""
-    view_gaps_s: tuple[float, ...] = ()  # of the last views: seconds from one to the next in the same work
-    last_view: tuple[str, str] = ("", "")  # step and time of the latest, while its work goes on
+    view_gaps_s: tuple[float, ...] = ()  # seconds between successive views of the same work, the latest ones
+    last_view: tuple[str, str] = ("", "")  # step and time of the latest view of the present work
 
     @property
     def step(self) -> StepState:
@@ -256,20 +256,20 @@ class RunState:
 
     @property
     def skipped(self) -> frozenset[str]:
-        """Steps that an operator has left out; not those whose gates alone were overridden."""
+        """Steps that an operator skipped before they had figures; steps whose gates were overridden are not here."""
         return frozenset(name for name, step in self.steps.items() if step.skipped and not step.verdicts)
 
     @property
     def terminal(self) -> bool:
-        """Whether the run has ended, one way or the other."""
+        """Whether the run has ended, completed or aborted."""
         return self.status in ("completed", "aborted")
 
     @property
     def deviation_count(self) -> int:
-        """Deviations without the notes."""
+        """Number of deviations, not counting notes."""
         return sum(not deviation.is_note for deviation in self.deviations)
 
     @property
     def deviations_told(self) -> str:
-        """The same in words: `1 deviation`."""
+        """The number of deviations in words, such as `1 deviation`."""
         return counted(self.deviation_count, "deviation")

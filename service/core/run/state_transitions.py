@@ -1,4 +1,4 @@
-"""The few ways in which a RunState changes; what the fold and the operator's actions are made of."""
+"""Elementary changes of a RunState, from which the fold and the operator's actions are built."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UNMEASURED: Mapping[str, Any] = {
 
 
 def seconds_between(earlier_utc: str, later_utc: str) -> float:
-    """Seconds from one time of the record (ISO 8601) to another."""
+    """Seconds from one recorded time (ISO 8601) to another."""
     return (datetime.fromisoformat(later_utc) - datetime.fromisoformat(earlier_utc)).total_seconds()
 
 
@@ -53,19 +53,19 @@ def change(state: RunState, step: str, **changes: Any) -> RunState:
 
 
 def pass_on(protocol: Protocol, state: RunState) -> RunState:
-    """From passed to the next step's ready; the last one waits for run_completed."""
+    """Advance from a passed step to the next one; after the last step the run waits for run_completed."""
     return state if state.current == protocol.step_ids[-1] else go(protocol, state, "advance")
 
 
 def supersede(
     state: RunState, event: Event, step: str, reason: str, viewpoint: str | None, captured: Mapping[str, int]
 ) -> RunState:
-    """List an attempt, or one viewpoint of it, as replaced."""
+    """List an attempt, or one viewpoint of it, as superseded by `event`."""
     now = state.steps[step]
     past = Superseded(event.seq, step, now.attempt, reason, viewpoint, captured, began=bool(now.started_utc))
     return replace(state, superseded=(*state.superseded, past))
 
 
 def deviate(state: RunState, event: Event, kind: DeviationKind, step: str | None, text: str) -> RunState:
-    """List a deviation."""
+    """List a deviation that `event` caused."""
     return replace(state, deviations=(*state.deviations, Deviation(event.seq, kind, step, text, event.actor)))

@@ -1,1 +1,1 @@
-"""Text that others wrote, read with the line of every fault; and the words that people read."""
+"""Reading text files with line numbers for every problem, and the words that people read."""

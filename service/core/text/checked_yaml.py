@@ -1,4 +1,4 @@
-"""A YAML file held against the pydantic model of its fields: everything that is wrong at once, each with its line."""
+"""Check a YAML file against a pydantic model and report every problem at once, each with its line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 def decoded(content: bytes, *, name: str, error: type[OrthocaptureError]) -> str:
-    """The text of a UTF-8 file, with or without a byte order mark. Raises `error` with the line of what is none."""
+    """Decode UTF-8 with or without a byte order mark. Raises `error` with the line of the first invalid byte."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as why:
@@ -28,14 +28,15 @@ def decoded(content: bytes, *, name: str, error: type[OrthocaptureError]) -> str
 def checked(
     data: Plain, model: type[ModelT], tree: YamlTree, at: FieldPath = ()
 ) -> tuple[ModelT | None, list[Problem]]:
-    """Part of a file as a record of `model`, or what is wrong with it.
+    """Part of a file as an instance of `model`, or None and what is wrong with it.
 
-    Types are as in JSON, without conversion: text in quotes is no number, and `yes` is no truth value.
+    Types are strict, as in JSON: quoted text is not a number, and `yes` is not a boolean.
 
     Args:
-        data: what stands at `at` in the file.
-        tree: the file, for the lines.
-        at: where the part begins.
+        data: the data at `at` in the file.
+        model: the pydantic model of that part.
+        tree: the file, for line numbers.
+        at: path to the part within the file.
     """
     try:
         return model.model_validate_json(json.dumps(data), strict=True), []
@@ -44,10 +45,10 @@ def checked(
 
 
 def problem_of(details: ErrorDetails, tree: YamlTree, model: type[BaseModel], at: FieldPath = ()) -> Problem:
-    """What pydantic found in a record of `model` that begins at `at`, in a technician's words, with its line."""
+    """A pydantic error as a Problem with its line, in plain words; the instance of `model` begins at path `at`."""
     start = len(at)
     for part in details["loc"]:
-        if (*at, part) in tree.lines:  # parts that are not in the file are names of union members
+        if (*at, part) in tree.lines:  # pydantic also puts names of union members into the path
             at = (*at, part)
     kind, last = details["type"], details["loc"][-1] if details["loc"] else ""
     if kind == "missing":
@@ -63,7 +64,7 @@ def problem_of(details: ErrorDetails, tree: YamlTree, model: type[BaseModel], at
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """` (did you mean 'title'?)` where a known word is near; "" otherwise."""
+    """` (did you mean 'title'?)` if a known word is similar, else ""."""
     near = difflib.get_close_matches(word, list(known), n=1)
     return f" (did you mean {near[0]!r}?)" if near else ""
 
@@ -71,11 +72,14 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def refuse(
     problems: Iterable[Problem], *, what: str, name: str, remedy: str, error: type[OrthocaptureError]
 ) -> NoReturn:
-    """Raise `error` with every problem, in the order of the file's lines.
+    """Raise `error` listing every problem in the order of its line.
 
     Args:
+        problems: at least one.
         what: the kind of file, such as "protocol".
-        name: the file.
+        name: the file's name.
+        remedy: what the reader should do.
+        error: the class to raise.
     """
     ordered = sorted(set(problems), key=lambda p: (p.line, p.field))
     places = [(f"{name}:{p.line}" if p.line else name) + (f" {p.field}" if p.field else "") for p in ordered]
@@ -86,7 +90,7 @@ def refuse(
 
 
 def _known(model: type[BaseModel], path: FieldPath) -> Mapping[str, object]:
-    """The fields of the record that stands at `path` within a record of `model`."""
+    """The fields of the model at `path` within `model`, for suggestions."""
     models = [model]
     for part in path:
         fields = [each.model_fields[part] for each in models if isinstance(part, str) and part in each.model_fields]
@@ -95,7 +99,7 @@ def _known(model: type[BaseModel], path: FieldPath) -> Mapping[str, object]:
 
 
 def _records(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The models that a field's type names, within tuples, mappings and unions."""
+    """The models named in a field's type, also within tuples, mappings and unions."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inside in get_args(annotation):

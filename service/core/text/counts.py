@@ -4,5 +4,5 @@ from __future__ import annotations
 
 
 def counted(number: int, one: str, more: str = "") -> str:
-    """`1 deviation`, `2 deviations`, `no deviation`. `more`: the plural where an s is not enough."""
+    """A count in words: `1 deviation`, `2 deviations`, `no deviation`. `more` is an irregular plural."""
     return f"{number or 'no'} {one if number in (0, 1) else more or one + 's'}"

@@ -1,4 +1,4 @@
-"""JSON that others wrote, as plain data: what is no such document is told with its line, whatever is wrong."""
+"""Read JSON from outside as plain data, with an error that names file and line whatever is wrong with it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,19 @@ from typing import Any, cast
 from service.core.errors import DataError
 
 MOST_DEEP = 100
-_LONGEST_INTEGER = 18  # digits; beyond them a number counts as a float, as most readers of JSON have it
+_LONGEST_INTEGER = 18  # digits; a longer integer is read as a float, as most JSON readers do
 
 
 def parse_json(text: str | bytes, *, name: str, remedy: str = "Correct the file") -> Any:
-    """Read one JSON document; `name` stands for the file in errors. A number beyond any float's range is infinite.
+    """Read one JSON document. A number beyond the range of a float becomes infinite.
+
+    Args:
+        text: the document; bytes are decoded as UTF-8, with or without a byte order mark.
+        name: the file's name in errors.
+        remedy: what an error tells the reader to do.
 
     Raises:
-        DataError: not UTF-8, no JSON, a name given twice in an object, or nested more than 100 deep.
+        DataError: not UTF-8, not JSON, a name given twice in an object, or nested more than 100 deep.
     """
     try:
         read = text.decode("utf-8-sig") if isinstance(text, bytes) else text
@@ -34,7 +39,7 @@ def parse_json(text: str | bytes, *, name: str, remedy: str = "Correct the file"
 
 
 class _TwiceError(Exception):
-    """A name twice in one object."""
+    """A name is given twice in one object."""
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -50,7 +55,7 @@ def _integer(digits: str) -> int | float:
 
 
 def _is_deep(document: object) -> bool:
-    """Whether it is nested deeper than allowed; level by level, since recursion is what must not be needed."""
+    """Whether a document is nested deeper than MOST_DEEP; iterative, because recursion could overflow."""
     level: list[object] = [document]
     for _ in range(MOST_DEEP + 1):
         level = [

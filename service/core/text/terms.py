@@ -1,4 +1,4 @@
-"""The one list of words for the names that records use: what people read on screens, in terminals and reports."""
+"""The words that people read, on screens, in terminals and in reports, for names in the records."""
 
 from __future__ import annotations
 
@@ -28,5 +28,5 @@ _WORDS: Mapping[str, str] = {
 
 
 def term(name: str) -> str:
-    """Words for a name of the records: ct_surface → CT surface; an unknown one with spaces."""
+    """The words for a name in the records: ct_surface → CT surface. An unknown name gets spaces for underscores."""
     return _WORDS.get(name, name.replace("_", " "))

@@ -1,4 +1,4 @@
-"""YAML text as plain data that remembers on which line every field stands."""
+"""YAML text as plain data, with the line number of every field."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Plain = None | bool | int | float | str | list["Plain"] | dict[str, "Plain"]
 
 MOST_DEEP = 50
 MOST_VALUES = 200_000
-_LONGEST_INTEGER = 18  # characters; a longer number counts as a float
+_LONGEST_INTEGER = 18  # characters; a longer integer is read as a float
 
-# The core schema of YAML 1.2 (section 10.3): unlike YAML 1.1, "on" and "12:30" stay text and 1e-3 is a number.
+# The core schema of YAML 1.2 (section 10.3). Unlike in YAML 1.1, "on" and "12:30" are text and 1e-3 is a number.
 _SCALARS: tuple[tuple[re.Pattern[str], Callable[[str], Plain]], ...] = (
     (re.compile(r"(null|Null|NULL|~|)"), lambda _: None),
     (re.compile(r"(true|True|TRUE|false|False|FALSE)"), lambda text: text.lower() == "true"),
@@ -32,26 +32,26 @@ class Problem:
     """One thing that is wrong in a file."""
 
     line: int  # from 1
-    field: str  # steps[3].gates[0].max, or empty for the file as a whole
+    field: str  # such as steps[3].gates[0].max; "" for the file as a whole
     message: str
 
 
 @dataclass(frozen=True)
 class YamlTree:
-    """A document: its data, the line of every field, and what is wrong with it as YAML."""
+    """A YAML document: its data, the line of every field, and problems such as duplicate keys."""
 
     data: Plain
     lines: Mapping[FieldPath, int]
     problems: tuple[Problem, ...]
 
     def line(self, path: FieldPath) -> int:
-        """The line of a field, or of the nearest field around it that is in the file."""
+        """The line of a field, or of the nearest enclosing field that is in the file."""
         while path not in self.lines:
             path = path[:-1]
         return self.lines[path]
 
 
-NO_LINES = YamlTree(data={}, lines={(): 0}, problems=())  # of data that came from no YAML file
+NO_LINES = YamlTree(data={}, lines={(): 0}, problems=())  # for data that is not from a YAML file
 
 
 def field_name(path: FieldPath) -> str:
@@ -62,8 +62,8 @@ def field_name(path: FieldPath) -> str:
 def parse_yaml(text: str, *, name: str) -> YamlTree:
     """Read one YAML document.
 
-    Raises ProtocolError with `name`:line where the text is not YAML, or no file that a person would write: nested
-    more than 50 deep, or of more than 200,000 values once every alias is replaced by what it stands for.
+    Raises ProtocolError with `name`:line if the text is not YAML, is nested more than 50 deep, or has more than
+    200,000 values with all aliases expanded.
     """
     try:
         _check_depth(text, name)
@@ -81,11 +81,11 @@ def parse_yaml(text: str, *, name: str) -> YamlTree:
         raise ProtocolError(
             f"not valid YAML: {error.reason}", where=f"{name}:{line}", remedy="Remove the unprintable character"
         ) from error
-    except (ValueError, OverflowError, RecursionError) as error:  # of the reader, for an escape that is no character
+    except (ValueError, OverflowError, RecursionError) as error:  # raised for an escape that is not a character
         raise ProtocolError(
             f"not valid YAML: {error}",
             where=f"{name}:1",
-            remedy="Look for an escape such as \\U… that is no character",
+            remedy="Look for an escape such as \\U… that is not a character",
         ) from error
     builder = _Builder(name)
     data = None if root is None else builder.build(root, (), ())
@@ -93,7 +93,7 @@ def parse_yaml(text: str, *, name: str) -> YamlTree:
 
 
 def _check_depth(text: str, name: str) -> None:
-    """The parser reads events one by one; what composes them recurses, and would end in a RecursionError."""
+    """Refuse deep nesting before composing the tree, which is recursive and would end in a RecursionError."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
@@ -106,7 +106,7 @@ def _check_depth(text: str, name: str) -> None:
 
 
 class _Builder:
-    """Walks the compose tree once; an alias is walked each time it stands somewhere."""
+    """Walks the composed tree once; an alias is expanded wherever it occurs."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -121,7 +121,7 @@ class _Builder:
         self._values += 1
         if self._values > MOST_VALUES:
             raise ProtocolError(
-                f"more than {MOST_VALUES:,} values, aliases replaced by what they stand for",
+                f"more than {MOST_VALUES:,} values with all aliases expanded",
                 where=f"{self._name}:{node.start_mark.line + 1}",
                 remedy="Write the file without aliases of aliases",
             )
