@@ -1,4 +1,4 @@
-"""The one seam for everything that must survive a crash: file writes, fsync, rename, commit; and clock and ids."""
+"""Interfaces for everything that must survive a crash (file writes, fsync, rename, commit), and for clock and ids."""
 
 from __future__ import annotations
 
@@ -12,44 +12,44 @@ from typing import Protocol
 
 
 class Files(Protocol):
-    """Every durable effect of the store is one call of this. All methods raise OSError, as the system does.
+    """The durable effects of the store: each is one call of this interface. All methods raise OSError.
 
-    A crash may fall before, within or after any call; the store's order of calls makes each of them harmless.
+    A crash may happen before, during or after any call; the order of the store's calls makes it harmless.
     """
 
     def make_directory(self, path: Path, *, private: bool = False) -> None:
-        """Create one directory; an existing one is fine. Not durable before `sync_directory(path.parent)`."""
+        """Create one directory, unless it exists. Durable only after `sync_directory(path.parent)`."""
         ...
 
     def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
-        """Create `path`, which must not exist, and write the chunks. Not durable before `sync_file`.
+        """Create `path`, which must not exist, and write the chunks. Durable only after `sync_file`.
 
-        What is `private` nobody else can read, not even for a moment.
+        A `private` file is never readable by others, not even for a moment.
         """
         ...
 
     def append(self, path: Path, offset: int, data: bytes) -> None:
-        """Cut a file, or begin a new one, to `offset` bytes and add the data. Not durable before `sync_file`."""
+        """Truncate a file, new or existing, to `offset` bytes and append data. Durable only after `sync_file`."""
         ...
 
     def make_read_only(self, path: Path) -> None:
-        """Take away write permission (0o444)."""
+        """Remove write permission (mode 0o444)."""
         ...
 
     def sync_file(self, path: Path) -> None:
-        """Data and metadata of the file reach the disk."""
+        """Flush the file's data and metadata to disk."""
         ...
 
     def rename(self, source: Path, target: Path) -> None:
-        """Atomic within one file system, replaces. Not durable before `sync_directory(target.parent)`."""
+        """Rename atomically in one file system, replacing `target`. Durable only after `sync_directory`."""
         ...
 
     def sync_directory(self, path: Path) -> None:
-        """The names in the directory reach the disk."""
+        """Flush the directory's entries to disk."""
         ...
 
     def remove(self, path: Path) -> None:
-        """Delete a file to which nothing refers; a missing one is fine."""
+        """Delete a file to which nothing refers, if it exists."""
         ...
 
     def commit(self, commit: Callable[[], None]) -> None:
@@ -58,48 +58,48 @@ class Files(Protocol):
 
 
 class DurableFiles:
-    """The seam on a POSIX file system."""
+    """`Files` on a POSIX file system."""
 
     def make_directory(self, path: Path, *, private: bool = False) -> None:
-        """See Files."""
+        """Create one directory, unless it exists; a private one with mode 0o700. Raises OSError."""
         path.mkdir(mode=0o700 if private else 0o777, exist_ok=True)
 
     def write(self, path: Path, chunks: Iterable[bytes], *, private: bool = False) -> None:
-        """See Files."""
+        """Create a new file and write the chunks; a private one with mode 0o600. Raises OSError."""
         flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC | os.O_NOFOLLOW
         with open(os.open(path, flags, 0o600 if private else 0o666), "wb") as handle:
             for chunk in chunks:
                 handle.write(chunk)
 
     def append(self, path: Path, offset: int, data: bytes) -> None:
-        """See Files."""
+        """Truncate a file (created if missing) to `offset` bytes and append the data. Raises OSError."""
         with open(os.open(path, os.O_CREAT | os.O_WRONLY | os.O_CLOEXEC, 0o666), "wb") as handle:
             handle.truncate(offset)
             handle.seek(offset)
             handle.write(data)
 
     def make_read_only(self, path: Path) -> None:
-        """See Files."""
+        """Remove write permission (mode 0o444). Raises OSError."""
         path.chmod(0o444)
 
     def sync_file(self, path: Path) -> None:
-        """See Files."""
+        """Flush the file's data and metadata to disk with fsync. Raises OSError."""
         _sync(path, os.O_RDONLY)
 
     def rename(self, source: Path, target: Path) -> None:
-        """See Files."""
+        """Rename atomically within one file system, replacing `target`. Raises OSError."""
         source.replace(target)
 
     def sync_directory(self, path: Path) -> None:
-        """See Files."""
+        """Flush the directory's entries to disk with fsync. Raises OSError."""
         _sync(path, os.O_RDONLY | os.O_DIRECTORY)
 
     def remove(self, path: Path) -> None:
-        """See Files."""
+        """Delete a file, if it exists. Raises OSError."""
         path.unlink(missing_ok=True)
 
     def commit(self, commit: Callable[[], None]) -> None:
-        """See Files."""
+        """Call `commit`, which commits one database transaction durably."""
         commit()
 
 
@@ -112,14 +112,14 @@ def _sync(path: Path, flags: int) -> None:
 
 
 class Clock(Protocol):
-    """Where times come from."""
+    """The source of times."""
 
     def utc_now(self) -> datetime:
-        """Aware, UTC."""
+        """The present time in UTC, timezone-aware."""
         ...
 
     def monotonic_s(self) -> float:
-        """Host monotonic time, the same origin in all processes of one boot."""
+        """Monotonic time of the host in seconds; all processes of one boot share its origin."""
         ...
 
 
@@ -127,46 +127,46 @@ class SystemClock:
     """The host's clocks."""
 
     def utc_now(self) -> datetime:
-        """See Clock."""
+        """The host's time in UTC, timezone-aware."""
         return datetime.now(UTC)
 
     def monotonic_s(self) -> float:
-        """See Clock."""
+        """Seconds of the host's monotonic clock."""
         return time.monotonic()
 
 
 def utc_text(at: datetime) -> str:
-    """ISO 8601 with microseconds and Z, as events carry it."""
+    """An aware time as ISO 8601 text in UTC with microseconds and Z, as in events."""
     return at.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
 class Ids(Protocol):
-    """Where names of new things come from; unique in the data folder."""
+    """The source of names for runs, jobs and tokens; unique within the data folder."""
 
     def new_run(self, at: datetime) -> str:
-        """Sorts by time."""
+        """A name for a run begun at `at`; names sort by time."""
         ...
 
     def new_job(self) -> str:
-        """Name of a job."""
+        """A name for a job."""
         ...
 
     def new_token(self) -> str:
-        """Unguessable: proof of a lease, and name of a temporary file."""
+        """An unguessable token: proof of a lease, or name of a temporary file."""
         ...
 
 
 class RandomIds:
-    """Random names; a run's begins with its date and time so that people can find it."""
+    """Random names; that of a run begins with its date and time, so that people can find it."""
 
     def new_run(self, at: datetime) -> str:
-        """See Ids."""
+        """A name such as 20260101-080000-a1b2c3, which sorts by time (UTC)."""
         return f"{at.astimezone(UTC):%Y%m%d-%H%M%S}-{secrets.token_hex(3)}"
 
     def new_job(self) -> str:
-        """See Ids."""
+        """A name of `job-` and 16 random hexadecimal digits."""
         return f"job-{secrets.token_hex(8)}"
 
     def new_token(self) -> str:
-        """See Ids."""
+        """An unguessable token of 32 hexadecimal digits."""
         return secrets.token_hex(16)

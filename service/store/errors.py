@@ -1,4 +1,4 @@
-"""What the store refuses and why, as leaves of the one error tree."""
+"""Errors of the store, as leaves of the one error tree."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from service.core.errors import StoreError
 
 
 class UnknownRunError(StoreError):
-    """No run, or more than one, answers to this name."""
+    """No run, or more than one, matches this name."""
 
 
 class LeaseHeldError(StoreError):
@@ -14,7 +14,7 @@ class LeaseHeldError(StoreError):
 
 
 class LeaseLostError(StoreError):
-    """The lease on a run or a job has gone to somebody else; nothing was written."""
+    """The lease on a run or a job now belongs to another process; nothing was written."""
 
 
 class StoreVersionError(StoreError):
@@ -22,8 +22,8 @@ class StoreVersionError(StoreError):
 
 
 class SigningKeyError(StoreError):
-    """The private key that signs checkpoints is missing, unusable or badly kept; what is recorded stays as it is."""
+    """The private key that signs checkpoints is missing, unusable or readable by others; the record is unaffected."""
 
 
 class TimestampError(StoreError):
-    """A time-stamp authority could not be reached, or its answer does not verify; the evidence stands without it."""
+    """A time-stamp authority cannot be reached or its answer does not verify; the evidence is valid without it."""

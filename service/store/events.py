@@ -1,4 +1,4 @@
-"""The chain of events: canonical form, hash, append within a transaction, read back."""
+"""The chain of events: canonical form, hashes, appending within a transaction, and reading back."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from service.store.durable_effects import Clock, utc_text
 
 ROOT = "0" * 64  # previous_sha256 of the first event
 _SAFE = 2**53 - 1
-# Where json.dumps and RFC 8785 may differ: 1.0, 1e-05 and 1e+16 are written otherwise, and names are sorted otherwise
-# beyond the surrogates. Text that only looks so is written out the long way.
+# Where json.dumps and RFC 8785 may differ: they write 1.0, 1e-05 and 1e+16 differently, and sort names with surrogate
+# pairs differently. Anything that matches takes the slow path, even if it is only text.
 _MAY_DIFFER = re.compile("\\.0(?![0-9])|[0-9]e[+-]|[\ud800-\U0010ffff]")
 _PLAIN = json.JSONEncoder(ensure_ascii=False, allow_nan=False, sort_keys=True, separators=(",", ":"))
 _REF_FIELDS: set[str] = set(ArtefactRef.model_fields)
 
 
 def canonical(value: object) -> str:
-    """RFC 8785 canonical JSON. Raises StoreError for NaN, infinity, integers beyond 2^53, lone surrogates."""
+    """RFC 8785 canonical JSON. Raises StoreError for NaN, infinity, integers beyond 2^53 and lone surrogates."""
     try:
         return rfc8785.dumps(cast("dict[str, Any]", value)).decode()
     except (rfc8785.CanonicalizationError, UnicodeEncodeError, RecursionError) as error:
@@ -39,22 +39,22 @@ def canonical(value: object) -> str:
 
 
 def canonical_parsed(value: object) -> str:
-    """The same as `canonical`, several times faster, for plain types as `parse_canonical` gives them.
+    """RFC 8785 canonical JSON, several times faster, for plain types as `parse_canonical` returns them.
 
-    Raises StoreError as `canonical` does.
+    Raises StoreError for NaN, infinity, integers beyond 2^53 and lone surrogates.
     """
     try:
         text = _PLAIN.encode(value)
     except (ValueError, RecursionError):
         return canonical(value)
-    # Nearly every text has none of these, which is quicker to tell than where they stand.
+    # Nearly every text has none of these, and testing for that is faster than the regular expression.
     if text.isascii() and ".0" not in text and "e-" not in text and "e+" not in text:
         return text
     return canonical(value) if _MAY_DIFFER.search(text) else text
 
 
 def parse_canonical(text: str) -> Any:
-    """Read canonical JSON back; canonical(parse_canonical(t)) == t. Raises ValueError."""
+    """Parse canonical JSON so that canonical(parse_canonical(t)) == t. Raises ValueError."""
     try:
         return _READER.decode(text)
     except RecursionError as error:
@@ -62,7 +62,7 @@ def parse_canonical(text: str) -> Any:
 
 
 def _integer(digits: str) -> int | float:
-    # The canonical form of 1e20 has no exponent: beyond the safe range the number can only have been a float.
+    # The canonical form of 1e20 has no exponent; beyond the safe range the number can only have been a float.
     value = int(digits)
     return value if -_SAFE <= value <= _SAFE else float(digits)
 
@@ -76,12 +76,12 @@ def sha256_text(text: str) -> str:
 
 
 def event_sha256(fields: Mapping[str, Any]) -> str:
-    """Hash of an event from its fields as plain data; `sha256` itself is left out."""
+    """SHA-256 of an event from its fields as plain data; the field `sha256` is ignored."""
     return sha256_text(canonical({name: value for name, value in fields.items() if name != "sha256"}))
 
 
 def event_sha256_of_text(fields: Mapping[str, Any], payload: str) -> str:
-    """The same for a payload that is canonical JSON already: it is not written out a second time."""
+    """SHA-256 of an event from its other fields and its payload, which is already canonical JSON."""
     return sha256_text(event_text({name: value for name, value in fields.items() if name != "sha256"}, payload))
 
 
@@ -95,7 +95,7 @@ def event_text(fields: Mapping[str, Any], payload: str) -> str:
 
 def payload_text(payload: Payload) -> str:
     """Canonical JSON of a payload. Raises StoreError naming the field that has no canonical form."""
-    # In JSON mode pydantic writes NaN within untyped fields as null: evidence must not change silently.
+    # In JSON mode pydantic writes NaN in untyped fields as null, which would silently change the evidence.
     for path, number in _numbers(payload.model_dump(mode="python"), payload.kind):
         if not math.isfinite(number):
             raise StoreError(
@@ -123,7 +123,7 @@ def _numbers(value: object, path: str) -> Iterator[tuple[str, float]]:
 
 
 def references(payload: object) -> tuple[ArtefactRef, ...]:
-    """Every ArtefactRef anywhere within a payload's plain data, in order, repetitions left out."""
+    """Every distinct ArtefactRef anywhere in a payload's plain data, in order. Raises StoreError."""
     return tuple(dict.fromkeys(_references(payload)))
 
 
@@ -148,10 +148,10 @@ def _reference(fields: Mapping[str, object]) -> ArtefactRef:
 
 
 def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence[Payload], actor: str) -> list[Event]:
-    """Append to a run's chain within the caller's IMMEDIATE transaction, so that nobody comes between.
+    """Append to a run's chain within the caller's IMMEDIATE transaction, so that no other writer interferes.
 
     Raises:
-        IntegrityError: the end of the chain is not where it was left.
+        IntegrityError: the chain does not end where the last append left it.
         StoreError: a payload has no canonical form.
     """
     seq, previous = read_head(connection, run_id)
@@ -179,7 +179,10 @@ def append(connection: Connection, clock: Clock, run_id: str, payloads: Sequence
 
 
 def read_head(connection: Connection, run_id: str) -> tuple[int, str]:
-    """Sequence number and hash of a run's last event; (0, 64 zeros) before the first. Raises IntegrityError."""
+    """Sequence number and hash of a run's last event; (0, 64 zeros) before the first.
+
+    Raises IntegrityError if the chain does not end where the last append left it.
+    """
     head = connection.execute(select(heads.c.seq, heads.c.sha256).where(heads.c.run_id == run_id)).one_or_none()
     last = connection.execute(
         select(events.c.seq, events.c.sha256).where(events.c.run_id == run_id).order_by(events.c.seq.desc()).limit(1)
@@ -195,7 +198,7 @@ def read_head(connection: Connection, run_id: str) -> tuple[int, str]:
 
 
 def read_events(connection: Connection, run_id: str, after_seq: int) -> list[Event]:
-    """The events after a sequence number, in order. Raises IntegrityError for a row that is no event."""
+    """The events after a sequence number, in order. Raises IntegrityError for a row that is not a valid event."""
     rows = connection.execute(
         select(events).where(events.c.run_id == run_id, events.c.seq > after_seq).order_by(events.c.seq)
     )
@@ -203,7 +206,7 @@ def read_events(connection: Connection, run_id: str, after_seq: int) -> list[Eve
 
 
 def to_event(row: Row[Any]) -> Event:
-    """A row as a record; does not check the hash. Raises IntegrityError."""
+    """A row as an Event; its hash is not checked. Raises IntegrityError if the row is not a valid event."""
     try:
         return Event(
             seq=row.seq,

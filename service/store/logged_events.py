@@ -1,4 +1,4 @@
-"""What was recorded, in the log of the process that recorded it: one line an event, once it is durable."""
+"""Log recorded events in the process that recorded them: one line per event, once it is durable."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _FIELDS = ("step", "attempt", "viewpoint", "device", "job", "job_kind", "duratio
 
 
 def tell(events: Sequence[Event]) -> None:
-    """The payload itself stays in the record: a line says which event, of what, and what went wrong."""
+    """Log one line per event: its kind, number and actor, what it concerns, and an error's message."""
     if not _log.isEnabledFor(logging.INFO):
         return
     for event in events:

@@ -1,4 +1,4 @@
-"""What callers hand to the store and get back from it, beside events: artefacts and jobs."""
+"""Records that callers pass to the store and get back from it, other than events: artefacts, jobs, signatures."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 from service.core.jobs.priorities import WAITED
 from service.core.records.events import ArtefactRef
 
-SITE = "site"  # name of the chain that holds what happens outside of runs: sign-ins, accounts, keys, starts
+SITE = "site"  # name of the chain for events outside runs: sign-ins, accounts, keys, starts
 
 
 @dataclass(frozen=True, slots=True)
 class NewArtefact:
-    """A stored file about to be recorded, and where it comes from. One of the payloads must refer to it.
+    """A stored file that is about to be recorded, with its origin. One of the payloads must refer to it.
 
-    `who` is the actor of the event and the times are those of the event unless given.
+    `who`, `at_utc` and `monotonic_s` default to the actor and the times of the event.
     """
 
     ref: ArtefactRef
@@ -31,7 +31,7 @@ class NewArtefact:
 
 @dataclass(frozen=True, slots=True)
 class Artefact:
-    """A recorded artefact: one row, as it stands in the evidence."""
+    """A recorded artefact: one row of the evidence."""
 
     run_id: str
     seq: int  # of the event that brought it
@@ -49,7 +49,7 @@ class Artefact:
 
 @dataclass(frozen=True, slots=True)
 class NewJob:
-    """Work for a worker. Enqueueing an `idempotency_key` that the run already has does nothing."""
+    """Work for a worker. A job whose `idempotency_key` the run already has is not enqueued again."""
 
     kind: str
     step: str
@@ -62,7 +62,7 @@ class NewJob:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A job as it stood when it was read; `token` is the proof of the lease while it runs."""
+    """A job as it was when it was read; `token` proves the lease while the job runs."""
 
     job_id: str
     run_id: str
@@ -86,7 +86,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class RunRow:
-    """A run of the data folder."""
+    """A run in the data folder, with the end of its chain."""
 
     run_id: str
     created_utc: str
@@ -98,13 +98,13 @@ class RunRow:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """A signature over a chain up to one event, and over the artefact rows up to there."""
+    """A signature over a chain, and over its artefact rows, up to one event."""
 
     run_id: str
     seq: int  # of the last event that it covers
     sha256: str  # of that event
     artefacts_sha256: str  # over the rows' record_sha256
-    site_seq: int  # where the site's chain was when it was signed; it says which key was valid
+    site_seq: int  # end of the site's chain at the time of signing, which tells the valid key
     site_sha256: str
     at_utc: str
     key_id: str
@@ -113,10 +113,10 @@ class Checkpoint:
 
 @dataclass(frozen=True, slots=True)
 class Timestamp:
-    """What a time-stamp authority says of a checkpoint (RFC 3161)."""
+    """A time-stamp authority's stamp on a checkpoint (RFC 3161)."""
 
     run_id: str
     seq: int  # of the checkpoint
-    authority: str  # address
-    at_utc: str  # when it was asked; the authority's own time is in the token
+    authority: str  # its address
+    at_utc: str  # time of the request; the authority's own time is in the token
     token: str  # base64 of the DER TimeStampResp

@@ -1,4 +1,4 @@
-"""The store of a data folder, as the runner, the worker and the command line use it."""
+"""The store of a data folder, for the runner, the worker, the web and the command line."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _OWN_KINDS = frozenset({"run_started", "site_opened", "job_enqueued", "job_finis
 
 
 class Store:
-    """Events, artefacts and jobs of all runs in one data folder. Safe for several processes and threads at once.
+    """Events, artefacts and jobs of all runs in one data folder. Several processes and threads may use it at once.
 
-    Methods raise StoreError (or a leaf of it) and nothing else; after a raise, nothing of the call was recorded.
+    Methods raise only StoreError and its subclasses; a call that raised has recorded nothing.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Store:
         self._clock = clock
         self._ids = ids
         self.database_path = path
-        self.sound_until: dict[str, tuple[int, str]] = {}  # chain → the last event that was verified before signing
+        self.sound_until: dict[str, tuple[int, str]] = {}  # chain → number and hash of the last event verified
 
     @classmethod
     def open(
@@ -57,7 +57,10 @@ class Store:
         *,
         create: bool = True,
     ) -> Store:
-        """Open a data folder, and make it when `create`. StoreVersionError for a newer database."""
+        """Open a data folder; with `create`, make it if it does not exist.
+
+        Raises StoreVersionError for a database of a newer version, StoreError if the folder cannot be used.
+        """
         files = files or DurableFiles()
         ids = ids or RandomIds()
         if not create and not database_path(data_dir).is_file():
@@ -84,26 +87,26 @@ class Store:
 
     @property
     def database(self) -> Database:
-        """For what has tables of its own beside the evidence: people, screens."""
+        """The database, for code with tables of its own beside the evidence: people, screens."""
         return self._database
 
     @property
     def artefact_folder(self) -> Path:
-        """Where the content-addressed files lie."""
+        """The folder of the content-addressed files."""
         return self._folder.folder
 
     @property
     def files(self) -> Files:
-        """Through which everything is written that must survive a crash."""
+        """The interface through which everything is written that must survive a crash."""
         return self._files
 
     @property
     def clock(self) -> Clock:
-        """Where its times come from."""
+        """The clock that gives the times of events."""
         return self._clock
 
     def free_bytes(self) -> int:
-        """Free space on the disk of the data folder."""
+        """Free space in bytes on the disk of the data folder. Raises StoreError."""
         try:
             return shutil.disk_usage(self.database_path.parent).free
         except OSError as error:
@@ -128,34 +131,34 @@ class Store:
     def put_file(
         self, path: Path, *, kind: str, media_type: str, original_name: str | None = None, sha256: str | None = None
     ) -> ArtefactRef:
-        """Copy a file into the store, durably. Nothing refers to it before `record`.
+        """Copy a file into the store durably. Nothing refers to it until `record`.
 
         Args:
-            path: the file; it stays where it is.
-            kind: image, raw, scan …, see ArtefactRef.
+            path: the file; it is copied and left in place.
+            kind: image, raw, scan …, as in ArtefactRef.
             media_type: such as image/jpeg.
-            original_name: as the device called it; the file's own name unless given.
-            sha256: what the driver hashed at arrival; refused when the copy differs.
+            original_name: the device's name for it; defaults to the file's own name.
+            sha256: the hash that the driver took on arrival; a copy that differs is refused.
         """
         digest, size = self._folder.put(chunks_of(path), expected_sha256=sha256)
         name = original_name or path.name
         return ArtefactRef(sha256=digest, kind=kind, media_type=media_type, size_bytes=size, original_name=name)
 
     def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
-        """Write bytes into the store, durably. Nothing refers to them before `record`."""
+        """Write bytes into the store durably. Nothing refers to them until `record`."""
         digest, size = self._folder.put([data])
         return ArtefactRef(
             sha256=digest, kind=kind, media_type=media_type, size_bytes=size, original_name=original_name
         )
 
     def artefact_path(self, sha256: str, *, verify: bool = False) -> Path:
-        """The read-only file of an artefact. Raises IntegrityError when missing or, with `verify`, altered."""
+        """The read-only file of an artefact. Raises IntegrityError if it is missing or, with `verify`, altered."""
         return self._folder.verified_path(sha256) if verify else self._folder.path(sha256)
 
     # --- runs and events ---
 
     def create_run(self, payload: RunStarted, actor: str, artefacts: Sequence[NewArtefact]) -> str:
-        """Begin a run: its first event, with protocol and rig among the artefacts. Returns the run's name."""
+        """Begin a run with its first event and its artefacts, protocol and rig among them. Returns the run's name."""
         run_id = self._ids.new_run(self._clock.utc_now())
         with self._database.writing() as connection:
             self._begin_chain(connection, run_id, payload, actor, artefacts)
@@ -164,7 +167,7 @@ class Store:
     def record_site(
         self, payloads: Sequence[Payload], *, actor: str, software: Mapping[str, str] | None = None
     ) -> list[Event]:
-        """Append events to the site's chain, which the first of them begins. `software`: for its root."""
+        """Append events to the site's chain, beginning it if need be; `software` goes into its first event."""
         with self._database.writing() as connection:
             return self.append_site(connection, payloads, actor=actor, software=software)
 
@@ -176,13 +179,13 @@ class Store:
         actor: str,
         software: Mapping[str, str] | None = None,
     ) -> list[Event]:
-        """The same within a transaction of `database.writing()`: what is recorded and what is done are one."""
+        """`record_site` within a transaction of `database.writing()`, so that an action and its record are atomic."""
         if connection.execute(select(runs.c.run_id).where(runs.c.run_id == SITE)).first() is None:
             self._begin_chain(connection, SITE, SiteOpened(software=dict(software or {})), actor, ())
         return append(connection, self._clock, SITE, payloads, actor)
 
     def append(self, connection: Connection, run_id: str, payloads: Sequence[Payload], *, actor: str) -> list[Event]:
-        """Append to a run's chain within a transaction of `database.writing()`, as `append_site` does."""
+        """Append to a run's chain within a transaction of `database.writing()`. Raises UnknownRunError."""
         self._require_run(connection, run_id)
         return append(connection, self._clock, run_id, payloads, actor)
 
@@ -194,7 +197,7 @@ class Store:
         actor: str,
         artefacts: Sequence[NewArtefact],
     ) -> None:
-        # The run's row holds the hash of the root event, which refers to the row: keys are checked at commit.
+        # The run's row holds the hash of the root event, which refers to the row; keys are checked at commit.
         connection.exec_driver_sql("PRAGMA defer_foreign_keys = ON")
         connection.execute(insert(heads).values(run_id=run_id, seq=0, sha256=ROOT))
         (root,) = append(connection, self._clock, run_id, [payload], actor)
@@ -215,12 +218,12 @@ class Store:
             return read_runs(connection)
 
     def open_runs(self) -> set[str]:
-        """Names of the runs that nothing has ended yet, from the index of events, without reading them."""
+        """Names of the runs that have not ended, from the index of events without reading them all."""
         with self._database.reading() as connection:
             return read_open_runs(connection)
 
     def find_run(self, name: str) -> str:
-        """The run that `name` means: its full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
+        """The run called `name`: a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
         return resolve_run(self.runs(), name)
 
     def record(
@@ -233,10 +236,10 @@ class Store:
         jobs: Sequence[NewJob] = (),
         lease: RunLease | None = None,
     ) -> list[Event]:
-        """Append events, artefact rows and jobs in one transaction: all of it is durable on return, or none of it.
+        """Append events, artefact rows and jobs in one transaction; all of it is durable on return, or none.
 
-        A job also appends JobEnqueued after the payloads; one whose key the run has already is left out.
-        With `lease`, a runner that has lost its run is refused (LeaseLostError).
+        Each job also appends a JobEnqueued after the payloads; a job whose key the run already has is left out.
+        With `lease`, raises LeaseLostError if another process has taken over the run.
         """
         for payload in payloads:
             if payload.kind in _OWN_KINDS:
@@ -254,13 +257,13 @@ class Store:
         return events
 
     def events(self, run_id: str, after_seq: int = 0) -> list[Event]:
-        """A run's events after a sequence number, in order. Does not verify the chain: see audit.verify."""
+        """A run's events after a sequence number, in order. The chain is not verified (verification.verify does)."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             return read_events(connection, run_id, after_seq)
 
     def first_event(self, run_id: str) -> Event:
-        """The event that a run begins with, without reading the others. Raises IntegrityError where it is missing."""
+        """A run's first event, without reading the others. Raises IntegrityError if it is missing."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
             row = connection.execute(select(events).where(events.c.run_id == run_id, events.c.seq == 1)).one_or_none()
@@ -269,7 +272,7 @@ class Store:
         return to_event(row)
 
     def head(self, run_id: str) -> int:
-        """Number of a run's last event."""
+        """Sequence number of a run's last event. Raises UnknownRunError."""
         with self._database.reading() as connection:
             seq: int | None = connection.execute(select(heads.c.seq).where(heads.c.run_id == run_id)).scalar()
         if seq is None:
@@ -283,23 +286,23 @@ class Store:
             return read_artefacts(connection, run_id)
 
     def holds(self, run_id: str, sha256: str) -> bool:
-        """Whether a run has recorded a file of this content."""
+        """Whether a run has recorded a file with this content."""
         found = select(artefacts.c.seq).where(artefacts.c.sha256 == sha256, artefacts.c.run_id == run_id).limit(1)
         with self._database.reading() as connection:
             return connection.execute(found).first() is not None
 
     def checkpoints(self, run_id: str) -> list[Checkpoint]:
-        """All signatures over a run's chain (or the site's), oldest first; signatures.signing makes them."""
+        """All checkpoints of a run's chain, or of the site's (SITE), oldest first; signatures.signing makes them."""
         with self._database.reading() as connection:
             return read_checkpoints(connection, run_id)
 
     def timestamps(self, run_id: str) -> list[Timestamp]:
-        """What time-stamp authorities say of a run's checkpoints, oldest first."""
+        """The time stamps on a run's checkpoints, oldest first."""
         with self._database.reading() as connection:
             return read_timestamps(connection, run_id)
 
     def lease(self, run_id: str, holder: str, seconds: float) -> RunLease:
-        """The sole right to drive a run. Raises LeaseHeldError while a living process has it."""
+        """Acquire the sole right to drive a run. Raises LeaseHeldError while a living process holds it."""
         with self._database.reading() as connection:
             self._require_run(connection, run_id)
         return acquire(self._database, self._clock, self._ids, run_id=run_id, holder=holder, seconds=seconds)
@@ -310,7 +313,7 @@ class Store:
             return is_held(connection, self._clock, run_id)
 
     def driven_runs(self) -> list[str]:
-        """All runs whose lease a living process holds."""
+        """Names of all runs whose lease a living process holds."""
         with self._database.reading() as connection:
             return held_runs(connection, self._clock)
 
@@ -327,12 +330,12 @@ class Store:
             return queue.read_jobs(connection, run_id)
 
     def jobs_started(self, run_id: str) -> dict[str, str]:
-        """When each job of a run that is being computed was begun (UTC), by the job's name."""
+        """Start time (UTC) of each job of a run that is being computed, by the job's name."""
         with self._database.reading() as connection:
             return queue.started(connection, run_id)
 
     def enqueue_job(self, run_id: str, job: NewJob, *, actor: str) -> Job:
-        """Enqueue a job, or return the one that has its key already."""
+        """Enqueue a job, or return the existing job with its key."""
         self.record(run_id, [], actor=actor, jobs=[job])
         with self._database.reading() as connection:
             found = queue.find_by_key(connection, run_id, job.idempotency_key)
@@ -341,7 +344,10 @@ class Store:
         return found
 
     def open_jobs(self, run_id: str | None = None, *, lane: Lane | None = None) -> int:
-        """How many jobs of a run, or of all, are queued or being computed; see `claim_job` for `lane`."""
+        """Number of jobs of a run, or of all runs, that are queued or being computed.
+
+        `lane` counts only jobs that a person or a step waits for ("waited"), or only the others ("background").
+        """
         with self._database.reading() as connection:
             return queue.open_jobs(connection, run_id, lane)
 
@@ -354,9 +360,10 @@ class Store:
         run_id: str | None = None,
         lane: Lane | None = None,
     ) -> Job | None:
-        """The first open job by priority and age, now this worker's for `lease_s` seconds; None without any.
+        """Claim the first open job by priority, then age, for `lease_s` seconds; None if there is none.
 
-        `lane`: only what a person or a step waits for, or only what nobody waits for.
+        `kinds`, `run_id` and `lane` restrict the choice: `lane` to jobs that a person or a step waits for ("waited"),
+        or to the others ("background").
         """
         with self._database.writing() as connection:
             return queue.claim(
@@ -389,14 +396,14 @@ class Store:
         """Append JobFinished with its artefacts and close the job. Raises LeaseLostError.
 
         Args:
-            job: as it was claimed.
-            measures: numbers of the answer.
-            duration_s: of the computation.
-            result: plain data of the answer.
-            artefacts: files of the answer.
-            late_s: how long after the specimen's release it arrives; None: in time.
-            follow: a sequence number, and what is asked, with all events after it, for the jobs that follow from
-                them; they are enqueued in the same transaction, so that no crash comes between.
+            job: the claimed job.
+            measures: the answer's measures.
+            duration_s: time that the computation took.
+            result: the answer as plain data.
+            artefacts: the answer's files.
+            late_s: seconds from the specimen's release to this answer; None if it is in time.
+            follow: a sequence number and a function that gets all events after it and returns the jobs that follow;
+                they are enqueued in the same transaction, so that a crash cannot lose them.
         """
         payload = JobFinished(
             job=job.job_id,
@@ -421,9 +428,9 @@ class Store:
         return event
 
     def fail_job(self, job: Job, error: Exception, *, retry: bool) -> list[Event]:
-        """Try a job again later, or fail it for good when not `retry` or no tries are left. Raises LeaseLostError.
+        """Queue a job again, or fail it for good if not `retry` or no tries are left. Raises LeaseLostError.
 
-        What is no OrthocaptureError was not foreseen: its traceback goes into the record.
+        An error that is not an OrthocaptureError is unexpected: its traceback goes into the record.
         """
         foreseen = isinstance(error, OrthocaptureError)
         name, message = type(error).__name__, str(error) if foreseen else repr(error)
@@ -434,13 +441,13 @@ class Store:
         return events
 
     def release_jobs(self, pids: Collection[int]) -> None:
-        """Queue the jobs of these processes of this host again, untried: they were told to stop, and have."""
+        """Queue the jobs of these local processes again without counting a try: they were told to stop and have."""
         with self._database.writing() as connection:
             queue.release(connection, pids)
 
 
 def read_runs(connection: Connection) -> list[RunRow]:
-    """All runs, oldest first; the site's chain is not among them."""
+    """All runs, oldest first, without the site's chain."""
     statement = (
         select(runs, heads.c.seq, heads.c.sha256)
         .outerjoin(heads, heads.c.run_id == runs.c.run_id)
@@ -454,7 +461,7 @@ def read_runs(connection: Connection) -> list[RunRow]:
 
 
 def read_open_runs(connection: Connection) -> set[str]:
-    """Runs without an end: neither the runner's own nor a person's abort, which it records later."""
+    """Runs that have neither an end recorded by the runner nor an operator's abort, which it confirms later."""
     ended = (
         select(event_index.c.seq)
         .where(event_index.c.run_id == heads.c.run_id, event_index.c.kind.in_(_ENDS))
@@ -467,7 +474,7 @@ def read_open_runs(connection: Connection) -> set[str]:
             events.c.seq == event_index.c.seq,
             event_index.c.run_id == heads.c.run_id,
             event_index.c.kind == "operator_action",
-            # A damaged payload is for the verification to find; here it must not raise.
+            # A damaged payload must not raise here; the verification finds it.
             case((func.json_valid(events.c.payload) == 1, func.json_extract(events.c.payload, "$.action")))
             == "abort",
         )
@@ -479,7 +486,7 @@ def read_open_runs(connection: Connection) -> set[str]:
 
 
 def resolve_run(known: Sequence[RunRow], name: str) -> str:
-    """The run that a full name, an unambiguous beginning, or `latest` means. Raises UnknownRunError."""
+    """The run for a full name, an unambiguous beginning, or `latest`. Raises UnknownRunError."""
     if not known:
         raise UnknownRunError("there is no run in this data folder yet", remedy="Start one with `orthocapture run`")
     if name == "latest":

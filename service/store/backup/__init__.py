@@ -1,1 +1,1 @@
-"""Copies of a data folder, and a data folder from a copy."""
+"""Backups of a data folder, and their restoration."""

@@ -1,7 +1,7 @@
-"""A copy of a data folder, made while it is written to: database, log of signatures, and what is new of the files.
+"""Back up a data folder while it is in use: the database, the log of signatures, and new files.
 
-The database is copied first, in one consistent state, by SQLite's own means; every file that a row of that state
-names is on disk by then. What a run adds meanwhile belongs to the next backup.
+The database is copied first, in one consistent state, with SQLite's backup interface; every file named in that state
+is then already on disk. What a run adds meanwhile belongs to the next backup.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from service.store.signatures.log import NAME as LOG_NAME
 from service.store.signatures.log import read_log
 from service.store.verification import verify as audit
 
-Progress = Callable[[str, int, int], None]  # what is being done, done, total (bytes)
-_SPARE_BYTES = 64 << 20  # beside what is to be copied
+Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)
+_SPARE_BYTES = 64 << 20  # must be free beyond what is copied
 
 
 @dataclass(frozen=True, slots=True)
 class BackupReport:
-    """What a backup did."""
+    """The result of a backup."""
 
     folder: Path
-    name: str  # of the state: `orthocapture store restore --state NAME`
+    name: str  # of the state, for `orthocapture store restore --state NAME`
     state: BackupState
-    copied: int  # files, this time
+    copied: int  # number of files copied this time
     copied_bytes: int
-    present: int  # files that were there from earlier backups
+    present: int  # number of files already there from earlier backups
 
 
 def back_up(
@@ -56,21 +56,21 @@ def back_up(
     files: Files | None = None,
     clock: Clock | None = None,
 ) -> BackupReport:
-    """Copy a data folder into a folder of backups; begun again after an interruption it goes on where it was.
+    """Copy a data folder into a folder of backups; after an interruption, a repeated call continues the copy.
 
     Args:
-        data_dir: the data folder; a run may be going on in it.
-        destination: the folder of backups: empty, not there yet, or holding earlier ones of this data folder.
-        with_keys: copy the private signing key too.
-        read_all: read every file that earlier backups have copied again, and copy anew those that were altered.
-        keep: how many states to keep, the newest; None: all. Those before one with faults are always kept.
-        progress: told how many bytes were copied.
-        files: the seam for durable effects.
-        clock: names the state.
+        data_dir: the data folder, which a run may be using.
+        destination: the folder of backups: new, empty, or with earlier backups of this data folder.
+        with_keys: also copy the private signing key.
+        read_all: hash again every file that earlier backups copied, and copy altered ones again.
+        keep: number of newest states to keep; None keeps all. If this state has faults, none is discarded.
+        progress: called with the number of bytes copied.
+        files: durable file operations.
+        clock: gives the state its name.
 
     Raises:
-        StoreError: there is no data, or the destination cannot be used or is too small; no backup was made.
-        IntegrityError: what was written does not read back as it was; no backup was made.
+        StoreError: there is no data, or the destination is unusable or too small; no backup was made.
+        IntegrityError: a written file does not read back as it was; no backup was made.
     """
     folder = BackupFolder(destination, files or DurableFiles(), RandomIds())
     here, there = data_dir.resolve(), destination.resolve()
@@ -80,7 +80,7 @@ def back_up(
             where=str(destination),
             remedy="Name a folder on another disk",
         )
-    source = open_read_only(data_dir, DurableFiles())  # before anything is made: there may be no data
+    source = open_read_only(data_dir, DurableFiles())  # raises if there is no data, before anything is created
     source.close()
     folder.prepare()
     with folder.locked(), folder_errors("the backup could not be written"):
@@ -96,9 +96,9 @@ def _silent(_what: str, _done: int, _total: int) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Holds:
-    """What the copied database names."""
+    """What the copied database refers to."""
 
-    sizes: dict[str, int]  # of files, by hash
+    sizes: dict[str, int]  # sizes of files, by hash
     heads: dict[str, tuple[int, str]]
     root_sha256: str
 
@@ -156,7 +156,7 @@ class _Backup:
         return BackupReport(self.folder.folder, self.name, state, len(copied), size, len(holds.sizes) - len(missing))
 
     def _copy_database(self, part: Path) -> str:
-        """In one step of SQLite's backup: one state, whoever writes meanwhile. Its SHA-256."""
+        """Copy in one step of SQLite's backup, which gives one consistent state. Returns the copy's SHA-256."""
         self.progress("copying the database", 0, 0)
         target = part / DATABASE_NAME
         source = open_read_only(self.data_dir, DurableFiles())
@@ -166,7 +166,7 @@ class _Backup:
                 assert isinstance(raw, sqlite3.Connection)  # the engine's own driver
                 with closing(sqlite3.connect(target, isolation_level=None)) as copy:
                     raw.backup(copy)
-                    copy.execute("PRAGMA journal_mode = DELETE")  # one file, which reading does not change
+                    copy.execute("PRAGMA journal_mode = DELETE")  # a single file that readers do not change
         except sqlite3.Error as error:
             raise StoreError(f"the database could not be copied: {error}", where=str(target), remedy=LOOK) from error
         finally:
@@ -175,13 +175,13 @@ class _Backup:
         return hash_file(target)[0]
 
     def _copy_signatures(self, part: Path, copied: set[tuple[str, int]]) -> str:
-        """The lines up to the first whose signature came after the database was copied. SHA-256, "" for no log."""
+        """Copy the lines before the first signature newer than the database copy. SHA-256; "" without a log."""
         log = self.data_dir / LOG_NAME
         lines = read_log(log)
         if lines is None:
             return ""
-        # Only what the data folder holds by now is newer. A line without a signature in either was there before it
-        # was cut back, and stays, for the audit to find.
+        # A line is newer only if the data folder now holds its signature. A line whose signature is in neither
+        # database is evidence of a cut database and is copied, for the audit to find.
         newer = self._signed_now() - copied
         count = len(lines)
         for line in lines:
@@ -209,7 +209,7 @@ class _Backup:
             )
 
     def _missing(self, sizes: dict[str, int]) -> list[str]:
-        """Hashes of the files that are to be copied. Altered ones are taken away first."""
+        """Hashes of the files to copy. Removes damaged copies, of wrong size or, with `read_all`, wrong content."""
         found: list[str] = []
         total, done = sum(sizes.values()), 0
         for sha256, size in sizes.items():
@@ -234,7 +234,7 @@ class _Backup:
             )
 
     def _copy_files(self, missing: list[str], sizes: dict[str, int]) -> list[str]:
-        """Copy and read again. What the data folder itself has lost or altered is told, and stops nothing."""
+        """Copy files and read them back. Returns the faults of the data folder's own files; they are not errors."""
         lost: list[str] = []
         total, done = sum(sizes[sha256] for sha256 in missing), 0
         for sha256 in missing:
@@ -244,7 +244,7 @@ class _Backup:
                 lost.append(fault)
             done += sizes[sha256]
             self.progress("copying files", done, total)
-        # Those of earlier backups too: whoever renamed them may have died before this call.
+        # Also for files of earlier backups: the process that renamed them may have died before syncing.
         for shard in {relative_path(sha256).parent for sha256 in sizes}:
             if (self.folder.artefacts.folder / shard).is_dir():
                 self.folder.files.sync_directory(self.folder.artefacts.folder / shard)
@@ -277,12 +277,12 @@ class _Backup:
             raise IntegrityError(
                 "what was written does not read back as it was",
                 where=str(path),
-                remedy="The medium is not to be trusted: use another one",
+                remedy="The medium cannot be trusted: use another one",
             )
 
 
 def _fault_of(source: Path, sha256: str) -> str:
-    """What is wrong with a file of the data folder; "" for nothing."""
+    """What is wrong with a file of the data folder; "" if nothing is."""
     shown = f"artefacts/{relative_path(sha256)}"
     try:
         return "" if hash_file(source)[0] == sha256 else f"{shown}: the file was altered; it is not in the backup"

@@ -1,11 +1,11 @@
-"""A folder of backups on disk: what it is known by, its states, and the one lock.
+"""A folder of backups on disk: its marker file, its states, and its lock.
 
-BACKUP/orthocapture-backup.json   says what this folder is
-BACKUP/artefacts/ab/abcd…         the files of all states, by their hash, written once
-BACKUP/states/TIME/               one backup: orthocapture.sqlite, signatures.jsonl, state.json, perhaps keys/
-BACKUP/states/TIME.part           one that was not finished; nobody takes it for a backup
+BACKUP/orthocapture-backup.json   marks the folder
+BACKUP/artefacts/ab/abcd…         the files of all states by hash, each written once
+BACKUP/states/TIME/               one backup: orthocapture.sqlite, signatures.jsonl, state.json, optionally keys/
+BACKUP/states/TIME.part           an unfinished backup, which is never used
 
-A state gets its name by one rename, after everything that it needs was written and read again.
+A state gets its name by one rename, after everything in it was written and read back.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ class BackupState(Record):
     format: Literal[1] = 1
     at_utc: str
     host: str
-    data_folder: str  # as it was called there
+    data_folder: str  # its path on that host
     database_sha256: str
-    signatures_sha256: str  # "" where nothing was signed yet
+    signatures_sha256: str  # "" if nothing was signed yet
     artefacts: int
     artefact_bytes: int
     heads: dict[str, tuple[int, str]]  # chain → number and hash of its last event
-    root_sha256: str  # of the oldest chain: which data folder this is
+    root_sha256: str  # of the oldest chain; identifies the data folder
     with_keys: bool
-    faults: tuple[str, ...]  # of the data folder itself, copied as it was; () for one that verified
+    faults: tuple[str, ...]  # in the data folder itself when it was copied; () if it verified
 
 
 @contextmanager
 def folder_errors(what: str) -> Generator[None]:
-    """What the system refuses becomes a StoreError: `what` could not be done."""
+    """Turn an OSError into a StoreError that begins with `what`."""
     try:
         yield
     except OSError as error:
@@ -71,7 +71,7 @@ class BackupFolder:
         self.artefacts = ArtefactFiles(folder / "artefacts", files, ids)
 
     def prepare(self) -> None:
-        """Make the folder, or see that it is one of backups. Raises StoreError."""
+        """Make the folder, or check that it is a folder of backups. Raises StoreError."""
         with folder_errors("the folder for backups cannot be made"):
             for directory in (*reversed(self.folder.absolute().parents), self.folder.absolute()):
                 if not directory.exists():
@@ -88,7 +88,7 @@ class BackupFolder:
         part = self.folder / (MARKER + PART)
         if any(path != part for path in self.folder.iterdir()):
             raise StoreError(
-                "this folder holds something else than backups",
+                "this folder holds something other than backups",
                 where=str(self.folder),
                 remedy="Name an empty folder, or one that does not exist yet",
             )
@@ -99,59 +99,59 @@ class BackupFolder:
         self.files.sync_directory(self.folder)
 
     def require(self) -> None:
-        """Raises StoreError unless this is a folder of backups that this software knows."""
+        """Raise StoreError unless this is a folder of backups in a known format."""
         try:
             known = json.loads((self.folder / MARKER).read_bytes()) == _SAYS
         except (OSError, ValueError):
             known = False
         if not known:
             raise StoreError(
-                "this is not a folder of backups of orthocapture, or of a newer version",
+                "this is not a folder of orthocapture backups, or it is of a newer version",
                 where=str(self.folder),
                 remedy="Name the folder that `orthocapture store backup` has written",
             )
 
     @contextmanager
     def locked(self) -> Generator[None]:
-        """One backup at a time. Raises StoreError."""
+        """Hold the lock that allows one backup at a time. Raises StoreError if another is running."""
         with (self.folder / MARKER).open("rb") as marker:
             try:
                 fcntl.flock(marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise StoreError(
-                    "another backup into this folder is under way",
+                    "another backup into this folder is running",
                     where=str(self.folder),
                     remedy="Wait until it has ended",
                 ) from error
             yield
 
     def states(self) -> list[str]:
-        """Names of the whole backups, oldest first."""
+        """Names of the complete backups, oldest first."""
         found = (self.folder / STATES).glob(f"*/{STATE_FILE}")
         return sorted(path.parent.name for path in found if path.parent.suffix != PART)
 
     def path(self, name: str) -> Path:
-        """Where a state lies, or will lie."""
+        """The folder of a state, which need not exist."""
         return self.folder / STATES / name
 
     def read(self, name: str) -> BackupState:
-        """What a state says of itself. Raises StoreError for a name that is none, IntegrityError."""
+        """The record of a state. Raises StoreError if there is no such state, IntegrityError if it is unreadable."""
         if name not in self.states():
             raise StoreError(
-                f"there is no backup {name!r} here" if name else "there is no whole backup here",
+                f"there is no backup {name!r} here" if name else "there is no complete backup here",
                 where=str(self.folder),
-                remedy=f"There are: {', '.join(self.states()) or 'none; an unfinished one is begun anew'}",
+                remedy=f"There are: {', '.join(self.states()) or 'none; repeat an unfinished backup'}",
             )
         path = self.path(name) / STATE_FILE
         try:
             return BackupState.model_validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:
             raise IntegrityError(
-                "what this backup says of itself cannot be read", where=str(path), remedy="Take an older backup"
+                "the record of this backup cannot be read", where=str(path), remedy="Use an older backup"
             ) from error
 
     def discard(self, path: Path) -> None:
-        """Take away a state; as it loses its name first, no half of it is ever taken for a whole one."""
+        """Delete a state; it is renamed first, so that a partly deleted one is never mistaken for complete."""
         if path.suffix != PART:
             part = path.with_name(path.name + PART)
             self.files.rename(path, part)
@@ -160,7 +160,7 @@ class BackupFolder:
         shutil.rmtree(path)
 
     def discard_unfinished(self) -> None:
-        """Take away what earlier backups did not finish; files that were copied by then stay and are used."""
+        """Delete unfinished states and partial files of earlier backups; complete copies stay and are used."""
         for path in (self.folder / STATES).glob(f"*{PART}"):
             self.discard(path)
         for path in (self.artefacts.folder / TEMPORARY).glob(f"*{PART}"):

@@ -1,4 +1,4 @@
-"""A data folder from a backup: into an empty folder only, verified before it becomes one."""
+"""Restore a data folder from a backup, only into an empty folder, and verify it before it is put in place."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from service.store.store import Store
 from service.store.verification import verify as audit
 from service.store.verification.verify import AuditReport
 
-Progress = Callable[[str, int, int], None]  # what is being done, done, total (bytes)
-_UNDER_WAY = "restoring"  # within the destination: no data folder until it was verified
+Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)
+_UNDER_WAY = "restoring"  # within the destination, which is no data folder until the restoration is verified
 
 
 @dataclass(frozen=True, slots=True)
 class RestoreReport:
-    """What was restored, and what its verification says."""
+    """What was restored, and the result of its verification."""
 
     folder: Path
     name: str
     state: BackupState
-    lost: tuple[str, ...]  # files that the backup itself does not hold whole
+    lost: tuple[str, ...]  # files that are missing or altered in the backup itself
     audit: AuditReport
 
     @property
@@ -51,22 +51,22 @@ def restore(
     progress: Progress | None = None,
     files: Files | None = None,
 ) -> RestoreReport:
-    """Make a data folder as it was when a backup was made. The backup is only read.
+    """Restore a data folder as it was when a backup was made. The backup is only read.
 
-    What a damaged backup has lost is told in the report, and the rest is restored all the same. Leases, sign-ins and
-    control of screens belonged to the processes of then and are left out. The site's chain says that it was restored.
+    The report lists what a damaged backup has lost; the rest is restored. Leases, sign-ins and control by screens
+    belonged to processes of that time and are left out. The restoration is recorded in the site's chain.
 
     Args:
         backup: the folder of backups.
-        destination: a folder that is empty, or not there yet.
-        name: which state; "" for the newest.
-        actor: who restores, for the record.
-        progress: told how many bytes were copied, then verified.
-        files: the seam for durable effects.
+        destination: an empty or new folder.
+        name: the state to restore; "" for the newest.
+        actor: the person who restores, for the record.
+        progress: called with the number of bytes copied, then verified.
+        files: durable file operations.
 
     Raises:
-        StoreError: the destination holds something, or cannot be written.
-        IntegrityError: the copied database is not the one that was written.
+        StoreError: the destination is not empty or cannot be written.
+        IntegrityError: the database or the log of signatures was altered in the backup or in copying.
     """
     files = files or DurableFiles()
     source = BackupFolder(backup, files, RandomIds())
@@ -83,7 +83,7 @@ def restore(
         lost = _copy_files(source, work, files, progress)
         report = audit.verify(work, progress=progress)
         _let_go(work, DataRestored(state=name, at_utc=state.at_utc, folder=state.data_folder, host=state.host), actor)
-        for part in (LOG_NAME, KEYS, "artefacts", DATABASE_NAME):  # the database last: it makes the data folder
+        for part in (LOG_NAME, KEYS, "artefacts", DATABASE_NAME):  # the database last: it makes this a data folder
             if (work / part).exists():
                 files.rename(work / part, destination / part)
         files.sync_directory(destination)
@@ -109,7 +109,7 @@ def _copy_state(state_dir: Path, work: Path, state: BackupState, files: Files) -
         files.sync_file(work / part)
         if hash_file(work / part)[0] != sha256:
             raise IntegrityError(
-                f"{part} of this backup was altered, or the copy of it",
+                f"{part} was altered in this backup or in copying",
                 where=str(state_dir / part),
                 remedy="Restore an older state with --state; nothing was restored",
             )

@@ -27,19 +27,19 @@ _MIGRATIONS = "service.store.database:migrations"  # package:folder, which Alemb
 
 
 def database_path(data_dir: Path) -> Path:
-    """Where the database of a data folder lies."""
+    """The path of a data folder's database."""
     return data_dir / DATABASE_NAME
 
 
 def read_schema(connection: Connection) -> dict[tuple[str, str], tuple[str, str | None]]:
-    """What this database is made of, as `fresh_schema` gives it."""
+    """The schema of this database in the form of `fresh_schema`: (type, name) → (table, SQL)."""
     made = connection.execute(text("SELECT type, name, tbl_name, sql FROM sqlite_master"))
     return {(str(row.type), str(row.name)): (str(row.tbl_name), row.sql) for row in made}
 
 
 @cache
 def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
-    """What a database is made of, as this software makes it: table and SQL by kind (table, index …) and name."""
+    """The schema of a new database of this version: (type such as table or index, name) → (table, SQL)."""
     engine = create_engine("sqlite://")
     try:
         with engine.begin() as connection:
@@ -50,23 +50,23 @@ def fresh_schema() -> Mapping[tuple[str, str], tuple[str, str | None]]:
 
 
 class Database:
-    """Connections to one database. Writers begin IMMEDIATE, so a transaction never has to be upgraded and retried."""
+    """Connections to one database. Writers use BEGIN IMMEDIATE, so no transaction must be upgraded and retried."""
 
     def __init__(self, engine: Engine, path: Path, files: Files) -> None:
         self._engine = engine
         self._path = path
         self._files = files
-        self._opened: dict[Path, tuple[int, int]] = {}  # the files written to: device and inode
+        self._opened: dict[Path, tuple[int, int]] = {}  # device and inode of the files written to
 
     @contextmanager
     def reading(self) -> Generator[Connection]:
-        """One consistent snapshot. Raises StoreError."""
+        """A read transaction: one consistent snapshot. Raises StoreError."""
         with _store_errors(self._path), self._engine.connect() as connection, connection.begin():
             yield connection
 
     @contextmanager
     def writing(self) -> Generator[Connection]:
-        """One transaction: commits through the seam at the end, rolls back on any exception. Raises StoreError."""
+        """A write transaction: commits through `Files` at the end, rolls back on any exception. Raises StoreError."""
         with _store_errors(self._path), self._engine.connect() as plain:
             connection = plain.execution_options(writes=True)
             with connection.begin() as transaction:
@@ -75,10 +75,10 @@ class Database:
                 self._files.commit(transaction.commit)
 
     def require_in_place(self) -> None:
-        """Raises StoreError unless the database and its log are the files that were written to before.
+        """Raise StoreError unless the database and its write-ahead log are still the files that were opened.
 
-        SQLite goes on writing to files that were moved away or deleted: what it wrote would be nowhere. The log
-        beside the database is not removed by SQLite itself as long as this process has a connection.
+        SQLite would go on writing to files that were moved or deleted, and the data would be lost. SQLite itself does
+        not remove the log while this process has a connection.
         """
         for path in (self._path, self._path.with_name(self._path.name + "-wal")):
             try:
@@ -102,7 +102,7 @@ class Database:
 
 
 def open_database(data_dir: Path, files: Files) -> Database:
-    """Open for writing; creates and upgrades. Raises StoreVersionError when a newer software has written it."""
+    """Open for writing, creating or upgrading the database. Raises StoreVersionError if a newer version wrote it."""
     path = database_path(data_dir)
     engine = _engine(f"file:{quote(str(path.absolute()))}?uri=true", writable=True)
     database = Database(engine, path, files)
@@ -121,7 +121,10 @@ def open_database(data_dir: Path, files: Files) -> Database:
 
 
 def open_read_only(data_dir: Path, files: Files) -> Database:
-    """Open an existing database without the means to change it. Raises StoreError, StoreVersionError."""
+    """Open an existing database read-only.
+
+    Raises StoreError if there is none, StoreVersionError if it is of another version.
+    """
     path = database_path(data_dir)
     if not path.is_file():
         raise StoreError(
@@ -158,14 +161,14 @@ def _engine(address: str, *, writable: bool) -> Engine:
     engine = create_engine(f"sqlite:///{address}", connect_args={"timeout": BUSY_TIMEOUT_S})
 
     def on_connect(connection: sqlite3.Connection, _record: ConnectionPoolEntry) -> None:
-        # The driver's own BEGIN comes too late and is never IMMEDIATE; on_begin below sends it.
+        # The driver's own BEGIN comes too late and is never IMMEDIATE, so on_begin below sends it.
         connection.isolation_level = None
         pragmas = ["foreign_keys = ON", "recursive_triggers = ON"]
         pragmas += ["journal_mode = WAL", "synchronous = FULL"] if writable else ["query_only = ON"]
         try:
             for pragma in pragmas:
                 connection.execute(f"PRAGMA {pragma}")
-        except sqlite3.Error:  # no database, or a damaged one: the pool does not know of this connection yet
+        except sqlite3.Error:  # not a database, or damaged; the pool does not know this connection yet
             connection.close()
             raise
 
@@ -213,7 +216,7 @@ def _upgrade(connection: Connection, path: Path) -> None:
             "this is not a database of orthocapture", where=str(path), remedy="Choose another data folder"
         )
     if present != REVISIONS[-1]:
-        # Half a second to import, for what happens once in the life of a database.
+        # The import takes half a second and is needed only once in the life of a database.
         from alembic import command  # noqa: PLC0415
         from alembic.config import Config  # noqa: PLC0415
 
@@ -230,9 +233,9 @@ def _store_errors(path: Path) -> Generator[None]:
         yield
     except DBAPIError as error:
         raise StoreError(_explain(error), where=str(path), remedy=_advise(error)) from error
-    except UnicodeDecodeError as error:  # of the driver, where damaged bytes are to be text
+    except UnicodeDecodeError as error:  # raised by the driver for damaged text
         raise StoreError(
-            "the database is damaged: it holds text that is no UTF-8", where=str(path), remedy=RESTORE
+            "the database is damaged: it holds text that is not UTF-8", where=str(path), remedy=RESTORE
         ) from error
     except SQLAlchemyError as error:
         raise StoreError(f"the database refused: {error}", where=str(path), remedy=LOOK) from error
@@ -249,7 +252,7 @@ def _explain(error: DBAPIError) -> str:
 def _advise(error: DBAPIError) -> str:
     code: Any = getattr(error.orig, "sqlite_errorname", "")
     return {
-        "SQLITE_BUSY": "Another process holds the database for too long; look for one that hangs",
+        "SQLITE_BUSY": "Another process has held the database for too long; look for one that hangs",
         "SQLITE_FULL": "Free space on this disk; what was recorded before is safe",
         "SQLITE_CORRUPT": RESTORE,
         "SQLITE_NOTADB": RESTORE,

@@ -1,4 +1,4 @@
-"""The tables as SQLAlchemy sees them. The migrations create them; a test holds the two together."""
+"""The tables for SQLAlchemy. The migrations create them; a test checks that the two agree."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ events = Table(
     sqlite_strict=True,
 )
 
-# What auditors filter events by, written with every event by the trigger events_indexed. Beside it the full-text
-# index `event_words` (FTS5, contentless, rowid = position), which SQLAlchemy cannot describe.
+# The index by which auditors filter events, written with every event by the trigger events_indexed. There is also the
+# full-text index `event_words` (FTS5, contentless, rowid = position), which SQLAlchemy cannot describe.
 event_index = Table(
     "event_index",
     metadata,
@@ -69,7 +69,7 @@ event_index = Table(
     sqlite_strict=True,
 )
 
-# The last link of each chain, written with every append: a chain cut short at its end shows.
+# The last event of each chain, written with every append, so that a truncated chain is found.
 heads = Table(
     "heads",
     metadata,
@@ -155,7 +155,7 @@ leases = Table(
     sqlite_strict=True,
 )
 
-# Signatures over the chain: each covers every event up to its own.
+# Signatures over the chains; each covers every event up to its own.
 checkpoints = Table(
     "checkpoints",
     metadata,
@@ -163,7 +163,7 @@ checkpoints = Table(
     Column("seq", Integer, nullable=False),  # of the last event that it covers
     Column("sha256", Text, nullable=False),  # of that event
     Column("artefacts_sha256", Text, nullable=False),  # over record_sha256 of the artefact rows up to it
-    Column("site_seq", Integer, nullable=False),  # where the site's chain was: it says which key was valid
+    Column("site_seq", Integer, nullable=False),  # end of the site's chain, which tells the valid key
     Column("site_sha256", Text, nullable=False),
     Column("at_utc", Text, nullable=False),
     Column("key_id", Text, nullable=False),  # SHA-256 of the raw public key
@@ -173,7 +173,7 @@ checkpoints = Table(
     sqlite_strict=True,
 )
 
-# RFC 3161: what a time-stamp authority says of a checkpoint.
+# Time stamps on checkpoints (RFC 3161).
 timestamps = Table(
     "timestamps",
     metadata,
@@ -187,7 +187,7 @@ timestamps = Table(
     sqlite_strict=True,
 )
 
-# People. What changes here is recorded in the site's chain; the rows are the present state.
+# People. The rows are the present state; every change is recorded in the site's chain.
 accounts = Table(
     "accounts",
     metadata,
@@ -206,7 +206,7 @@ accounts = Table(
     sqlite_strict=True,
 )
 
-# One-time links: for the first administrator, and for everyone whom an administrator invites.
+# One-time links for the first administrator and for everybody whom an administrator invites.
 invitations = Table(
     "invitations",
     metadata,
@@ -225,13 +225,13 @@ sessions = Table(
     Column("screen", Text, nullable=False, unique=True),  # a short name for people and for the record
     Column("csrf", Text, nullable=False),
     Column("created_utc_s", REAL, nullable=False),
-    Column("seen_utc_s", REAL, nullable=False),  # last deliberate act, not the page's own requests
+    Column("seen_utc_s", REAL, nullable=False),  # last action of the person; the page's own requests do not count
     Column("locked", Integer, nullable=False),
     Column("pin_failures", Integer, nullable=False),
     sqlite_strict=True,
 )
 
-# Which screen may act on a run, and who asks for it.
+# Which screen may act on a run, and which one asks for control.
 control = Table(
     "control",
     metadata,

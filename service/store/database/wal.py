@@ -1,7 +1,7 @@
-"""The write-ahead log of a database as it lies there: commits that SQLite would pass over without a word.
+"""Find commits in a database's write-ahead log that SQLite would silently ignore.
 
-SQLite reads the log up to the first frame whose checksum does not fit, and takes what follows for the rest of a write
-that a power cut ended. Of a damaged frame that is not true: whole commits follow it. The format is that of
+SQLite reads the log up to the first frame with a wrong checksum and takes the rest for a write cut off by a power
+failure. After a damaged frame, however, whole commits may follow. The format is described in
 https://sqlite.org/fileformat2.html#walformat.
 """
 
@@ -16,19 +16,19 @@ from service.store.verification.chain_checks import Fault
 
 _HEADER = struct.Struct(">8I")
 _FRAME = struct.Struct(">6I")
-_MAGIC = 0x377F0682  # the last bit says how words are laid out for the checksum
+_MAGIC = 0x377F0682  # the last bit gives the byte order of the checksum
 _WORD = 0xFFFFFFFF
 _HEAD_DAMAGED = -1
 
 
 def wal_findings(data_dir: Path) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on commits that are not read any more. Raises StoreError where the log cannot be read.
+    """Faults and notes on commits that SQLite ignores. Raises StoreError if the log cannot be read.
 
-    One commit may be the rest of a write that a power cut ended: its frames need not have reached the disk in order.
-    From two on something was altered, because a commit is only begun once the one before it is on the disk.
+    One such commit may be the rest of a write cut off by a power failure, because frames need not reach the disk in
+    order; it is a note. Two or more mean damage, because a commit begins only when the one before it is on disk.
     """
     log = data_dir / f"{DATABASE_NAME}-wal"
-    # Looked at again where something is found: a process may be writing to it just now.
+    # Read again if something is found, because a process may be writing to the log.
     commits = _passed_over(log) and _passed_over(log)
     if commits == _HEAD_DAMAGED:
         return [Fault(None, None, log.name, "its head is damaged: what was committed last is lost")], []
@@ -40,7 +40,7 @@ def wal_findings(data_dir: Path) -> tuple[list[Fault], list[str]]:
 
 
 def _passed_over(log: Path) -> int:
-    """How many commits lie in a write-ahead log behind a frame that is damaged; 0 without a log."""
+    """Number of commits after a damaged frame of a write-ahead log, or _HEAD_DAMAGED; 0 without a log."""
     try:
         content = log.read_bytes()
     except FileNotFoundError:
@@ -64,7 +64,7 @@ def _passed_over(log: Path) -> int:
             sums = _checksum(content[start : start + 8], sums, order)
             sums = _checksum(content[start + _FRAME.size : start + size], sums, order)
             sound = of_frame == salts and sums == (one, two)
-        if not sound and of_frame == salts and pages:  # other salts are of an earlier use of the file
+        if not sound and of_frame == salts and pages:  # frames with other salts are from an earlier use of the file
             commits += 1
     return commits
 

@@ -1,1 +1,1 @@
-"""Content-addressed files, what crashes leave of them, and the space that they take."""
+"""Content-addressed files, leftovers of crashes, and used disk space."""

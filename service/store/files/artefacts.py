@@ -1,4 +1,4 @@
-"""Content-addressed files, and the rows that say where each came from."""
+"""Content-addressed files, and the rows that record the origin of each."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from service.store.events import canonical_parsed, references, sha256_text
 from service.store.records import Artefact, NewArtefact
 
 CHUNK_BYTES = 1 << 20
-TEMPORARY = "tmp"  # beside the shards, on the same file system, so that the rename is atomic
+TEMPORARY = "tmp"  # beside the shards on the same file system, so that a rename is atomic
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 
 
 def relative_path(sha256: str) -> Path:
-    """ab/abcdef…, below the artefact folder. Raises StoreError for what is not a SHA-256."""
+    """The path ab/abcdef… below the artefact folder. Raises StoreError if `sha256` is not a SHA-256."""
     if not _SHA256.fullmatch(sha256):
         raise StoreError(
             f"{sha256!r} is not a SHA-256", remedy="Use the reference that put_file or put_bytes returned"
@@ -36,14 +36,14 @@ def relative_path(sha256: str) -> Path:
 
 
 def chunks_of(path: Path) -> Iterator[bytes]:
-    """The bytes of a file, one megabyte at a time."""
+    """Yield the bytes of a file, one megabyte at a time. Raises OSError."""
     with path.open("rb") as handle:
         while chunk := handle.read(CHUNK_BYTES):
             yield chunk
 
 
 def hash_file(path: Path) -> tuple[str, int]:
-    """SHA-256 and size of a file. Raises OSError."""
+    """SHA-256 and size in bytes of a file. Raises OSError."""
     meter = _Meter(chunks_of(path))
     for _ in meter:
         pass
@@ -51,7 +51,7 @@ def hash_file(path: Path) -> tuple[str, int]:
 
 
 class _Meter:
-    """Hashes and counts what passes through."""
+    """Hashes and counts the bytes that pass through."""
 
     def __init__(self, chunks: Iterable[bytes]) -> None:
         self._chunks = chunks
@@ -70,7 +70,7 @@ class _Meter:
 
 
 class ArtefactFiles:
-    """The folder of content-addressed files: written once, read-only, never changed."""
+    """The folder of content-addressed files, each written once and read-only."""
 
     def __init__(self, folder: Path, files: Files, ids: Ids) -> None:
         self._folder = folder
@@ -80,7 +80,7 @@ class ArtefactFiles:
 
     @property
     def folder(self) -> Path:
-        """Where the shards lie."""
+        """The folder that holds the shards."""
         return self._folder
 
     def prepare(self) -> None:
@@ -90,13 +90,13 @@ class ArtefactFiles:
             self._files.sync_directory(directory.parent)
 
     def put(self, chunks: Iterable[bytes], *, expected_sha256: str | None = None) -> tuple[str, int]:
-        """Store bytes durably under their SHA-256; putting the same again changes nothing. Returns hash and size.
+        """Store bytes durably under their SHA-256, unless already stored. Returns hash and size in bytes.
 
-        The order makes a crash harmless: data, mode, fsync, rename, fsync of the directory; the row comes later.
+        A crash is harmless because of the order: data, mode, fsync, rename, fsync of the directory, later the row.
 
         Raises:
-            StoreError: the bytes are not those expected, or the disk is full.
-            IntegrityError: a file of this name is there with other content.
+            StoreError: the bytes do not have the expected hash, or the disk is full.
+            IntegrityError: the file exists with other content.
         """
         temporary = self._folder / TEMPORARY / f"{self._ids.new_token()}.part"
         meter = _Meter(chunks)
@@ -116,7 +116,7 @@ class ArtefactFiles:
             except (OSError, StoreError):
                 self._files.remove(temporary)
                 raise
-            # Also for a file that was there: whoever renamed it may have died before this call.
+            # Also for an existing file: the process that renamed it may have died before syncing.
             self._files.sync_directory(target.parent)
         return meter.sha256, meter.size
 
@@ -127,11 +127,11 @@ class ArtefactFiles:
             self._durable_shards.add(shard)
 
     def _made_young(self, target: Path) -> bool:
-        """Whether the file is there already; it counts as new then, lest it be removed as a leftover of old."""
+        """Whether the file exists; if so, touch it, so that it is not removed as an old leftover."""
         with _locked(self._folder, fcntl.LOCK_SH):
             try:
                 os.utime(target)
-            except (FileNotFoundError, PermissionError):  # of another user: the same bytes take its place
+            except (FileNotFoundError, PermissionError):  # another user's file is replaced by the same bytes
                 return False
         return True
 
@@ -145,7 +145,7 @@ class ArtefactFiles:
             )
 
     def path(self, sha256: str) -> Path:
-        """The file of a recorded artefact. Raises IntegrityError when it is missing."""
+        """The file of a recorded artefact. Raises IntegrityError if it is missing."""
         path = self._folder / relative_path(sha256)
         if not path.is_file():
             raise IntegrityError(
@@ -154,14 +154,14 @@ class ArtefactFiles:
         return path
 
     def verified_path(self, sha256: str) -> Path:
-        """The file, after hashing it again. Raises IntegrityError when it is missing or altered."""
+        """The file of a recorded artefact, hashed again. Raises IntegrityError if it is missing or altered."""
         path = self.path(sha256)
         self._check_same(path, sha256)
         return path
 
 
 def alone_with(folder: Path) -> AbstractContextManager[None]:
-    """Nobody takes a file of this artefact folder for stored meanwhile. Raises OSError."""
+    """Hold the exclusive lock of an artefact folder, so that no process reuses a stored file. Raises OSError."""
     return _locked(folder, fcntl.LOCK_EX)
 
 
@@ -178,7 +178,7 @@ def _locked(folder: Path, how: int) -> Generator[None]:
 def _check_arrival(sha256: str, expected_sha256: str | None) -> None:
     if expected_sha256 is not None and sha256 != expected_sha256:
         raise StoreError(
-            f"the file changed on its way: SHA-256 {sha256} instead of {expected_sha256}",
+            f"the file changed in transfer: SHA-256 {sha256} instead of {expected_sha256}",
             where="artefacts",
             remedy="Fetch it from the device again",
         )
@@ -197,7 +197,7 @@ def _put_errors() -> Generator[None]:
 
 
 def record_sha256(event_sha256: str, fields: dict[str, Any]) -> str:
-    """Hash that binds an artefact's row to the event that brought it; `record_sha256` itself is left out."""
+    """SHA-256 that binds an artefact's row to its event; the field `record_sha256` is ignored."""
     named = {name: value for name, value in fields.items() if name != "record_sha256"}
     return sha256_text(canonical_parsed(named | {"event_sha256": event_sha256}))
 
@@ -208,7 +208,7 @@ def insert_artefacts(
     """Write the rows of new artefacts beside the events that refer to them, in the caller's transaction.
 
     Raises:
-        StoreError: an artefact that no event refers to, or an event that refers to an artefact without a row.
+        StoreError: no event refers to an artefact, or an event refers to an artefact without a row.
         IntegrityError: the file is missing or has another size.
     """
     waiting = list(new)
@@ -272,7 +272,7 @@ def _require_row(connection: Connection, event: Event, ref: ArtefactRef) -> None
 
 
 def read_artefacts(connection: Connection, run_id: str) -> list[Artefact]:
-    """All rows of a run, in the order of the events."""
+    """All artefact rows of a run, in the order of its events."""
     rows = connection.execute(
         select(artefacts).where(artefacts.c.run_id == run_id).order_by(artefacts.c.seq, artefacts.c.position)
     )
@@ -280,7 +280,7 @@ def read_artefacts(connection: Connection, run_id: str) -> list[Artefact]:
 
 
 def to_artefact(row: Row[Any]) -> Artefact:
-    """A row as a record."""
+    """A row of `artefacts` as an Artefact."""
     return Artefact(
         run_id=row.run_id,
         seq=row.seq,

@@ -1,8 +1,8 @@
-"""What crashes leave in the artefact folder: found, and removed so that a run that goes on loses nothing.
+"""Find and remove what crashes left in the artefact folder, without harming a run in progress.
 
-A whole file without a row is either what a crash left between the file and its record, or what a living process is
-about to record. So nothing is removed that is younger than the oldest process with a run or a job in hand, or than an
-age that covers what has neither; storing the same bytes again makes a file young (service.store.files.artefacts).
+A complete file without a row was either left by a crash before its record, or is about to be recorded by a living
+process. So a file stays if it is newer than the start of the oldest process that holds a run or a job, or younger
+than a minimum age, for processes that hold neither. Storing the same bytes again makes a file new (files.artefacts).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from service.store.files.artefacts import TEMPORARY, alone_with, hash_file, rela
 from service.store.queue.leases import identity_of, is_live
 from service.store.store import Store
 
-USUAL_AGE_S = 3600.0  # an import or an export that has just begun holds no lease yet
+USUAL_AGE_S = 3600.0  # an import or export that has just begun holds no lease yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,11 @@ class Leftover:
     """One file to which no record refers.
 
     Attributes:
-        path: within the data folder.
-        size_bytes: of the file.
-        written_utc: when it was last written, or stored again.
-        kind: `part` is a write that was cut off, `unrecorded` a whole file whose record never came.
-        stays: why it is not removed now; "" where it may be.
+        path: relative to the data folder.
+        size_bytes: its size.
+        written_utc: when it was last written or stored again.
+        kind: `part` is an interrupted write, `unrecorded` a complete file that was never recorded.
+        stays: why it must not be removed now; "" if it may be.
     """
 
     path: str
@@ -48,9 +48,9 @@ class Leftover:
 
 
 def leftovers(store: Store, *, min_age_s: float = USUAL_AGE_S) -> list[Leftover]:
-    """Every leftover, by its path; nothing is changed.
+    """Every leftover, sorted by path; nothing is changed.
 
-    What is neither named by its content nor a part of a write is no leftover: `audit verify` calls it a fault.
+    Other foreign files, neither named by their hash nor an interrupted write, are faults for `audit verify`.
 
     Raises:
         StoreError: the folder or the database cannot be read.
@@ -64,9 +64,9 @@ def leftovers(store: Store, *, min_age_s: float = USUAL_AGE_S) -> list[Leftover]
 
 
 def remove_leftovers(store: Store, *, actor: str, min_age_s: float = USUAL_AGE_S) -> list[Leftover]:
-    """Remove every leftover that may be, and write down which in the site's chain; those that were removed.
+    """Remove every leftover that may be removed, record it in the site's chain, and return what was removed.
 
-    Nobody stores a file meanwhile. A crash in the middle leaves some that are said to be removed; the next call
+    The folder is locked meanwhile. After a crash in between, files recorded as removed may still exist; the next call
     removes them.
 
     Raises:
@@ -90,14 +90,14 @@ def remove_leftovers(store: Store, *, actor: str, min_age_s: float = USUAL_AGE_S
 
 def _refused(error: OSError) -> StoreError:
     return StoreError(
-        f"what crashes have left cannot be looked through or removed: {error.strerror or error}",
+        f"files left by crashes cannot be listed or removed: {error.strerror or error}",
         where=str(error.filename or ""),
         remedy="Check the permissions of the data folder; nothing that is recorded was touched",
     )
 
 
 def _candidates(folder: Path) -> list[tuple[Path, float, int]]:
-    """Files that look like leftovers, with the time of their last change (s, UTC) and their size, by path."""
+    """(path, time of last change in s UTC, size in bytes) of files that look like leftovers, sorted by path."""
     found: list[tuple[Path, float, int]] = []
     for path in sorted(folder.glob("*/*")):
         if path.is_symlink() or not path.is_file():
@@ -129,7 +129,7 @@ def _judged(connection: Connection, found: Collection[tuple[Path, float, int]], 
             kind="part" if part else "unrecorded",
         )
         if changed_s >= begun_s:
-            one = replace(one, stays=f"{writer} works here since before it was written, and may still record it")
+            one = replace(one, stays=f"{writer} was already running when it was written and may still record it")
         elif time.time() - changed_s < min_age_s:
             one = replace(one, stays=f"it is younger than {min_age_s / 60:g} minutes")
         judged.append(one)
@@ -137,14 +137,14 @@ def _judged(connection: Connection, found: Collection[tuple[Path, float, int]], 
 
 
 def _oldest_writer(connection: Connection) -> tuple[float, str]:
-    """Since when (s, UTC) the oldest process works that has a run or a job here, and its name; infinity: none."""
+    """Start time (s, UTC) and name of the oldest process that holds a run or a job here; infinity if none does."""
     now_s, oldest = time.time(), (float("inf"), "")
     held = [(row, row.holder) for row in connection.execute(select(leases))]
     held += [(row, row.worker) for row in connection.execute(select(jobs).where(jobs.c.state == "running"))]
     for row, name in held:
         if is_live(row, now_s):
             there = identity_of(row).life() == "lives"
-            # Of a process on another host it is not known since when it works: nothing is removed beside it.
+            # The start of a process on another host is not known, so nothing is removed while it may run.
             begun_s = psutil.boot_time() + row.process_started_s if there else 0.0
             oldest = min(oldest, (begun_s, str(name)))
     return oldest

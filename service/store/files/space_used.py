@@ -1,4 +1,4 @@
-"""What a run's files take, what is free, and what could be deleted: the facts behind a forecast of disk space."""
+"""Used and free disk space, and what could be deleted: the figures for a forecast of disk space."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from service.store.database.tables import artefacts, event_index
 from service.store.store import Store
 
 _VIEWS = ("viewpoint_captured", "view_held", "view_imported")
-_LOOKED_AT = 30  # runs in which an earlier one of the same protocol is looked for
-# Below the data folder, and no evidence.
+_LOOKED_AT = 30  # newest runs among which one of the same protocol with photographs is looked for
+# Folders below the data folder that hold no evidence.
 _REMOVABLE: Mapping[str, str] = {
-    "exports": "exports, once they were taken away",
+    "exports": "exports that were copied elsewhere",
     "logs": "logs",
-    "artefacts/tmp": "what interrupted writes left",
+    "artefacts/tmp": "remains of interrupted writes",
 }
 _WORTH_SAYING_BYTES = 1_000_000
 
@@ -29,7 +29,7 @@ _WORTH_SAYING_BYTES = 1_000_000
 def forecast_of(
     store: Store, protocol: Protocol, state: RunState | None = None, *, simulated: bool = False
 ) -> Forecast:
-    """Of a run under way, or of one that is about to begin (`state` None). Raises StoreError."""
+    """The forecast for a run in progress, or for one about to begin (`state` None). Raises StoreError."""
     run_id = "" if state is None else state.run_id
     with store.database.reading() as connection:
         here = read_usage(connection, run_id) if run_id else Usage()
@@ -45,20 +45,20 @@ def forecast_of(
 
 
 def require_space(store: Store, found: Forecast) -> None:
-    """Raises SpaceShortError, with what helps, where nothing more may be begun."""
+    """Raise SpaceShortError, with a remedy, if no new work may begin."""
     if found.verdict == "stop":
         folder = store.database_path.parent
         raise SpaceShortError(found.words, where=str(folder), remedy=_helps(folder))
 
 
 def require_export_space(store: Store, run_id: str, target: Path) -> None:
-    """Raises SpaceShortError where a run's files, copied once more, would not leave the evidence its room."""
+    """Raise SpaceShortError if a copy of a run's files would not fit or would use space kept for the evidence."""
     with store.database.reading() as connection:
         usage = read_usage(connection, run_id)
     needed = usage.view_bytes + usage.computed_bytes + usage.other_bytes
     try:
         free, same = shutil.disk_usage(target.parent).free, _same_disk(target.parent, store.database_path.parent)
-    except OSError:  # which writing will say in its own words
+    except OSError:  # writing the export will report it
         return
     kept = LEAST_FREE_BYTES if same else 0
     if free - kept < needed:
@@ -75,7 +75,7 @@ def _same_disk(one: Path, other: Path) -> bool:
 
 
 def read_usage(connection: Connection, run_id: str) -> Usage:
-    """What the files of a run take by now."""
+    """Recorded sizes of a run's files so far."""
     of_event = (event_index.c.run_id == artefacts.c.run_id) & (event_index.c.seq == artefacts.c.seq)
     found = (
         select(event_index.c.kind, func.sum(artefacts.c.size_bytes), func.count(artefacts.c.seq.distinct()))
@@ -92,7 +92,7 @@ def read_usage(connection: Connection, run_id: str) -> Usage:
 
 
 def _before(connection: Connection, run_id: str, protocol_id: str, *, simulated: bool) -> Usage | None:
-    """Of the newest other run of the protocol that has taken photographs; None: there is none."""
+    """Usage of the newest other run of the protocol with photographs; None if there is none."""
     rows = connection.execute(
         text(
             "SELECT r.run_id FROM runs AS r JOIN events AS e ON e.run_id = r.run_id AND e.seq = 1 "
@@ -109,7 +109,7 @@ def _helps(folder: Path) -> str:
     sizes = {words: _size(folder / name) for name, words in _REMOVABLE.items()}
     worth = [f"{words}: {size_words(size)}" for words, size in sizes.items() if size > _WORTH_SAYING_BYTES]
     inside = f". In the data folder you can delete {'; '.join(worth)}" if worth else ""
-    return f"Move what is not of this folder off the disk{inside}. Then try again; nothing that was captured is lost"
+    return f"Move other files off this disk{inside}. Then try again; nothing that was captured is lost"
 
 
 def _size(folder: Path) -> int:

@@ -1,1 +1,1 @@
-"""The job queue and the leases of its workers and of runners."""
+"""The job queue, and the leases of workers on jobs and of runners on runs."""

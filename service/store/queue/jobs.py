@@ -1,4 +1,4 @@
-"""The job queue: enqueue once, claim with a lease, renew, finish, fail or try again. Rows change; events do not."""
+"""The job queue: enqueue once, claim with a lease, renew, finish, fail or retry. Rows change; events do not."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from service.store.events import append, canonical, parse_canonical
 from service.store.queue.leases import ProcessIdentity, identity_of, identity_values
 from service.store.records import Job, NewJob
 
-ACTOR = "store"  # of events that no worker can write any more
+ACTOR = "store"  # actor of events about a worker that is gone
 
 
 def enqueue(
     connection: Connection, clock: Clock, ids: Ids, run_id: str, new: Sequence[NewJob], *, actor: str
 ) -> list[Event]:
-    """Append JobEnqueued and insert the row of every job whose key the run does not have yet."""
+    """Append JobEnqueued and insert a row for every job whose key the run does not have yet. Returns the events."""
     appended: list[Event] = []
     for job in new:
         if find_by_key(connection, run_id, job.idempotency_key) is not None:
@@ -59,7 +59,7 @@ def enqueue(
 
 
 def find_by_key(connection: Connection, run_id: str, idempotency_key: str) -> Job | None:
-    """The job of a run with this key."""
+    """The job of a run with this key, or None."""
     row = connection.execute(
         select(jobs).where(jobs.c.run_id == run_id, jobs.c.idempotency_key == idempotency_key)
     ).one_or_none()
@@ -75,7 +75,7 @@ def read_jobs(connection: Connection, run_id: str) -> list[Job]:
 
 
 def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> int:
-    """How many jobs are queued or being computed."""
+    """Number of jobs queued or being computed, of one run or of all, in one lane or in both."""
     statement = select(func.count()).select_from(jobs).where(jobs.c.state.in_(("queued", "running")), _of_lane(lane))
     if run_id is not None:
         statement = statement.where(jobs.c.run_id == run_id)
@@ -83,7 +83,7 @@ def open_jobs(connection: Connection, run_id: str | None, lane: Lane | None) -> 
 
 
 def started(connection: Connection, run_id: str) -> dict[str, str]:
-    """When each job that is being computed was begun, by its name."""
+    """Start time (UTC) of each job of a run that is being computed, by its name."""
     running = select(jobs.c.job_id, jobs.c.started_utc).where(jobs.c.run_id == run_id, jobs.c.state == "running")
     return {row.job_id: row.started_utc for row in connection.execute(running)}
 
@@ -99,11 +99,10 @@ def claim(
     run_id: str | None,
     lane: Lane | None = None,
 ) -> Job | None:
-    """Take the job of the highest priority, the oldest of these, that is queued or that its worker has lost.
+    """Claim the oldest job of the highest priority that is queued or that its worker has lost; None if there is none.
 
-    A worker loses a job when it dies or lets its lease run out. `lane`: only what is waited for, or only the rest.
-
-    A job that has killed its worker `try_limit` times is failed here, so that it cannot go round for ever.
+    A worker loses a job when it dies or its lease expires. `kinds`, `run_id` and `lane` restrict the choice. A job
+    that has lost its worker `try_limit` times is failed here, so that it is not retried for ever.
     """
     now = clock.utc_now()
     statement = select(jobs).where(jobs.c.state.in_(("queued", "running"))).order_by(jobs.c.priority, jobs.c.position)
@@ -147,7 +146,7 @@ def _of_lane(lane: Lane | None) -> ColumnElement[bool]:
 
 
 def renew(connection: Connection, clock: Clock, job: Job, lease_s: float) -> Job:
-    """Push the time limit out again. Raises LeaseLostError."""
+    """Extend the lease on a job to `lease_s` seconds from now. Raises LeaseLostError."""
     held_row(connection, job)
     until = clock.utc_now().timestamp() + lease_s
     connection.execute(update(jobs).where(jobs.c.job_id == job.job_id).values(until_utc_s=until))
@@ -155,7 +154,7 @@ def renew(connection: Connection, clock: Clock, job: Job, lease_s: float) -> Job
 
 
 def finish(connection: Connection, clock: Clock, job: Job, payload: JobFinished) -> Event:
-    """Append the result and close the job. Raises LeaseLostError when the job has gone to another worker."""
+    """Append the result and close the job. Raises LeaseLostError if another worker has taken the job."""
     row = held_row(connection, job)
     (event,) = append(connection, clock, job.run_id, [payload], row.worker)
     _end(connection, row, event, state="finished", error=None)
@@ -163,7 +162,7 @@ def finish(connection: Connection, clock: Clock, job: Job, payload: JobFinished)
 
 
 def release(connection: Connection, pids: Collection[int]) -> None:
-    """Queue the jobs of these processes of this host again, untried: they were told to stop, and have."""
+    """Queue the jobs of these local processes again without counting a try: they were told to stop and have."""
     here = ProcessIdentity.of_this_process()
     mine = (jobs.c.state == "running", jobs.c.host == here.host, jobs.c.boot == here.boot, jobs.c.pid.in_(pids))
     values = {"state": "queued", "tries": jobs.c.tries - 1, "token": None, "until_utc_s": None}
@@ -173,9 +172,9 @@ def release(connection: Connection, pids: Collection[int]) -> None:
 def fail(
     connection: Connection, clock: Clock, job: Job, error: str, message: str, *, retry: bool, traceback: str = ""
 ) -> list[Event]:
-    """Put the job back in the queue, or fail it for good when not `retry` or its tries are used up.
+    """Put the job back into the queue, or fail it for good if not `retry` or its tries are used up.
 
-    Raises LeaseLostError when the job has gone to another worker.
+    Raises LeaseLostError if another worker has taken the job.
     """
     row = held_row(connection, job)
     if not retry or row.tries >= row.try_limit:
@@ -214,7 +213,7 @@ def held_row(connection: Connection, job: Job) -> Row[Any]:
         raise LeaseLostError(
             f"job {job.job_id} is no longer this worker's ({state})",
             where=f"run {job.run_id}, {job.kind} of step {job.step}",
-            remedy="Drop the result; the job is done by whoever has it now",
+            remedy="Discard the result; the worker that has the job now will finish it",
         )
     return row
 
@@ -267,7 +266,7 @@ def _end(connection: Connection, row: Row[Any], event: Event, *, state: str, err
 
 
 def to_job(row: Row[Any]) -> Job:
-    """A row as a record."""
+    """A row of `jobs` as a Job."""
     return Job(
         job_id=row.job_id,
         run_id=row.run_id,

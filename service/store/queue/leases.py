@@ -1,7 +1,7 @@
-"""Leases: one runner a run. A process of this host has one for as long as it lives, others for a time.
+"""Leases: one runner per run. A process on this host holds its lease as long as it lives, others for a limited time.
 
-No clock takes a run away from a runner that lives on this host: its clock may be set, its waits may be long, and a
-process that was stopped (SIGSTOP) would go on moving the arm when it is continued.
+A runner alive on this host never loses its run to a timeout: the clock may be set, a wait may be long, and a process
+stopped by SIGSTOP would go on moving the arm when it is continued.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ from service.store.durable_effects import Clock, Ids
 from service.store.errors import LeaseHeldError, LeaseLostError
 
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
-_SAME_START_S = 1.5  # boot time is known to a second
+_SAME_START_S = 1.5  # the boot time is known to one second
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessIdentity:
-    """Who holds a lease, so that another process of the same host can tell whether it still lives.
+    """The process that holds a lease, so that another process on the same host can tell whether it is still alive.
 
-    `process_started_s` counts from boot, not from an epoch: a step of the system clock does not change it.
+    `process_started_s` counts from boot, not from an epoch, so that setting the system clock does not change it.
     """
 
     host: str
-    boot: str  # boot id where the system has one: a process of an earlier boot is dead
+    boot: str  # boot id, "" if the system has none; a process of an earlier boot is dead
     pid: int
     process_started_s: float
 
     @classmethod
     def of_this_process(cls) -> ProcessIdentity:
-        """This process."""
+        """The identity of this process."""
         process = psutil.Process()
         return cls(socket.gethostname(), _boot(), process.pid, _started_s(process))
 
     def life(self) -> Literal["lives", "dead", "unknown"]:
-        """What is known of it; of a process of another host nothing is. A stopped process lives."""
+        """Whether the process is alive; unknown for a process on another host. A stopped process is alive."""
         if self.host != socket.gethostname():
             return "unknown"
         if self.boot != _boot():
@@ -73,12 +73,12 @@ def _started_s(process: psutil.Process) -> float:
 
 
 def identity_of(row: Row[Any]) -> ProcessIdentity:
-    """The holder that a row of `leases` or `jobs` names."""
+    """The holder named in a row of `leases` or `jobs`."""
     return ProcessIdentity(row.host, row.boot, row.pid, row.process_started_s)
 
 
 def identity_values(identity: ProcessIdentity) -> dict[str, Any]:
-    """The same as column values."""
+    """An identity as column values of `leases` or `jobs`."""
     return {
         "host": identity.host,
         "boot": identity.boot,
@@ -88,7 +88,7 @@ def identity_values(identity: ProcessIdentity) -> dict[str, Any]:
 
 
 class RunLease:
-    """The right to drive one run, until it is released or this process dies; renewed by itself within a `with`."""
+    """The right to drive one run until released or this process dies; within a `with` block it renews itself."""
 
     def __init__(self, run_id: str, token: str, seconds: float, database: Database, clock: Clock) -> None:
         self.run_id = run_id
@@ -100,14 +100,14 @@ class RunLease:
         self._keeper = threading.Thread(target=self._keep, name=f"lease of {run_id}", daemon=True)
 
     def renew(self) -> None:
-        """Push the time limit out again. Raises LeaseLostError when another process has taken over."""
+        """Extend the lease by its duration from now. Raises LeaseLostError if another process has taken over."""
         with self._database.writing() as connection:
             check_lease(connection, self)
             until = self._clock.utc_now().timestamp() + self._seconds
             connection.execute(update(leases).where(leases.c.token == self.token).values(until_utc_s=until))
 
     def release(self) -> None:
-        """Let the next runner in; releasing twice, or after a take-over, does nothing."""
+        """Release the run for the next runner; no effect if already released or taken over."""
         with self._database.writing() as connection:
             connection.execute(delete(leases).where(leases.c.token == self.token))
 
@@ -116,8 +116,8 @@ class RunLease:
             try:
                 self.renew()
             except LeaseLostError:
-                return  # the next write is refused, and says so
-            except StoreError as error:  # the disk was full or busy for a moment; the lease may outlive it
+                return  # the runner's next write is refused with this error
+            except StoreError as error:  # the disk may be full or busy for a moment; try again before the lease ends
                 _log.warning("the lease of %s was not renewed: %s", self.run_id, error)
 
     def __enter__(self) -> Self:
@@ -133,26 +133,26 @@ class RunLease:
 
 
 def is_held(connection: Connection, clock: Clock, run_id: str) -> bool:
-    """Whether somebody has the lease of a run who may still live."""
+    """Whether a process that may still be alive holds the lease of a run."""
     row = connection.execute(select(leases).where(leases.c.run_id == run_id)).one_or_none()
     return row is not None and is_live(row, clock.utc_now().timestamp())
 
 
 def held_runs(connection: Connection, clock: Clock) -> list[str]:
-    """Runs whose lease somebody has who may still live, by name."""
+    """Names, sorted, of the runs whose lease is held by a process that may still be alive."""
     now_utc_s = clock.utc_now().timestamp()
     rows = connection.execute(select(leases).order_by(leases.c.run_id)).all()
     return [row.run_id for row in rows if is_live(row, now_utc_s)]
 
 
 def is_live(row: Row[Any], now_utc_s: float) -> bool:
-    """Whether the holder of a row of `leases` or `jobs` may still live; of another host: as long as its time runs."""
+    """Whether the holder in a row of `leases` or `jobs` may be alive; on another host, until its lease expires."""
     life = identity_of(row).life()
     return life == "lives" or (life == "unknown" and now_utc_s < row.until_utc_s)
 
 
 def acquire(database: Database, clock: Clock, ids: Ids, *, run_id: str, holder: str, seconds: float) -> RunLease:
-    """Take the lease of a run. Raises LeaseHeldError naming who has it and how long."""
+    """Take the lease of a run. Raises LeaseHeldError, naming the holder, while another process has it."""
     token = ids.new_token()
     with database.writing() as connection:
         now = clock.utc_now().timestamp()
@@ -177,7 +177,7 @@ def acquire(database: Database, clock: Clock, ids: Ids, *, run_id: str, holder: 
 
 
 def check_lease(connection: Connection, lease: RunLease) -> None:
-    """Raises LeaseLostError unless the lease is still the one in the database."""
+    """Raise LeaseLostError unless the database still holds this lease."""
     if connection.execute(select(leases.c.run_id).where(leases.c.token == lease.token)).first() is None:
         raise LeaseLostError(
             "another process has taken over this run",

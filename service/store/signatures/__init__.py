@@ -1,1 +1,1 @@
-"""Signed checkpoints over the chains: keys, time stamps, and the log of signatures outside the database."""
+"""Signed checkpoints of the chains: keys, time stamps, and the log of signatures outside the database."""

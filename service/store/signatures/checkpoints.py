@@ -1,4 +1,4 @@
-"""Checkpoints as text and as rows: what exactly is signed, written and read back."""
+"""Checkpoints: the exact bytes that are signed, and the rows that hold them."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from service.store.database.tables import artefacts, checkpoints, events, timest
 from service.store.events import canonical, parse_canonical
 from service.store.records import SITE, Checkpoint, Timestamp
 
-PURPOSE = "orthocapture checkpoint v1"  # so that no signature of this key can be taken for one of another kind
+PURPOSE = "orthocapture checkpoint v1"  # keeps a signature from being used for anything else
 _COLUMNS = tuple(field.name for field in fields(Checkpoint))
 
 
 def statement(checkpoint: Checkpoint) -> bytes:
-    """What is signed: RFC 8785 canonical JSON of every field but the signature, and of what it is for."""
+    """The bytes that are signed: RFC 8785 canonical JSON of every field except the signature, with the purpose."""
     named = asdict(checkpoint)
     del named["signature"]
     return canonical(named | {"purpose": PURPOSE}).encode()
 
 
 def key_fingerprint(public_key: bytes) -> str:
-    """SHA-256 of the 32 raw bytes of an Ed25519 public key: what people write down and compare."""
+    """SHA-256 (hexadecimal) of the 32 raw bytes of an Ed25519 public key, which people write down and compare."""
     return hashlib.sha256(public_key).hexdigest()
 
 
 def signed_by(checkpoint: Checkpoint, public_key: bytes) -> bool:
-    """Whether the signature is this key's over this checkpoint."""
+    """Whether this key (32 raw bytes) made the checkpoint's signature."""
     try:
         signature = base64.b64decode(checkpoint.signature, validate=True)
         Ed25519PublicKey.from_public_bytes(public_key).verify(signature, statement(checkpoint))
@@ -43,22 +43,22 @@ def signed_by(checkpoint: Checkpoint, public_key: bytes) -> bool:
 
 
 class RowsDigest:
-    """SHA-256 over the lines `record_sha256` of a run's artefact rows, in the order of the events."""
+    """Running SHA-256 over the `record_sha256` of a run's artefact rows, one per line, in the order of the events."""
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
 
     def add(self, record_sha256: str) -> None:
-        """One more row."""
+        """Add one more row."""
         self._hash.update(record_sha256.encode() + b"\n")
 
     def hexdigest(self) -> str:
-        """Over the rows up to now."""
+        """The digest over the rows added so far."""
         return self._hash.hexdigest()
 
 
 def artefacts_digest(connection: Connection, run_id: str) -> str:
-    """The digest over all artefact rows of a run."""
+    """The RowsDigest over all artefact rows of a run, in hexadecimal."""
     digest = RowsDigest()
     ordered = select(artefacts.c.record_sha256).where(artefacts.c.run_id == run_id)
     for record_sha256 in connection.execute(ordered.order_by(artefacts.c.seq, artefacts.c.position)).scalars():
@@ -67,31 +67,31 @@ def artefacts_digest(connection: Connection, run_id: str) -> str:
 
 
 def insert_checkpoint(connection: Connection, checkpoint: Checkpoint) -> None:
-    """Write a row, in the caller's transaction."""
+    """Insert a checkpoint's row in the caller's transaction."""
     connection.execute(insert(checkpoints).values(**asdict(checkpoint)))
 
 
 def last_checkpoint(connection: Connection, run_id: str) -> Checkpoint | None:
-    """The newest of a run."""
+    """The newest checkpoint of a run, or None."""
     newest = select(checkpoints).where(checkpoints.c.run_id == run_id).order_by(checkpoints.c.seq.desc()).limit(1)
     row = connection.execute(newest).one_or_none()
     return None if row is None else _to_checkpoint(row)
 
 
 def read_checkpoints(connection: Connection, run_id: str) -> list[Checkpoint]:
-    """All of a run, oldest first."""
+    """All checkpoints of a run, oldest first."""
     found = select(checkpoints).where(checkpoints.c.run_id == run_id).order_by(checkpoints.c.seq)
     return [_to_checkpoint(row) for row in connection.execute(found)]
 
 
 def read_every_checkpoint(connection: Connection) -> list[Checkpoint]:
-    """Of all chains, in the order in which they were made."""
+    """The checkpoints of all chains, in the order in which they were made."""
     made = select(checkpoints).order_by(checkpoints.c.site_seq, checkpoints.c.run_id == SITE, checkpoints.c.seq)
     return [_to_checkpoint(row) for row in connection.execute(made)]
 
 
 def read_timestamps(connection: Connection, run_id: str) -> list[Timestamp]:
-    """All time stamps of a run's checkpoints, oldest first."""
+    """All time stamps on a run's checkpoints, oldest first."""
     found = select(timestamps).where(timestamps.c.run_id == run_id).order_by(timestamps.c.seq, timestamps.c.authority)
     return [Timestamp(row.run_id, row.seq, row.authority, row.at_utc, row.token) for row in connection.execute(found)]
 
@@ -101,6 +101,6 @@ def _to_checkpoint(row: Row[Any]) -> Checkpoint:
 
 
 def read_key_changes(connection: Connection) -> list[tuple[int, dict[str, Any]]]:
-    """Every KeyChanged of the site's chain with its number, oldest first, as plain data. Raises ValueError."""
+    """(seq, payload as plain data) of every KeyChanged in the site's chain, oldest first. Raises ValueError."""
     found = select(events.c.seq, events.c.payload).where(events.c.run_id == SITE, events.c.kind == "key_changed")
     return [(row.seq, parse_canonical(row.payload)) for row in connection.execute(found.order_by(events.c.seq))]

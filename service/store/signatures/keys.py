@@ -1,4 +1,4 @@
-"""Private keys as files that nobody else can read, not even for a moment: DIR/keys/KEY_ID.pem."""
+"""Private keys as files DIR/keys/KEY_ID.pem, which no other user can read at any moment."""
 
 from __future__ import annotations
 
@@ -29,16 +29,17 @@ def public_bytes(key: Ed25519PrivateKey) -> bytes:
 
 
 class KeyFolder:
-    """The private keys of one data folder. Callers hold the database's write lock, so one process works at a time."""
+    """The private keys of one data folder. Callers hold the database's write lock, so no two processes interfere."""
 
     def __init__(self, data_dir: Path, files: Files) -> None:
         self._folder = data_dir / FOLDER
         self._files = files
 
     def make(self) -> Ed25519PrivateKey:
-        """A new key, durable on return. Raises SigningKeyError.
+        """Make a new key, durable on return. Raises SigningKeyError.
 
-        The order makes a crash harmless: written aside and synced, renamed, the folder synced; the event comes later.
+        A crash is harmless because of the order: write and sync a part file, rename it, sync the folder; the event
+        comes later.
         """
         key = Ed25519PrivateKey.generate()
         pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
@@ -59,7 +60,10 @@ class KeyFolder:
         return key
 
     def load(self, key_id: str) -> Ed25519PrivateKey:
-        """The private key of a fingerprint. Raises SigningKeyError: missing, readable by others, or another key."""
+        """The private key with this fingerprint.
+
+        Raises SigningKeyError if the file is missing, damaged, readable by others or holds another key.
+        """
         path = self._path(key_id)
         try:
             for checked in (self._folder, path):
@@ -81,11 +85,11 @@ class KeyFolder:
         return key
 
     def present(self) -> list[str]:
-        """Fingerprints of the whole key files that are there."""
+        """Fingerprints of the complete key files, sorted."""
         return sorted(path.stem for path in self._folder.glob(f"*{_SUFFIX}")) if self._folder.is_dir() else []
 
     def destroy_all_but(self, key_id: str) -> None:
-        """Remove every other key, and what a crash left half-written. Raises SigningKeyError."""
+        """Remove every other key and partly written key files. Raises SigningKeyError."""
         try:
             others = [p for p in self._folder.iterdir() if p.suffix in (_SUFFIX, _PART) and p != self._path(key_id)]
             for path in others:

@@ -1,8 +1,8 @@
-"""Everything that was ever signed, once more, in a file beside the database to which lines are only added.
+"""The log of signatures: a second, append-only record of every checkpoint, in a file beside the database.
 
-Who rewrites, cuts back or replaces the database leaves signatures behind that no longer fit it. Each line is signed
-itself and names the line before it, so that lines cannot be taken out, changed or exchanged; that the end was not cut
-off shows in a copy elsewhere (service.store.signatures.log_copy).
+If the database is rewritten, cut or replaced, the log holds signatures that no longer fit it. Each line is signed and
+holds the hash of the line before it, so that lines cannot be removed, changed or swapped. A cut at the end is found
+with a copy kept elsewhere (service.store.signatures.log_copy).
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from service.store.signatures.keys import public_bytes
 from service.store.verification.chain_checks import Fault
 
 NAME = "signatures.jsonl"
-PURPOSE = "orthocapture signature log v1"  # so that no signature of this key can be taken for one of another kind
+PURPOSE = "orthocapture signature log v1"  # keeps a signature from being used for anything else
 _FIRST = "0" * 64
-_MOST_AT_ONCE = 3  # signatures of one transaction: of a new key, of a run, of the site's chain that names it
+_MOST_AT_ONCE = 3  # most signatures in one transaction: a new key's, a run's, and the site's chain's
 _COLUMNS = {field.name: int if field.type == "int" else str for field in fields(Checkpoint)}
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line: a checkpoint, and the signature that binds it to the line before.
+    """One line of the log: a checkpoint, and a signature that binds it to the line before.
 
     Attributes:
         number: from 1.
-        checkpoint: None for a line that cannot be read.
-        problem: why it cannot be read, or does not follow the line before it; "" for a sound one.
-        message: what is signed.
-        key_id: of the key that signed the line.
+        checkpoint: None if the line cannot be read.
+        problem: why the line cannot be read or does not follow the line before it; "" if it is valid.
+        message: the bytes that are signed.
+        key_id: fingerprint of the key that signed the line.
         signature: base64.
     """
 
@@ -56,10 +56,10 @@ class Line:
     signature: str = ""
 
     def signed_by(self, public_key: bytes) -> bool:
-        """Whether the line's signature is this key's."""
+        """Whether this key (32 raw bytes) made the line's signature."""
         try:
             signature = base64.b64decode(self.signature, validate=True)
-            if base64.b64encode(signature).decode() != self.signature:  # its last letter has bits that say nothing
+            if base64.b64encode(signature).decode() != self.signature:  # the last character has unused bits
                 return False
             Ed25519PublicKey.from_public_bytes(public_key).verify(signature, self.message)
         except (InvalidSignature, binascii.Error, ValueError):
@@ -75,11 +75,11 @@ class SignatureLog:
         self._files = files
 
     def lines(self) -> list[Line] | None:
-        """Every line, oldest first; None where there is no log. Raises StoreError."""
+        """Every line, oldest first; None if there is no log. Raises StoreError if it cannot be read."""
         return read_log(self.path)
 
     def begin(self) -> None:
-        """Make the log before the first signature: from then on it is missed. Raises StoreError."""
+        """Create the log before the first signature; from then on a missing log is a fault. Raises StoreError."""
         try:
             if not self.path.exists():
                 self._files.write(self.path, ())
@@ -88,7 +88,7 @@ class SignatureLog:
             raise _unwritten(self.path, error) from error
 
     def add(self, checkpoints: Sequence[Checkpoint], key: Ed25519PrivateKey) -> None:
-        """Append those that the log does not hold yet, durably. Raises StoreError."""
+        """Append, durably, those checkpoints that the log does not hold yet. Raises StoreError."""
         try:
             _add(self._files, self.path, checkpoints, key)
         except OSError as error:
@@ -96,21 +96,21 @@ class SignatureLog:
 
 
 def unlogged(checkpoints: Sequence[Checkpoint], lines: Sequence[Line]) -> bool:
-    """Whether a signature has no line yet: the log could not be written when it was made."""
+    """Whether a checkpoint has no line yet, because the log could not be written when it was made."""
     held = {(one.checkpoint.run_id, one.checkpoint.seq) for one in lines if one.checkpoint is not None}
     return any((one.run_id, one.seq) not in held for one in checkpoints)
 
 
 def _unwritten(path: Path, error: OSError) -> StoreError:
     return StoreError(
-        f"what is signed cannot be written down: {error.strerror or error}",
+        f"the log of signatures cannot be written: {error.strerror or error}",
         where=str(path),
         remedy="Check free space and permissions of the data folder",
     )
 
 
 def read_log(path: Path) -> list[Line] | None:
-    """The lines of a log; None where there is no such file. Raises StoreError when it cannot be read."""
+    """The lines of a log; None if the file does not exist. Raises StoreError if it cannot be read."""
     try:
         content = path.read_bytes()
     except FileNotFoundError:
@@ -126,7 +126,7 @@ def read_log(path: Path) -> list[Line] | None:
 
 def _parsed(content: bytes) -> Iterator[Line]:
     previous = _FIRST
-    # A line without its end is what a power cut left of one that was never reported as written.
+    # A line without a line end was cut off by a power failure and was never reported as written.
     whole = content[: content.rfind(b"\n") + 1]
     for number, raw in enumerate(whole.splitlines(keepends=True), start=1):
         yield _line(number, raw, previous)
@@ -164,7 +164,7 @@ def _add(files: Files, path: Path, checkpoints: Sequence[Checkpoint], key: Ed255
     with path.open("rb") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)  # one process appends at a time
         content = stream.read()
-        end = content.rfind(b"\n") + 1  # behind it: half a line, of a write that a power cut ended
+        end = content.rfind(b"\n") + 1  # a power failure may have left part of a line after it
         lines = list(_parsed(content[:end]))
         held = {(line.checkpoint.run_id, line.checkpoint.seq) for line in lines if line.checkpoint is not None}
         last = content[:end].splitlines(keepends=True)[-1:]
@@ -191,13 +191,13 @@ def log_findings(
     *,
     awaited: bool,
 ) -> tuple[list[Fault], list[str]]:
-    """Faults and notes: what does not fit between a log and the checkpoints of a database.
+    """Faults and notes on differences between the log and the checkpoints of a database.
 
     Args:
-        lines: of the log, oldest first; None where there is none.
-        present: the database's checkpoints, by run; runs that are not among them are left out.
-        public_keys: raw, by fingerprint.
-        awaited: whether there must be a log: this software, or a later one, has signed here.
+        lines: the log's lines, oldest first; None if there is no log.
+        present: the database's checkpoints by run; lines for other runs are not compared.
+        public_keys: raw public keys by fingerprint.
+        awaited: whether there must be a log, because something was signed here.
     """
     if lines is None:
         missing = Fault(None, None, NAME, "the log of signatures is missing: it was taken away")
@@ -218,7 +218,7 @@ def log_findings(
             gone = (signed.run_id, signed.seq) not in here
             change = "is no longer here: what it signed was taken away" if gone else "is another one here"
             faults.append(Fault(signed.run_id, signed.seq, "", f"the signature of {place}, {change}"))
-    # A power cut between a signature and its line leaves the newest ones out, which the next signature makes good.
+    # A power failure between a signature and its line leaves out the newest lines; the next signature adds them.
     newest = max((line.checkpoint.site_seq for line in lines if line.checkpoint is not None), default=0)
     unlogged = {place: item for place, item in here.items() if place not in held}
     if len(unlogged) <= _MOST_AT_ONCE and all(item.site_seq >= newest for item in unlogged.values()):

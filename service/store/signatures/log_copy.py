@@ -1,4 +1,4 @@
-"""The copy of the log of signatures in a second place, such as a share: brought up to date, and compared."""
+"""The copy of the log of signatures in a second place, such as a network share: updating and comparing it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FILES = DurableFiles()
 
 
 def keep_elsewhere(data_dir: Path, copy: Path | None, tell: Callable[[str], object], files: Files = _FILES) -> None:
-    """Bring the copy up to date, where there is one. What is wrong with it is told, and stops nothing."""
+    """Bring the copy up to date, if one is configured. A problem with it is passed to `tell` and raises nothing."""
     if copy is None:
         return
     try:
@@ -25,11 +25,11 @@ def keep_elsewhere(data_dir: Path, copy: Path | None, tell: Callable[[str], obje
 
 
 def bring_up_to_date(data_dir: Path, copy: Path, files: Files = _FILES) -> None:
-    """Append to `copy` what the log has and it has not. One that says something else is left as it is.
+    """Append to `copy` the lines of the log that it lacks. A copy with other content is left as it is.
 
     Raises:
-        IntegrityError: the copy is not the beginning of the log: one of them was changed.
-        StoreError: the copy cannot be written; the next call makes good what this one could not.
+        IntegrityError: the copy is not a beginning of the log: one of them was changed.
+        StoreError: the copy cannot be written; the next call will add what is missing.
     """
     log = _bytes(data_dir / NAME)
     held = _whole_lines(_bytes(copy))
@@ -43,7 +43,7 @@ def bring_up_to_date(data_dir: Path, copy: Path, files: Files = _FILES) -> None:
         if not copy.exists():
             files.write(copy, ())
             files.sync_directory(copy.parent)
-        files.append(copy, len(held), log[len(held) :])  # over half a line, of a write that was cut off
+        files.append(copy, len(held), log[len(held) :])  # overwrites a partly written line
         files.sync_file(copy)
     except OSError as error:
         raise StoreError(
@@ -54,7 +54,7 @@ def bring_up_to_date(data_dir: Path, copy: Path, files: Files = _FILES) -> None:
 
 
 def copy_faults(data_dir: Path, copy: Path) -> tuple[list[Fault], list[str]]:
-    """Faults and notes: where the log is not the one of which the copy was made.
+    """Faults and notes on differences between the log and its copy.
 
     Raises:
         StoreError: the copy is missing or cannot be read.

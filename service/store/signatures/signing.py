@@ -1,4 +1,4 @@
-"""Ed25519 checkpoints over the chains: the key of a data folder, signing the end of a chain, changing the key."""
+"""Signing with Ed25519: checkpoints over the ends of chains, the key of a data folder, and its replacement."""
 
 from __future__ import annotations
 
@@ -30,32 +30,31 @@ from service.store.signatures.log import SignatureLog, unlogged
 from service.store.store import Store
 from service.store.verification.soundness import require_sound
 
-_ACTOR = "service"  # the first key is made by the software itself, when it first signs
+_ACTOR = "service"  # actor of the first key and of run_signed, which the software makes itself
 
 
 @dataclass(frozen=True, slots=True)
 class PublicKey:
-    """A key of the site's chain."""
+    """A key in the history of the site's chain."""
 
     key_id: str
     public_key: bytes
-    seq: int  # of its KeyChanged
-    replaced_seq: int | None  # of its successor's; None: the present one
+    seq: int  # of its KeyChanged event
+    replaced_seq: int | None  # seq of its successor's KeyChanged; None for the key in use
     reason: str
-    introduced: bool  # by a signature of its predecessor; the first key never is
+    introduced: bool  # whether its predecessor signed its KeyChanged; never for the first key
 
 
 def checkpoint(store: Store, run_id: str) -> Checkpoint:
-    """Sign the end of a run's chain (or the site's, SITE) unless it is signed already; durable on return.
+    """Sign the end of a run's chain (or the site's, SITE) unless it is already signed; durable on return.
 
-    The first signature of a data folder makes the key and records it in the site's chain.
-
-    What is signed is verified first: the chain, the earlier signatures, and what the log of signatures says of them.
-    The signature of a run goes into the site's chain, which is signed too, and all of them into the log.
+    The first signature in a data folder makes the key and records it in the site's chain. Before signing, the chain,
+    its earlier signatures and the log of signatures are verified. The signature of a run is recorded in the site's
+    chain, which is then signed too; the log gets every signature.
 
     Raises:
         UnknownRunError: there is no such run.
-        IntegrityError: the chain does not verify, or does not end where it was left; nothing is signed.
+        IntegrityError: the chain does not verify, or does not end where the last append left it; nothing is signed.
         SigningKeyError: the private key is missing or cannot be used.
         StoreError: the log of signatures cannot be written.
     """
@@ -80,23 +79,23 @@ def checkpoint(store: Store, run_id: str) -> Checkpoint:
                 entry = RunSigned(run=run_id, seq=signed.seq, sha256=signed.sha256)
                 store.append_site(connection, [entry], actor=_ACTOR)
                 _sign(store, connection, SITE, key)
-            every = read_every_checkpoint(connection)  # also those whose lines a power cut or a full disk kept out
+            every = read_every_checkpoint(connection)  # also those that a power failure or full disk kept out
     log.add(every, key)
     return signed
 
 
 def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> PublicKey:
-    """Replace the signing key. The old one signs the new one's KeyChanged as its last act, and is destroyed.
+    """Replace the signing key. The old key finally signs the KeyChanged of the new one and is then destroyed.
 
     Args:
         store: the data folder.
         reason: why, for the record.
-        actor: who.
-        lost: the old private key is gone: the new one is recorded without its predecessor's signature,
-            which every later verification tells.
+        actor: the person who replaces it.
+        lost: the old private key is gone. The new one is recorded without its predecessor's signature, and every
+            later verification says so.
 
     Raises:
-        SigningKeyError: the old key cannot be used and `lost` is not given; or it can, and `lost` is.
+        SigningKeyError: the old key cannot be used and `lost` is false, or it can be used and `lost` is true.
     """
     folder = KeyFolder(store.database_path.parent, store.files)
     log = _log_of(store)
@@ -116,7 +115,7 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
         _sign(store, connection, SITE, old or new)
         every = read_every_checkpoint(connection)
     log.add(every, old or new)
-    with store.database.writing() as connection:  # again under the lock: nobody else makes a key meanwhile
+    with store.database.writing() as connection:  # under the lock again, because another process may make a key
         folder.destroy_all_but(read_key_changes(connection)[-1][1]["key_id"])
     return public_keys(store)[-1]
 
@@ -124,7 +123,7 @@ def rotate_key(store: Store, *, reason: str, actor: str, lost: bool = False) -> 
 def sign(store: Store, message: bytes) -> tuple[str, str]:
     """Fingerprint of the key in use, and its signature over a message in base64. Raises SigningKeyError.
 
-    The message begins with what it is for, so that no signature can be taken for one of another kind.
+    The message must begin with its purpose, so that the signature cannot be used for anything else.
     """
     with store.database.writing() as connection:
         key = _present_key(store, connection)
@@ -132,7 +131,7 @@ def sign(store: Store, message: bytes) -> tuple[str, str]:
 
 
 def public_keys(store: Store) -> list[PublicKey]:
-    """Every key that ever signed here, oldest first; the last one is in use."""
+    """Every key that has signed in this data folder, oldest first; the last one is in use."""
     with store.database.reading() as connection:
         changes = read_key_changes(connection)
         signed = {item.seq: item for item in read_checkpoints(connection, SITE)}
@@ -169,15 +168,15 @@ def _require_lost(connection: Connection, folder: KeyFolder) -> None:
 
 
 def _present_key(store: Store, connection: Connection) -> Ed25519PrivateKey:
-    """The key in use; made, recorded and signed by itself when there is none yet."""
+    """The key in use; if there is none yet, one is made and recorded, and signs its own KeyChanged."""
     folder = KeyFolder(store.database_path.parent, store.files)
     changes = read_key_changes(connection)
     if changes:
         key_id = changes[-1][1]["key_id"]
         key = folder.load(key_id)
-        folder.destroy_all_but(key_id)  # what a crash while changing the key has left
+        folder.destroy_all_but(key_id)  # keys left by a crash during a replacement
         return key
-    # A file without its event is what a crash before the commit leaves: it is taken, not left lying about.
+    # A crash before the commit leaves a key file without its event; use that key.
     left = folder.present()
     key = folder.load(left[0]) if left else folder.make()
     _record_key(store, connection, key, previous="", reason="first signature", actor=_ACTOR)
@@ -199,7 +198,7 @@ def _record_key(
 
 
 def _signed_end(connection: Connection, run_id: str) -> Checkpoint | None:
-    """The checkpoint of the last event; None when that one is not signed."""
+    """The checkpoint of a chain's last event; None if that event is not signed."""
     last = last_checkpoint(connection, run_id)
     return last if last is not None and (last.seq, last.sha256) == read_head(connection, run_id) else None
 

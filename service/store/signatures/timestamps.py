@@ -1,4 +1,4 @@
-"""RFC 3161: an authority elsewhere says when a checkpoint existed. Asked when one is configured, never required."""
+"""Time stamps (RFC 3161): an outside authority confirms when a checkpoint existed. Optional."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ from service.store.verification.chain_checks import Fault
 
 _DEVICE = "time-stamp authority"
 _LARGEST_REPLY = 1 << 20
-# What a token and the certificates in it may end in.
+# Exceptions raised by damaged tokens and certificates.
 _UNREADABLE = (ValueError, TypeError, UnsupportedAlgorithm, x509.ExtensionNotFound, x509.DuplicateExtension)
 _TYPE, _REPLY_TYPE = "application/timestamp-query", "application/timestamp-reply"
 
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """A time-stamp authority, and the certificates (PEM: its root, those between) that its answers must lead to."""
+    """A time-stamp authority, with the PEM file of its root and intermediate certificates."""
 
     url: str
     certificates: Path
@@ -53,16 +53,16 @@ class Authority:
 
 
 def stamped_bytes(checkpoint: Checkpoint) -> bytes:
-    """What the authority is asked about: what was signed, and the signature."""
+    """The bytes to be stamped: the signed statement and its signature."""
     return statement(checkpoint) + b"\n" + checkpoint.signature.encode()
 
 
 def timestamp(store: Store, signed: Checkpoint, authority: Authority) -> Timestamp:
-    """Have a checkpoint stamped, verify the answer and keep it; one that is there already is returned.
+    """Have a checkpoint stamped, verify the answer and store it; an existing stamp is returned as it is.
 
     Raises:
-        TimestampError: no answer, or one that does not verify. Nothing was recorded and nothing is lost.
-        StoreError: that the stamp was given could not be signed.
+        TimestampError: no answer, or an answer that does not verify; nothing was recorded.
+        StoreError: the stamp was stored, but the record of it could not be signed.
     """
     for present in store.timestamps(signed.run_id):
         if (present.seq, present.authority) == (signed.seq, authority.url):
@@ -80,7 +80,7 @@ def timestamp(store: Store, signed: Checkpoint, authority: Authority) -> Timesta
         raise TimestampError(
             f"the time-stamp authority gave no valid answer: {error}",
             where=authority.url,
-            remedy="Check the network, address and certificates in the rig file; the checkpoint stands by itself",
+            remedy="Check the network, address and certificates in the rig file; the checkpoint is valid without it",
         ) from error
     found = Timestamp(signed.run_id, signed.seq, authority.url, asked_utc, base64.b64encode(reply).decode())
     with store.database.writing() as connection:
@@ -112,10 +112,10 @@ def timestamp(store: Store, signed: Checkpoint, authority: Authority) -> Timesta
 
 
 def stamp_end(store: Store, run_id: str, authority: Authority | None) -> None:
-    """Sign the end of a run, and have that stamped where an authority is configured.
+    """Sign the end of a run, and have the signature stamped if an authority is configured.
 
-    An authority that does not answer is recorded as a trouble, and that is signed too; nothing is raised for it.
-    Raises StoreError when the checkpoint itself cannot be made.
+    If the authority fails, a device_trouble is recorded and signed, and nothing is raised.
+    Raises StoreError if the checkpoint itself cannot be made.
     """
     signed = checkpoint(store, run_id)
     if authority is None:
@@ -131,7 +131,7 @@ def stamp_end(store: Store, run_id: str, authority: Authority | None) -> None:
 def timestamp_findings(
     checkpoints: Sequence[Checkpoint], stamps: Sequence[Timestamp], certificates: Path | None
 ) -> tuple[list[Fault], list[str]]:
-    """Faults and notes on the time stamps of a run. Raises TimestampError for certificates that cannot be read."""
+    """Faults and notes on the time stamps of a run. Raises TimestampError if the certificates cannot be read."""
     signed = {item.seq: item for item in checkpoints}
     faults: list[Fault] = []
     notes: list[str] = []
@@ -178,7 +178,7 @@ def _verify(
 
 
 def _certificates(path: Path) -> tuple[list[x509.Certificate], list[x509.Certificate]]:
-    """Self-issued certificates are roots, the others lie between."""
+    """(roots, intermediates) in a PEM file; self-issued certificates are roots. Raises TimestampError."""
     try:
         found = x509.load_pem_x509_certificates(path.read_bytes())
         roots = [certificate for certificate in found if certificate.issuer == certificate.subject]
@@ -192,10 +192,10 @@ def _certificates(path: Path) -> tuple[list[x509.Certificate], list[x509.Certifi
 
 
 def _post_within(authority: Authority, body: bytes) -> bytes:
-    """The answer. Raises OSError, ValueError.
+    """The authority's answer within `timeout_s` in all. Raises OSError, ValueError.
 
-    The time-out of a socket bounds each of its operations: neither finding the address without a network nor an
-    answer that drips is bounded by it. A thread that is left behind is.
+    A socket's timeout limits only single operations, not a name look-up without a network or an answer that trickles
+    in. So the request runs in a thread, which is abandoned when the time is up.
     """
     answered: queue.Queue[bytes | OSError | ValueError] = queue.Queue(1)
     too_late = TimeoutError(f"nothing within {authority.timeout_s:g} s")
@@ -207,7 +207,7 @@ def _post_within(authority: Authority, body: bytes) -> bytes:
             late = isinstance(getattr(error, "reason", error), TimeoutError)
             answered.put(too_late if late else error)
         except http.client.HTTPException as error:
-            answered.put(ValueError(f"its answer is no HTTP ({error!r})"))
+            answered.put(ValueError(f"its answer is not HTTP ({error!r})"))
 
     threading.Thread(target=ask, name="time stamp", daemon=True).start()
     try:

@@ -1,4 +1,4 @@
-"""The pure part of the audit: rows and hashes in, faults out. No database, no files. Signatures: audit_signatures."""
+"""The pure part of verification: rows and hashes in, faults out, without database or files."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Fault:
     """One thing that does not verify."""
 
     run_id: str | None
-    seq: int | None  # of the event that it concerns
+    seq: int | None  # of the event concerned
     file: str
-    what: str  # what differs
+    what: str  # what is wrong
 
     def __str__(self) -> str:
         place = ", ".join(
@@ -46,7 +46,7 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class FileState:
-    """What hashing a listed file again gave."""
+    """The result of hashing a recorded file again; `problem` is "" if it could be read."""
 
     shown: str
     sha256: str
@@ -56,22 +56,22 @@ class FileState:
 
 @dataclass
 class ChainFacts:
-    """What other checks need to know of a chain, gathered while its events pass by once."""
+    """What other checks need from a chain, collected in one pass over its events."""
 
     sha256_at: dict[int, str] = field(default_factory=dict[int, str])
-    jobs: dict[int, Any] = field(default_factory=dict[int, Any])  # payloads that concern jobs
-    jobs_utc: dict[int, str] = field(default_factory=dict[int, str])  # when
+    jobs: dict[int, Any] = field(default_factory=dict[int, Any])  # seq → payload about a job
+    jobs_utc: dict[int, str] = field(default_factory=dict[int, str])  # seq → its time
     key_changes: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])
-    people: list[tuple[Any, str]] = field(default_factory=list[tuple[Any, str]])  # changes and sign-ins, when
-    stamps: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of authorities, as the site tells
-    heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of ServiceStarted
-    runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of the site's chain
-    to_sign: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # what is signed when it happens
-    last_own: int = 0  # number of the last event that does not come from a job
+    people: list[tuple[Any, str]] = field(default_factory=list[tuple[Any, str]])  # account changes, sign-ins; times
+    stamps: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # time_stamp_kept, of the site
+    heads_at_start: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # of service_started
+    runs_signed: list[tuple[int, Any]] = field(default_factory=list[tuple[int, Any]])  # run_signed, of the site
+    to_sign: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # events that are signed at once
+    last_own: int = 0  # seq of the last event that is not about a job
     first: Mapping[str, Any] | None = None
 
     def add(self, seq: int, payload: Any, at_utc: str) -> None:
-        """An event whose content is as it was recorded."""
+        """Add an event whose content has verified."""
         kind = payload["kind"]
         if kind in _OF_JOBS:
             self.jobs[seq] = payload
@@ -103,7 +103,7 @@ def run_faults(
     files: Mapping[str, FileState] | None,  # None: not read
     facts: ChainFacts,
 ) -> Iterator[Fault]:
-    """Every fault of one run, in the order of its events, then those of the run as a whole. Fills `facts`."""
+    """Every fault of one run: first by event, then of the run as a whole. Fills `facts`."""
     by_seq: dict[int, list[Mapping[str, Any]]] = {}
     for row in artefact_rows:
         by_seq.setdefault(int(row["seq"]), []).append(row)
@@ -133,7 +133,7 @@ def run_faults(
 def chain_fault(
     run_id: str, event_rows: Iterable[Mapping[Any, Any]], end: tuple[int, str]
 ) -> Fault | tuple[int, str]:
-    """The first fault of the events that follow `end` (number and hash), or where the chain ends now."""
+    """The first fault in the events that follow `end` (seq, sha256), or the new end of the chain."""
     seq, previous = end
     for row in event_rows:
         for fault in _link_faults(run_id, row, seq, previous):
@@ -155,7 +155,7 @@ def _link_faults(run_id: str, row: Mapping[str, Any], before: int, previous: str
 
 
 def _payload_of(row: Mapping[str, Any]) -> tuple[Any, tuple[ArtefactRef, ...], str]:
-    """The payload as plain data, what it refers to and an empty text; or None, and what is wrong with the event."""
+    """(payload as plain data, its references, "") of a valid event; (None, (), what is wrong) of an invalid one."""
     try:
         payload = parse_canonical(row["payload"])
         PAYLOAD.validate_python(payload)
@@ -168,7 +168,7 @@ def _payload_of(row: Mapping[str, Any]) -> tuple[Any, tuple[ArtefactRef, ...], s
             return None, (), "the payload is not in canonical form: its text was altered"
         if payload["kind"] != row["kind"]:
             return None, (), f"the column kind says {row['kind']}, the payload {payload['kind']}"
-        # In canonical form a reference's name of a field stands as it is; looking through every payload takes long.
+        # Searching every payload for references is slow; in canonical form a reference always contains this text.
         named = references(payload) if '"original_name":' in text else ()
     except (ValidationError, ValueError, StoreError) as error:
         return None, (), f"the content was altered: it cannot be read ({str(error).splitlines()[0]})"
@@ -235,7 +235,7 @@ def _end_faults(
 
 
 def _same_moment(one_utc: str, other_utc: str) -> bool:
-    """To a few seconds: older versions read the clock twice."""
+    """Whether two times agree to a few seconds; older versions read the clock twice."""
     try:
         apart = datetime.fromisoformat(one_utc) - datetime.fromisoformat(other_utc)
     except (ValueError, TypeError):
@@ -289,7 +289,7 @@ def _end_of_job_faults(
 
 
 def summary(payload: Mapping[str, Any]) -> str:
-    """One line on an event's payload: its short fields, in order."""
+    """One line on an event's payload: its scalar fields in order, long ones cut."""
     parts = [
         f"{name}={value}"
         for name, value in payload.items()

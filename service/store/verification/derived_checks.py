@@ -1,4 +1,4 @@
-"""What the database holds beside the chains and can be made again from them: schema, references, index, queue."""
+"""Check what can be derived again: the database's schema, references between rows, the event index, the queue."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from sqlalchemy import Connection, text
 from service.store.database.engine import DATABASE_NAME, fresh_schema, read_schema
 from service.store.verification.chain_checks import Fault
 
-# Of an index that says something else than the events, or of events that it does not have.
-# Every column is given its name here: one flipped bit makes a large letter of a small one in that of a table.
+# Index rows that differ from their events, and events that are missing from the index.
+# All columns are named explicitly: a flipped bit in the stored schema may turn a lower-case letter into a capital.
 _INDEX = """
 SELECT coalesce(e.run_id, i.run_id) AS run_id, coalesce(e.seq, i.seq) AS seq,
        e.seq IS NULL AS foreign_row, i.seq IS NULL AS missing_row
@@ -21,7 +21,7 @@ WHERE e.seq IS NULL OR i.seq IS NULL OR i.kind IS NOT e.kind OR i.actor IS NOT e
 """
 
 
-# Places are given in the order of writing over all runs, one after the other.
+# Positions count up in the order of writing over all runs.
 _PLACES = """
 SELECT run_id AS run_id, seq AS seq, place AS place, before AS before,
        position - row_number() OVER (ORDER BY position) AS gap
@@ -29,18 +29,18 @@ FROM (SELECT run_id, seq, position, position AS place,
              lag(seq) OVER (PARTITION BY run_id ORDER BY position) AS before FROM event_index)
 ORDER BY position
 """
-# A cross join: SQLite looks up the event of each job. Left to choose, it goes through all jobs for each event.
+# CROSS JOIN makes SQLite look up the event of each job; otherwise it may scan all jobs for each event.
 _QUEUE = """
 SELECT j.run_id AS run_id, j.enqueued_seq AS enqueued_seq, j.job_id AS job_id, j.position AS position,
        row_number() OVER (ORDER BY i.position) AS place
 FROM jobs AS j CROSS JOIN event_index AS i ON i.run_id = j.run_id AND i.seq = j.enqueued_seq ORDER BY i.position
 """
-_STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # what ANALYZE makes, by anybody's hand
-_NUMBERS = ("user_version", "application_id")  # of the database; this software sets none of them
+_STATISTICS = {("table", "sqlite_stat1"), ("table", "sqlite_stat4")}  # made by ANALYZE, which is harmless
+_NUMBERS = ("user_version", "application_id")  # numbers in the database's header, which this software leaves 0
 
 
 def schema_faults(connection: Connection) -> Iterator[Fault]:
-    """Tables, indexes and triggers that are not as this software makes them: a trigger may do nothing any more."""
+    """Tables, indexes and triggers that differ from those of this software; a changed trigger may protect nothing."""
     for name in _NUMBERS:
         number = connection.execute(text(f"PRAGMA {name}")).scalar_one()
         if number != 0:
@@ -58,16 +58,16 @@ def schema_faults(connection: Connection) -> Iterator[Fault]:
 
 
 def reference_faults(connection: Connection) -> Iterator[Fault]:
-    """Rows that belong to a row which is not there, such as a lease on a run that never was."""
+    """Rows that refer to a missing row, such as a lease on a run that does not exist."""
     for row in connection.execute(text("PRAGMA foreign_key_check")):
         what = f"row {row.rowid} of the table {row.table} belongs to a row of {row.parent} that is not there"
         yield Fault(None, None, DATABASE_NAME, what)
 
 
 def index_faults(connection: Connection, run_ids: Sequence[str], *, every_run: bool) -> Iterator[Fault]:
-    """Rows of the index that auditors filter by: missing, foreign, out of order, or saying something else.
+    """Rows of the event index that are missing, foreign, out of order or different from their event.
 
-    `every_run`: rows of runs that are not there at all are told too.
+    With `every_run`, rows of runs that do not exist are reported too.
     """
     wanted = frozenset(run_ids)
     for left, right in (("events AS e", "event_index AS i"), ("event_index AS i", "events AS e")):
@@ -91,7 +91,7 @@ def index_faults(connection: Connection, run_ids: Sequence[str], *, every_run: b
 
 
 def queue_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
-    """Jobs that do not stand in the queue where they were put: one after the other, over all runs."""
+    """Jobs whose position in the queue is not the order in which they were enqueued, over all runs."""
     wanted = frozenset(run_ids)
     for row in connection.execute(text(_QUEUE)):
         if row.position != row.place and row.run_id in wanted:

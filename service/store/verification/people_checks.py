@@ -1,6 +1,6 @@
-"""Who may act, held against the site's chain: accounts and their secrets, links, and who is signed in where.
+"""Check accounts, their secrets, invitation links and sessions against the site's chain.
 
-These rows are the present state. Whoever puts one in past the software could act under another's name from then on.
+These rows are the present state. Anybody who inserted one without the software could act under another's name.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from service.store.records import SITE
 from service.store.verification.chain_checks import Fault
 
 Rows = Sequence[Mapping[str, Any]]
-_SESSION = ("token_sha256", "account", "screen", "csrf", "created_utc_s")  # of a row, from its beginning to its end
+_SESSION = ("token_sha256", "account", "screen", "csrf", "created_utc_s")  # columns that never change
 _ENDS = frozenset({"signed_out", "ended"})
 _LOCKS = {"screen_locked": 1, "screen_unlocked": 0}
 
 
 def session_sha256(row: Mapping[str, Any]) -> str:
-    """Hash of what never changes in a row of sessions; a flipped bit may have made bytes of a text."""
+    """SHA-256 of the columns of a session that never change. (A flipped bit may have turned text into bytes.)"""
     values = {name: row[name] for name in _SESSION}
     return sha256_text(canonical({k: str(v) if isinstance(v, bytes) else v for k, v in values.items()}))
 
@@ -43,16 +43,16 @@ class _Link:
 
 @dataclass
 class _Told:
-    """What the site's chain says of people."""
+    """The state of accounts, links and sessions according to the site's chain."""
 
     accounts: dict[str, _Account] = field(default_factory=dict[str, _Account])
-    links: dict[str, _Link] = field(default_factory=dict[str, _Link])  # by hash of what is stored
-    open_links: dict[str, str] = field(default_factory=dict[str, str])  # account → hash of the one that is valid
-    unhashed_links: set[str] = field(default_factory=set[str])  # accounts with events from before the hashes
+    links: dict[str, _Link] = field(default_factory=dict[str, _Link])  # by SHA-256 of the stored token_sha256
+    open_links: dict[str, str] = field(default_factory=dict[str, str])  # account → hash of its valid link
+    unhashed_links: set[str] = field(default_factory=set[str])  # accounts with events older than these hashes
     sessions: dict[str, tuple[str, int]] = field(default_factory=dict[str, tuple[str, int]])  # screen → hash, locked
 
     def changed(self, change: Mapping[str, Any], at_utc: str) -> None:
-        """An account_changed."""
+        """Apply an account_changed event."""
         name, new, stored = str(change["account"]), str(change["new"]), change.get("stored") or {}
         if change["field"] == "link":
             sha256, hours = stored.get("token_sha256"), new.removeprefix("valid for ").removesuffix(" h")
@@ -79,7 +79,7 @@ class _Told:
         account.stored |= stored
 
     def signed_in(self, event: Mapping[str, Any]) -> None:
-        """A sign_in_recorded."""
+        """Apply a sign_in_recorded event."""
         screen, outcome = str(event["screen"]), str(event["outcome"])
         if outcome == "signed_in":
             self.sessions[screen] = str(event.get("session_sha256", "")), 0
@@ -92,13 +92,13 @@ class _Told:
 def people_faults(
     events: Iterable[tuple[Mapping[str, Any], str]], accounts: Rows, links: Rows, sessions: Rows
 ) -> Iterator[Fault]:
-    """Rows that did not come about as the site's chain tells it. Older chains tell less, which is no fault.
+    """Rows that do not agree with the site's chain. What older chains do not record is not a fault.
 
     Args:
-        events: payloads of account_changed and sign_in_recorded with their times, oldest first.
-        accounts: rows of that table.
+        events: (payload, time) of account_changed and sign_in_recorded, oldest first.
+        accounts: rows of the table accounts.
         links: rows of the table invitations.
-        sessions: rows of that table.
+        sessions: rows of the table sessions.
     """
     told = _Told()
     for payload, at_utc in events:

@@ -1,4 +1,4 @@
-"""Whether a search finds what the events say: their words are indexed once more, and the two are compared."""
+"""Check the full-text index: index the words of the events again and compare."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from service.store.database.engine import DATABASE_NAME
 from service.store.verification.chain_checks import Fault
 
 _MADE = "USING fts5(words, content = '', columnsize = 0)"
-_PARTS = {"data": "id, block", "idx": "segid, term, pgno", "config": "k, v"}  # of the index, as tables
-# As the trigger events_indexed writes them, in the order in which it did.
+_PARTS = {"data": "id, block", "idx": "segid, term, pgno", "config": "k, v"}  # shadow tables of the index
+# The same words in the same order as the trigger events_indexed wrote them.
 _WORDS = """
 SELECT i.position, e.actor || ' ' ||
        coalesce((SELECT group_concat(atom, ' ') FROM json_tree(e.payload) WHERE type = 'text'), '')
@@ -29,12 +29,12 @@ _DAMAGED = "the index by which auditors search is damaged"
 
 
 def word_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Fault]:
-    """Events whose words a search would not find as they stand there, or would find in another event.
+    """Events whose words a search would not find, or would find in another event.
 
-    Everything is done on copies in a private database: the evidence is not even opened for writing.
+    All work is done on copies in a private database; the evidence is not opened for writing.
     """
     try:
-        with closing(sqlite3.connect("")) as private:  # "": in a file of its own once it is large
+        with closing(sqlite3.connect("")) as private:  # "": a temporary database, on disk once it is large
             wrong, damage = _compared(connection, private)
     except sqlite3.Error as error:
         wrong, damage = [], f"{_DAMAGED}: {error}"
@@ -53,7 +53,7 @@ def word_faults(connection: Connection, run_ids: Sequence[str]) -> Iterator[Faul
 
 
 def _compared(connection: Connection, private: sqlite3.Connection) -> tuple[list[int], str]:
-    """Places of events whose words differ; and what is wrong with the way to them, "" for nothing."""
+    """Positions of events whose words differ, and what is wrong with the index itself ("" if nothing)."""
     for name in _BOTH:
         private.execute(f"CREATE VIRTUAL TABLE {name} {_MADE}")
     for part, columns in _PARTS.items():
@@ -73,7 +73,7 @@ def _compared(connection: Connection, private: sqlite3.Connection) -> tuple[list
     if not _same(*(private.execute(f"SELECT term, doc, col, offset FROM {name}_places") for name in _BOTH)):
         wrong = [int(row[0]) for row in private.execute(_OTHER.format(*_BOTH))]
         return wrong, f"{_DAMAGED}: it does not hold the words of the events"
-    # What is there in order need not be found: a search goes another way, by the first words of the index's pages.
+    # Correct contents do not prove that a search works, which goes by the first words of the pages: try every word.
     for (term,) in private.execute("SELECT term FROM words"):
         asked = (f"SELECT count(*) FROM {name} WHERE {name} MATCH ?" for name in _BOTH)
         found, awaited = (private.execute(ask, (f'"{term}"',)).fetchone()[0] for ask in asked)

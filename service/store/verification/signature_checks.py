@@ -1,4 +1,4 @@
-"""The pure part of the audit that concerns signatures: keys, checkpoints and time stamps in, faults and notes out."""
+"""The pure part of verifying signatures: keys, checkpoints and time stamps in, faults and notes out."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from service.store.verification.chain_checks import ChainFacts, Fault
 
 @dataclass(frozen=True, slots=True)
 class KeyPeriod:
-    """A public key and the part of the site's chain during which it signed."""
+    """A public key and the part of the site's chain during which it was in use."""
 
     key_id: str
     public_key: bytes
-    seq: int  # of its KeyChanged
-    replaced_seq: int | None
+    seq: int  # of its KeyChanged event
+    replaced_seq: int | None  # seq of its successor's KeyChanged; None for the key in use
 
 
 @dataclass
 class Keys:
-    """The history of keys as the site's chain tells it."""
+    """The history of keys in the site's chain, with faults and notes."""
 
     periods: dict[str, KeyPeriod] = field(default_factory=dict[str, KeyPeriod])
     faults: list[Fault] = field(default_factory=list[Fault])
@@ -34,10 +34,10 @@ class Keys:
 
 
 def key_history(site: ChainFacts, checkpoints: Sequence[Checkpoint]) -> Keys:
-    """The keys of the site's chain; `checkpoints` are those of the site.
+    """The keys in the site's chain; `checkpoints` are the site's.
 
-    A new key counts as introduced when its predecessor signed its KeyChanged. One that is not is a note: it
-    happens when the old key was lost, and only a fingerprint written down elsewhere tells it from an intruder's.
+    A new key counts as introduced if its predecessor signed its KeyChanged. Otherwise a note says so: the old key may
+    have been lost, and only a fingerprint written down elsewhere distinguishes the new key from an intruder's.
     """
     keys = Keys()
     vouchers = {item.seq: item for item in checkpoints}
@@ -73,7 +73,7 @@ def checkpoint_faults(
     keys: Mapping[str, KeyPeriod],
     artefact_rows: Sequence[Mapping[str, Any]],
 ) -> Iterator[Fault]:
-    """Every fault of a run's checkpoints, which come oldest first, as the artefact rows come in their order."""
+    """Every fault of a run's checkpoints, given oldest first; `artefact_rows` in the order of the events."""
     digest, position = RowsDigest(), 0
     for item in checkpoints:
         while position < len(artefact_rows) and int(artefact_rows[position]["seq"]) <= item.seq:
@@ -110,7 +110,7 @@ def _fault(item: Checkpoint, what: str) -> Fault:
 
 
 def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[Fault]:
-    """Ends of the run's chain that the site's chain wrote down at each start of the service: all must be there."""
+    """The site's chain records the end of the run's chain at each start of the service; each must still be there."""
     for start_seq, heads in site.heads_at_start:
         if run_id in heads:
             seq, sha256 = heads[run_id]
@@ -125,9 +125,9 @@ def start_faults(run_id: str, chain: ChainFacts, site: ChainFacts) -> Iterator[F
 def stamp_faults(
     site: ChainFacts, signed: Mapping[str, Sequence[Checkpoint]], stamps: Mapping[str, Sequence[Timestamp]]
 ) -> Iterator[Fault]:
-    """Time stamps that are not those of which the site's chain tells. Both by run; stamps of other runs are left out.
+    """Time stamps that differ from those recorded in the site's chain; `signed` and `stamps` are by run.
 
-    Stamps from before the site's chain told of them are let be.
+    Stamps of other runs, and stamps made before the site's chain recorded them, are not checked.
     """
     told: dict[tuple[str, int, str], tuple[str, str]] = {}
     for _, payload in site.stamps:
@@ -148,7 +148,7 @@ def stamp_faults(
 
 
 def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, every_run: bool) -> Iterator[Fault]:
-    """What the site's chain says of signed runs must be so: a run that is gone or shorter now was cut or deleted."""
+    """Runs recorded as signed in the site's chain that are now missing, shorter or different: cut or deleted."""
     gone: set[str] = set()
     for at, payload in site.runs_signed:
         run_id, seq = str(payload["run"]), int(payload["seq"])
@@ -163,9 +163,9 @@ def signed_run_faults(site: ChainFacts, chains: Mapping[str, ChainFacts], *, eve
 
 
 def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: ChainFacts) -> Iterator[Fault]:
-    """A step that passed, or a run that ended, is signed at once: without that, signatures were taken away.
+    """Events that are always signed at once (step passed, run ended) but have no signature: it was removed.
 
-    The last event may still wait for its signature, also when a worker has reported since.
+    The last event may still be waiting for its signature, even if a worker has reported since.
     """
     signed = checkpoints[-1].seq if checkpoints else 0
     for seq, kind in chain.to_sign:
@@ -175,7 +175,7 @@ def unsigned_end_faults(run_id: str, checkpoints: Sequence[Checkpoint], chain: C
 
 
 def unsigned(run_id: str, checkpoints: Sequence[Checkpoint], events: int) -> tuple[int, str]:
-    """How many events come after the last checkpoint, and a note on it, "" when there is none."""
+    """Number of events after the last checkpoint, and a note on them; (0, "") if there are none."""
     last = checkpoints[-1].seq if checkpoints else 0
     count = max(0, events - last)
     if count == 0:

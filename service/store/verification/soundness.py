@@ -1,4 +1,4 @@
-"""Before anything is signed: does it verify? A signature would make a forged record a genuine one."""
+"""Verify a chain before it is signed, because a signature would make a forged record look genuine."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from service.store.verification.chain_checks import Fault, chain_fault
 
 
 def require_sound(store: Store, connection: Connection, run_id: str, lines: Sequence[Line] | None) -> None:
-    """The chain, its earlier signatures and the log of signatures must fit together. Raises IntegrityError.
+    """Raise IntegrityError unless the chain, its earlier signatures and the log of signatures agree.
 
-    What this process has verified before is not read again; that it is still there is looked at.
+    Events that this process has verified before are not read again; only the last of them must still be there.
 
     Args:
         store: remembers how far each chain was verified.
         connection: within the transaction that signs.
-        run_id: of the chain, or SITE.
-        lines: of the log of signatures; None where there is none.
+        run_id: the chain's run, or SITE.
+        lines: lines of the log of signatures; None if there is no log.
     """
     found = _chain(store, connection, run_id)
     fault = found if isinstance(found, Fault) else _signature_fault(connection, run_id, lines)
@@ -50,7 +50,7 @@ def _chain(store: Store, connection: Connection, run_id: str) -> Fault | tuple[i
 
 
 def _signature_fault(connection: Connection, run_id: str, lines: Sequence[Line] | None) -> Fault | None:
-    """What is wrong with the earlier signatures of a chain: with the events they sign, or with the log of them."""
+    """A disagreement of a chain's earlier signatures with their events or with the log of signatures, or None."""
     of_event = (events.c.run_id == checkpoints.c.run_id) & (events.c.seq == checkpoints.c.seq)
     joined = select(checkpoints.c.seq).outerjoin_from(checkpoints, events, of_event)
     other = joined.where(checkpoints.c.run_id == run_id, events.c.sha256.is_distinct_from(checkpoints.c.sha256))

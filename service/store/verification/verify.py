@@ -1,4 +1,4 @@
-"""Verify a data folder against its own evidence, and list a run's evidence. Opens everything read-only."""
+"""Verify the evidence in a data folder, and list a run's evidence. Everything is opened read-only."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ from service.store.verification.chain_checks import ChainFacts, Fault, FileState
 from service.store.verification.people_checks import people_faults
 from service.store.verification.search_checks import word_faults
 
-Progress = Callable[[str, int, int], None]  # what is being done, done, total (bytes)
+Progress = Callable[[str, int, int], None]  # (activity, bytes done, bytes in total)
 
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
-    """What was checked and what is wrong. `ok` means no fault; notes are no faults.
+    """What was checked and what is wrong. `ok` means no faults; notes are not faults.
 
-    The site's chain is always checked too, because it holds the keys; the numbers are those of `runs`.
+    The site's chain is always checked too, because it holds the keys; the counts are of `runs` only.
     """
 
     data_dir: str
-    runs: tuple[str, ...]  # those asked for
-    heads: Mapping[str, str]  # run → sha256 of its last event: compare it with one written down elsewhere
+    runs: tuple[str, ...]  # the runs asked for
+    heads: Mapping[str, str]  # run → SHA-256 of its last event, to compare with one written down elsewhere
     events: int
     artefacts: int
     files: int
@@ -62,7 +62,7 @@ class AuditReport:
     checkpoints: int
     timestamps: int
     unsigned_events: Mapping[str, int]  # run → events after its last checkpoint
-    key_ids: tuple[str, ...]  # fingerprints of the site's keys, oldest first: compare them as well
+    key_ids: tuple[str, ...]  # fingerprints of the site's keys, oldest first, to compare as well
     faults: tuple[Fault, ...]  # in the order of the chain
     notes: tuple[str, ...]
 
@@ -73,13 +73,13 @@ class AuditReport:
 
     @property
     def first_fault(self) -> Fault | None:
-        """The earliest fault."""
+        """The first fault in the order of the chain, or None."""
         return self.faults[0] if self.faults else None
 
 
 @dataclass(frozen=True, slots=True)
 class EvidenceRecord:
-    """One event of a run with the artefacts that it brought, for people to read."""
+    """One event of a run with its artefacts, for people to read."""
 
     seq: int
     at_utc: str
@@ -100,22 +100,22 @@ def verify(
     files: bool = True,
     signatures_copy: Path | None = None,
 ) -> AuditReport:
-    """Walk the chain and hash every file again, of one run or of all, and check every signature.
+    """Check the chain, hash every file again and check every signature, of one run or of all.
 
-    A chain rewritten from some event to its end, hashes included, is found by its checkpoints, whose key an
-    intruder does not have. What comes after the last checkpoint is told as a note; only `heads` covers it.
+    A chain that was rewritten up to its end, hashes included, is found by its checkpoints, whose key an intruder does
+    not have. Events after the last checkpoint are reported in a note; only `heads` covers them.
 
     Args:
         data_dir: the data folder.
         run_id: one run, or None for all.
-        progress: told how many bytes were hashed.
-        certificates: of the time-stamp authorities (PEM). Without it only what a time stamp was given for is checked.
-        files: False leaves the files alone, which a note tells.
-        signatures_copy: of the log of signatures, kept elsewhere: a log that was cut shows against it.
+        progress: called with the number of bytes hashed.
+        certificates: PEM file of the time-stamp authorities. Without it, only the stamped content is checked.
+        files: False skips the files; a note says so.
+        signatures_copy: a copy of the log of signatures, kept elsewhere, which shows whether the log was cut.
 
     Raises:
         UnknownRunError: there is no such run.
-        StoreError: there is no database, or it is not readable as one.
+        StoreError: there is no database, or it cannot be read.
     """
     of_wal, notes_of_wal = wal_findings(data_dir)
     database = open_read_only(data_dir, DurableFiles())
@@ -140,7 +140,7 @@ def _verify_readable(
     *,
     with_files: bool,
 ) -> AuditReport:
-    """Raises StoreError where a damaged database holds rows that its own tables forbid."""
+    """Verify; raises StoreError if the check fails on rows that only a damaged database can hold."""
     try:
         return _verify(data_dir, connection, run_id, progress, certificates, with_files=with_files)
     except (TypeError, ValueError, LookupError, ArithmeticError) as error:
@@ -284,7 +284,7 @@ _Rows = dict[str, list[dict[str, Any]]]  # by run
 
 @dataclass(frozen=True, slots=True)
 class _Evidence:
-    """Everything but the events, which may be many: they pass by once."""
+    """All rows other than the events, which may be many and are streamed instead."""
 
     run_ids: tuple[str, ...]
     has_site: bool
@@ -304,7 +304,7 @@ class _Evidence:
 def _read(connection: Connection, run_id: str | None) -> _Evidence:
     damage = _damage(connection)
     known = set(connection.execute(select(runs.c.run_id)).scalars())
-    # A run whose row was deleted is still there in its events, or in what signs them.
+    # A run whose row was deleted may still have events or checkpoints.
     known |= set(connection.execute(select(events.c.run_id).distinct()).scalars())
     known |= set(connection.execute(select(checkpoints.c.run_id).distinct()).scalars())
     if run_id is not None and run_id not in known:
@@ -377,7 +377,7 @@ def _file_state(folder: Path, sha256: str) -> FileState:
 
 
 def _unlisted(folder: Path, listed: frozenset[str]) -> tuple[list[str], list[Fault]]:
-    """Crash leftovers are notes: half-written temporary files, and whole ones whose row was never committed."""
+    """(notes, faults) on files that no row names. Leftovers of crashes are notes: partial and unrecorded files."""
     notes: list[str] = []
     foreign: list[Fault] = []
     for path in sorted(path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink()):

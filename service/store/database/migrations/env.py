@@ -1,4 +1,4 @@
-"""Runs the migrations on the connection that service.store.database.engine hands over; never opens one itself."""
+"""Run the migrations on the connection that service.store.database.engine passes in."""
 
 from alembic import context
 

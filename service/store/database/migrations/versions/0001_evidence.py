@@ -118,7 +118,7 @@ def upgrade() -> None:
                 f"CREATE TRIGGER {table}_no_{verb} BEFORE {verb.upper()} ON {table} "
                 f"BEGIN SELECT RAISE(ABORT, '{table} is append-only: {verb} refused'); END"
             )
-    # INSERT OR REPLACE deletes without firing a DELETE trigger, so a key that exists is refused beforehand.
+    # INSERT OR REPLACE deletes without firing a DELETE trigger, so inserting an existing key is refused.
     for table, taken in (
         ("runs", "run_id = NEW.run_id"),
         ("events", "run_id = NEW.run_id AND (seq = NEW.seq OR previous_sha256 = NEW.previous_sha256)"),

@@ -1,4 +1,4 @@
-"""Checkpoints and time stamps (append-only), and the people: accounts, invitations, sessions, control."""
+"""Add checkpoints and time stamps (append-only), and people: accounts, invitations, sessions, control."""
 
 import sqlalchemy as sa
 from alembic import op

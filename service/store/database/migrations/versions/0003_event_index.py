@@ -1,4 +1,4 @@
-"""What auditors filter and search events by: a narrow table and a full-text index, kept up by a trigger."""
+"""Add indexes by which auditors filter and search events: a narrow table, a full-text index and a trigger."""
 
 import sqlalchemy as sa
 from alembic import op
@@ -8,7 +8,7 @@ down_revision = "0002"
 branch_labels = None
 depends_on = None
 
-# Every text within the payload, in order, and who wrote it. Numbers are read, not searched.
+# The actor and every text in the payload, in order. Numbers are not searched for.
 _WORDS = (
     "{row}.actor || ' ' || "
     "coalesce((SELECT group_concat(atom, ' ') FROM json_tree({row}.payload) WHERE type = 'text'), '')"
@@ -34,7 +34,7 @@ def upgrade() -> None:
         sqlite_strict=True,
     )
     op.create_index("event_index_by_kind", "event_index", ["run_id", "kind", "seq"])
-    # Contentless: the words lie in the events already. Never updated, so sizes of columns are not needed either.
+    # Contentless, because the events hold the words already; never updated, so column sizes are not needed.
     op.execute("CREATE VIRTUAL TABLE event_words USING fts5(words, content = '', columnsize = 0)")
     op.execute(
         f"INSERT INTO event_index ({_COLUMNS}) SELECT {_FACETS.format(row='e')} FROM events AS e "

@@ -1,4 +1,4 @@
-"""Jobs have a priority: what a person or a step waits for goes before what is computed in the background."""
+"""Add a priority to jobs: what a person or a step waits for comes before background work."""
 
 import sqlalchemy as sa
 from alembic import op

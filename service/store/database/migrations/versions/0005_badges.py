@@ -1,4 +1,4 @@
-"""Accounts may have a badge: what a reader types of it, hashed as PINs are."""
+"""Add badges to accounts: the text that a badge reader types, hashed like a PIN."""
 
 import sqlalchemy as sa
 from alembic import op
