@@ -1,1 +1,1 @@
-"""People: accounts, roles, sign-ins, screens, and who controls a run."""
+"""People: accounts, roles, sign-ins, screens, and control of runs."""

@@ -1,4 +1,4 @@
-"""Accounts: first set-up, invitations, roles, and what an administrator or their owner changes."""
+"""Accounts: first set-up, invitations, roles, and changes by administrators and owners."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ INVITATION_S = 72 * 3600.0
 
 
 class Accounts:
-    """What administrators do to accounts, and people to their own. Each change is recorded as it is made."""
+    """Changes that administrators make to accounts, and people to their own; each is recorded in its transaction."""
 
     def __init__(self, store: Store, passwords: Passwords) -> None:
         self._store = store
@@ -41,31 +41,31 @@ class Accounts:
         return self._store.clock.utc_now().timestamp()
 
     def all(self) -> list[Account]:
-        """Every account, by name."""
+        """Every account, sorted by name."""
         with self._store.database.reading() as connection:
             return [to_account(row) for row in connection.execute(select(accounts).order_by(accounts.c.account))]
 
     def get(self, account: str) -> Account:
-        """One account. Raises AccountError."""
+        """The account of this name. Raises AccountError if there is none."""
         with self._store.database.reading() as connection:
             return to_account(get_account(connection, account))
 
     # --- one-time links ---
 
     def first_link(self) -> str | None:
-        """A token to make the first administrator with, or None when there is one already."""
+        """A new one-time token for making the first administrator, or None if there is one already."""
         with self._store.database.writing() as connection:
             if self._administrators(connection):
                 return None
             return self._new_link(connection, "", FIRST_LINK_S, actor=SERVICE)
 
     def invitation(self, token: str) -> Invitation:
-        """What a link is for. Raises LinkError when it is unknown, used or too old."""
+        """The invitation of a link. Raises LinkError if the link is unknown, used or too old."""
         with self._store.database.reading() as connection:
             return self._invitation(connection, token)
 
     def set_up(self, token: str, account: str, full_name: str, password: str, pin: str) -> str:
-        """Use the first link: make the administrator; the account's name. Raises LinkError, AccountError."""
+        """Use the first link to make the administrator; returns its account. Raises LinkError, AccountError."""
         name = plain_name(account)
         require_name(name)
         plain = require_full_name(full_name)
@@ -82,7 +82,7 @@ class Accounts:
         return name
 
     def accept(self, token: str, password: str, pin: str) -> str:
-        """Use an invitation: the account gets its password and PIN; its name. Raises LinkError, AccountError."""
+        """Use an invitation to set password and PIN; returns the account. Raises LinkError, AccountError."""
         name = self.invitation(token).account
         require_password(password, name)
         require_pin(pin)
@@ -101,7 +101,7 @@ class Accounts:
         return name
 
     def invite(self, by: Person, account: str, full_name: str, role: Role) -> str:
-        """Make an account and the token of its link, which is shown once. Raises AccountError."""
+        """Make an account. Returns the token of its link, which is shown only once. Raises AccountError."""
         name = plain_name(account)
         require_name(name)
         plain = require_full_name(full_name)
@@ -116,7 +116,7 @@ class Accounts:
             return self._new_link(connection, name, INVITATION_S, actor=by.account)
 
     def reset(self, by: Person, account: str, reason: str) -> str:
-        """Take away password, PIN and badge, end all sign-ins, and make a new link. Raises AccountError."""
+        """Remove password, PIN and badge, end all sign-ins, and return a new link's token. Raises AccountError."""
         why = require_reason(reason)
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
@@ -134,7 +134,7 @@ class Accounts:
     # --- an administrator's changes ---
 
     def change_role(self, by: Person, account: str, role: Role, reason: str) -> None:
-        """Give an account another role; its sign-ins end. Raises AccountError."""
+        """Give an account another role and end its sign-ins. Raises AccountError."""
         why = require_reason(reason)
         _require_role(role)
         with self._store.database.writing() as connection:
@@ -148,7 +148,7 @@ class Accounts:
             record_change(self._store, connection, by.account, account, "role", row.role, role, why)
 
     def disable(self, by: Person, account: str, reason: str) -> None:
-        """Shut an account out; its sign-ins and links end. Raises AccountError for the last administrator."""
+        """Disable an account and end its sign-ins and links. Raises AccountError, also for the last administrator."""
         why = require_reason(reason)
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
@@ -162,7 +162,7 @@ class Accounts:
             record_change(self._store, connection, by.account, account, "state", row.state, "disabled", why)
 
     def enable(self, by: Person, account: str, reason: str) -> None:
-        """Let a disabled account in again, with the password it had. Raises AccountError."""
+        """Enable a disabled account again with its old password. Raises AccountError."""
         why = require_reason(reason)
         with self._store.database.writing() as connection:
             row = get_account(connection, account)
@@ -190,12 +190,15 @@ class Accounts:
     # --- one's own ---
 
     def change_password(self, person: Person, password: str) -> None:
-        """Set a new password; the person's other sign-ins end. The old one has been checked before. AccountError."""
+        """Set a new password and end the person's other sign-ins. Raises AccountError if it is not acceptable.
+
+        The caller has checked the old password.
+        """
         require_password(password, person.account)
         self._change_secret(person, "password", self._passwords.hash(password))
 
     def change_pin(self, person: Person, pin: str) -> None:
-        """Set a new PIN. The password has been checked before. Raises AccountError."""
+        """Set a new PIN; the caller has checked the password. Raises AccountError if it is not acceptable."""
         require_pin(pin)
         self._change_secret(person, "pin", self._passwords.hash(pin))
 

@@ -1,4 +1,4 @@
-"""Which protocols people have approved on this site: each content by its hash, in the site's chain."""
+"""Approvals of protocols on this site: each content by its hash, recorded in the site's chain."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.store.store import Store
 
 @dataclass(frozen=True, slots=True)
 class Approval:
-    """A content of a protocol that a person has approved, when and as what."""
+    """A person's approval of one content of a protocol."""
 
     payload: ProtocolApproved
     by: str
@@ -28,11 +28,11 @@ class Approval:
 
 @dataclass(frozen=True, slots=True)
 class ProtocolStanding:
-    """How a protocol file stands on a site.
+    """Whether a protocol file is approved on a site.
 
     Attributes:
-        approval: of exactly this content; None: nobody has approved it.
-        other: the content with the same id and version that was approved last; None where there is no other.
+        approval: the approval of exactly this content; None if there is none.
+        other: the last approval of other content with the same id and version; None if there is none.
     """
 
     approval: Approval | None
@@ -40,12 +40,12 @@ class ProtocolStanding:
 
     @property
     def changed(self) -> bool:
-        """Whether this is an unapproved content under an id and a version that stand for another one."""
+        """Whether this content is not approved, but other content of the same id and version is."""
         return self.approval is None and self.other is not None
 
 
 def approvals(store: Store, protocol: str, version: str) -> list[Approval]:
-    """Of all contents under an id and a version, oldest first."""
+    """All approvals for an id and version of a protocol, oldest first."""
     found = (
         select(events)
         .join(event_index, (event_index.c.run_id == events.c.run_id) & (event_index.c.seq == events.c.seq))
@@ -67,7 +67,7 @@ def _same(one: Approval, protocol: str, version: str) -> bool:
 
 
 def standing_of(store: Store, loaded: LoadedProtocol) -> ProtocolStanding:
-    """How a protocol file stands."""
+    """The standing of a protocol file on this site."""
     known = approvals(store, loaded.protocol.id, loaded.protocol.version)
     mine = [one for one in known if one.payload.sha256 == loaded.sha256]
     others = [one for one in known if one.payload.sha256 != loaded.sha256]
@@ -82,9 +82,9 @@ def approve(
     reason: str = "",
     identified: Identified = "",
 ) -> ProtocolStanding:
-    """Record that a person approves this content, unless it is approved; how it stands then.
+    """Record that a person approves this content, unless it is approved already. Returns the new standing.
 
-    Raises ConfigurationError where another content has the same id and version, and no reason is given.
+    Raises ConfigurationError if other content of the same id and version is approved and no reason is given.
     """
     standing = standing_of(store, loaded)
     if standing.approval is not None:
@@ -111,7 +111,7 @@ def approve(
 
 
 def difference(before: str, now: str) -> list[str]:
-    """The lines that differ, each with − or + before it and its number: `− 41: min: 0.9`."""
+    """The lines that differ, each with − or + and its line number, such as `− 41: min: 0.9`."""
     out: list[str] = []
     old = new = 0
     for line in list(unified_diff(before.splitlines(), now.splitlines(), n=0, lineterm=""))[2:]:

@@ -1,4 +1,4 @@
-"""Who somebody is when an action demands a role: by a secret of an account, or by claim where there are none."""
+"""Identify the person who acts: by a secret of their account, or by claim on a site without accounts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from service.people.sessions import KnownBy, People
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """A person as an event names them, and how the program knows."""
+    """A person as named in an event, and how they were identified."""
 
     name: str
     role: str
@@ -32,15 +32,20 @@ def identity_for(
     secret: Callable[[], str],
     known_by: KnownBy = "password",
 ) -> Identity | None:
-    """Who acts, for a verb that demands a role now; None for the others. Raises as `identify` does."""
+    """The person who acts, if the verb now needs a role; else None.
+
+    Raises:
+        SignInRefusedError: name and secret do not belong together.
+        NotAllowedError: no name was given, or the account has another role.
+    """
     role = demanded_role(protocol, state) if verb == "accept" else ""
     return identify(people, typed, role, secret, known_by) if role else None
 
 
 def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identity:
-    """Who acts on the command line, where a name is a claim: that of an account needs its password.
+    """The person who acts on the command line: by claim, or by password if the name is that of an account.
 
-    Raises SignInRefusedError: name and password do not belong together, or the account is not in use.
+    Raises SignInRefusedError if name and password do not belong together or the account is not in use.
     """
     name = plain_name(typed)
     account = next((account for account in people.accounts.all() if account.account == name), None)
@@ -53,14 +58,14 @@ def who_acts(people: People, typed: str, password: Callable[[], str]) -> Identit
 def identify(
     people: People, typed: str, role: str, secret: Callable[[], str], known_by: KnownBy = "password"
 ) -> Identity:
-    """The person of this name, in this role.
+    """Identify the person of this name in this role.
 
     Args:
         people: accounts of the data folder.
-        typed: name as it was typed.
-        role: what the action demands.
-        secret: asks for it; not called on a site that has no accounts, where a name is a claim.
-        known_by: what the secret is: the account's password, PIN or badge.
+        typed: the name as typed.
+        role: the role that the action needs.
+        secret: asks for the secret; not called on a site without accounts, where the name is a claim.
+        known_by: the kind of secret: the account's password, PIN or badge.
 
     Raises:
         SignInRefusedError: name and secret do not belong together.

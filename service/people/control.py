@@ -1,4 +1,4 @@
-"""Which screen has control of a run. One acts, the others look on; every change of hands is in the run's chain."""
+"""Which screen controls a run: one may act, the others only watch; every change is recorded in the run's chain."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from service.people.rows import SESSION_S, require_reason
 from service.store.database.tables import accounts, control, runs, sessions
 from service.store.store import Store
 
-UNANSWERED_S = 60.0  # after which a question to a locked screen counts as answered
+UNANSWERED_S = 60.0  # after this time a locked screen that does not answer may lose control
 
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Who has control, and who asks for it; "" for nobody. A screen whose sign-in has ended has none."""
+    """Who has control of a run and who asks for it; "" for nobody. When a sign-in ends, so does its control."""
 
     screen: str = ""
     account: str = ""
@@ -32,7 +32,7 @@ class Holder:
 
 
 class Control:
-    """Control of the runs of a data folder. Methods raise ControlError when the answer is no."""
+    """Control of the runs in a data folder. Methods raise ControlError if a request is refused."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -41,12 +41,12 @@ class Control:
         return self._store.clock.utc_now().timestamp()
 
     def holder(self, run_id: str) -> Holder:
-        """Who has control now."""
+        """Who has control of the run now. Raises UnknownRunError."""
         with self._store.database.reading() as connection:
             return self._holder(connection, run_id)
 
     def require(self, run_id: str, person: Person) -> None:
-        """Raises ControlError unless this person's screen has control of the run."""
+        """Raise ControlError unless this person's screen has control of the run."""
         holder = self.holder(run_id)
         if holder.screen != person.screen:
             raise ControlError(
@@ -58,7 +58,7 @@ class Control:
             )
 
     def take(self, run_id: str, person: Person) -> None:
-        """Take control that is free, one's own on another screen, or not defended by a locked screen."""
+        """Take control that is free, one's own elsewhere, or held by a locked screen that does not answer."""
         _require_operator(person)
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)
@@ -85,10 +85,12 @@ class Control:
                 )
 
     def take_over(self, run_id: str, person: Person, reason: str) -> None:
-        """A supervisor takes control from whoever has it, with a reason."""
+        """Let a supervisor take control from whoever has it, with a reason. Raises NotAllowedError for others."""
         if person.role != "supervisor":
             raise NotAllowedError(
-                "only a supervisor takes over control", where=run_id, remedy="Ask for control, or call a supervisor"
+                "only a supervisor may take over control",
+                where=run_id,
+                remedy="Ask for control, or call a supervisor",
             )
         why = require_reason(reason)
         with self._store.database.writing() as connection:
@@ -97,7 +99,7 @@ class Control:
                 self._give(connection, run_id, person, holder, "taken_over" if holder.screen else "free", why)
 
     def ask(self, run_id: str, person: Person) -> None:
-        """Ask the screen that has control. A later question replaces one that nobody answered."""
+        """Ask the screen in control to hand over. A later request replaces one that was not answered in time."""
         _require_operator(person)
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)
@@ -113,12 +115,12 @@ class Control:
                 run_id,
                 asked_by_screen=person.screen,
                 asked_by_account=person.account,
-                # Asking again does not start the waiting anew.
+                # Asking again does not restart the waiting time.
                 asked_utc_s=holder.asked_utc_s if holder.asked_by_screen == person.screen else self._now_s(),
             )
 
     def answer(self, run_id: str, person: Person, *, grant: bool) -> None:
-        """The screen in control says yes, which hands over, or no."""
+        """Answer a request as the screen in control: with `grant` hand over, else refuse."""
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)
             if holder.screen != person.screen:
@@ -139,7 +141,7 @@ class Control:
             raise ended
 
     def release(self, run_id: str, person: Person) -> None:
-        """Give control back, for anybody to take."""
+        """Give up control, so that anybody may take it."""
         with self._store.database.writing() as connection:
             holder = self._holder(connection, run_id)
             if holder.screen != person.screen:
@@ -221,6 +223,4 @@ def _valid(screen: str, now_s: float) -> Any:
 
 def _require_operator(person: Person) -> None:
     if not person.may("operate"):
-        raise NotAllowedError(
-            f"the role {person.role} looks on and does not act", where="control", remedy="Ask a technician"
-        )
+        raise NotAllowedError(f"the role {person.role} may only watch", where="control", remedy="Ask a technician")

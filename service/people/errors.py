@@ -1,4 +1,4 @@
-"""What is refused to people, and why, as leaves of the one error tree."""
+"""Errors of accounts, sign-ins and control, as leaves of the one error tree."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from service.core.errors import OrthocaptureError
 
 
 class PeopleError(OrthocaptureError):
-    """Something that people asked for was refused; nothing was changed."""
+    """A person's request was refused; nothing was changed."""
 
 
 class NotSignedInError(PeopleError):
-    """Nobody is signed in on this screen, or no longer."""
+    """Nobody is signed in on this screen, or the sign-in has ended."""
 
 
 class SignInRefusedError(PeopleError):
-    """Name or password is wrong, or the account may not sign in now; on purpose it is not told which."""
+    """Name or password is wrong, or the account may not sign in now; which of these is deliberately not said."""
 
 
 class AccountJustChangedError(SignInRefusedError):
-    """The password was right, but the account was changed while it was checked; this counts as no failed try."""
+    """The password was right, but the account was changed meanwhile; this does not count as a failed try."""
 
 
 class TooManyTriesError(PeopleError):
@@ -32,7 +32,7 @@ class NotAllowedError(PeopleError):
 
 
 class ScreenLockedError(PeopleError):
-    """The screen is locked: looking is possible, acting is not."""
+    """The screen is locked: it shows pages but allows no actions."""
 
 
 class PinRefusedError(PeopleError):

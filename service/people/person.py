@@ -1,4 +1,4 @@
-"""Who acts, and what is known of accounts, screens and one-time links: plain records without secrets of sign-in."""
+"""Records of people, accounts, screens and one-time links, without their secrets."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from service.people.roles import Permission, Role, may
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """Somebody signed in, on one screen."""
+    """A person signed in on one screen."""
 
     account: str
     full_name: str
     role: Role
     screen: str  # name of this sign-in, for people and for the record
-    csrf: str = field(repr=False)  # every form of this sign-in carries it
+    csrf: str = field(repr=False)  # token that every form of this sign-in carries
     locked: bool = False
 
     def may(self, permission: Permission) -> bool:
@@ -25,16 +25,16 @@ class Person:
 
 @dataclass(frozen=True, slots=True)
 class Account:
-    """An account as the administrator sees it."""
+    """An account as administrators see it."""
 
     account: str
     full_name: str
     role: Role
     state: str  # invited, active, disabled
     failures: int  # wrong passwords in a row
-    locked_until_utc_s: float  # 0 for not locked out
+    locked_until_utc_s: float  # 0 if not locked out
     created_utc: str
-    badge: bool = False  # has one
+    badge: bool = False  # whether it has a badge
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,7 @@ class Screen:
 
 @dataclass(frozen=True, slots=True)
 class Invitation:
-    """What a one-time link is for. `account` is "" for the first administrator, who chooses a name."""
+    """The purpose of a one-time link. `account` is "" for the first administrator, who chooses a name."""
 
     account: str
     full_name: str

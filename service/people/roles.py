@@ -6,12 +6,12 @@ from typing import Literal
 
 Role = Literal["technician", "supervisor", "auditor", "administrator"]
 Permission = Literal[
-    "read",  # every page of every run, the audit's included
+    "read",  # every page of every run, audit pages included
     "operate",  # start and drive a run: tick, confirm, redo, skip, pause, resume, abort; take control
     "sign",  # sign a step
     "correct",  # correct a recorded value, with reason
     "release",  # release a completed run as second person
-    "enrol",  # give people badges, and take them away
+    "enrol",  # enrol and revoke people's badges
     "export",  # make a bundle, a report or a data set
     "administer",  # accounts, invitations, signing key
 ]

@@ -1,4 +1,4 @@
-"""Reading and recording people: rows of accounts and sign-ins, and the site's events that go with every change."""
+"""Rows of accounts and sign-ins, and the events in the site's chain that record every change of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from service.store.events import sha256_text
 from service.store.store import Store
 from service.store.verification.people_checks import session_sha256
 
-SERVICE = "web"  # actor of what happens without anybody signed in
+SERVICE = "web"  # actor of events that no signed-in person caused
 SESSION_S = 12 * 3600.0
 Outcome = Literal["signed_in", "refused", "locked_out", "signed_out", "screen_locked", "screen_unlocked", "ended"]
 _NAME = re.compile(r"[a-z][a-z0-9._-]{1,31}")
@@ -25,12 +25,12 @@ _RESERVED = frozenset({"web", "runner", "worker", "site", "service", "camera", "
 
 
 def plain_name(typed: str) -> str:
-    """The account that a typed name means: letters of either case are the same."""
+    """The account name for a typed name: lower case, without outer blanks."""
     return typed.strip().lower()
 
 
 def require_name(name: str) -> None:
-    """Raises AccountError for a name that cannot be an account's."""
+    """Raise AccountError unless the name is valid for an account."""
     if not _NAME.fullmatch(name):
         raise AccountError(
             "this cannot be the name of an account",
@@ -42,7 +42,7 @@ def require_name(name: str) -> None:
 
 
 def require_full_name(name: str) -> str:
-    """The name without outer blanks. Raises AccountError for one that cannot stand in a record."""
+    """The name with single blanks. Raises AccountError if it is not a printable name of 2 to 80 characters."""
     plain = " ".join(name.split())
     if not 2 <= len(plain) <= 80 or not plain.isprintable():
         raise AccountError(
@@ -54,7 +54,7 @@ def require_full_name(name: str) -> str:
 
 
 def require_reason(reason: str) -> str:
-    """The reason without outer blanks. Raises AccountError when there is none."""
+    """The reason without outer blanks. Raises AccountError unless it has 3 to 500 characters."""
     plain = reason.strip()
     if not 3 <= len(plain) <= 500:
         raise AccountError(
@@ -64,12 +64,12 @@ def require_reason(reason: str) -> str:
 
 
 def find_account(connection: Connection, account: str) -> Row[Any] | None:
-    """The row of an account, if there is one."""
+    """The row of an account, or None."""
     return connection.execute(select(accounts).where(accounts.c.account == account)).one_or_none()
 
 
 def get_account(connection: Connection, account: str) -> Row[Any]:
-    """The row of an account. Raises AccountError."""
+    """The row of an account. Raises AccountError if there is none."""
     row = find_account(connection, account)
     if row is None:
         raise AccountError(f"there is no account {account!r}", where="account", remedy="See the list of accounts")
@@ -77,19 +77,19 @@ def get_account(connection: Connection, account: str) -> Row[Any]:
 
 
 def full_names(connection: Connection) -> dict[str, str]:
-    """Full name of every account, closed ones included."""
+    """Full name of every account by its name, disabled ones included."""
     rows = connection.execute(select(accounts.c.account, accounts.c.full_name))
     return {row.account: row.full_name for row in rows}
 
 
 def named(account: str, full_names: Mapping[str, str]) -> str:
-    """A person as documents name them: full name, then the account that the records have."""
+    """A person's name in documents: `Full Name (account)`, or just the account."""
     full_name = full_names.get(account, "")
     return f"{full_name} ({account})" if full_name and full_name != account else account
 
 
 def to_account(row: Row[Any]) -> Account:
-    """A row without its secrets."""
+    """A row of `accounts` as an Account, without its secrets."""
     return Account(
         account=row.account,
         full_name=row.full_name,
@@ -103,7 +103,7 @@ def to_account(row: Row[Any]) -> Account:
 
 
 def to_person(row: Row[Any]) -> Person:
-    """Who a row of sessions joined with accounts stands for."""
+    """The person in a row of `sessions` joined with `accounts`."""
     return Person(
         account=row.account,
         full_name=row.full_name,
@@ -127,9 +127,9 @@ def record_change(
     full_name: str = "",
     stored: Mapping[str, str] | None = None,
 ) -> Event:
-    """Append that an account changed, in the transaction that changes it.
+    """Record a change of an account in the transaction that makes it. Returns the event.
 
-    `stored`: what is kept of secrets that it sets, by column; only the hash of it goes into the chain.
+    `stored` holds the stored forms of new secrets by column; only their hashes go into the chain.
     """
     hashes = {column: sha256_text(value) for column, value in (stored or {}).items()}
     change = AccountChanged(
@@ -150,14 +150,14 @@ def record_sign_in(
     actor: str = SERVICE,
     session: Mapping[str, Any] | None = None,
 ) -> None:
-    """Append what happened to a sign-in, in the transaction in which it happens. `session`: the row of a new one."""
+    """Record the outcome of a sign-in in its transaction. `session` is the row of a new session."""
     known = "" if session is None else session_sha256(session)
     event = SignInRecorded(account=account, outcome=outcome, screen=screen, address=address, session_sha256=known)
     store.append_site(connection, [event], actor=actor)
 
 
 def end_sessions(store: Store, connection: Connection, account: str, *, actor: str, keep: str = "") -> None:
-    """End all sign-ins of an account, but the screen `keep`; each is recorded."""
+    """End and record all sign-ins of an account except that of the screen `keep`."""
     chosen = (sessions.c.account == account) & (sessions.c.screen != keep)
     for row in connection.execute(select(sessions.c.screen).where(chosen)).all():
         record_sign_in(store, connection, "ended", account=account, screen=row.screen, actor=actor)

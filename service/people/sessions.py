@@ -1,4 +1,4 @@
-"""People at the screens: signing in and out, the lock of a screen, the password asked again for a signature."""
+"""People at screens: signing in and out, locking a screen, and asking for the password again before a signature."""
 
 from __future__ import annotations
 
@@ -40,25 +40,24 @@ LONGEST_WAIT_S = 900.0
 _SCREEN_LETTERS = "23456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
-KnownBy = Literal["password", "pin", "badge"]  # of what somebody gives to sign
+KnownBy = Literal["password", "pin", "badge"]  # the secret with which a person signs
 NAMES: Mapping[KnownBy, str] = {"password": "password", "pin": "PIN", "badge": "badge"}
 
 
 def wait_after_s(failures: int) -> float:
-    """How long an account waits after so many wrong passwords in a row."""
+    """Seconds that an account must wait after this many wrong passwords in a row."""
     over = failures - FREE_FAILURES
     return 0.0 if over < 0 else min(FIRST_WAIT_S * 2.0 ** min(over, 10), LONGEST_WAIT_S)
 
 
 class People:
-    """Accounts and sign-ins of a data folder. Every change is one transaction with its event in the site's chain."""
+    """Accounts and sign-ins of a data folder. Every change and its event in the site's chain are one transaction."""
 
     def __init__(self, store: Store, hasher: PasswordHasher | None = None) -> None:
         self._store = store
         self._passwords = Passwords(hasher)
-        self._one_guess = (
-            Lock()
-        )  # at a time: no guess overtakes the count of failures, and argon2's memory is bounded
+        # One check at a time, so that every guess is counted before the next and argon2's memory stays bounded.
+        self._one_guess = Lock()
         self.accounts = Accounts(store, self._passwords)
         self.badges = Badges(store, self._passwords, self.check_password)
 
@@ -66,15 +65,15 @@ class People:
         return self._store.clock.utc_now().timestamp()
 
     def first_link(self) -> str | None:
-        """A new one-time token (page /set-up/TOKEN) while there is no administrator; earlier ones are void."""
+        """A new one-time token for the page /set-up/TOKEN, voiding earlier ones; None if an administrator exists."""
         return self.accounts.first_link()
 
     # --- passwords ---
 
     def sign_in(self, account: str, password: str, *, address: str = "", replaces: str = "") -> str:
-        """The token of a new sign-in, for the cookie. `replaces`: the token that the browser had, which ends.
+        """Sign in and return the token for the cookie. `replaces` is the browser's old token, which ends.
 
-        Raises SignInRefusedError, in the same words and after the same time whatever the cause.
+        Raises SignInRefusedError, with the same words and after the same time whatever the cause.
         """
         with self._one_guess:
             row = self._checked(account, password, address)
@@ -107,7 +106,7 @@ class People:
             return token
 
     def check_password(self, account: str, password: str) -> None:
-        """The password asked again, for a signature. A wrong one counts; raises SignInRefusedError."""
+        """Check a password again for a signature. A wrong one counts as a failed try: SignInRefusedError."""
         with self._one_guess:
             row = self._checked(account, password, "")
             if row.failures or self._passwords.is_outdated(row.password_hash):
@@ -116,9 +115,10 @@ class People:
                     self._reset_failures(connection, row, password)
 
     def check_secret(self, account: str, known_by: KnownBy, secret: str) -> None:
-        """Password, PIN or badge asked again, for a signature. A wrong one counts; raises SignInRefusedError.
+        """Check a password, PIN or badge again for a signature.
 
-        Only the right password begins the count anew: who knows a PIN gains no further guesses at the password.
+        A wrong one counts as a failed try and raises SignInRefusedError. Only the right password resets the count, so
+        that knowing a PIN gives no further guesses at the password.
         """
         if known_by == "password":
             self.check_password(account, secret)
@@ -127,7 +127,7 @@ class People:
             self._checked(account, secret.strip().upper(), "", known_by)
 
     def refuse_address(self, address: str) -> None:
-        """Record that an address has failed too often and is not listened to for a while."""
+        """Record that an address has failed too often and must wait."""
         with self._store.database.writing() as connection:
             record_sign_in(self._store, connection, "locked_out", account="", address=address)
 
@@ -152,7 +152,7 @@ class People:
                     .values(failures=failures, locked_until_utc_s=self._now_s() + wait_s if wait_s else 0.0)
                 )
                 waits = wait_s > 0
-            # A name that is no account may be a password typed into the wrong field: it is not written down.
+            # An unknown name is not recorded, because it may be a password typed into the wrong field.
             record_sign_in(
                 self._store,
                 connection,
@@ -168,7 +168,7 @@ class People:
         )
 
     def _require_unchanged(self, connection: Connection, row: Row[Any]) -> None:
-        """The account is still what its password was checked against."""
+        """Raise AccountJustChangedError if the account has changed since its password was checked."""
         present = find_account(connection, row.account)
         if present is None or present.state != "active" or present.password_hash != row.password_hash:
             raise AccountJustChangedError(
@@ -187,12 +187,12 @@ class People:
     # --- sign-ins ---
 
     def person(self, token: str, *, idle_lock_s: float, deliberate: bool) -> Person | None:
-        """Who has this token, if it is valid. Locks the screen when nobody has acted on it for `idle_lock_s`.
+        """The person with this token, or None if it is not valid. Locks the screen after `idle_lock_s` idle seconds.
 
         Args:
-            token: of the cookie.
-            idle_lock_s: site's limit.
-            deliberate: whether a person did this, rather than the page by itself; only that keeps a screen open.
+            token: the cookie's token.
+            idle_lock_s: the site's limit for idle time.
+            deliberate: whether a person acted, rather than the page by itself; only that keeps a screen unlocked.
         """
         now = self._now_s()
         with self._store.database.reading() as connection:
@@ -214,7 +214,7 @@ class People:
         return None if row is None else to_person(row)
 
     def sign_out(self, person: Person) -> None:
-        """End this sign-in."""
+        """End this person's sign-in on this screen."""
         with self._store.database.writing() as connection:
             record_sign_in(
                 self._store,
@@ -232,7 +232,7 @@ class People:
             self._lock(connection, person.account, person.screen, actor=person.account)
 
     def unlock(self, person: Person, pin: str) -> None:
-        """Open a locked screen. Raises PinRefusedError; NotSignedInError once too many were wrong, which ends it."""
+        """Unlock a screen. Raises PinRefusedError for a wrong PIN; after too many, ends it with NotSignedInError."""
         with self._one_guess:
             with self._store.database.reading() as connection:
                 row = connection.execute(
@@ -285,7 +285,7 @@ class People:
         return [Screen(r.screen, r.account, r.created_utc_s, r.seen_utc_s, bool(r.locked)) for r in rows]
 
     def end_screen(self, person: Person, screen: str) -> None:
-        """End one of a person's own sign-ins, on another screen perhaps."""
+        """End one of a person's own sign-ins, on this or another screen. Raises AccountError if there is none."""
         with self._store.database.writing() as connection:
             chosen = (sessions.c.screen == screen) & (sessions.c.account == person.account)
             if connection.execute(select(sessions.c.screen).where(chosen)).one_or_none() is None:

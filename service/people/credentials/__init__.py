@@ -1,1 +1,1 @@
-"""Passwords, PINs and badges, and failed tries."""
+"""Passwords, PINs, badges, and failed tries."""

@@ -1,4 +1,4 @@
-"""Badges: what a reader types of them signs where the site allows it. Hashed and told by events, as PINs are."""
+"""Badges, whose readers type a code: they may sign where the site allows it. Hashed and recorded like PINs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from service.store.store import Store
 
 
 class Badges:
-    """What supervisors and administrators do about the badges of people."""
+    """Enrolling and revoking badges, by supervisors and administrators."""
 
     def __init__(self, store: Store, passwords: Passwords, check_password: Callable[[str, str], None]) -> None:
         self._store = store
@@ -23,24 +23,24 @@ class Badges:
         self._check_password = check_password
 
     def enrol(self, by: Person, account: str, password: str, badge: str) -> None:
-        """Give an account a badge, in the place of the one that it had.
+        """Give an account a badge, which replaces its old one.
 
-        Its owner agrees by the account's password: otherwise whoever enrols badges could sign as anybody.
+        The owner agrees by giving the account's password; otherwise whoever enrols badges could sign as anybody.
 
         Raises:
-            AccountError: it is no badge, or somebody else's.
-            SignInRefusedError: the password is not that of the account.
+            AccountError: the code is not a badge's, or the badge belongs to somebody else.
+            SignInRefusedError: the password is wrong.
         """
         plain = plain_badge(badge)
         self._check_password(account, password)
         if any(self._passwords.matches(stored, plain) for stored in self._others(account)):
             raise AccountError(
-                "this badge belongs to somebody else", where="badge", remedy="Revoke it there first, or take another"
+                "this badge belongs to somebody else", where="badge", remedy="Revoke it there first, or use another"
             )
         self._set(by, account, self._passwords.hash(plain), "enrolled")
 
     def revoke(self, by: Person, account: str, reason: str) -> None:
-        """Take a badge away; it signs nothing from then on. Raises AccountError."""
+        """Revoke an account's badge, which then signs nothing any more. Raises AccountError."""
         self._set(by, account, "", "revoked", require_reason(reason))
 
     def _others(self, account: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Passwords, PINs and random tokens: what is acceptable, and what of them is stored."""
+"""Passwords, PINs, badge codes and random tokens: what is acceptable, and what is stored."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BADGE = re.compile(r"[0-9A-F]{6,32}")
 
 
 class Passwords:
-    """Argon2id hashes (RFC 9106; the library's default parameters unless told otherwise)."""
+    """Argon2id hashes (RFC 9106), by default with the library's parameters."""
 
     def __init__(self, hasher: PasswordHasher | None = None) -> None:
         self._hasher = hasher or PasswordHasher()
@@ -30,7 +30,7 @@ class Passwords:
         return self._hasher.hash(_same_form(secret))
 
     def matches(self, stored: str, secret: str) -> bool:
-        """Whether a secret belongs to a stored hash; takes as long when there is none ("")."""
+        """Whether a secret belongs to a stored hash; takes the same time if nothing is stored ("")."""
         decoy = self._decoy
         try:
             self._hasher.verify(stored or decoy, _same_form(secret))
@@ -39,7 +39,7 @@ class Passwords:
         return bool(stored)
 
     def is_outdated(self, stored: str) -> bool:
-        """Whether a stored hash was made with other parameters than today's."""
+        """Whether a stored hash was made with parameters other than the present ones."""
         return self._hasher.check_needs_rehash(stored)
 
     @cached_property
@@ -48,12 +48,12 @@ class Passwords:
 
 
 def _same_form(secret: str) -> str:
-    # Keyboards differ in how they send the same letter: é as one character or as two.
+    # Keyboards may send the same letter differently: é as one character or as two.
     return unicodedata.normalize("NFKC", secret)
 
 
 def require_password(password: str, account: str) -> None:
-    """Raises AccountError for a password that is too short, too long, or the account's name."""
+    """Raise AccountError if a password is too short, too long, or the account's name."""
     if not PASSWORD_MIN <= len(password) <= PASSWORD_MAX:
         raise AccountError(
             "the password is too short or too long",
@@ -65,28 +65,28 @@ def require_password(password: str, account: str) -> None:
 
 
 def require_pin(pin: str) -> None:
-    """Raises AccountError for a PIN that is not 4 to 8 digits."""
+    """Raise AccountError unless a PIN has 4 to 8 digits."""
     if not _PIN.fullmatch(pin):
         raise AccountError("the PIN is not 4 to 8 digits", where="pin", remedy="Use 4 to 8 digits")
 
 
 def plain_badge(typed: str) -> str:
-    """What a badge reader has typed, as it is hashed. Raises AccountError for what cannot be a badge."""
+    """A badge's code in the form that is hashed. Raises AccountError if it cannot be a badge's."""
     plain = typed.strip().upper()
     if not _BADGE.fullmatch(plain):
         raise AccountError(
-            "this is no badge: 6 to 32 digits or letters A to F are",
+            "this is not a badge: a badge has 6 to 32 digits or letters A to F",
             where="badge",
-            remedy="Hold the badge before the reader while the field has the focus",
+            remedy="Hold the badge to the reader while the field has the focus",
         )
     return plain
 
 
 def new_token() -> str:
-    """256 random bits for a cookie or a link."""
+    """A token of 256 random bits for a cookie or a link."""
     return secrets.token_urlsafe(32)
 
 
 def token_sha256(token: str) -> str:
-    """What is stored of a token."""
+    """SHA-256 (hexadecimal) of a token, which is stored instead of it."""
     return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()

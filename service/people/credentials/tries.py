@@ -1,4 +1,4 @@
-"""Failed tries to sign in of the last minutes, as the site's chain has them: what a restart must not forgive."""
+"""Recent failed tries to sign in, from the site's chain, so that a restart does not forget them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from service.store.store import Store
 
 
 def failed_tries(store: Store, window_s: float) -> list[tuple[str, float]]:
-    """Address and age in s of every failed try within the window, oldest first. Raises IntegrityError.
+    """(address, age in s) of every failed try within the last `window_s` seconds, oldest first.
 
-    A try that seems to lie ahead, because the clock was set back, counts as made now.
+    A try that seems to be in the future, because the clock was set back, counts as made now. Raises IntegrityError.
     """
     now = store.clock.utc_now()
     recent = (
@@ -40,6 +40,6 @@ def failed_tries(store: Store, window_s: float) -> list[tuple[str, float]]:
 
 
 def _is_try(event: SignInRecorded) -> bool:
-    # Without an address it was a PIN or the password of a signature. That an address has to wait is no try.
+    # Events without an address concern a PIN or a signature; that an address has to wait is not a try.
     refused = event.outcome == "refused" or (event.outcome == "locked_out" and event.account != "")
     return refused and event.address != ""
