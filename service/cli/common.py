@@ -1,4 +1,4 @@
-"""What every command shares: consoles, options, errors turned into exit statuses, progress after two seconds."""
+"""Shared by all commands: consoles, options, exit statuses for errors, and a progress bar."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 PROGRESS_AFTER_S = 2.0
 _NUMBER = re.compile(r"[-+−±]?\d[\d.,:+−± e%-]*|more|–|-|")
 
-# The streams are looked up at each print, so that a redirected stdout is followed; results there, the rest on stderr.
+# Results go to stdout, everything else to stderr. The streams are looked up at each print, so redirection works.
 console = Console(highlight=False, soft_wrap=True)
 error_console = Console(stderr=True, highlight=False, soft_wrap=True)
 
@@ -39,7 +39,7 @@ data_option: OptionInfo = typer.Option(
 json_option: OptionInfo = typer.Option("--json", help="Print the result as JSON, for other programs.")
 
 strict_option: OptionInfo = typer.Option(
-    "--strict", help="Refuse odd files (copies, other sizes, images without a pose) instead of leaving them out."
+    "--strict", help="Refuse unusable files (copies, other sizes, images without a pose) instead of skipping them."
 )
 
 DataOption = Annotated[Path, data_option]
@@ -49,9 +49,9 @@ DEFAULT_DATA = Path("runs")
 
 
 def print_table(table: Table, to: Console | None = None) -> None:
-    """Print a table; words wrap at the terminal's edge, but no number is ever cut or broken.
+    """Print a table. Words wrap at the terminal's edge; numbers are never cut or broken.
 
-    Where the numbers alone are wider than the terminal, the table is too.
+    If the numbers alone are wider than the terminal, so is the table.
     """
     least = 1
     for column in table.columns:
@@ -62,7 +62,7 @@ def print_table(table: Table, to: Console | None = None) -> None:
         column.min_width = width if numeric else min(8, max((cell_len(cell) for cell in cells), default=1))
         least += width + 3
     shown = to or console
-    # Into a file or another program nothing is wrapped: `grep` finds what stands in a cell.
+    # Output to a file or another program is not wrapped, so that `grep` finds the text of a cell.
     whole = 0 if shown.is_terminal else Measurement.get(shown, shown.options.update(max_width=10_000), table).maximum
     if max(least, whole) > shown.width:
         table.width = max(least, whole)
@@ -75,12 +75,12 @@ def print_json(value: Any) -> None:
 
 
 def error_record(error: OrthocaptureError) -> dict[str, str]:
-    """An error as plain data."""
+    """An error as plain data, for JSON output."""
     return {"kind": type(error).__name__, "what": error.what, "where": error.where, "remedy": error.remedy}
 
 
 def fail(error: OrthocaptureError, *, json: bool = False) -> typer.Exit:
-    """Report an error and return the exit to raise: `raise fail(error)`. Status 1: refused or failed."""
+    """Print an error and return the exit to raise, as in `raise fail(error)`, with status 1."""
     if json:
         print_json({"error": error_record(error)})
     else:
@@ -94,7 +94,7 @@ def fail(error: OrthocaptureError, *, json: bool = False) -> typer.Exit:
 
 @contextmanager
 def reporting_errors(json: bool = False) -> Generator[None]:
-    """Around a command's body: an OrthocaptureError becomes its message and exit status 1; others are defects."""
+    """Wrap a command's body: an OrthocaptureError is printed and ends it with status 1; others are bugs and pass."""
     try:
         yield
     except OrthocaptureError as error:
@@ -102,20 +102,20 @@ def reporting_errors(json: bool = False) -> Generator[None]:
 
 
 def tell_left_out(left_out: Mapping[str, str]) -> None:
-    """Name the files that took no part, each with its reason."""
+    """Print the files that were left out, each with the reason."""
     for name, reason in left_out.items():
         error_console.print(f"[yellow]left out[/] {escape(name)}: {escape(reason)}")
 
 
 def require_writable(file: Path) -> None:
-    """Raise ConfigurationError unless the file can be written: said before a computation, not after it."""
+    """Raise ConfigurationError unless the file can be written; called before a long computation."""
     if file.is_dir():
-        raise ConfigurationError("this is a folder, a file is to be written", where=str(file), remedy="Name the file")
+        raise ConfigurationError("this is a folder, not a file", where=str(file), remedy="Name the file to write")
     if not file.parent.is_dir():
         raise ConfigurationError(
             "the folder of the file to write does not exist",
             where=str(file),
-            remedy="Make the folder, or name another",
+            remedy="Create the folder, or name another one",
         )
     there = file.exists()
     try:
@@ -128,7 +128,7 @@ def require_writable(file: Path) -> None:
 
 
 def require_writable_folder(folder: Path) -> None:
-    """Make the folder if need be, and raise ConfigurationError unless files can be written into it."""
+    """Create the folder if need be, and raise ConfigurationError unless files can be written into it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -145,7 +145,7 @@ def _unwritable(path: Path, error: OSError) -> ConfigurationError:
 
 @contextmanager
 def progress_bar(*, quiet: bool = False) -> Generator[Callable[[str, int, int], None]]:
-    """A bar with time left on stderr, from the third second on. Yields report(what, done, total)."""
+    """A progress bar on stderr, shown after PROGRESS_AFTER_S seconds. Yields report(what, done, total)."""
     started = time.monotonic()
     bar = Progress(
         TextColumn("{task.description}"),

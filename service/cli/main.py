@@ -1,4 +1,4 @@
-"""`orthocapture`: the command line, put together from one file a group of commands."""
+"""`orthocapture`: the command line, assembled from one file per command or group of commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-# Loaded when asked for: `status` must not wait for the numerics that `register` needs.
+# Imported on demand, so that `status` need not load the numerics that `register` needs.
 _COMMANDS = {
     "demo": "service.cli.run.demo:demo_command",
     "serve": "service.cli.site.serve:serve_command",
@@ -55,11 +55,11 @@ class _Commands(TyperGroup):
         """The command of this name, or None."""
         if cmd_name not in _COMMANDS:
             return None
-        # The shell asks for names at each press of a key: importing every command for that takes seconds.
+        # Shell completion asks for names at every key press, and importing every command would take seconds.
         return TyperCommand(cmd_name, callback=None) if ctx.resilient_parsing else _loaded(cmd_name)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that was typed, loaded; a near name where there is no such command."""
+        """The command that was typed, imported; suggests a similar name if there is no such command."""
         name = args[0]
         if name in _COMMANDS:
             return name, _loaded(name), args[1:]
@@ -97,13 +97,13 @@ def orthocapture(
         bool, typer.Option("--version", help="Show the version and exit.", callback=_tell_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Acquire a surgical vision data set that is accurate to a fraction of a millimetre, with the proof."""
+    """Acquire surgical vision data sets that are accurate to a fraction of a millimetre, with proof of origin."""
 
 
 def main() -> None:
     """Entry point of the distribution."""
-    # The matrices are small and the processes many: threads of the linear algebra wait for one another, ten times
-    # slower on a busy machine. It reads this when it is loaded, here and in every process started from here.
+    # With small matrices and many processes, threads of the linear algebra wait for each other and are ten times
+    # slower on a busy machine. The library reads this when it is loaded, here and in every child process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     logging.basicConfig(level=logging.WARNING, format="%(asctime)s %(name)s %(levelname)s %(message)s")
     app()

@@ -1,4 +1,4 @@
-"""Where the protocols that come with orthocapture lie, in a checkout and in an installed wheel alike."""
+"""The folder of the protocols that come with orthocapture, in a checkout or an installed wheel."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The commands that compute from files, without a run."""
+"""Commands that compute from files, without a run."""

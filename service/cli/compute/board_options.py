@@ -1,4 +1,4 @@
-"""The options that describe a calibration board, alike for every command that looks for one."""
+"""Options that describe a calibration board, shared by the commands that search for one."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from service.compute.calibration.board.images import probe_board
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.units import metres, mm
 
-_SQUARE_MM = (0.5, 1000.0)  # what is printed on boards; a square in metres or micrometres is a slip of the unit
+_SQUARE_MM = (0.5, 1000.0)  # plausible squares; anything else is probably in another unit
 
 BoardOption = Annotated[
     str,
     typer.Option(
         "--board",
         metavar="COLSxROWS",
-        help="Inner corners, where four squares meet: 16x23 for a board of 17 × 24 squares; of a ChArUco board "
-        "too. Of circles: in a row, and rows.",
+        help="Number of inner corners, where four squares meet: 16x23 for a board of 17 × 24 squares, ChArUco boards "
+        "included. For circles: number in a row, and number of rows.",
     ),
 ]
 SquareOption = Annotated[
-    float, typer.Option("--square-mm", help="Side of a square; of circles the distance between two rows.")
+    float, typer.Option("--square-mm", help="Side of a square; for circles, the distance between two rows.")
 ]
-PatternOption = Annotated[Pattern, typer.Option("--pattern", help="What is printed.")]
+PatternOption = Annotated[Pattern, typer.Option("--pattern", help="The printed pattern.")]
 MarkerOption = Annotated[
-    float | None, typer.Option("--marker-mm", help="Side of a ChArUco marker; without: ¾ of a square.")
+    float | None, typer.Option("--marker-mm", help="Side of a ChArUco marker; default: ¾ of a square.")
 ]
-DictionaryOption = Annotated[str, typer.Option("--dictionary", help="Of the ChArUco markers.")]
+DictionaryOption = Annotated[str, typer.Option("--dictionary", help="Dictionary of the ChArUco markers.")]
 LegacyOption = Annotated[
-    bool, typer.Option("--legacy", help="A ChArUco board as OpenCV printed it before version 4.6.")
+    bool, typer.Option("--legacy", help="The ChArUco board was made by OpenCV before version 4.6.")
 ]
 DEFAULT_DICTIONARY = "DICT_5X5_1000"
 
@@ -45,8 +45,8 @@ def described_board(
 
     Raises:
         typer.BadParameter: the counts are not COLSxROWS.
-        ConfigurationError: a square that nobody prints.
-        DataError: a board that cannot be.
+        ConfigurationError: the size of a square is implausible.
+        DataError: no such board is possible.
     """
     columns, _, rows = board.lower().replace("×", "x").partition("x")
     if not (columns.isdigit() and rows.isdigit()):
@@ -55,7 +55,7 @@ def described_board(
     if not low <= square_mm <= high:
         likely = f"; {mm(square_mm):g} for a square of {square_mm:g} m" if 0 < square_mm < low else ""
         raise ConfigurationError(
-            f"squares of {square_mm:g} mm are not what boards have ({low:g} to {high:g} mm)",
+            f"squares of {square_mm:g} mm are implausible; boards have {low:g} to {high:g} mm",
             where="--square-mm",
             remedy=f"Give the side of a square in millimetres{likely}",
         )
@@ -64,7 +64,7 @@ def described_board(
 
 
 def require_board(files: Sequence[Path], board: Board) -> None:
-    """Raise ComputeError where a few of the images tell that the board is another than the one described."""
+    """Raise ComputeError if a sample of the images shows a board other than the one described."""
     if board.pattern == "charuco":
         board.charuco()
     wrong = probe_board(files, board)

@@ -1,4 +1,4 @@
-"""`orthocapture calibrate`: the camera's intrinsics and the hand-eye from anyone's board images, without a run."""
+"""`orthocapture calibrate`: intrinsics and hand-eye calibration from any board images, without a run."""
 
 from __future__ import annotations
 

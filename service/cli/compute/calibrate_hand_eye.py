@@ -1,4 +1,4 @@
-"""`orthocapture calibrate hand-eye`: where the camera sits on the robot's flange, from images of a board."""
+"""`orthocapture calibrate hand-eye`: the camera's pose on the robot's flange, from images of a board."""
 
 from __future__ import annotations
 
@@ -66,30 +66,31 @@ def hand_eye_command(
         Setup,
         typer.Option("--setup", help="eye-to-hand: the camera stands beside the robot, the board is on its flange."),
     ] = "eye-in-hand",
-    method: Annotated[Method, typer.Option("--method", help="Which one gives the answer.")] = "weighted",
+    method: Annotated[Method, typer.Option("--method", help="The method that gives the result.")] = "weighted",
     joints: Annotated[
         Path | None,
-        typer.Option("--joints", help="CSV image,q1,…,q6 in radians: the arm's own error is then estimated too."),
+        typer.Option("--joints", help="CSV image,q1,…,q6 in radians; the arm's own error is then estimated too."),
     ] = None,
     arm: Annotated[
-        str | None, typer.Option("--arm", help=f"Model: {', '.join(ARM_MODELS)}; without: found from the joints.")
+        str | None,
+        typer.Option("--arm", help=f"Arm model: {', '.join(ARM_MODELS)}; default: found from the joints."),
     ] = (None),
-    suggest: Annotated[int, typer.Option("--suggest", help="How many next board poses to suggest.", min=0)] = 6,
+    suggest: Annotated[int, typer.Option("--suggest", help="Number of further board poses to suggest.", min=0)] = 6,
     preview: Annotated[
-        Path | None, typer.Option("--preview", help="PNG of the suggested poses beside those taken.")
+        Path | None, typer.Option("--preview", help="PNG to write of the suggested poses and those taken.")
     ] = None,
     strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Calibrate the camera's place on the robot's flange, and say how far to trust it."""
+    """Calibrate the camera's pose on the robot's flange, with its uncertainty."""
     with reporting_errors(json):
         target = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
         if setup == "eye-to-hand" and (joints is not None or arm is not None):
             raise typer.BadParameter("--joints and --arm are for a camera on the flange, not for --setup eye-to-hand")
         if setup == "eye-to-hand" and preview is not None:
-            raise typer.BadParameter("--preview shows suggested places of a camera that the robot moves")
+            raise typer.BadParameter("--preview shows suggested poses of a camera that the robot moves")
         if arm is not None:
-            arm_model(arm)  # an unknown one is refused before images are searched
+            arm_model(arm)  # refuse an unknown model before searching images
         model = read_camera_json(camera)
         folder = image_folder(images, size=(model.width, model.height), strict=strict)
         known, folder = posed_images(robot_poses, folder, images, strict=strict)
@@ -122,7 +123,7 @@ def hand_eye_command(
             camera_covariance=read_camera_covariance(camera),
         )
         best = result if result.corrected is None else result.corrected
-        # Suggestions are places of the camera: of one that stands still there are none.
+        # Suggestions are poses of the camera, so there are none for a camera that stands still.
         suggested = suggest_board_poses(
             best,
             T_base_flange,
@@ -153,7 +154,7 @@ def hand_eye_command(
 
 
 class _Reach:
-    """Whether an arm reaches a pose in a posture like the one of the nearest pose that it had."""
+    """Whether an arm can reach a pose from the joint positions of the nearest recorded pose."""
 
     def __init__(self, arm: ArmModel, joints_rad: Array, T_base_flange: Array) -> None:
         self._arm, self._joints, self._poses = arm, joints_rad, T_base_flange
@@ -179,9 +180,9 @@ def _arm(
     found = matching_arm(values, T_base_flange)
     if found is None:
         raise ConfigurationError(
-            "no known arm has these poses at these joints",
+            "no known arm has these poses at these joint angles",
             where=str(joints),
-            remedy="Check that angles are radians and poses the flange's, or name the model with --arm",
+            remedy="Check that angles are in radians and poses are of the flange, or name the model with --arm",
         )
     return values, found
 
@@ -209,9 +210,9 @@ def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
     )
     camera_mm, camera_deg = record["sigma"]["camera_mm"], record["sigma"]["camera_deg"]
     if camera_mm:
-        console.print(f"of that ± {camera_mm:.3f} mm, ± {camera_deg:.4f}° from what is not known of the camera")
+        console.print(f"of that ± {camera_mm:.3f} mm, ± {camera_deg:.4f}° from the uncertainty of the camera")
     else:
-        console.print("camera.json states no covariance: the camera counts as exactly known")
+        console.print("camera.json states no covariance: the camera is taken as exactly known")
     if result.robot_noise_mm is not None and result.robot_noise_deg is not None:
         console.print(f"robot noise for each axis: {result.robot_noise_mm:.3f} mm, {result.robot_noise_deg:.4f}°")
     if result.corrected is not None:
@@ -220,7 +221,7 @@ def _tell(result: HandEyeResult, record: dict[str, Any], setup: Setup) -> None:
             f"{np.median(result.corrected.held_out_mm):.3f} mm, robot noise {result.corrected.robot_noise_mm:.3f} mm"
         )
     elif len(result.arm_held_out_mm) > 1:
-        console.print("estimating the arm's own error gains nothing on held-out images: not used")
+        console.print("estimating the arm's own error does not improve held-out images: not used")
     for name, reason in {**record["left_out"], **record["excluded"], **record["images_without_board"]}.items():
         console.print(f"not used: {escape(name)}: {escape(reason)}")
     suggested = record["suggested_poses"]

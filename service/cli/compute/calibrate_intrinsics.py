@@ -1,4 +1,4 @@
-"""`orthocapture calibrate intrinsics`: a camera from images of a board."""
+"""`orthocapture calibrate intrinsics`: a camera's intrinsics from images of a board."""
 
 from __future__ import annotations
 
@@ -73,17 +73,18 @@ def intrinsics_command(
         typer.Option("--model", help="Distortion: none, k1 k2, + p1 p2, + k3, rational k1 … k6."),
     ] = "opencv4",
     distance_m: Annotated[
-        float | None, typer.Option("--distance-m", help="Of the specimen; without: where the board was.")
+        float | None,
+        typer.Option("--distance-m", help="Distance of the specimen, for the uncertainty; default: the board's."),
     ] = None,
     capture_images: Annotated[
         Path | None,
-        typer.Option("--capture-images", help="Folder of images to be used with this camera: was the lens the same?"),
+        typer.Option("--capture-images", help="Folder of images for this camera; checks that the lens is the same."),
     ] = None,
     report: Annotated[Path | None, typer.Option("--report", help="Folder for plots (PNG).")] = None,
     strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Calibrate a camera from images of a flat board, and say how far to trust it."""
+    """Calibrate a camera from images of a flat board, with its uncertainty."""
     with reporting_errors(json):
         seen = described_board(board, square_mm, pattern, marker_mm, dictionary, legacy=legacy)
         folder = image_folder(images, strict=strict)
@@ -133,19 +134,19 @@ def intrinsics_command(
 
 
 def _with_reasons(error: ComputeError, views: UsableViews, files: Sequence[Path]) -> ComputeError:
-    """The refusal with the images that were not even offered to the solver."""
+    """The error with the first images that were excluded before the estimation, and why."""
     reasons = "".join(f"; {files[k].name}: {reason}" for k, reason in sorted(views.excluded.items())[:5])
     return ComputeError(error.what + reasons, where=error.where, remedy=error.remedy)
 
 
 def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[dict[str, Any], list[str]]:
-    """What changed between the images, as a record and as warnings."""
+    """Changes of the optics between the images, as a record and as warnings."""
     calibrated = [optics_of(file) for file in calibration]
     within = compare_optics(calibrated, calibrated)
     record: dict[str, Any] = {"calibration_departures": [str(departure) for departure in within.departures]}
     warnings = [f"the lens changed during the calibration: {line}" for line in summary(within.departures)]
     if not states_focus(calibrated):
-        warnings.append("the images do not say where the lens was focused: a changed focus would go unseen")
+        warnings.append("the images do not state the focus distance: a change of focus would go unnoticed")
     if capture_folder is not None:
         comparison = compare_optics(calibrated, [optics_of(file) for file in image_folder(capture_folder).files])
         record |= {
@@ -155,17 +156,17 @@ def _optics(calibration: Sequence[Path], capture_folder: Path | None) -> tuple[d
             "not_stated": list(comparison.unknown),
         }
         warnings += [f"the lens is not as it was calibrated: {line}" for line in summary(comparison.departures)]
-        # Width and height are always there; without focal length and aperture nothing is known of the lens.
+        # Width and height are always compared; without focal length and aperture nothing is known about the lens.
         if not {"focal_length_mm", "aperture_f"} & set(comparison.compared):
-            warnings.append("the images state neither focal length nor aperture: a change would not be seen")
+            warnings.append("the images state neither focal length nor aperture: a change would go unnoticed")
     return record, warnings
 
 
 def optics_of(file: Path) -> Optics:
-    """What the file's EXIF says of its optics.
+    """The optics stated in a file's EXIF.
 
     Raises:
-        DataError: the file is no picture.
+        DataError: the file is not an image.
     """
     if file.suffix.lower() in _WITHOUT_EXIF:
         width, height = image_size(file)
@@ -218,7 +219,7 @@ def _tell(
         console.print(f"  {name:<3} {getattr(result.camera, name):14.6g} ± {result.sigma[name]:.2g}")
     console.print(
         f"projection at {uncertainty.distance_m:.2f} m known to {uncertainty.centre_px:.3f} px "
-        f"({uncertainty.centre_mm:.4f} mm) in the centre, {uncertainty.worst_px:.3f} px "
+        f"({uncertainty.centre_mm:.4f} mm) at the centre, {uncertainty.worst_px:.3f} px "
         f"({uncertainty.worst_mm:.4f} mm) at worst"
     )
     for view in record["excluded"]:

@@ -1,4 +1,4 @@
-"""`orthocapture layout`: can the spheres be told from one another as they are placed?"""
+"""`orthocapture layout`: check whether the spheres can be told apart in their present layout."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from service.core.units import metres, mm
 
 
 def layout_command(
-    spheres: Annotated[Path | None, typer.Option("--spheres", help="spheres.json.")] = None,
+    spheres: Annotated[Path | None, typer.Option("--spheres", help="spheres.json with known centres.")] = None,
     mesh: Annotated[Path | None, typer.Option("--mesh", help="Scan, CT mesh or point cloud.")] = None,
     photo: Annotated[
         list[Path] | None, typer.Option("--photo", help="Photograph that shows all spheres; may be repeated.")
@@ -35,7 +35,7 @@ def layout_command(
     mesh_unit: Annotated[MeshUnit, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
     json: JsonOption = False,
 ) -> None:
-    """Say how well every sphere can be told from every other, and which to move. Status 1: move some first."""
+    """Check how well the spheres can be told apart, and suggest which to move. Exit status 1: some must be moved."""
     with reporting_errors(json):
         centres, covariances, radius_m = _centres(spheres, mesh, photo or [], camera, radius_mm, mesh_unit)
         report = check_layout(centres, covariances, radius_m=radius_m)
@@ -98,7 +98,7 @@ def _show(report: LayoutReport, centres: Array, radius_m: float) -> None:
 
 
 def _moves(centres: Array, radius_m: float) -> tuple[Move, ...]:
-    """What to move; nothing where no single move helps, which the problems say as well."""
+    """Suggested moves; empty if no single move helps, which the report's problems also say."""
     _, _, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
     try:
         return suggest_moves(centres, up=axes[2], radius_m=radius_m)

@@ -1,4 +1,4 @@
-"""`orthocapture register`: register anyone's posed images with a scan, without a run."""
+"""`orthocapture register`: register any posed images with a scan, without a run."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ def register_command(
         typer.Option("--poses", help="Poses CSV (T_world_camera, metres), transforms.json or COLMAP model folder."),
     ],
     out: Annotated[Path, typer.Option("--out", help="The result file to write.")],
-    mesh: Annotated[Path | None, typer.Option("--mesh", help="The scan with the spheres in it.")] = None,
+    mesh: Annotated[Path | None, typer.Option("--mesh", help="The scan, with the spheres in it.")] = None,
     spheres: Annotated[Path | None, typer.Option("--spheres", help="spheres.json, instead of a mesh.")] = None,
     radius_mm: Annotated[float | None, typer.Option("--radius-mm", help="Radius of the spheres.")] = None,
     mesh_unit: Annotated[MeshUnit, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
     control: Annotated[
-        str, typer.Option("--control", help="Indices of the mesh's spheres that only serve the evaluation: 3,7,9.")
+        str, typer.Option("--control", help="Indices of spheres in the mesh used only for evaluation, such as 3,7,9.")
     ] = "",
     seeds: SeedsOption = None,
     estimate_scale: Annotated[bool, typer.Option("--estimate-scale", help="The poses are not metric.")] = False,
     workers: Annotated[
-        int | None, typer.Option("--workers", min=1, help="Processes that look at images; one a core by default.")
+        int | None, typer.Option("--workers", min=1, help="Processes that search images; default: one per core.")
     ] = None,
     full_search: Annotated[
-        bool, typer.Option("--full-search", help="Search every image whole, not only where the poses say.")
+        bool, typer.Option("--full-search", help="Search whole images, not only where the poses predict spheres.")
     ] = False,
     sphere_colour: Annotated[
         str | None,
@@ -77,25 +77,26 @@ def register_command(
         float | None,
         typer.Option(
             "--largest-sphere",
-            help="Radius of the largest sphere looked for, over the image's width; without: 0.13.",
+            help="Radius of the largest sphere searched for, as a fraction of the image's width; default: 0.13.",
             min=0.02,
             max=0.7,
         ),
     ] = None,
     detector: Annotated[
-        DetectorName, typer.Option("--detector", help="paper: the published chain, for comparison; searches whole.")
+        DetectorName,
+        typer.Option("--detector", help="paper: the published method, for comparison; it searches whole images."),
     ] = "classical",
     boxes: Annotated[
         Path | None,
         typer.Option(
             "--boxes",
-            help="For --detector paper: JSON of another detector, boxes (left, top, right, bottom) by image.",
+            help="For --detector paper: JSON with boxes (left, top, right, bottom) of another detector by image.",
         ),
     ] = None,
     strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Register posed images with a scan by the spheres that both show, and say how well it fits."""
+    """Register posed images with a scan by the spheres visible in both, and report the accuracy."""
     with reporting_errors(json):
         require_writable(out)
         model = read_camera_json(camera)
@@ -165,7 +166,7 @@ def register_command(
 
 
 def _file_detector(detector: DetectorName, boxes: Path | None, names: list[str]) -> DetectFile | None:
-    """What looks at one file; None for the default."""
+    """The detector for one file; None for the default."""
     if detector == "classical":
         if boxes is not None:
             raise typer.BadParameter("--boxes needs --detector paper")
@@ -174,7 +175,7 @@ def _file_detector(detector: DetectorName, boxes: Path | None, names: list[str])
 
 
 def _search(located: LocatedOutlines, names: list[str]) -> dict[str, object]:
-    """How many images were searched whole, in how many only predicted places, and what was not found there."""
+    """Counts of images searched whole and at predicted places only, and the spheres missing there, as plain data."""
     return {
         "images_searched": located.count("searched"),
         "images_predicted": located.count("predicted"),
@@ -196,7 +197,7 @@ def _spheres(
     control: str,
     seeds: str | None,
 ) -> tuple[Array, Array, float]:
-    """Registration and control centres (M, 3), (C, 3) and the radius, metres."""
+    """Centres of registration (M, 3) and control spheres (C, 3), and their radius, in metres."""
     if (mesh is None) == (spheres is None):
         raise typer.BadParameter("give either --mesh or --spheres")
     if spheres is not None:
@@ -215,7 +216,7 @@ def _spheres(
         raise ConfigurationError(
             f"--control names sphere {chosen[-1]}, the mesh has {len(centres)} (0 … {len(centres) - 1})",
             where=str(mesh),
-            remedy="Run without --control once: result.json lists the spheres in their order",
+            remedy="Run once without --control: result.json lists the spheres in order",
         )
     rest = [i for i in range(len(centres)) if i not in chosen]
     return centres[rest], centres[chosen], metres(radius_mm)

@@ -1,4 +1,4 @@
-"""`orthocapture sfm`: camera poses from images alone, or with the robot and the spheres, without a run."""
+"""`orthocapture sfm`: camera poses from images alone, or also from robot poses and spheres, without a run."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ from service.core.errors import DataError
 from service.core.geometry import Array, Transform, align_points, apply
 from service.core.units import deg, metres, mm
 
-_FAR = 0.1  # of the cameras' spread: robot poses that miss the reconstruction by more are in another frame
+_FAR = 0.1  # fraction of the cameras' spread; robot poses that are off by more are in another frame
 
 
 def sfm_command(
@@ -57,26 +57,28 @@ def sfm_command(
     mapper: Annotated[
         Literal["incremental", "global"], typer.Option("--mapper", help="COLMAP's mapper, or GLOMAP's.")
     ] = "incremental",
-    effort: Annotated[Effort, typer.Option("--effort", help="Features an image: seconds or minutes.")] = "quality",
+    effort: Annotated[
+        Effort, typer.Option("--effort", help="Number of features per image: takes seconds or minutes.")
+    ] = "quality",
     robot_poses: Annotated[
         Path | None,
         typer.Option(
             "--robot-poses",
-            help="CSV image,x,y,z,qx,qy,qz,qw (metres): T_base_camera, or T_base_flange with --hand-eye. Only "
-            "neighbours are matched then, and --hybrid uses the poses.",
+            help="CSV image,x,y,z,qx,qy,qz,qw (metres): T_base_camera, or T_base_flange with --hand-eye. Then only "
+            "neighbouring images are matched, and --hybrid uses the poses.",
         ),
     ] = None,
     hand_eye: Annotated[
         Path | None, typer.Option("--hand-eye", help="hand_eye.json with T_flange_camera of the robot's poses.")
     ] = None,
     stations: Annotated[
-        Path | None, typer.Option("--stations", help="CSV image,station, where the robot stood at several places.")
+        Path | None, typer.Option("--stations", help="CSV image,station, if the robot stood at several stations.")
     ] = None,
     refine_principal_point: Annotated[
-        bool, typer.Option("--refine-principal-point", help="Let the final adjustment move the principal point.")
+        bool, typer.Option("--refine-principal-point", help="Refine the principal point in the final adjustment.")
     ] = False,
     refine_intrinsics: Annotated[
-        bool, typer.Option("--refine-intrinsics", help="Let it move focal lengths and distortion too.")
+        bool, typer.Option("--refine-intrinsics", help="Refine all intrinsics, distortion included.")
     ] = False,
     hybrid: Annotated[
         bool,
@@ -85,19 +87,19 @@ def sfm_command(
         ),
     ] = False,
     mesh: Annotated[Path | None, typer.Option("--mesh", help="For --hybrid: the scan with the spheres.")] = None,
-    spheres: Annotated[Path | None, typer.Option("--spheres", help="Instead of a mesh: spheres.json.")] = None,
+    spheres: Annotated[Path | None, typer.Option("--spheres", help="spheres.json, instead of a mesh.")] = None,
     radius_mm: Annotated[float | None, typer.Option("--radius-mm", help="Radius of the spheres.")] = None,
     mesh_unit: Annotated[MeshUnit, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
     workspace: Annotated[
-        Path | None, typer.Option("--workspace", help="Keep features and matches here for another mapper.")
+        Path | None, typer.Option("--workspace", help="Folder to keep features and matches for another mapper.")
     ] = None,
     strict: StrictOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Estimate camera poses with the calibrated camera held; the model serves register --estimate-scale."""
+    """Estimate camera poses with fixed, calibrated intrinsics; use the model with register --estimate-scale."""
     with reporting_errors(json):
         if refine_principal_point and refine_intrinsics:
-            raise typer.BadParameter("--refine-intrinsics includes the principal point: give one of the two")
+            raise typer.BadParameter("--refine-intrinsics includes the principal point: give only one of the two")
         if hybrid and (mesh is None) == (spheres is None):
             raise typer.BadParameter("--hybrid needs either --mesh or --spheres")
         refine: Refine = "nothing"
@@ -148,7 +150,7 @@ def _robot_poses(path: Path | None, hand_eye: Path | None, files: Mapping[str, P
 def _spheres(
     mesh: Path | None, spheres: Path | None, radius_mm: float | None, mesh_unit: MeshUnit
 ) -> tuple[Array, float]:
-    """Centres (M, 3) and radius, metres."""
+    """Sphere centres (M, 3) and radius, in metres."""
     if spheres is not None:
         known = read_spheres_json(spheres)
         return known.registration_m, known.radius_m if radius_mm is None else metres(radius_mm)
@@ -179,7 +181,10 @@ def _reconstruct(
     options: SfmOptions,
     progress: Any,
 ) -> tuple[SfmModel, float | None]:
-    """The model, and how far the robot's poses are from it; all pairs again where they are in another frame."""
+    """The model, and the rms distance in metres of the robot's poses from it (None without them).
+
+    If the robot's poses are in another frame or images are missing, it matches all pairs and reconstructs again.
+    """
     solved = reconstruct(
         files,
         camera,
@@ -207,7 +212,7 @@ def _reconstruct(
 def _disagreement(
     solved: SfmModel, prior: Mapping[str, Transform], stations: Mapping[str, str] | None
 ) -> tuple[float, float]:
-    """Rms distance of robot and reconstructed camera positions, and the cameras' spread, metres."""
+    """Rms distance between the robot's and the reconstructed camera positions, and the cameras' spread, in metres."""
     squares: list[float] = []
     spread: list[float] = []
     groups = sorted({stations[name] for name in solved.T_world_camera}) if stations else [""]

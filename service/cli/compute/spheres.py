@@ -23,46 +23,46 @@ from service.core.geometry import Array
 from service.core.text.counts import counted
 from service.core.units import metres, mm
 
-_NAMED = 3  # spheres that a refusal names
+_NAMED = 3  # most spheres listed in an error
 
 SeedsOption = Annotated[
     str | None,
     typer.Option(
-        "--seeds", help="A point at or near each sphere, mm in the mesh's frame: x,y,z;x,y,z or a JSON file of them."
+        "--seeds", help="A point at or near each sphere, in mm in the mesh's frame: x,y,z;x,y,z, or a JSON file."
     ),
 ]
 
 
 def spheres_command(
-    mesh: Annotated[Path, typer.Option("--mesh", help="OBJ, PLY or STL; a PLY or text file of points.")],
+    mesh: Annotated[Path, typer.Option("--mesh", help="Mesh (OBJ, PLY or STL) or point cloud (PLY or text).")],
     radius_mm: Annotated[float, typer.Option("--radius-mm", help="Radius of the spheres.")],
     out: Annotated[Path, typer.Option("--out", help="The spheres.json to write.")],
-    expect: Annotated[int | None, typer.Option("--expect", help="How many there must be.")] = None,
+    expect: Annotated[int | None, typer.Option("--expect", help="Number of spheres that must be found.")] = None,
     seeds: SeedsOption = None,
     mesh_unit: Annotated[MeshUnit, typer.Option("--mesh-unit", help="Unit of the mesh: mm, m or auto.")] = "auto",
     max_rms_mm: Annotated[
         float | None,
-        typer.Option("--max-rms-mm", help="Roughness that a sphere may have; without: 2.5 % of the radius.", min=0),
+        typer.Option("--max-rms-mm", help="Largest rms residual of a sphere; default: 2.5 % of the radius.", min=0),
     ] = None,
     max_radius_off_mm: Annotated[
         float | None,
         typer.Option(
             "--max-radius-off-mm",
-            help="By how much its own radius may be off; without: 4 % of it, more by noise.",
+            help="Largest error of a sphere's fitted radius; default: 4 % of the radius, more with noise.",
             min=0,
         ),
     ] = None,
     max_form_mm: Annotated[
         float | None,
-        typer.Option("--max-form-mm", help="By how much its form may depart from a sphere's; without: 1 %.", min=0),
+        typer.Option("--max-form-mm", help="Largest form error of a sphere; default: 1 % of the radius.", min=0),
     ] = None,
     min_cap_deg: Annotated[
         float | None,
-        typer.Option("--min-cap-deg", help="How wide the seen cap must be at least; without: 50°.", min=0, max=180),
+        typer.Option("--min-cap-deg", help="Smallest angle of the visible cap; default: 50°.", min=0, max=180),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Find every sphere of a radius in a mesh or point cloud, with its covariance and what it was measured on."""
+    """Find every sphere of a given radius in a mesh or point cloud, with its covariance and fit."""
     with reporting_errors(json):
         require_writable(out)
         radius_m = metres(_positive(radius_mm))
@@ -103,7 +103,7 @@ def _limits(
     max_form_mm: float | None,
     min_cap_deg: float | None,
 ) -> SphereLimits:
-    """The default limits with what was given instead, as parts of the radius."""
+    """The default limits with those given instead, as fractions of the radius."""
     given = {"max_rms": max_rms_mm, "max_radius_residual": max_radius_off_mm, "max_form": max_form_mm}
     changed = {name: metres(value) / radius_m for name, value in given.items() if value is not None}
     if min_cap_deg is not None:
@@ -113,7 +113,7 @@ def _limits(
 
 
 def _with_limits(error: ComputeError, limits: SphereLimits, radius_mm: float) -> ComputeError:
-    """The refusal with the limits that it was judged by, and how to change them."""
+    """The error with the limits that were applied and the options that change them."""
     words = (
         f"Judged by --max-rms-mm {limits.max_rms * radius_mm:.3g}, "
         f"--max-radius-off-mm {limits.max_radius_residual * radius_mm:.3g}, "
@@ -130,7 +130,12 @@ def spheres_of(
     seeds: str | None,
     limits: SphereLimits | None = None,
 ) -> tuple[MeshSphere, ...]:
-    """Spheres of a mesh or point cloud file, metres; in the order of the seeds if given."""
+    """The spheres in a mesh or point cloud file, in metres, in the order of the seeds if given.
+
+    Raises:
+        DataError: the file or the seeds cannot be used.
+        ComputeError: the expected spheres are not there.
+    """
     seeds_m = read_seeds(seeds)
     if expected is not None and seeds_m is not None and len(seeds_m) != expected:
         raise DataError(
@@ -149,14 +154,14 @@ def spheres_of(
         return locate_spheres(vertices, faces, radius_m, expected, limits, normals=normals, seeds_m=seeds_m)
     except ComputeError as error:
         seen = seen_radius(vertices, faces, radius_m, limits, normals=normals)
-        # Other balls may lie in a scan, but not more of them than of those that are looked for.
+        # A scan may hold some other balls; suggest their radius only if there are at least as many as expected.
         if seen is None or (expected is not None and len(seen.spheres) < expected):
             raise
         raise _of_another_radius(error, seen, radius_m) from error
 
 
 def _of_another_radius(error: ComputeError, seen: SeenRadius, radius_m: float) -> ComputeError:
-    """The refusal with the radius that the mesh's spheres have."""
+    """The error with the radius of the spheres that the mesh does hold."""
     count = len(seen.spheres)
     where = ", ".join("({:.1f}, {:.1f}, {:.1f})".format(*mm(s.centre_m)) for s in seen.spheres[:_NAMED])
     more = ", …" if count > _NAMED else ""
@@ -170,8 +175,15 @@ def _of_another_radius(error: ComputeError, seen: SeenRadius, radius_m: float) -
 
 
 def read_seeds(text: str | None) -> Array | None:
-    """Seeds (K, 3) in metres from "x,y,z;x,y,z" in millimetres, or a JSON file: a list of [x, y, z], or an object
-    with such a list under registration_mm, as spheres.json has it."""
+    """Seeds (K, 3) in metres from text or a file in millimetres; None if none are given.
+
+    Args:
+        text: "x,y,z;x,y,z", or the path of a JSON file with a list of [x, y, z], or with an object that has such a
+            list under registration_mm, such as spheres.json.
+
+    Raises:
+        DataError: the seeds cannot be read.
+    """
     if text is None:
         return None
     path = Path(text)

@@ -1,1 +1,1 @@
-"""The commands that read, verify, replay, report and keep what was recorded."""
+"""Commands that read, verify, replay, report and back up the record."""

@@ -1,4 +1,4 @@
-"""`orthocapture audit`: look at the recorded evidence of a run, and check that nobody has changed it."""
+"""`orthocapture audit`: show the recorded evidence of a run, and verify that nothing was changed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from service.store.verification.verify import AuditReport, EvidenceRecord
 
 audit_app = typer.Typer(
     name="audit",
-    help="Look at the recorded evidence of a run, or check that nothing of it was changed.",
+    help="Show, verify, sign, report and export the recorded evidence of a run.",
     no_args_is_help=True,
 )
 
@@ -58,7 +58,7 @@ CertificatesOption = Annotated[
 ]
 SignaturesOption = Annotated[
     Path | None,
-    _existing_file("Copy of signatures.jsonl that was kept elsewhere: what was cut off since shows against it."),
+    _existing_file("Copy of signatures.jsonl kept elsewhere, which shows whether anything was cut off since."),
 ]
 
 
@@ -68,7 +68,7 @@ def show_command(
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
-    """List everything that was recorded: what happened, when, by whom, and the files that belong to it."""
+    """List everything that was recorded: what happened, when, who did it, and the files."""
     with reporting_errors(json):
         run_id = resolve_run(audit.list_runs(data), run)
         records = audit.show(data, run_id)
@@ -86,9 +86,9 @@ def verify_command(
     signatures: SignaturesOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Check the evidence: read every file again, follow the chain, check the signatures, and name the first fault.
+    """Verify the evidence: hash every file again, follow the chain, check the signatures, and name the first fault.
 
-    The exit status is 0 when all is as it was recorded, and 1 when anything differs.
+    The exit status is 0 if everything is as it was recorded, and 1 if anything differs.
     """
     with reporting_errors(json):
         run_id = None if run == "all" else resolve_run(audit.list_runs(data), run)
@@ -107,7 +107,7 @@ def verify_command(
 
 
 def _tell_the_pages(data: Path, report: AuditReport, took_s: float) -> None:
-    """So that the audit's pages know of it. A folder that can only be read is none the worse for it."""
+    """Save the result for the audit's pages, if the folder is writable."""
     by, at_utc = f"{getpass.getuser()} (command line)", utc_text(datetime.now(UTC))
     for run_id in report.runs:
         with suppress(OSError):
@@ -119,7 +119,7 @@ def _tell_the_pages(data: Path, report: AuditReport, took_s: float) -> None:
 def checkpoint_command(
     run: RunArgument = "latest", data: DataOption = DEFAULT_DATA, json: JsonOption = False
 ) -> None:
-    """Sign the end of a run's chain now, so that everything up to it can no longer be rewritten."""
+    """Sign the end of a run's chain now, so that nothing up to it can be rewritten unnoticed."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         made = checkpoint(store, store.find_run(run))
     if json:
@@ -130,7 +130,7 @@ def checkpoint_command(
 
 @audit_app.command("keys")
 def keys_command(data: DataOption = DEFAULT_DATA, json: JsonOption = False) -> None:
-    """Show the fingerprints of the keys that sign. Write them down elsewhere: a bundle is checked against them."""
+    """Show the fingerprints of the signing keys. Write them down elsewhere: bundles are checked against them."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         keys = public_keys(store)
     if json:
@@ -154,7 +154,7 @@ def rotate_key_command(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Replace the signing key. The old one signs the new one as its last act, and its file is destroyed."""
+    """Replace the signing key. The old key signs the new one, and then its file is destroyed."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         key = rotate_key(store, reason=reason, actor=operator or getpass.getuser(), lost=lost)
     if json:
@@ -167,20 +167,20 @@ def rotate_key_command(
 def export_command(
     run: RunArgument,
     bundle: Annotated[
-        Path, typer.Argument(help="The zip file to write; that of a simulated run gets SIMULATED in its name.")
+        Path, typer.Argument(help="The zip file to write; for a simulated run SIMULATED is added to its name.")
     ],
     data: DataOption = DEFAULT_DATA,
     hashes_only: Annotated[
-        bool, typer.Option("--hashes-only", help="Leave the recorded files out; the records hold their hashes.")
+        bool, typer.Option("--hashes-only", help="Leave out the recorded files; the records hold their hashes.")
     ] = False,
     operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
     json: JsonOption = False,
 ) -> None:
-    """Write a run's evidence into one file that anybody can verify elsewhere, with a report and the verifier inside.
+    """Write a run's evidence to one zip file that anybody can verify, with a report and the verifier inside.
 
-    Refused when the evidence does not verify, and when the protocol asks for a release that was not given.
+    It is refused if the evidence does not verify, or if a release that the protocol requires is missing.
     """
-    # These load the numerics, which `verify` does without.
+    # Imported here because they load the numerics, which `verify` does not need.
     from service.audit.bundle.export import export_bundle  # noqa: PLC0415
     from service.audit.bundle.report import bundle_report  # noqa: PLC0415
 
@@ -218,7 +218,7 @@ def _key_json(key: PublicKey) -> dict[str, Any]:
 
 
 def report_json(report: AuditReport) -> dict[str, Any]:
-    """A report as plain data, with `ok` and `first_fault` on top."""
+    """A verification report as plain data, with `ok` and `first_fault` added."""
     first = None if report.first_fault is None else {**asdict(report.first_fault), "text": str(report.first_fault)}
     return {"ok": report.ok, "first_fault": first, **asdict(report)}
 

@@ -1,4 +1,4 @@
-"""`orthocapture audit figures`: what a report draws, as SVG for print and as CSV for one's own plots."""
+"""`orthocapture audit figures`: the figures of a report as SVG for print, and their data as CSV."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def figures_command(
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
-    """Write every figure of a run's report as SVG, and what it draws as CSV, with the tables of errors.
+    """Write every figure of a run's report as SVG and its data as CSV, with the tables of errors.
 
-    They are those of the report, by the number of its section. The evidence is verified first: the exit status is 1
-    when it does not verify, and nothing is written then.
+    File names begin with the number of the report's section. The evidence is verified first; if it does not verify,
+    nothing is written and the exit status is 1.
     """
     with reporting_errors(json):
         require_writable_folder(out)
@@ -46,7 +46,7 @@ def figures_command(
             if not verified.ok:
                 error_console.print(f"[bold red]The evidence does NOT verify:[/] {escape(str(verified.first_fault))}")
                 raise typer.Exit(1)
-            # Numerics take a second to load: `audit verify` must not wait for them.
+            # The numerics take a second to load, and `audit verify` does not need them.
             from service.audit.record.run import read_run  # noqa: PLC0415
             from service.audit.report.content import report_content  # noqa: PLC0415
             from service.audit.report.output.figures import figure_files, write_figures  # noqa: PLC0415

@@ -1,4 +1,4 @@
-"""`orthocapture audit report`: a run as a document that a person outside can read."""
+"""`orthocapture audit report`: write a report of a run for readers outside."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ def report_command(
     operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
     json: JsonOption = False,
 ) -> None:
-    """Write a report of a run: deviations first, accuracy, gates, signatures, certificates, pictures, verification.
+    """Write a report of a run: deviations, accuracy, gates, signatures, certificates, pictures, verification.
 
-    The evidence is verified first. The exit status is 1 when it does not verify; the report then says so on top.
-    That a report was made is recorded in the run, unless its evidence does not verify or the folder is read-only.
-    A run that awaits its release is reported too, and the report says that it was not released.
+    The evidence is verified first. If it does not verify, the exit status is 1 and the report says so at the top.
+    The report is recorded in the run, unless the evidence does not verify or the folder is read-only.
+    A run that is not yet released can be reported as well; the report says so.
     """
     with reporting_errors(json):
         if pdf is None and html is None:
-            raise ConfigurationError("no file to write", remedy="Say --pdf FILE, --html FILE, or both")
+            raise ConfigurationError("no file to write", remedy="Give --pdf FILE, --html FILE, or both")
         run_id = resolve_run(audit.list_runs(data), run)
         with progress_bar(quiet=json) as progress:
             verified = audit.verify(data, run_id, progress)
-            # Numerics, pictures and fonts take a second to load: `audit verify` must not wait for them.
+            # Numerics, pictures and fonts take a second to load, and `audit verify` does not need them.
             from service.audit.record.run import read_run  # noqa: PLC0415
             from service.audit.report.content import report_content  # noqa: PLC0415
             from service.audit.report.output.html import write_html  # noqa: PLC0415
@@ -84,7 +84,7 @@ def report_command(
         console.print(f"Report of run {run_id}: {escape(', '.join(written))}")
         if not recorded:
             why = "its evidence does not verify" if not verified.ok else "the data folder is read-only"
-            console.print(f"  Not recorded in the run that it was made, because {why}.")
+            console.print(f"  The report is not recorded in the run, because {why}.")
     if not verified.ok:
         if not json:
             error_console.print(f"[bold red]The evidence does NOT verify:[/] {escape(str(verified.first_fault))}")
@@ -92,7 +92,7 @@ def report_command(
 
 
 def _write(path: Path, write: Callable[[Path], None], leave: Callable[[Path, str], None] | None) -> None:
-    """Write a file that gets its name only once it is recorded: where that fails, no report appears."""
+    """Write a file under a temporary name and rename it once recorded; if recording fails, no report appears."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".report-") as folder:
@@ -108,12 +108,12 @@ def _write(path: Path, write: Callable[[Path], None], leave: Callable[[Path, str
 
 
 def _record(data: Path, run_id: str, head_sha256: str, actor: str, part: Path, file_name: str) -> None:
-    from service.audit.bundle.export import record_export  # noqa: PLC0415  # with the rest of what `verify` does without
+    from service.audit.bundle.export import record_export  # noqa: PLC0415  # loads the numerics
 
     with Store.open(data, create=False) as store:
         record_export(store, run_id, part, file_name=file_name, what="report", head_sha256=head_sha256, actor=actor)
 
 
 def _writable(data: Path) -> bool:
-    """Whether anything can be recorded: an auditor may have a copy on a medium that cannot be written."""
+    """Whether anything can be recorded; an auditor's copy may be on a read-only medium."""
     return os.access(data, os.W_OK) and os.access(database_path(data), os.W_OK)

@@ -1,4 +1,4 @@
-"""`orthocapture replay`: compute again what a run recorded, and say whether it comes out the same."""
+"""`orthocapture replay`: compute a run's results again and compare them with the record."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from service.worker.loop import HANDLERS
 
 _COULD_NOT = 2
 _STATUS = {"identical": 0, "within_tolerance": 0, "different": 1, "not_replayed": _COULD_NOT}
-_SHOWN = 8  # differences of a job
+_SHOWN = 8  # most differences shown per job
 _WORDS = {
     "identical": "[bold green]equal, bit for bit[/]",
     "within_tolerance": "[bold green]equal[/] within rounding (1e-9)",
@@ -44,19 +44,19 @@ _WORDS = {
 def replay_command(
     run: Annotated[str, typer.Argument(help="Name of the run, its first characters, or `latest`.")] = "latest",
     data: DataOption = DEFAULT_DATA,
-    step: Annotated[str | None, typer.Option("--step", help="Only what this step computed.")] = None,
+    step: Annotated[str | None, typer.Option("--step", help="Only the jobs of this step.")] = None,
     jobs: Annotated[
         str,
         typer.Option(
             "--jobs",
             metavar="KINDS",
-            help="Kinds of jobs, with commas between: calibrate,register. `all` adds the looks at each live image.",
+            help="Kinds of jobs, separated by commas: calibrate,register. `all` adds the checks of each live image.",
         ),
     ] = ",".join(DEFAULT_KINDS),
     end_to_end: Annotated[
         bool,
         typer.Option(
-            "--end-to-end", help="Give each job the recomputed results of those before it; report the drift."
+            "--end-to-end", help="Feed each job the recomputed results of earlier jobs, and report the drift."
         ),
     ] = False,
     out: Annotated[
@@ -66,8 +66,8 @@ def replay_command(
 ) -> None:
     """Compute calibration, registration and evaluation again from the recorded files, and compare.
 
-    The recorded parameters are used, and nothing is written into the evidence. The exit status is 0 when everything
-    comes out equal, 1 when something differs, and 2 when it could not be replayed.
+    The recorded parameters are used, and nothing is written into the evidence. The exit status is 0 if everything is
+    equal, 1 if something differs, and 2 if the run could not be replayed.
     """
     try:
         kinds = list(HANDLERS) if jobs == "all" else [kind.strip() for kind in jobs.split(",") if kind.strip()]
@@ -79,7 +79,7 @@ def replay_command(
             text = json_module.dumps(report_json(report), indent=1, ensure_ascii=False, allow_nan=False)
             (out / "replay.json").write_text(text + "\n", encoding="utf-8")
     except OrthocaptureError as error:
-        fail(error, json=json)  # says what is wrong; its status 1 would mean a difference
+        fail(error, json=json)  # only prints; its exit status 1 would mean a difference
         raise typer.Exit(_COULD_NOT) from error
     if json:
         print_json(report_json(report))
@@ -89,7 +89,7 @@ def replay_command(
 
 
 def report_json(report: ReplayReport) -> dict[str, Any]:
-    """A report as plain data with the verdicts on top."""
+    """A replay report as plain data, with the verdicts added."""
     plain: dict[str, Any] = {"verdict": report.verdict, **asdict(report)}
     for job, shown in zip(report.jobs, plain["jobs"], strict=True):
         shown["differences"] = [_plain(difference) for difference in job.differences]
@@ -106,7 +106,7 @@ def report_json(report: ReplayReport) -> dict[str, Any]:
 
 
 def _plain(difference: Difference) -> dict[str, Any]:
-    """Without infinities, which JSON does not have."""
+    """A difference as plain data, with None for infinities, which JSON does not have."""
     plain = {**asdict(difference), "within_tolerance": difference.within_tolerance}
     for name in ("difference", "relative"):
         if plain[name] == float("inf"):
@@ -120,13 +120,13 @@ def _print(report: ReplayReport) -> None:
         f"Evidence verified first: {report.files_verified} files, {report.bytes_verified / 1e6:.1f} MB read again."
     )
     if report.versions:
-        console.print(f"{len(report.versions)} installed distributions are not what they were:")
+        console.print(f"{len(report.versions)} installed distributions have other versions than recorded:")
         for change in report.versions:
             console.print(f"  {escape(change.name)} {change.recorded or 'none'} → {change.now or 'none'}")
     else:
         console.print("Every installed distribution has the version that was recorded.")
     table = Table(box=None, pad_edge=False)
-    for heading in ("step", "computed again", "comes out", "files the same", "took"):
+    for heading in ("step", "computed again", "result", "equal files", "took"):
         table.add_column(heading, justify="right" if heading == "took" else "left", overflow="fold")
     for job in report.jobs:
         same = sum(artefact.recorded_sha256 == artefact.recomputed_sha256 for artefact in job.artefacts)
@@ -143,8 +143,8 @@ def _print(report: ReplayReport) -> None:
             _print_job(job)
     changed = [(gate.step, old, new) for gate in report.gates for old, new in gate.changed]
     console.print(
-        f"Gates: {report.gates_judged} verdicts follow from the recorded measures; with the recomputed ones "
-        + (f"{len(changed)} come out otherwise:" if changed else "none comes out otherwise.")
+        f"Gates: {report.gates_judged} verdicts follow from the recorded measures; with the recomputed measures "
+        + (f"these differ ({len(changed)}):" if changed else "none differs.")
     )
     for step, old, new in changed:
         console.print(f"  {step}: {escape(describe(old))} → {escape(describe(new))}")

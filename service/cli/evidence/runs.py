@@ -1,4 +1,4 @@
-"""`orthocapture runs`, `compare` and `history`: finding runs, and holding them against one another."""
+"""`orthocapture runs`, `compare` and `history`: find runs and compare them."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from service.store.store import Store
 def runs_command(
     search: Annotated[
         str,
-        typer.Option("--search", help="Words of specimen, purpose, site, people, remarks, notes or protocol."),
+        typer.Option("--search", help="Words in specimen, purpose, site, people, remarks, notes or protocol."),
     ] = "",
-    since: Annotated[str, typer.Option("--since", help="First day, as 2026-11-21.", metavar="DAY")] = "",
+    since: Annotated[str, typer.Option("--since", help="First day, such as 2026-11-21.", metavar="DAY")] = "",
     until: Annotated[str, typer.Option("--until", help="Last day.", metavar="DAY")] = "",
     result: Annotated[str, typer.Option("--result", help=f"One of {', '.join(RESULTS)}.")] = "",
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
-    """List the recorded runs, newest first; all of them, or those that fit."""
+    """List the recorded runs, newest first: all, or those that match."""
     if result and result not in RESULTS:
-        raise typer.BadParameter(f"{result!r} is none of {', '.join(RESULTS)}", param_hint="--result")
+        raise typer.BadParameter(f"{result!r} is not one of {', '.join(RESULTS)}", param_hint="--result")
     wanted = RunWanted(search, _day(since, "--since"), _day(until, "--until"), result)
     with reporting_errors(json), Store.open(data, create=False) as store:
         found = find_runs(store, wanted)
@@ -50,7 +50,7 @@ def runs_command(
         print_json([_record(run) for run in found])
         return
     if not found:
-        console.print("No run fits." if wanted.active else "No run has been recorded here yet.")
+        console.print("No run matches." if wanted.active else "No run has been recorded here yet.")
         return
     table = Table(box=None, pad_edge=False)
     for heading in ("run", "begun (UTC)", "specimen", "purpose", "protocol", "by", "result"):
@@ -62,12 +62,12 @@ def runs_command(
 
 
 def by(run: FoundRun) -> str:
-    """Who worked at the rig, or at least who began the run."""
+    """Who worked at the rig, or, if not stated, who began the run."""
     return run.about.operator or run.begun_by
 
 
 def result_words(run: FoundRun) -> str:
-    """`completed, 0.213 mm (within), released`."""
+    """A run's result in words, such as `completed, 0.213 mm (within), released`."""
     words = [RESULT_WORDS[run.status]]
     if run.accuracy is not None:
         words.append(run.accuracy.words)
@@ -94,17 +94,17 @@ def _day(given: str, option: str) -> str:
     try:
         return date.fromisoformat(given).isoformat() if given else ""
     except ValueError as error:
-        raise typer.BadParameter(f"{given!r} is no day such as 2026-11-21", param_hint=option) from error
+        raise typer.BadParameter(f"{given!r} is not a day such as 2026-11-21", param_hint=option) from error
 
 
 def compare_command(
     first: Annotated[str, typer.Argument(help="A run: its name, its first characters, or `latest`.")],
-    second: Annotated[str, typer.Argument(help="The run to hold against it.")],
-    everything: Annotated[bool, typer.Option("--all", help="Also what is the same in both.")] = False,
+    second: Annotated[str, typer.Argument(help="The run to compare it with.")],
+    everything: Annotated[bool, typer.Option("--all", help="Also show what is the same in both.")] = False,
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
-    """Hold two runs side by side: protocol, gates, figures, accuracy, calibration, durations, deviations."""
+    """Compare two runs: protocol, gates, figures, accuracy, calibration, durations, deviations."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         comparison = compare_runs(_compared(store, first), _compared(store, second))
     if json:
@@ -161,7 +161,7 @@ def history_command(
     out: Annotated[Path | None, typer.Option("--out", help="Write into this file.", dir_okay=False)] = None,
     data: DataOption = DEFAULT_DATA,
 ) -> None:
-    """Calibration and accuracy over time for each camera, lens and arm, as CSV."""
+    """Print calibration and accuracy over time for each camera, lens and arm, as CSV."""
     with reporting_errors(), Store.open(data, create=False) as store:
         if out is not None:
             require_writable(out)

@@ -1,4 +1,4 @@
-"""`orthocapture store`: the folder in which the evidence lies."""
+"""`orthocapture store`: maintain the folder that holds the evidence."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from service.store.records import SITE
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 
-store_app = typer.Typer(name="store", help="Look after the folder that holds the evidence.", no_args_is_help=True)
+store_app = typer.Typer(name="store", help="Maintain the folder that holds the evidence.", no_args_is_help=True)
 
 
 @store_app.callback()
 def store() -> None:
-    """Look after the folder that holds the evidence."""
+    """Maintain the folder that holds the evidence."""
 
 
 store_app.command("backup")(backup_command)
@@ -40,16 +40,16 @@ store_app.command("restore")(restore_command)
 @store_app.command("gc")
 def gc_command(
     data: DataOption = DEFAULT_DATA,
-    remove: Annotated[bool, typer.Option("--remove", help="Remove them; without it they are only listed.")] = False,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the files instead of listing them.")] = False,
     min_age_min: Annotated[
-        float, typer.Option("--min-age-min", min=0, help="Leave what is younger than this many minutes.")
+        float, typer.Option("--min-age-min", min=0, help="Keep files younger than this many minutes.")
     ] = USUAL_AGE_S / 60,
     operator: Annotated[str, typer.Option("--operator", help="Your name, as it goes into the record.")] = "",
     json: JsonOption = False,
 ) -> None:
-    """List what crashes have left: files that no record refers to. With --remove they are removed, and that recorded.
+    """List files left by crashes, to which no record refers. With --remove, remove them and record the removal.
 
-    Recorded files are never touched. Files that a process at work may still record are left, too.
+    Recorded files are never touched, nor are files that a running process may still record.
     """
     with reporting_errors(json), Store.open(data, create=False) as opened:
         age_s = 60 * min_age_min

@@ -1,4 +1,4 @@
-"""`orthocapture store backup` and `restore`: a copy of a data folder elsewhere, and a data folder from such a one."""
+"""`orthocapture store backup` and `restore`: back up a data folder elsewhere, and restore it."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from service.store.backup.restore import RestoreReport, restore
 
 def backup_command(
     destination: Annotated[
-        Path, typer.Argument(metavar="BACKUP", help="Folder of backups: empty, new, or with earlier ones.")
+        Path, typer.Argument(metavar="BACKUP", help="Folder of backups: new, empty, or with earlier backups.")
     ],
     data: DataOption = DEFAULT_DATA,
     with_keys: Annotated[
-        bool, typer.Option("--with-keys", help="Copy the private signing key too: whoever reads it can sign.")
+        bool, typer.Option("--with-keys", help="Copy the private signing key too; anybody who reads it can sign.")
     ] = False,
     read_all: Annotated[
-        bool, typer.Option("--read-all", help="Read what earlier backups have copied again, and mend it.")
+        bool, typer.Option("--read-all", help="Read all files of earlier backups again, and repair damaged ones.")
     ] = False,
-    keep: Annotated[int | None, typer.Option("--keep", help="Keep this many states; else all.", min=1)] = None,
+    keep: Annotated[int | None, typer.Option("--keep", help="Keep this many states; default: all.", min=1)] = None,
     json: JsonOption = False,
 ) -> None:
-    """Copy the data folder, also during a run; after the first time only what is new.
+    """Back up the data folder, also during a run; after the first time only new files are copied.
 
-    Repeat it after an interruption: it goes on where it was. The exit status is 1 when there is no backup, and when
-    what was copied does not verify.
+    After an interruption, repeat the command and it will continue. The exit status is 1 if no backup was made, or if
+    the copied data does not verify.
     """
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         made = back_up(data, destination, with_keys=with_keys, read_all=read_all, keep=keep, progress=progress)
@@ -54,14 +54,14 @@ def backup_command(
 
 def restore_command(
     backup: Annotated[Path, typer.Argument(metavar="BACKUP", help="The folder of backups.")],
-    destination: Annotated[Path, typer.Argument(metavar="DIR", help="The new data folder: empty, or not there yet.")],
-    state: Annotated[str, typer.Option("--state", help="Which backup; else the newest.")] = "",
+    destination: Annotated[Path, typer.Argument(metavar="DIR", help="The new data folder: empty or not existing.")],
+    state: Annotated[str, typer.Option("--state", help="The backup to restore; default: the newest.")] = "",
     operator: Annotated[str, typer.Option(help="Your name, as it goes into the record.")] = "",
     json: JsonOption = False,
 ) -> None:
-    """Make a data folder as it was when the backup was made, and verify it.
+    """Restore a data folder as it was when the backup was made, and verify it.
 
-    The exit status is 1 when anything of it is missing or does not verify.
+    The exit status is 1 if anything is missing or does not verify.
     """
     with reporting_errors(json), progress_bar(quiet=json) as progress:
         made = restore(backup, destination, name=state, actor=operator or getpass.getuser(), progress=progress)
@@ -108,7 +108,7 @@ def _print_backup(made: BackupReport) -> None:
     )
     if not state.with_keys:
         console.print(
-            "  The signing key is not in it: keep the folder keys/ elsewhere (see docs/howto/operating.md)."
+            "  It does not hold the signing key: keep the folder keys/ elsewhere (see docs/howto/operating.md)."
         )
     if state.faults:
         console.print(f"[bold red]What was copied does not verify.[/] First fault: {escape(state.faults[0])}")
@@ -120,7 +120,7 @@ def _print_restore(made: RestoreReport) -> None:
     console.print(f"{escape(str(made.folder))} is as {escape(state.data_folder)} was at {state.at_utc}.")
     if not state.with_keys:
         console.print(
-            "  The signing key was not in the backup: put the folder keys/ back, or say that it is lost with"
+            "  The signing key was not in the backup: restore the folder keys/, or declare the key lost with"
         )
         console.print("  orthocapture audit rotate-key --lost --reason ...")
     for line in made.lost:

@@ -1,1 +1,1 @@
-"""The commands that make and drive a run."""
+"""Commands that start and drive runs."""

@@ -1,4 +1,4 @@
-"""`orthocapture act` and `note`: what people do to a run, or write down of it, that another terminal drives."""
+"""`orthocapture act` and `note`: act on a run that another terminal drives, or write a note on it."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def act_command(
     verb: Annotated[
         str,
         typer.Argument(
-            help="confirm, sign, redo, skip, accept, pause, resume or abort; of a capture by hand: release or finish."
+            help="confirm, sign, redo, skip, accept, pause, resume or abort; for a manual capture: release or finish."
         ),
     ],
     run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
     step: Annotated[str | None, typer.Option("--step", help="The step, if it is not the current one.")] = None,
-    viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo this viewpoint alone.")] = None,
-    reason: Annotated[str, typer.Option("--reason", help="Why; needed for redo, skip, accept and abort.")] = "",
-    meaning: Annotated[str, typer.Option("--meaning", help="What a signature says.")] = "",
+    viewpoint: Annotated[str | None, typer.Option("--viewpoint", help="Redo only this viewpoint.")] = None,
+    reason: Annotated[str, typer.Option("--reason", help="Why; required for redo, skip, accept and abort.")] = "",
+    meaning: Annotated[str, typer.Option("--meaning", help="What the signature means.")] = "",
     operator: OperatorOption = "",
     password_stdin: PasswordOption = False,
     data: DataOption = DEFAULT_DATA,
@@ -47,7 +47,7 @@ def act_command(
 ) -> None:
     """Answer or stop a run that another terminal drives. A confirmation ticks the whole checklist."""
     if verb not in (*VERBS, *_OF_A_CAPTURE):
-        raise typer.BadParameter(f"{verb!r} is none of {', '.join((*VERBS, *_OF_A_CAPTURE))}", param_hint="VERB")
+        raise typer.BadParameter(f"{verb!r} is not one of {', '.join((*VERBS, *_OF_A_CAPTURE))}", param_hint="VERB")
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)
@@ -69,7 +69,7 @@ def act_command(
         identity = identity_for(
             People(store), protocol, state, verb, name, partial(typed_password, name, from_stdin=password_stdin)
         )
-        if identity is None and verb == "pause":  # the safe direction: nobody is kept from it
+        if identity is None and verb == "pause":  # pausing is always safe, so anybody may do it
             identity = Identity(name, "", "claimed")
         identity = identity or who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin))
         name = identity.name
@@ -95,7 +95,7 @@ def act_command(
 def _ask_capture(
     store: Store, run_id: str, protocol: Protocol, state: RunState, asked: CaptureAsked, name: str
 ) -> None:
-    """Ask a capture by hand for a release of the shutter, or to end with what it has."""
+    """Ask a manual capture to release the shutter or to finish. Raises IllegalTransitionError."""
     if asked.step not in protocol.step_ids:
         raise IllegalTransitionError(f"there is no step {asked.step!r}", where=asked.what)
     refusal = capture_refusal(protocol, state, asked.step, asked.attempt)
@@ -112,14 +112,14 @@ def _report_recorded(run_id: str, verb: str, step: str | None, name: str, *, jso
 
 
 def signed_by_verb(verb: str, protocol: Protocol, state: RunState) -> str:
-    """SHA-256 of the event that an action binds; "" for one that is no signature."""
+    """SHA-256 of the event that an action binds; "" if the action is not a signature."""
     if verb == "accept":
         return state.step.gates_sha256
     return record_to_sign(protocol, state) if verb == "sign" else ""
 
 
 def note_command(
-    text: Annotated[str, typer.Argument(help="What to write down; may be left out with a photograph.")] = "",
+    text: Annotated[str, typer.Argument(help="The note's text; may be left out with a photograph.")] = "",
     photo: Annotated[Path | None, typer.Option("--photo", help="A photograph, JPEG or PNG.", dir_okay=False)] = None,
     run: Annotated[str, typer.Option("--run", help="Name of the run, its first characters, or `latest`.")] = "latest",
     step: Annotated[str, typer.Option("--step", help="The step, if it is not the current one.")] = "",
@@ -128,7 +128,7 @@ def note_command(
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
-    """Write a note on a step of a run, with or without a photograph. It is recorded and changes nothing else."""
+    """Write a note on a step of a run, with or without a photograph. It is recorded and has no other effect."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)

@@ -1,4 +1,4 @@
-"""The worker process beside a run: it ends with the run, and one that dies is replaced."""
+"""The worker process beside a run: it ends with the run and is replaced if it dies."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import psutil
 
 _GRACE_S = 10.0
 _POLL_S = 0.5
-_FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 60.0  # before one that died is replaced; doubled each time
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 1.0, 60.0  # before a dead worker is replaced; doubled each time
 
 
 @contextmanager
 def worker_beside(data: Path, tell: Callable[[str], object]) -> Generator[None]:
-    """A worker process that ends with this block, or with this process; `tell` hears when one has died."""
+    """Run a worker process until the end of this block or of this process; `tell` is called when one dies."""
     beside = _Beside(data, tell)
     keeper = threading.Thread(target=beside.keep, name="keeper of the worker", daemon=True)
     keeper.start()
@@ -35,39 +35,39 @@ class _Beside:
     def __init__(self, data: Path, tell: Callable[[str], object]) -> None:
         self.over = threading.Event()
         self._tell = tell
-        # The parent's number is told, for a worker that looks who its parent is may look too late.
+        # Pass the parent's process id: a worker that asks for it itself may ask after the parent has died.
         words = ["worker", "--data", str(data), "--json", "--parent", str(os.getpid())]
         self._command = [sys.executable, "-m", "service.cli.main", *words]
         self._process = self._start()
 
     def keep(self) -> None:
-        """Look after the worker until `over`. What it computed when it died, its successor begins anew."""
+        """Replace the worker whenever it dies, until `over`. Its successor begins the interrupted job again."""
         wait_s = _FIRST_WAIT_S
         while not self.over.wait(_POLL_S):
             status = self._process.poll()
             if status is None:
                 continue
-            self._tell(f"the worker, which computes, has ended (status {status}); another one is started")
+            self._tell(f"the worker process has ended (status {status}); another one is started")
             if self.over.wait(wait_s):
                 return
             wait_s = min(2 * wait_s, _LONGEST_WAIT_S)
             try:
                 self._process = self._start()
-            except OSError as error:  # no memory for it now
+            except OSError as error:  # for want of memory, say
                 self._tell(f"no worker could be started: {error.strerror}")
 
     def end(self) -> None:
-        """End the worker and all that it has started."""
+        """End the worker and all its child processes."""
         self._process.terminate()
         try:
             self._process.wait(timeout=_GRACE_S)
-        except subprocess.TimeoutExpired:  # in the middle of a long job, which the next worker begins anew
+        except subprocess.TimeoutExpired:  # in the middle of a long job, which the next worker begins again
             for child in (*psutil.Process(self._process.pid).children(recursive=True), self._process):
                 child.kill()
             self._process.wait()
 
     def _start(self) -> subprocess.Popen[bytes]:
-        # A session of its own: Ctrl-C is for the runner, which ends its worker in order.
+        # In its own session, so that Ctrl-C reaches only the runner, which ends its worker in an orderly way.
         return subprocess.Popen(
             self._command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True
         )

@@ -1,4 +1,4 @@
-"""`orthocapture run`, `resume` and `status`: a protocol from its first step to its last."""
+"""`orthocapture run`, `resume` and `status`: run a protocol from its first step to its last."""
 
 from __future__ import annotations
 
@@ -72,9 +72,11 @@ AutoOption = Annotated[
     bool, typer.Option("--auto-confirm", help="Answer every question automatically; simulated rigs only.")
 ]
 PasswordOption = Annotated[
-    bool, typer.Option("--password-stdin", help="Where an action demands a role: read the password from stdin.")
+    bool, typer.Option("--password-stdin", help="Read the password, if one is needed, from stdin.")
 ]
-WorkerOption = Annotated[bool, typer.Option("--worker/--no-worker", help="Compute here, or leave it to others.")]
+WorkerOption = Annotated[
+    bool, typer.Option("--worker/--no-worker", help="Compute in this command, or leave it to other workers.")
+]
 
 
 def run_command(
@@ -87,7 +89,7 @@ def run_command(
     password_stdin: PasswordOption = False,
     approve_change: Annotated[
         str,
-        typer.Option("--approve-change", help="Why a content other than the approved one is right."),
+        typer.Option("--approve-change", help="Reason to approve a protocol whose content has changed."),
     ] = "",
     specimen: SpecimenOption = "",
     purpose: PurposeOption = "",
@@ -103,7 +105,7 @@ def run_command(
         with Store.open(data) as store:
             name = operator or getpass.getuser()
             who = who_acts(People(store), name, partial(typed_password, name, from_stdin=password_stdin))
-            if not auto_confirm:  # which is for simulated rigs
+            if not auto_confirm:  # simulated rigs need no approval
                 approve(store, loaded, who.name, reason=approve_change, identified=who.identified)
             run_id = start_run(store, loaded, rig_file, operator=who.name, auto_confirm=auto_confirm, about=about)
             state = drive(store, run_id, rig_file, data=data, auto_confirm=auto_confirm, worker=worker, who=who)
@@ -120,7 +122,7 @@ def resume_command(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Go on with a run after a crash, a power cut or a pause: nothing captured is lost or taken twice."""
+    """Continue a run after a crash, a power failure or a pause; nothing captured is lost or taken twice."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         _, root = recorded_run(store, run_id)
@@ -130,7 +132,7 @@ def resume_command(
 
 
 def typed_password(name: str, *, from_stdin: bool) -> str:
-    """A password from the keyboard, or the next line of stdin. Raises ConfigurationError where none is given."""
+    """A password from the keyboard, or the next line of stdin. Raises ConfigurationError if none is given."""
     if from_stdin:
         return sys.stdin.readline().rstrip("\n")
     try:
@@ -144,7 +146,7 @@ def status_command(
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
-    """Show how far a run is: steps, gates, deviations."""
+    """Show the state of a run: steps, gates, deviations."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, root = recorded_run(store, run_id)
@@ -192,7 +194,7 @@ def _standing(verdict: GateVerdict, step: StepState) -> Standing:
 
 
 def status_record(run_id: str, state: RunState) -> dict[str, Any]:
-    """A run's state as plain data."""
+    """A run's state as plain data, for JSON output."""
     return {
         "run": run_id,
         "status": state.status,
@@ -218,7 +220,7 @@ def status_record(run_id: str, state: RunState) -> dict[str, Any]:
 
 
 def next_best_views(state: RunState) -> list[dict[str, Any]]:
-    """Of the newest summary of the images; none before the first one."""
+    """The suggested views in a run's newest summary of its images, as plain data; empty before the first one."""
     jobs = [job for step in state.steps.values() for job in step.jobs.values()]
     done = [job for job in jobs if job.kind == "live_summary" and job.status == "finished"]
     newest = max(done, key=lambda job: job.enqueued_seq, default=None)
@@ -239,14 +241,14 @@ def drive(
     """Run the runner in this process, with a worker beside it, until the run ends.
 
     Args:
-        store: of the data folder `data`.
+        store: the store of the data folder `data`.
         run_id: the run.
         rig: its devices.
         data: the data folder.
         auto_confirm: a simulated technician answers every question.
-        worker: compute here.
+        worker: start a worker process beside the run.
         screens: people answer in the browser.
-        who: the person at this terminal, where it is known; else the run's operator, who is asked for a password.
+        who: the person at this terminal; None for the run's operator, who is asked for a password.
     """
     protocol, root = recorded_run(store, run_id)
     require_rig_free(store, rig.path, run_id=run_id)
@@ -266,7 +268,7 @@ def drive(
         people = People(store)
         who = who or who_acts(people, root.operator, partial(typed_password, root.operator, from_stdin=False))
         operator = TerminalOperator(who.name, protocol, display, hands, preview=preview, people=people, who=who)
-    # Told to end, the runner ends as with Ctrl-C: the arm is stopped, the devices and the lease are let go.
+    # SIGTERM ends the runner like Ctrl-C: the arm stops, and devices and lease are released.
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         beside = worker_beside(data, error_console.print) if worker else nullcontext()
@@ -292,7 +294,7 @@ def drive(
 
 
 def open_devices(station: Station) -> OpenDevices:
-    """What is open now, for the screens."""
+    """The devices that are open now, for the screens."""
     return OpenDevices(
         robots=cast(dict[str, RobotArm], station.opened("robot")),
         cameras=cast(dict[str, Camera], station.opened("camera")),
@@ -301,7 +303,7 @@ def open_devices(station: Station) -> OpenDevices:
 
 
 def _preview(protocol: Protocol, rig: Rig, step: str) -> str:
-    """What a capture step is going to do, for the person who is asked to release it."""
+    """What a capture step will do, in words, for the person who is asked to confirm it."""
     try:
         plans = preview_plans(protocol, protocol.step(step), rig, partial(layout_of, rig))
         board = preview_board_poses(protocol, protocol.step(step), rig, partial(layout_of, rig))

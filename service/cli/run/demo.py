@@ -1,4 +1,4 @@
-"""`orthocapture demo`: a whole run on a simulated rig, from specimen to registered data set, over the real wires."""
+"""`orthocapture demo`: a whole run on a simulated rig over the real wire protocols, up to the registered data set."""
 
 from __future__ import annotations
 
@@ -58,11 +58,11 @@ def demo_command(
     image_width: Annotated[int, typer.Option("--image-width", help="Width of the simulated photographs.")] = 1280,
     host: Annotated[
         str | None,
-        typer.Option("--host", help="Address of the simulated arm, such as 127.0.0.2; without: one with free ports."),
+        typer.Option("--host", help="Address of the simulated arm, such as 127.0.0.2; default: one with free ports."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Run the demonstration protocol on a simulated rig and show what comes out. Takes a few minutes."""
+    """Run the demonstration protocol on a simulated rig and show the results. Takes a few minutes."""
     started_s = time.monotonic()
     with reporting_errors(json):
         folder = out.resolve() / time.strftime("%Y%m%d-%H%M%S")
@@ -106,9 +106,9 @@ def demo_command(
 
 
 def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
-    """True registration error at the scene centre for each source of poses, from the simulator's own record.
+    """True registration error in mm at the scene's centre for each source of poses, from the simulator's own record.
 
-    Read after the run, by the demo and tests alone.
+    Only the demo and tests use it, after the run.
     """
     truth = json_module.loads(truth_file.read_text())
     exposures = [
@@ -130,10 +130,10 @@ def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
 
 
 def free_address() -> str:
-    """The first address of this machine at which a simulated arm's ports are free; its clients know no other ports.
+    """The first loopback address at which a simulated arm's ports are free; clients of the arm use fixed ports.
 
     Raises:
-        ConfigurationError: none is.
+        ConfigurationError: they are free at no address.
     """
     for last in range(1, 255):
         address = f"127.0.0.{last}"
@@ -157,7 +157,7 @@ def _is_free(address: str, port: int) -> bool:
 
 @contextmanager
 def _simulated_rig(folder: Path, scene: int, image_width: int, host: str) -> Generator[dict[str, Any]]:
-    """A rig process around one scene; ended with this block."""
+    """Run a simulated rig process around one scene until the end of this block."""
     folder.mkdir(parents=True)
     command = [
         sys.executable, "-m", "simulators", "rig", "--scene", str(scene), "--dir", str(folder),

@@ -1,4 +1,4 @@
-"""The hands of a simulated technician: on a simulated rig, a confirmation also does what it confirms."""
+"""The hands of a simulated technician: on a simulated rig, confirming something also does it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.core.errors import OrthocaptureError
 from service.core.protocol.models import Step
 from service.core.text.json_text import parse_json
 
-_ASKS_FOR_A_PHOTOGRAPH = ("next: ", "take the photograph now")  # how such words begin
+_ASKS_FOR_A_PHOTOGRAPH = ("next: ", "take the photograph now")  # beginnings of messages that ask for a photograph
 _LONGEST_ANSWER = 1 << 20  # characters
 _PATIENCE_S = 900  # a CT volume or a scan of the whole scene takes minutes on a busy machine
 
@@ -26,13 +26,13 @@ class SimulatedHands:
     _done: set[tuple[str, int]] = field(default_factory=set[tuple[str, int]])
 
     def do(self, step: Step, attempt: int) -> None:
-        """What a technician does before confirming this step; once for each attempt."""
+        """Do what a technician does before confirming this step, once for each attempt. Raises as `act` does."""
         self.act(step.id, attempt, [action.model_dump(exclude_none=True) for action in step.simulated_hands])
 
     def act(self, step: str, attempt: int, actions: Sequence[Mapping[str, Any]]) -> None:
         """Do these actions (the vocabulary of simulators/rig_world.py) one after the other; once for each attempt.
 
-        Raises OrthocaptureError when the simulated world does not answer or cannot do one of them.
+        Raises OrthocaptureError if the simulated world does not answer or cannot do one of them.
         """
         if self.address is None or (step, attempt) in self._done:
             return
@@ -47,7 +47,7 @@ class SimulatedHands:
         self._done.add((step, attempt))
 
     def read(self, message: str) -> None:
-        """The technician reads what the screen says."""
+        """Let the technician read a message of the screen."""
         if self.address is not None and message.startswith(_ASKS_FOR_A_PHOTOGRAPH):
             _ask_world(self.address, {"op": "act", "action": "read", "words": message})
 

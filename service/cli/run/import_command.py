@@ -1,4 +1,4 @@
-"""`orthocapture import`: photographs, scan and CT that were captured earlier become a run, as imported."""
+"""`orthocapture import`: make a run of photographs, scan and CT that were captured earlier."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from service.steps import params_models
 from service.store.store import Store
 
 _PROTOCOL = shipped_protocols() / "import_spine.yaml"
-_SHOWN = 12  # files left out that are shown one by one
+_SHOWN = 12  # most left-out files listed one by one
 _PARTS: dict[PhotographRole, str] = {
     "calibration": "calibration images",
     "image": "images",
@@ -53,9 +53,7 @@ def import_command(
     folder: Annotated[Path, typer.Argument(help="Folder with calibration/, images/, control/, scan/ and so on.")],
     protocol: Annotated[
         Path,
-        typer.Option(
-            "--protocol", help="The protocol of the import.", show_default="import_spine.yaml, which comes with it"
-        ),
+        typer.Option("--protocol", help="The protocol of the import.", show_default="the shipped import_spine.yaml"),
     ] = _PROTOCOL,
     calibration_images: Annotated[
         Path | None, typer.Option("--calibration-images", metavar="DIR", help="Images of the board.")
@@ -64,18 +62,18 @@ def import_command(
     control_images: Annotated[
         Path | None, typer.Option("--control-images", metavar="DIR", help="Images that show the control spheres.")
     ] = None,
-    scan: Annotated[Path | None, typer.Option("--scan", help="The mesh, or the folder of the only one.")] = None,
+    scan: Annotated[Path | None, typer.Option("--scan", help="The mesh, or a folder with only one mesh.")] = None,
     control_scan: Annotated[
-        Path | None, typer.Option("--control-scan", help="The mesh that still holds the control spheres.")
+        Path | None, typer.Option("--control-scan", help="The mesh that also shows the control spheres.")
     ] = None,
     ct: Annotated[Path | None, typer.Option("--ct", metavar="DIR", help="Folder of one DICOM series.")] = None,
     simulated: Annotated[
-        bool, typer.Option("--simulated", help="The files come from simulators: everything is marked so.")
+        bool, typer.Option("--simulated", help="The files come from simulators; all results are marked accordingly.")
     ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show what would be imported, and import nothing.")
     ] = False,
-    again: Annotated[bool, typer.Option("--again", help="Import what was imported before as one more run.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Import the same files again as another run.")] = False,
     data: DataOption = DEFAULT_DATA,
     operator: OperatorOption = "",
     worker: WorkerOption = True,
@@ -87,7 +85,7 @@ def import_command(
 ) -> None:
     """Import photographs, scan and CT that were captured earlier; register and evaluate them as a run.
 
-    Interrupted, the same command goes on where it stopped.
+    After an interruption, the same command continues the run.
     """
     given: dict[PhotographRole | FileRole, Path | None] = {
         "calibration": calibration_images,
@@ -132,21 +130,21 @@ def import_command(
 
 
 def _require_wanted(protocol: Protocol, listing: ImportList) -> None:
-    """Before anything is recorded: what the protocol cannot do without must be there."""
+    """Raise ConfigurationError, before anything is recorded, if a part that the protocol needs is missing."""
     for step in protocol.steps:
         part = part_of(protocol, step.id)
         if part is not None and not step.skippable and not listing.holds(part):
             raise ConfigurationError(
                 f"the protocol needs {part.replace('_', ' ')} (step {step.id!r}), and the folder holds none",
                 where=listing.folder,
-                remedy="Name it by its option, see --help; or use a protocol in which that step may be skipped",
+                remedy="Name it with its option (see --help), or use a protocol in which that step may be skipped",
             )
 
 
 def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, again: bool, about: RunAbout) -> str:
-    """The run of this very list that has not ended, or a new one.
+    """The unfinished run of exactly this list and protocol, or a new run.
 
-    Raises ConfigurationError when the list was imported before, or when its files come from a simulated run.
+    Raises ConfigurationError if the list was imported before, or if files of a simulated run are imported as real.
     """
     listing = hashlib.sha256(rig.source).hexdigest()
     ours = {file.sha256 for file in rig.section.imported.all_files()} if rig.section.imported is not None else set()
@@ -156,12 +154,12 @@ def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, ag
         root = recorded_root(store, row.run_id)
         if root.rig.sha256 == listing and root.protocol_sha256 == loaded.sha256 and not again:
             if row.run_id in unfinished:
-                error_console.print(f"Going on with run {row.run_id}, which was interrupted.")
+                error_console.print(f"Continuing run {row.run_id}, which was interrupted.")
                 return row.run_id
             raise ConfigurationError(
                 f"these files were imported before: run {row.run_id}",
                 where=str(store.database_path),
-                remedy="Read that run, or import them as one more run with --again",
+                remedy="Read that run, or import them as another run with --again",
             )
         if row.simulated and not rig.section.simulated and any(file.ref.sha256 in ours for file in theirs):
             raise ConfigurationError(
@@ -176,7 +174,7 @@ def _run_of(store: Store, loaded: LoadedProtocol, rig: Rig, *, operator: str, ag
 
 
 def listing_record(listing: ImportList) -> dict[str, Any]:
-    """What was found, as plain data."""
+    """The import list as plain data, for JSON output."""
     return {
         "folder": listing.folder,
         "photographs": {role: photographs_record(listing, role) for role in _PARTS if listing.holds(role)},
@@ -186,7 +184,7 @@ def listing_record(listing: ImportList) -> dict[str, Any]:
 
 
 def photographs_record(listing: ImportList, role: PhotographRole) -> dict[str, Any]:
-    """Counts, camera, lens, dates and sizes of the photographs of one kind."""
+    """Counts, cameras, lenses, dates and sizes of the photographs with this role, as plain data."""
     views = listing.of(role)
     times = sorted(str(view.camera["exif_time"]) for view in views if view.camera.get("exif_time"))
     return {
@@ -233,7 +231,7 @@ def _show(listing: ImportList) -> None:
 
 
 def _dates(first: str, last: str) -> str:
-    """Two times of EXIF (`2024:03:01 10:14:00.000+00:00`), as far as people want to know them."""
+    """The span between two EXIF times (`2024:03:01 10:14:00.000+00:00`), to the minute."""
     if not first:
         return "not stated"
     begin, end = (f"{text[:10].replace(':', '-')} {text[11:16]}" for text in (first, last))

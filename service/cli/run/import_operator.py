@@ -1,4 +1,4 @@
-"""Who answers an import's questions: what was brought is imported, what was not is skipped; a person does more."""
+"""The operator of an import: confirms parts that are in the list, skips parts that are not, asks for the rest."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from service.runner.operator import AnswerBy
 
 
 def part_of(protocol: Protocol, step_id: str) -> PhotographRole | FileRole | None:
-    """Which part of an import a step brings in; None for a step that brings nothing."""
+    """The part of an import that a step imports; None if it imports nothing."""
     step = protocol.step(step_id)
     match step.kind:
         case "image_import":
@@ -32,13 +32,16 @@ def part_of(protocol: Protocol, step_id: str) -> PhotographRole | FileRole | Non
 
 @dataclass
 class ImportOperator(TerminalOperator):
-    """The person who gave the command: with it they confirmed the import of what the list holds, and nothing else."""
+    """The person who gave the command, which confirms the import of everything in the list and nothing else."""
 
     listing: ImportList | None = None
     _retried: bool = False
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
-        """Confirm or skip the import of a part; ask for anything else, where there is a terminal."""
+        """Confirm or skip the import of a part; ask at the terminal about anything else.
+
+        Raises OrthocaptureError if there is no terminal.
+        """
         part = part_of(self.protocol, question.step)
         if question.for_ == "confirm" and part is not None and self.listing is not None:
             if self.listing.holds(part):
@@ -46,7 +49,7 @@ class ImportOperator(TerminalOperator):
             if "skip" in question.options:
                 return OperatorAction(action="skip", step=question.step, reason=f"no {_words(part)} among the files")
         if question.for_ == "recovery" and "confirm" in question.options and state.sessions > 1 and not self._retried:
-            self._retried = True  # whoever gives the command again wants what had failed tried again, once
+            self._retried = True  # giving the command again asks for one retry of what failed
             return OperatorAction(action="confirm", step=question.step)
         if not os.isatty(self.descriptor):
             raise OrthocaptureError(

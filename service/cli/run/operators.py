@@ -1,4 +1,4 @@
-"""Who answers a run's questions: a person at the terminal, or the automatic stand-in on a simulated rig."""
+"""Who answers a run's questions: a person at the terminal, people at screens, or automation on a simulated rig."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from service.people.errors import PeopleError
 from service.people.sessions import People
 from service.runner.operator import AnswerBy
 
-_MOST_MENDS = 4  # of one step: whoever has followed its advice so often decides by himself
+_MOST_MENDS = 4  # how often a step's advice is followed automatically before a person must decide
 
 
 class Display:
-    """Progress with the time left, and one line for each thing that happened. On stderr: stdout is for results."""
+    """A progress bar with the time left, and one line per event, on stderr; stdout is for results."""
 
     def __init__(self, console: Console, reporter: Reporter) -> None:
         self.console = console
@@ -62,7 +62,7 @@ class Display:
         self._progress.update(self._progress.task_ids[0], completed=done, total=total or None)
 
     def clear(self) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         if self._progress is not None:
             self._progress.stop()
             self._progress = None
@@ -76,7 +76,7 @@ class Display:
 
 @dataclass
 class _Operator:
-    """What all who answer have in common."""
+    """The base of all operators."""
 
     name: str
     protocol: Protocol
@@ -84,55 +84,55 @@ class _Operator:
     hands: SimulatedHands
 
     def show(self, what: str, done: int, total: int) -> None:
-        """Progress."""
+        """Show progress."""
         self.display.show(what, done, total)
 
     def tell(self, message: str) -> None:
-        """News."""
+        """Print one line."""
         self.display.tell(message)
 
     def busy(self, what: str) -> None:
-        """For the screens."""
+        """Tell the screens what a long call is doing."""
         self.display.reporter.busy(what)
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
-        """For the screens, the signal tower, and people who are elsewhere."""
+        """Report the run's state to the screens, the signal tower, and alerts to people elsewhere."""
         asks, words = (asked.for_, _elsewhere(self.protocol, asked)) if asked is not None else ("", "")
         attempt = state.step.attempt
         self.display.reporter.attend(doing, state.current, attempt, pedal_armed=pedal_armed, asks=asks, words=words)
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
-        """The whole list: so the terminal says what a confirmation means."""
+        """The items that a confirmation ticks: the whole list, as the terminal says."""
         return question.checklist
 
     def close(self) -> None:
-        """The run has ended, or this process is about to."""
+        """Clean up: the run has ended, or this process is about to."""
 
     def prepare(self, step: str, attempt: int) -> None:
-        """The simulated technician's hands, if there are any."""
+        """Let the simulated technician, if there is one, do what was confirmed."""
         self.hands.do(self.protocol.step(step), attempt)
 
     def mend(self, step: str, attempt: int, hands: Sequence[Mapping[str, Any]]) -> None:
-        """The simulated technician does what the step has asked for."""
+        """Let the simulated technician do what the step has asked for."""
         self.hands.act(step, attempt, hands)
 
 
 @dataclass
 class ScreenOperator(_Operator):
-    """People at screens: their answers come as events; here only the pedal is attended to."""
+    """People at screens, whose answers arrive as events; this process only watches the pedal."""
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | None:
-        """Nothing: the web process appends what people do."""
+        """Always None: the web process records what people do."""
         return None
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
-        """What was ticked on a screen: the pedal is another way to press the button there, and no more than that."""
+        """The items ticked on a screen: the pedal does no more than the button there."""
         return state.steps[question.step].ticked
 
 
 @dataclass
 class _Accepting:
-    """An acceptance that is being typed: its reason, the figures that it binds, and the name once it is told."""
+    """An acceptance that is being typed: its reason, the hash of its figures, and the name once given."""
 
     reason: str
     sha256: str
@@ -141,18 +141,18 @@ class _Accepting:
 
 @dataclass
 class TerminalOperator(_Operator):
-    """A person who types; the terminal is polled so that pedal and web can answer as well."""
+    """A person who types; the terminal is polled, so that pedal and web can answer as well."""
 
-    descriptor: int = 0  # of the terminal
-    preview: Callable[[str], str] = lambda _step: ""  # what a step is going to do, where that can be told
-    people: People | None = None  # accounts of the site, for what demands a role
+    descriptor: int = 0  # file descriptor of the terminal
+    preview: Callable[[str], str] = lambda _step: ""  # what a step will do, in words; "" if unknown
+    people: People | None = None  # accounts of the site, for actions that need a role
     who: Identity | None = None  # the person who types
     _asked: AskOperator | None = None
     _typed: bytes = b""
     _accepting: _Accepting | None = None
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
-        """Show a new question once, then look whether a line was typed."""
+        """Show a new question once; then return the answer if a line was typed."""
         if question != self._asked:
             self._asked = question
             self._stop_accepting()
@@ -169,7 +169,7 @@ class TerminalOperator(_Operator):
         return action
 
     def _line(self) -> str | None:
-        """A whole line, if one was typed. Not through sys.stdin: its buffer would hide further lines from select."""
+        """A complete line, or None. Not read through sys.stdin, whose buffer would hide further lines from select."""
         while b"\n" not in self._typed:
             if not select.select([self.descriptor], [], [], 0)[0]:
                 return None
@@ -181,7 +181,7 @@ class TerminalOperator(_Operator):
         return line.decode(errors="replace")
 
     def print_question(self, question: AskOperator) -> None:
-        """Show what is asked, with what can be answered."""
+        """Show a question and the possible answers."""
         self.display.clear()
         step = self.protocol.step(question.step)
         lines = [question.text, *(f"  ☐ {item}" for item in question.checklist)]
@@ -192,7 +192,7 @@ class TerminalOperator(_Operator):
         lines.append(f"\nType one of: {', '.join(question.options)} (with a reason where one is needed).")
         if "confirm" in question.options and question.checklist:
             lines.append("By `confirm` you say that every item of the list is done.")
-        # As text: brackets in an instruction are no markup. Wrapped: at the terminal's edge not a word is lost.
+        # Text, so that brackets in an instruction are not taken for markup; wrapped at the terminal's edge.
         title, why = Text(step.title), Text(step.why)
         panel = Panel(Text("\n".join(lines), overflow="fold"), title=title if len(title) < 60 else None)
         if len(title) >= 60:
@@ -202,7 +202,7 @@ class TerminalOperator(_Operator):
             self.display.console.print(Text("Why: ") + why, soft_wrap=False)
 
     def _accept(self, accepting: _Accepting, line: str, state: RunState) -> AnswerBy | None:
-        """The name first, then the password, each a line of its own: the run is attended to between them."""
+        """Read first the name, then the password, each on its own line; the run is attended to in between."""
         if not accepting.name:
             accepting.name = line.strip() or self.name
             self.display.tell(f"the password of {accepting.name}, then Enter (it is not shown):")
@@ -227,7 +227,7 @@ class TerminalOperator(_Operator):
         return AnswerBy(action, who.name if who else accepting.name)
 
     def close(self) -> None:
-        """What is typed is shown again."""
+        """Show typed characters again."""
         self._stop_accepting()
 
     def _stop_accepting(self) -> None:
@@ -243,11 +243,11 @@ class TerminalOperator(_Operator):
 
     def _action(self, question: AskOperator, state: RunState, verb: str, reason: str) -> OperatorAction | None:
         if verb not in question.options:
-            self.display.tell(f"{verb!r} is not possible now; one of: {', '.join(question.options)}")
+            self.display.tell(f"{verb!r} is not possible now; type one of: {', '.join(question.options)}")
             return None
         if verb == "accept":
             if not reason:
-                self.display.tell("accept needs a reason: type `accept`, a space and why")
+                self.display.tell("accept needs a reason: type `accept`, a space and the reason")
                 return None
             self._accepting = _Accepting(reason, state.step.gates_sha256)
             self.display.tell(f"who accepts it? The name of the {demanded_role(self.protocol, state)}, then Enter:")
@@ -270,14 +270,14 @@ class TerminalOperator(_Operator):
 
 
 def _elsewhere(protocol: Protocol, asked: AskOperator) -> str:
-    """A question in few words, for people who are elsewhere."""
+    """A question in a few words, for people who are elsewhere."""
     title = protocol.step(asked.step).title
     due = {"confirm": "a confirmation is awaited", "sign": "a signature is due", "recovery": asked.text}
     return f"{title}: {due[asked.for_]}"
 
 
 def _ways_lines(question: AskOperator) -> list[str]:
-    """The choices, the recommended one first, each with what to type, what it takes and what it loses."""
+    """The choices, the recommended one first, each with what to type, its time and what it loses."""
     lines = ["\nWhat can be done now, the recommended first:"] if question.ways else []
     for way in question.ways:
         if way.available:
@@ -290,17 +290,17 @@ def _ways_lines(question: AskOperator) -> list[str]:
 
 @dataclass
 class AutomaticOperator(_Operator):
-    """Confirms and signs on a simulated rig, and follows a step's advice on how to mend what fell short."""
+    """Confirms and signs on a simulated rig, and follows a step's advice when its figures are outside limits."""
 
     _mends: dict[str, int] = field(default_factory=dict[str, int])  # step → how often its advice was followed
 
     def tell(self, message: str) -> None:
-        """News; a simulated hand that holds the camera goes where the words lead."""
+        """Print one line; a simulated person who holds the camera follows its directions."""
         super().tell(message)
         self.hands.read(message)
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction:
-        """Say yes; recorded as automatic. Raises OrthocaptureError where there is no advice to follow, or no end."""
+        """Say yes, recorded as automatic. Raises OrthocaptureError if there is no advice left to follow."""
         if question.for_ == "recovery":
             mends = self._mends.get(question.step, 0)
             if state.step.mend and "confirm" in question.options and mends < _MOST_MENDS:

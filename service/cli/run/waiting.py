@@ -1,4 +1,4 @@
-"""At the end of a run: the results that are still being computed, with the time left, until all have arrived."""
+"""Wait, at the end of a run, for the results that are still being computed, and show the time left."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from service.run_record import RunFollower, results_to_come
 from service.steps.time_left import duration_words
 from service.store.store import Store
 
-_LOOK_S = 2.0  # a look at a whole run costs a sixth of a second, which the results themselves need
+_LOOK_S = 2.0  # reading a whole run takes a sixth of a second, which the computation also needs
 
 
 def wait_for_results(store: Store, run_id: str, protocol: Protocol, display: Display) -> None:
-    """Show what is still computed until nothing is; Ctrl-C leaves it to another worker, and loses nothing."""
+    """Show what is still being computed until all is done; Ctrl-C leaves it to another worker and loses nothing."""
     run = RunFollower(store, run_id, protocol)
     pending = [one for one in results_to_come(run.now()) if not one.failed]
     if not pending or not store.open_jobs(run_id):
@@ -49,7 +49,7 @@ def wait_for_results(store: Store, run_id: str, protocol: Protocol, display: Dis
 
 @contextmanager
 def _told_to_leave() -> Generator[threading.Event]:
-    """Set by Ctrl-C and SIGTERM. As exceptions they would be lost where they fall into a finaliser or a callback."""
+    """An event set by Ctrl-C and SIGTERM; an exception could get lost in a finaliser or callback."""
     leave = threading.Event()
     before = {number: signal.signal(number, lambda *_: leave.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

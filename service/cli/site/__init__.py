@@ -1,1 +1,1 @@
-"""The commands of a site: its rig, pages, workers, protocols and plans."""
+"""Commands of a site: its rig, pages, workers, protocols and plans."""

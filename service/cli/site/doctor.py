@@ -1,4 +1,4 @@
-"""`orthocapture doctor`: open every device of a rig and say what is there and what is wrong."""
+"""`orthocapture doctor`: open every device of a rig and report its state and problems."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ from service.store.database.engine import database_path
 from service.store.files.space_used import forecast_of
 from service.store.store import Store
 
-# Libraries without a ready-made package for every Python and machine, and what cannot be done without them.
+# Optional libraries, which lack wheels for some Pythons and machines, and what is not possible without them.
 _PARTS = {
     "rtde_control": "ur-rtde: arms of Universal Robots cannot be driven",
     "pycolmap": "pycolmap: camera poses cannot be found from images alone",
     "embreex": "embreex: rigs cannot be simulated",
 }
-_LOW_DISK_BYTES = 20e9  # a full capture of RAW and JPEG with its scans
+_LOW_DISK_BYTES = 20e9  # roughly a full capture of RAW and JPEG with its scans
 
 
 def doctor_command(
     rig: RigOption,
     data: DataOption = DEFAULT_DATA,
     protocol: Annotated[
-        Path | None, typer.Option("--protocol", help="Say whether the disk will do for a run of this protocol.")
+        Path | None, typer.Option("--protocol", help="Check that the disk has room for a run of this protocol.")
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Open every device of a rig: versions, clock offsets, free space, and what is wrong."""
+    """Open every device of a rig; report versions, clock offsets, free space and problems."""
     found: dict[str, DeviceReport | OrthocaptureError] = {}
     with reporting_errors(json):
         rig_file = load_rig(rig)
@@ -104,7 +104,7 @@ def _clock_words(clock: HostClock) -> str:
         beyond = f", more than {HOST_LIMIT_S:g} s" if abs(clock.offset_s) > HOST_LIMIT_S else ""
         return f"{clock.offset_s:+.6f} s against the network's time (chrony){beyond}"
     if clock.synchronised:
-        error = "" if clock.error_s is None else f", within {clock.error_s:.3f} s by its own word"
+        error = "" if clock.error_s is None else f", within {clock.error_s:.3f} s as it states itself"
         return f"is set by the network's time{error}"
     return "is not known to be set" if clock.synchronised is None else "is not set by the network's time"
 
@@ -112,15 +112,15 @@ def _clock_words(clock: HostClock) -> str:
 def _offset_words(offset_s: float, clock: str, *, late: bool) -> str:
     if clock == "uptime":
         return (
-            f"its clock counts from when it was switched on, {offset_s:+.3f} s from this machine's count: that is as "
-            "it should be, for only a change during a run matters"
+            f"its clock counts from when it was switched on, {offset_s:+.3f} s from this machine's count: that is "
+            "normal, only a change during a run matters"
         )
     words = f"clock {offset_told(offset_s, clock)}"
     if not late:
         return words
     return (
-        f"[yellow]{words}, more than {DEVICE_LIMIT_S:g} s: set it before a run, or the times in its files are wrong "
-        "by that[/]"
+        f"[yellow]{words}, more than {DEVICE_LIMIT_S:g} s: set it before a run, or the times in its files will be "
+        "wrong by as much[/]"
     )
 
 
@@ -138,9 +138,9 @@ def _record(report: DeviceReport | OrthocaptureError) -> dict[str, Any]:
 
 
 def _serial_note(who: DeviceIdentity) -> str:
-    """A camera's number over USB may have digits before that of the body, which its photographs state alone."""
+    """A note that a camera's serial number over USB may have extra digits before that in its photographs."""
     known = who.kind == "camera" and who.serial
-    return " (as USB states it; its photographs may state its end alone)" if known else ""
+    return " (as stated over USB; its photographs may state only the last digits)" if known else ""
 
 
 def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:

@@ -1,4 +1,4 @@
-"""`orthocapture plan`: what a capture step will do before anything moves, and which views would help a run most."""
+"""`orthocapture plan`: what a capture step will do, before anything moves, and which views would help a run most."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from service.steps import calibration, params_models
 from service.steps.preview import BoardPreview, preview_board_poses, preview_plans
 from service.store.store import Store
 
-plan_app = typer.Typer(no_args_is_help=True, help="Plan viewpoints: before a capture, and while one runs.")
+plan_app = typer.Typer(no_args_is_help=True, help="Plan viewpoints, before and during a capture.")
 
 
 @plan_app.command("show")
 def show_command(
     protocol: Annotated[Path, typer.Argument(help="The protocol file.")],
     rig: Annotated[Path, typer.Option("--rig", help="The rig file; `collision: {arm: …}` names the arm.")],
-    step: Annotated[str | None, typer.Option("--step", help="This capture step alone.")] = None,
+    step: Annotated[str | None, typer.Option("--step", help="Only this capture step.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Which viewpoints the arm can take, in which order, in what time; what board images will tell. No device."""
+    """Show the viewpoints that the arm can reach, their order and time, and the use of board images. No device."""
     with reporting_errors(json):
         loaded = load_protocol(protocol, params_models())
         rig_file = load_rig(rig)
@@ -80,7 +80,7 @@ def _board_record(step: Step, board: BoardPreview) -> dict[str, Any]:
 
 
 def _coverage_text(counts: Sequence[Sequence[int]]) -> str:
-    """Corners expected in each cell of the image, row by row; a dot where none will be."""
+    """Number of corners expected in each cell of the image, row by row; a dot for none."""
     width = max(len(str(n)) for row in counts for n in row)
     return "\n".join("    " + " ".join((str(n) if n else "·").rjust(width) for n in row) for row in counts)
 
@@ -91,7 +91,7 @@ def next_command(
     data: DataOption = DEFAULT_DATA,
     json: JsonOption = False,
 ) -> None:
-    """The views that would bring a run's predicted error under its limit soonest, as of its last capture step."""
+    """Show the views that would bring a run's predicted error under its limit soonest, as of its last capture."""
     with reporting_errors(json), Store.open(data, create=False) as store:
         run_id = store.find_run(run)
         protocol, _ = recorded_run(store, run_id)

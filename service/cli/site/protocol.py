@@ -1,4 +1,4 @@
-"""`orthocapture protocol`: check a protocol file, write its schema and its diagram."""
+"""`orthocapture protocol`: check a protocol file, and print schema, diagram and ways on."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ protocol_app = typer.Typer(name="protocol", help="Check a protocol file before i
 @protocol_app.command("check")
 def check_command(
     file: Annotated[Path, typer.Argument(help="The protocol file.")],
-    rig: Annotated[Path | None, typer.Option("--rig", help="Check it together with this rig file: stations.")] = None,
+    rig: Annotated[Path | None, typer.Option("--rig", help="Also check that this rig file has its stations.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Read a protocol and say everything that is wrong with it, by file, line and field."""
+    """Check a protocol and report every problem with file, line and field."""
     with reporting_errors(json):
         loaded = load_protocol(file, params_models())
         protocol = loaded.protocol
@@ -35,7 +35,7 @@ def check_command(
         if problems:
             listed = "\n".join(f"  {file}:{p.line} {p.field}: {p.message}" for p in problems)
             raise ProtocolError(
-                f"{len(problems)} of its numbers or names cannot be meant:\n{listed}\n",
+                f"{len(problems)} of its numbers or names are implausible:\n{listed}\n",
                 where=f"{file}:{problems[0].line}",
                 remedy="Correct the measure, its unit or its limit; docs/reference/steps.md lists the measures",
             )
@@ -44,7 +44,7 @@ def check_command(
             print_json({"id": protocol.id, "version": protocol.version, "sha256": loaded.sha256, "steps": steps})
             return
         console.print(
-            f"{escape(str(file))} is sound: {protocol.id} {protocol.version}, {counted(len(protocol.steps), 'step')}"
+            f"{escape(str(file))} is valid: {protocol.id} {protocol.version}, {counted(len(protocol.steps), 'step')}"
         )
         for step in protocol.steps:
             marks = ", ".join(m for m, on in (("irreversible", step.irreversible), ("signed", step.sign)) if on)
@@ -66,6 +66,6 @@ def diagram_command(file: Annotated[Path, typer.Argument(help="The protocol file
 
 @protocol_app.command("ways")
 def ways_command(file: Annotated[Path, typer.Argument(help="The protocol file.")]) -> None:
-    """Print what can be done about every failure of a protocol's steps, with cost and loss, as a page of tables."""
+    """Print the ways on after every failure of a protocol's steps, with time and loss, as a page of tables."""
     with reporting_errors():
         typer.echo(ways_text(load_protocol(file, params_models()).protocol), nl=False)

@@ -1,4 +1,4 @@
-"""`orthocapture serve`: the guided screen and the auditor's view, in the browser."""
+"""`orthocapture serve`: serve the guided screen and the auditor's view to browsers."""
 
 from __future__ import annotations
 
@@ -49,53 +49,55 @@ def serve_command(
     data: DataOption = DEFAULT_DATA,
     protocols: Annotated[
         Path,
-        typer.Option(
-            "--protocols", help="Folder with the protocols to offer.", show_default="those that come with it"
-        ),
+        typer.Option("--protocols", help="Folder of the protocols to offer.", show_default="the shipped protocols"),
     ] = _PROTOCOLS,
     host: Annotated[str, typer.Option("--host", help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", help="0 takes a free one.", min=0, max=65535)] = 8000,
-    tls_certificate: Annotated[Path | None, typer.Option("--tls-certificate", help="PEM, chain included.")] = None,
+    port: Annotated[
+        int, typer.Option("--port", help="Port to listen on; 0 takes a free one.", min=0, max=65535)
+    ] = 8000,
+    tls_certificate: Annotated[
+        Path | None, typer.Option("--tls-certificate", help="PEM file of the TLS certificate with its chain.")
+    ] = None,
     tls_key: Annotated[Path | None, typer.Option("--tls-key", help="PEM file of its private key.")] = None,
     insecure_lan: Annotated[
-        bool, typer.Option("--insecure-lan", help="Other machines without TLS: passwords can be read on the way.")
+        bool, typer.Option("--insecure-lan", help="Serve other machines without TLS; passwords can be intercepted.")
     ] = False,
     name: Annotated[
-        list[str] | None, typer.Option("--name", help="Further host name by which browsers reach this machine.")
+        list[str] | None, typer.Option("--name", help="Another host name by which browsers reach this machine.")
     ] = None,
     idle_lock_min: Annotated[
-        float, typer.Option("--idle-lock-min", help="Minutes without a touch until the PIN is asked for.", min=0.05)
+        float, typer.Option("--idle-lock-min", help="Idle minutes until the PIN is asked for.", min=0.05)
     ] = 10.0,
     trusted_proxy: Annotated[
         list[str] | None,
         typer.Option(
             "--trusted-proxy",
-            help="Address of a proxy before this one, whose word on where requests come from counts.",
+            help="Address of a reverse proxy whose X-Forwarded-For is trusted; may be repeated.",
         ),
     ] = None,
     connections: Annotated[
-        int, typer.Option("--connections", help="Most connections at once, in all.", min=1)
+        int, typer.Option("--connections", help="Most simultaneous connections in all.", min=1)
     ] = _LIMITS.in_all,
     address_connections: Annotated[
-        int, typer.Option("--address-connections", help="Most connections at once from one address.", min=1)
+        int, typer.Option("--address-connections", help="Most simultaneous connections from one address.", min=1)
     ] = _LIMITS.per_address,
     client_wait_s: Annotated[
         float,
         typer.Option(
-            "--client-wait-s", help="Seconds that a client may take to send a request, and to go on reading.", min=0.1
+            "--client-wait-s", help="Seconds that a client has to send a request, and may pause reading.", min=0.1
         ),
     ] = _LIMITS.wait_s,
     json: JsonOption = False,
 ) -> None:
-    """Serve the guided screen and the audit. Runs go on when this ends; stop them on the screen."""
+    """Serve the guided screen and the audit. Runs continue when this command ends; stop them on the screen."""
     with reporting_errors(json):
         tls = _tls(tls_certificate, tls_key)
         lan = _leaves_this_machine(host)
         if lan and tls is None and not insecure_lan:
             raise ConfigurationError(
-                f"{host} is not this machine alone, and there is no TLS",
+                f"{host} is reachable from other machines, and there is no TLS",
                 where="--host",
-                remedy="Give --tls-certificate and --tls-key, or say --insecure-lan in a network you trust",
+                remedy="Give --tls-certificate and --tls-key, or --insecure-lan in a network you trust",
             )
         rig_file = load_rig(rig)
         proxies = known_proxies(trusted_proxy or [])
@@ -126,7 +128,7 @@ def serve_command(
             http = server(create_app(site), listener, proxies, tls, log)
             with http.capture_signals():
                 _announce(address, f"{address}/set-up/{link}" if link else "", json=json)
-                # The numerics behind steps and protocols take seconds to load: while the first page is being read.
+                # The numerics behind steps and protocols take seconds to load, so load them in the background.
                 threading.Thread(target=params_models, daemon=True).start()
                 http.run(sockets=[listener])
             checkpoint(store, SITE)
@@ -149,7 +151,7 @@ def _tls(certificate: Path | None, key: Path | None) -> tuple[Path, Path] | None
         return None
     for path in (certificate, key):
         if not path.is_file():
-            raise ConfigurationError("the file for TLS is not there", where=str(path))
+            raise ConfigurationError("the TLS file does not exist", where=str(path))
     return certificate, key
 
 

@@ -1,4 +1,4 @@
-"""`orthocapture simulate`: becomes a simulator process; this package imports none of them."""
+"""`orthocapture simulate`: replace this process by a simulator; this package imports none of them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def simulate_command(context: typer.Context) -> None:
         near = get_close_matches(chosen, described["simulators"], n=1)
         meant = f"Did you mean {near[0]!r}?" if near else f"There are {', '.join(described['simulators'])}."
         context.fail(f"No such simulator {chosen!r}. {meant}")
-    # In the style of every other command, though a simulator declares its options by itself.
+    # Show help in the style of the other commands, though simulators declare their own options.
     app = _all(described["simulators"], context.command.help or "") if options is None else _one(described)
     command = typer.main.get_command(app)
     if not words or {"--help", "-h"} & set(words):
@@ -46,7 +46,7 @@ def simulate_command(context: typer.Context) -> None:
 
 
 def _one_at_a_time(words: list[str], options: list[dict[str, Any]]) -> list[str]:
-    """The same with `--image A B` as `--image A --image B`, which is how typer knows several values."""
+    """Write `--image A B` as `--image A --image B`, as typer expects several values."""
     many = {flag for option in options if option["many"] for flag in option["flags"]}
     out: list[str] = []
     under = ""
@@ -68,7 +68,7 @@ def _described(name: str) -> dict[str, Any]:
 
 def _one(described: dict[str, Any]) -> typer.Typer:
     def shown(**_: object) -> None:
-        """Never called: only its options are shown."""
+        """Never called; it only carries the options."""
 
     options = [_option(option) for option in described["options"]]
     shown.__signature__ = inspect.Signature(options)  # pyright: ignore[reportFunctionMemberAccess]
@@ -87,7 +87,7 @@ def _all(simulators: dict[str, str], words: str) -> typer.Typer:
 def _option(option: dict[str, Any]) -> inspect.Parameter:
     words = _sentence(option["help"])
     if option["default"]:
-        words += f" Without: {option['default']}."
+        words += f" Default: {option['default']}."
     flags = option["flags"]
     single: Any = {"int": int, "float": float}.get(option["number"], str)
     if option["choices"]:

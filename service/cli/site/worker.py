@@ -1,4 +1,4 @@
-"""`orthocapture worker`: serve registration jobs of a data folder."""
+"""`orthocapture worker`: compute the jobs of a data folder."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def worker_command(
     data: DataOption = DEFAULT_DATA,
     until_idle: Annotated[bool, typer.Option("--until-idle", help="End when no job is left.")] = False,
     jobs: Annotated[
-        int, typer.Option("--jobs", min=0, help="How many to compute at once; 0: as many as there are cores.")
+        int, typer.Option("--jobs", min=0, help="Number of jobs to compute at once; 0: one per core.")
     ] = 0,
     parent: Annotated[
         int, typer.Option("--parent", hidden=True, help="End when this process is not the parent.")
     ] = 0,
     json: JsonOption = False,
 ) -> None:
-    """Compute: calibration, spheres, structure from motion, registration, as many jobs at once as there are cores."""
+    """Compute jobs: calibration, spheres, structure from motion, registration; one job per core at once."""
     stopped = False
 
     def on_terminate(_signal: int, _frame: object) -> None:
