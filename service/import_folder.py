@@ -1,4 +1,4 @@
-"""A folder of photographs, scan and CT that were captured earlier becomes the list of an import, and its rig."""
+"""List a folder of photographs, scan and CT captured earlier for an import, and make the rig that stands for it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from service.core.records.import_list import (
 from service.rig import Rig, RigSection
 from service.station import Station
 
-#: Names of sub-folders, in small letters, in which each part is looked for when no option names another place.
+#: Names of subfolders, in lower case, in which each part is searched for unless an option names another place.
 FOLDERS: dict[PhotographRole | FileRole, tuple[str, ...]] = {
     "calibration": ("calibration", "calibration_images", "calib", "board"),
     "image": ("images", "photographs", "photos"),
@@ -46,17 +46,17 @@ FOLDERS: dict[PhotographRole | FileRole, tuple[str, ...]] = {
     "control_scan": ("control_scan", "control_scans"),
     "ct": ("ct", "dicom"),
 }
-# A photograph that lies in several parts counts once, in the first of these.
+# A photograph found in several parts counts once, in the first of these.
 _PHOTOGRAPHS: tuple[PhotographRole, ...] = ("calibration", "control_image", "image")
 _NEEDED: tuple[PhotographRole, ...] = ("calibration", "image")
 _SCANS: tuple[FileRole, ...] = ("scan", "control_scan")
-_NAMED = 8  # damaged files in an error
+_NAMED = 8  # most damaged files named in an error
 Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where each part of an import lies: folders; for scans and the CT mesh also files. None: not there."""
+    """The folder of each part of an import; for scans also a file. None if there is no such part."""
 
     folder: Path
     calibration: Path | None = None
@@ -70,9 +70,9 @@ class Places:
 def find_places(
     folder: Path, given: Mapping[PhotographRole | FileRole, Path | None], wanted: Set[PhotographRole | FileRole]
 ) -> Places:
-    """The parts of a folder that are wanted: those given, else the sub-folders that are called so.
+    """The places of the wanted parts: those given, else subfolders with one of the names in FOLDERS.
 
-    Raises DataError when the folder, or a place that was given, does not exist; or nobody wants it.
+    Raises DataError if the folder or a given place does not exist, or if a part is given that is not wanted.
     """
     if not folder.is_dir():
         raise DataError("the folder does not exist", where=str(folder))
@@ -93,10 +93,10 @@ def find_places(
 
 
 def list_import(places: Places, progress: Progress = lambda _what, _done, _total: None) -> ImportList:
-    """Every file to be imported, with its hash, and what is left out and why.
+    """Every file to be imported, with its hash, and the files left out, with the reasons.
 
     Raises:
-        DataError: photographs are damaged, or there are none; several scans or CT series, or none that is whole.
+        DataError: photographs are damaged or missing, or there is not exactly one complete scan or CT series.
         DeviceUnavailableError: a folder cannot be read.
     """
     views, left_out = _views(places, progress)
@@ -122,7 +122,7 @@ def list_import(places: Places, progress: Progress = lambda _what, _done, _total
 
 
 def import_rig(listing: ImportList, *, simulated: bool) -> Rig:
-    """What stands for the rig in a run of an import: the list, and the folders of scan and CT as devices."""
+    """The rig of an import's run: the list, with the folders of scan and CT as devices."""
     devices: dict[str, dict[str, Any]] = {}
     for role in _SCANS:
         if listing.holds(role):
@@ -184,7 +184,7 @@ def _views(places: Places, progress: Progress) -> tuple[list[ImportedView], list
 
 
 def camera_record(exif: ExifRecord) -> dict[str, Any]:
-    """What a photograph says of camera, lens and settings, as the events of captures name it; only what it says."""
+    """Camera, lens and settings stated in a photograph's EXIF, with the keys used in capture events."""
     stated: dict[str, Any] = {
         "make": exif.make,
         "model": exif.model,
@@ -206,7 +206,7 @@ def camera_record(exif: ExifRecord) -> dict[str, Any]:
 
 
 def _names(photographs: Sequence[tuple[PhotographRole, Path]], places: Places) -> dict[Path, str]:
-    """A name for each view: the file's, with its folders in front where several files are called so."""
+    """A name for each view: the file's stem, with its folders in front if several files have the same stem."""
     stems = [_plain(path.stem) for _, path in photographs]
     names: dict[Path, str] = {}
     taken: set[str] = set()
@@ -224,7 +224,7 @@ def _names(photographs: Sequence[tuple[PhotographRole, Path]], places: Places) -
 
 
 def _plain(text: str) -> str:
-    """As views may be called: letters, digits and a few signs, 56 at most (the last ones, where cameras count)."""
+    """A valid name of a view: letters, digits and `_.-+`; the last 56 characters, where cameras put their counter."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "_.-+") else "_" for c in text)[-56:]
 
 
@@ -234,7 +234,7 @@ def _damaged(damaged: Sequence[LeftOut], places: Places) -> DataError:
     return DataError(
         f"{len(damaged)} photographs are damaged: {shown}{more}",
         where=str(places.folder),
-        remedy="Copy them again from the camera or its card; what cannot be had again, take out of the folder",
+        remedy="Copy them again from the camera or its card, or remove them from the folder",
     )
 
 
@@ -249,14 +249,14 @@ def _none(role: PhotographRole, places: Places, left_out: Sequence[LeftOut]) -> 
         )
     mine = [one for one in left_out if one.path.is_relative_to(place)]
     why = f"; left out: {mine[0].path.name} ({mine[0].reason}){' and others' * (len(mine) > 1)}" if mine else ""
-    return DataError(f"no photograph that can be used{why}", where=str(place), remedy="Look at the files there")
+    return DataError(f"no usable photograph{why}", where=str(place), remedy="Check the files there")
 
 
 # --- scan and CT ------------------------------------------------------------------------------------------------
 
 
 def _scan(place: Path, role: str) -> tuple[tuple[Path, ...], list[LeftOut]]:
-    """The files of the only mesh of a folder, or of the mesh that a file is; and what else lies there."""
+    """The files of a mesh, given as a file or as a folder with only one mesh, and the other files there."""
     option = f"--{role.replace('_', '-')}"
     if place.is_file():
         meshes, others = [place], []
@@ -278,7 +278,7 @@ def _scan(place: Path, role: str) -> tuple[tuple[Path, ...], list[LeftOut]]:
 
 
 def _ct(folder: Path) -> tuple[tuple[Path, ...], list[LeftOut]]:
-    """The slices of the only sound series of a folder, and what else lies there."""
+    """The slices of the only complete series in a folder, and the other files there."""
     section = RigSection(name="CT", devices={"ct": {"driver": "dicom_folder", "folder": str(folder), "stable_s": 0}})
     station = Station(Rig(section, folder / "import-list.json", b""))
     try:
@@ -288,15 +288,15 @@ def _ct(folder: Path) -> tuple[tuple[Path, ...], list[LeftOut]]:
     sound = [series for series in found if not series.problems and series.slices > 1]
     if len(sound) != 1:
         problems = "; ".join(f"{one.description or one.uid}: {', '.join(one.problems)}" for one in found)
-        what = f"{len(sound)} CT series" if sound else f"no CT series that is whole ({problems or 'no DICOM file'})"
-        raise DataError(what, where=str(folder), remedy="Name the folder of one whole series with --ct")
+        what = f"{len(sound)} CT series" if sound else f"no complete CT series ({problems or 'no DICOM file'})"
+        raise DataError(what, where=str(folder), remedy="Name the folder of one complete series with --ct")
     chosen = set(sound[0].files)
     others = [path for path in files_below(folder) if path not in chosen]
     return sound[0].files, [LeftOut(path, odd(path, folder) or "no slice of the series") for path in others]
 
 
 def _elsewhere(places: Places) -> list[LeftOut]:
-    """Files of the folder that lie in none of its parts."""
+    """Files of the folder that are in none of its parts."""
     parts = [
         place
         for place in (
@@ -331,7 +331,7 @@ def _file(file: ListedFile, places: Places, media_type: str = "application/octet
 
 
 def _shown(path: Path, places: Places) -> str:
-    """Within the folder, or absolute."""
+    """A path relative to the import's folder, or absolute if outside it."""
     return str(path.relative_to(places.folder) if path.is_relative_to(places.folder) else path)
 
 

@@ -1,4 +1,4 @@
-"""Notes on the steps of a run: text, a photograph or both, checked, bounded and put into the run's chain."""
+"""Notes on the steps of a run: text, a photograph or both, checked, bounded and recorded in the run's chain."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _REMEDY = "Take the photograph again, as JPEG or PNG"
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """A photograph as it came, with the name of its file."""
+    """A photograph as received, with its file name."""
 
     content: bytes
     name: str = "photograph"
@@ -35,12 +35,12 @@ def take_note(
     actor: str,
     via: Literal["web", "cli"],
 ) -> Event:
-    """Record a note on a step, the current one where `step` is ""; its event.
+    """Record a note on a step (the current one if `step` is "") and return its event.
 
     Raises:
         IllegalTransitionError: the run has ended (its record is sealed), or there is no such step.
         ConfigurationError: the text is too long.
-        DataError: neither text nor photograph; the photograph is too large, or no JPEG or PNG that can be decoded.
+        DataError: there is neither text nor photograph, or the photograph is too large or not a valid JPEG or PNG.
     """
     state = log.state
     step = step or state.current
@@ -48,7 +48,7 @@ def take_note(
         raise IllegalTransitionError(
             f"the run is {state.status}, and its record is closed",
             where=log.run_id,
-            remedy="An auditor's correction, with its reason, can still be added to a value that was recorded",
+            remedy="A recorded value can still be corrected, with a reason",
         )
     if step not in state.steps:
         known = ", ".join(log.protocol.step_ids)
@@ -72,10 +72,10 @@ def take_note(
 
 
 def require_size(size_bytes: int, name: str) -> None:
-    """Raise DataError for a photograph that is too large: said before it is read."""
+    """Raise DataError if a photograph is too large; called before it is read."""
     if size_bytes > PHOTOGRAPH_BYTES:
         raise DataError(
-            f"the photograph has {size_bytes / 1e6:.1f} MB, and {PHOTOGRAPH_BYTES / 1e6:.0f} MB at most are kept",
+            f"the photograph has {size_bytes / 1e6:.1f} MB; at most {PHOTOGRAPH_BYTES / 1e6:.0f} MB are kept",
             where=_plain(name),
             remedy="Take it with fewer pixels",
         )
@@ -86,8 +86,8 @@ def _plain(name: str) -> str:
 
 
 def _checked(photograph: Photograph) -> tuple[str, str]:
-    """Media type and the ending of its name, once the picture has been decoded."""
-    # The decoder takes its time to load, and a web process starts without it.
+    """Media type and file suffix, after decoding the picture. Raises DataError."""
+    # The decoder takes long to load, and a web process starts without it.
     import cv2  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""The rig file: which devices a site has, at which stations, validated; or what an import brought."""
+"""The rig file: the devices and stations of a site, validated; for an import, the list of its files."""
 
 from __future__ import annotations
 
@@ -20,46 +20,46 @@ from service.core.units import metres
 
 _REMEDY = "Compare it with the example in docs/howto/your_hardware.md"
 
-if TYPE_CHECKING:  # the module brings scipy, for which a web process must not wait when it starts
+if TYPE_CHECKING:  # the module imports scipy, which would delay the start of a web process
     from service.core.geometry import Transform
 
 Vector3 = tuple[float, float, float]
 
 
 class StationSection(Record):
-    """A place where a robot base stands; the scene as a technician measured it, in that base frame."""
+    """A place where a robot's base stands, with the scene as a technician measured it, in that base frame."""
 
     robot: str  # name of the device that stands there
     scene_centre_m: Vector3  # centre of the scene in this station's base frame, to a centimetre
-    scene_up: Vector3 = (0.0, 0.0, 1.0)  # the only one: an arm at a wall or ceiling is not planned for
+    scene_up: Vector3 = (0.0, 0.0, 1.0)  # no other value: arms mounted on walls or ceilings are not supported
     approach_azimuth_deg: float  # direction from the scene to the base, about the base's z axis
 
 
 class PayloadSection(Record):
-    """What hangs on the flange."""
+    """The load on the flange."""
 
     mass_kg: Annotated[float, Field(gt=0, lt=50)]  # camera, lens and mount together
     centre_of_gravity_m: Vector3  # in the flange frame
 
 
 class CollisionSection(Record):
-    """What the planner keeps clear of; the sizes suit a UR10e with a full-frame camera over a board on a table."""
+    """Obstacles for the planner; the defaults suit a UR10e with a full-frame camera over a board on a table."""
 
-    arm: str | None = None  # kinematics, such as UR10e; None: as the controller names itself
-    table_below_scene_m: float = 0.07  # the table's top below the scene's centre
+    arm: str | None = None  # arm model, such as UR10e; None: as the controller states it
+    table_below_scene_m: float = 0.07  # distance of the table's top below the scene's centre
     specimen_size_m: Vector3 = (
         0.34,
         0.46,
         0.17,
-    )  # along the approach, across it, up; with spheres
+    )  # along the approach, across it, up; spheres included
     camera_from_m: Vector3 = (0.0, 0.0, -0.09)  # axis of a capsule around body and lens, in the camera's frame
     camera_to_m: Vector3 = (0.0, 0.0, 0.05)  # the other end of that axis
     camera_radius_m: Annotated[float, Field(gt=0, lt=0.3)] = 0.06  # of that capsule
-    margin_m: Annotated[float, Field(ge=0, lt=0.2)] = 0.01  # clearance that must stay
+    margin_m: Annotated[float, Field(ge=0, lt=0.2)] = 0.01  # smallest clearance
 
 
 class OpticsSection(Record):
-    """The lens, for the depth of field."""
+    """The lens, for computing the depth of field."""
 
     focal_length_mm: Annotated[float, Field(gt=0)]  # as it is taped
     aperture_f: Annotated[float, Field(gt=0)]  # as it is set
@@ -68,34 +68,34 @@ class OpticsSection(Record):
 
 
 class LensSection(Record):
-    """What is engraved on the lens and stated of the sensor: from this the first board images are planned."""
+    """Nominal data of lens and sensor, from which the first board images are planned."""
 
     focal_length_mm: Annotated[float, Field(gt=0)]  # engraved on the lens
     sensor_width_mm: Annotated[float, Field(gt=0)]  # width of the sensor
     image_px: tuple[Annotated[int, Field(gt=0)], Annotated[int, Field(gt=0)]]  # width and height of the photographs
-    focus_distance_m: Annotated[float, Field(gt=0.05)] | None = None  # from the camera; None: the lens hardly extends
+    focus_distance_m: Annotated[float, Field(gt=0.05)] | None = None  # from the camera; None: focused far away
     tolerance: Annotated[float, Field(gt=0, lt=0.5)] = 0.025  # of the focal length, relative
 
     def focal_px(self, width_px: int) -> float:
-        """Focal length in pixels of images of this width: the lens extends when it is focused near."""
+        """Focal length in pixels for images of this width, with the lens's extension at close focus."""
         f_m = metres(self.focal_length_mm)
         extended = 1.0 if self.focus_distance_m is None else self.focus_distance_m / (self.focus_distance_m - f_m)
         return self.focal_length_mm * extended / self.sensor_width_mm * width_px
 
 
 class TimestampSection(Record):
-    """A time-stamp authority (RFC 3161) asked at the end of every run; without its answer the run ends too."""
+    """A time-stamp authority (RFC 3161) that is asked at the end of every run; the run ends even if it fails."""
 
     url: Annotated[str, Field(pattern=r"^https?://")]  # where the authority answers
-    certificates: str  # PEM file beside the rig file: the authority's root, and those between
+    certificates: str  # PEM file, relative to the rig file: the authority's root and intermediate certificates
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 10.0  # for its answer
 
 
 class WebhookSection(Record):
-    """An address that gets each alert as JSON. The rig file is evidence: a secret address is named, not written."""
+    """An address that gets each alert as JSON. The rig file is evidence: keep a secret address in a variable."""
 
     url: Annotated[str, Field(pattern=r"^https?://")] | None = None  # the address itself
-    url_env: str | None = None  # environment variable that holds it
+    url_env: str | None = None  # environment variable that holds the address
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -105,7 +105,7 @@ class WebhookSection(Record):
 
 
 class EmailSection(Record):
-    """A mail server and whom it is to tell."""
+    """A mail server, and the recipients of alerts."""
 
     to: Annotated[tuple[str, ...], Field(min_length=1)]  # addresses
     sender: str  # address that the mail comes from
@@ -117,19 +117,19 @@ class EmailSection(Record):
 
 
 class AlertsSection(Record):
-    """Whom to tell, away from the screen, that a run has stopped, waits or has ended."""
+    """Alerts to people away from the screen when a run has stopped, waits for a person, or has ended."""
 
     webhook: WebhookSection | None = None  # a web address to tell
     email: EmailSection | None = None  # people to write to
     on: tuple[Literal["stopped", "waits", "ended"], ...] = ("stopped", "waits", "ended")  # what is told
-    waits_after_s: Annotated[float, Field(ge=0, le=86400)] = 30.0  # for a person, until that is told
+    waits_after_s: Annotated[float, Field(ge=0, le=86400)] = 30.0  # how long a run waits for a person before an alert
 
 
 class SigningSection(Record):
-    """What may stand for the password where a step is signed or figures are accepted; the password always may."""
+    """What may replace the password when a step is signed or figures are accepted; the password always works."""
 
     pin: bool = False  # a PIN may
-    badge: bool = False  # of a reader that types what it reads, and Enter
+    badge: bool = False  # read by a reader that types the code and Enter
 
 
 class RigSection(Record):
@@ -137,7 +137,7 @@ class RigSection(Record):
 
     name: str  # of the site or the room, as people know it
     simulated: bool = False  # devices are simulators: everything recorded is marked so
-    hands: str | None = None  # address of a simulated technician (simulated rigs only)
+    hands: str | None = None  # HOST:PORT of a simulated technician (simulated rigs only)
     devices: dict[str, dict[str, Any]]  # by a name of your choice: robot, camera, scanner and so on; see Devices
     stations: dict[str, StationSection] = Field(default_factory=dict)  # by the name that protocols use
     # The camera mount's drawing: a rigid 4×4 matrix, metres; the calibration replaces it.
@@ -145,14 +145,12 @@ class RigSection(Record):
     payload: PayloadSection | None = None  # what the arm is told that it carries
     collision: CollisionSection = CollisionSection()  # what the plan of motions keeps clear of
     optics: OpticsSection | None = None  # None: depth of field is not judged
-    lens: LensSection | None = None  # needed where the software plans the board poses
-    timestamp: TimestampSection | None = None  # None: nobody outside is asked
-    signature_copy: str | None = (
-        None  # a file elsewhere, on a share say, that gets each line of the log of signatures
-    )
-    alerts: AlertsSection | None = None  # None: nobody elsewhere is told
+    lens: LensSection | None = None  # required if the software plans the board poses
+    timestamp: TimestampSection | None = None  # None: no time stamps
+    signature_copy: str | None = None  # file elsewhere, such as on a share, that gets a copy of the log of signatures
+    alerts: AlertsSection | None = None  # None: no alerts
     signing: SigningSection = SigningSection()  # what may stand for a password
-    imported: ImportList | None = None  # of a run that captures nothing: what was captured earlier
+    imported: ImportList | None = None  # the files of an import; None for a run that captures
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,15 +160,18 @@ class Rig:
     section: RigSection
     path: Path
     source: bytes
-    tree: YamlTree = NO_LINES  # for the lines of what a driver finds wrong later
+    tree: YamlTree = NO_LINES  # line numbers for problems that drivers find later
 
     @property
     def folder(self) -> Path:
-        """Relative paths in the file are relative to this."""
+        """The folder of the rig file, to which relative paths in it refer."""
         return self.path.parent
 
     def nominal_T_flange_camera(self) -> Transform:
-        """The camera mount's drawing; ConfigurationError when the rig file has none or it is not rigid."""
+        """T_flange_camera (4, 4) in metres from the mount's drawing.
+
+        Raises ConfigurationError if the rig file has none, or if it is not rigid.
+        """
         rows = self.section.T_flange_camera_nominal
         where = str(self.path)
         if rows is None:
@@ -190,12 +191,12 @@ class Rig:
 
 
 def load_rig(path: Path) -> Rig:
-    """Read rig.yaml. Raises ConfigurationError with line and field of everything that is wrong, all of it at once."""
+    """Read rig.yaml. Raises ConfigurationError that lists every problem with line and field."""
     return parse_rig(read_rig(path), path)
 
 
 def read_rig(path: Path) -> bytes:
-    """The bytes of a rig file. Raises ConfigurationError where it cannot be read."""
+    """The bytes of a rig file. Raises ConfigurationError if it cannot be read."""
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
@@ -214,7 +215,7 @@ def read_rig(path: Path) -> bytes:
 
 
 def parse_rig(source: bytes, path: Path) -> Rig:
-    """The rig that a file's bytes describe. Raises ConfigurationError with line and field of all that is wrong."""
+    """The rig in a file's bytes. Raises ConfigurationError that lists every problem with line and field."""
     tree = _tree(source, path)
     section, problems = checked(tree.data, RigSection, tree)
     problems += tree.problems
@@ -225,9 +226,9 @@ def parse_rig(source: bytes, path: Path) -> Rig:
 
 
 def parse_recorded_rig(source: bytes, path: Path) -> Rig:
-    """The rig of a recorded run. What was taken for a number or truth value when the run began still is.
+    """The rig of a recorded run, read with the type conversions that older versions allowed.
 
-    Raises ConfigurationError for what is no rig at all.
+    Raises ConfigurationError if the bytes are not a rig file.
     """
     tree = _tree(source, path)
     try:
@@ -238,7 +239,7 @@ def parse_recorded_rig(source: bytes, path: Path) -> Rig:
 
 
 def _violations(data: Plain) -> Iterator[tuple[FieldPath, str]]:
-    """(field, what is wrong) for what the types of the fields cannot say; the data may be malformed in any way."""
+    """Yield (field, what is wrong) beyond the types of the fields; the data may be malformed in any way."""
     devices, stations = (data.get(name) if isinstance(data, dict) else None for name in ("devices", "stations"))
     known: list[str] = list(devices) if isinstance(devices, dict) else []
     for name, station in stations.items() if isinstance(stations, dict) else ():
@@ -251,19 +252,19 @@ def _violations(data: Plain) -> Iterator[tuple[FieldPath, str]]:
         if isinstance(up, list) and up != [0, 0, 1]:
             yield (
                 ("stations", name, "scene_up"),
-                "only arms that stand upright are planned for: the scene's up is the base's z axis, [0, 0, 1]",
+                "only upright arms are supported: scene_up must be the base's z axis, [0, 0, 1]",
             )
 
 
 def _tree(source: bytes, path: Path) -> YamlTree:
-    """The file as plain data. Raises ConfigurationError for what is neither YAML nor JSON, or holds no fields."""
-    # The list of an import is JSON, of thousands of lines, which YAML would take seconds for.
+    """The file as plain data. Raises ConfigurationError if it is neither YAML nor JSON, or not a mapping."""
+    # An import's list is JSON of thousands of lines, which would take seconds to parse as YAML.
     try:
         tree = _read_json(source, path) if source.startswith(b"{") else _read_yaml(source, path)
     except (DataError, ProtocolError) as error:
         raise ConfigurationError(f"the rig file: {error.what}", where=error.where, remedy=error.remedy) from error
     if not isinstance(tree.data, dict):
-        raise ConfigurationError("the rig file holds no mapping", where=str(path), remedy=_REMEDY)
+        raise ConfigurationError("the rig file is not a mapping of fields", where=str(path), remedy=_REMEDY)
     return tree
 
 

@@ -1,4 +1,4 @@
-"""The runner's view of the evidence: the run's events as they are, folded; and the writing of new ones."""
+"""The runner's view of the evidence: reading and folding a run's events, and writing new ones."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from service.store.store import Store
 
 
 def recorded_root(store: Store, run_id: str) -> RunStarted:
-    """The first event of a run. Raises IntegrityError where it is of another kind."""
+    """The payload of a run's first event. Raises IntegrityError if it is not run_started."""
     root = store.first_event(run_id).payload
     if not isinstance(root, RunStarted):
         raise IntegrityError("the run's first event is not run_started", where=run_id, remedy=RESTORE)
@@ -37,14 +37,14 @@ def recorded_root(store: Store, run_id: str) -> RunStarted:
 
 
 def recorded_protocol(store: Store, root: RunStarted) -> Protocol:
-    """The protocol as it was when a run began, from the evidence. Raises IntegrityError, ProtocolError."""
+    """The protocol as recorded when a run began. Raises IntegrityError if altered, ProtocolError if not readable."""
     content = store.artefact_path(root.protocol.sha256, verify=True).read_bytes()
     return parse_protocol(content, params_models(), name=root.protocol.original_name).protocol
 
 
 @dataclass(frozen=True, slots=True)
 class RunRecord:
-    """What is recorded of one run, as read at one moment: its events and their fold belong together."""
+    """The record of one run at one moment: its events and their fold, which belong together."""
 
     store: Store
     run_id: str
@@ -53,17 +53,17 @@ class RunRecord:
     state: RunState
 
     def captures(self, step_id: str) -> tuple[View, ...]:
-        """The valid captures of a step's current attempt, in order."""
+        """The valid captures of a step's current attempt, in the order of capture."""
         payloads = (self.events[seq - 1].payload for seq in sorted(self.state.steps[step_id].captured.values()))
         return tuple(payload for payload in payloads if isinstance(payload, View))
 
 
 @dataclass
 class RunFollower:
-    """Reads the events of one run as they are recorded, and folds them; safe to use from several threads.
+    """Follows the events of one run and folds them; several threads may use it.
 
-    An event that cannot have happened is not taken: every later `refresh` and `now` raises IntegrityError again.
-    `leave_not_before_s` is the host's time.monotonic() when the newest leave to move was not in the record yet.
+    An impossible event is not added, so every later `refresh` and `now` raises IntegrityError again.
+    `leave_not_before_s` is a time.monotonic() of the host at which the newest leave to move was not yet recorded.
     """
 
     store: Store
@@ -72,7 +72,7 @@ class RunFollower:
     leave_not_before_s: float = field(init=False, default=-math.inf)
     _events: list[Event] = field(init=False, default_factory=list[Event], repr=False)
     _state: RunState = field(init=False, repr=False)
-    _log: RunRecord | None = field(init=False, default=None, repr=False)  # of the newest state, once it was asked for
+    _log: RunRecord | None = field(init=False, default=None, repr=False)  # of the newest state, made on request
     _looked_s: float = field(init=False, default=-math.inf)
     _reading: Lock = field(init=False, default_factory=Lock, repr=False, compare=False)
 
@@ -82,16 +82,16 @@ class RunFollower:
 
     @property
     def state(self) -> RunState:
-        """The fold of what was read last."""
+        """The state as of the last read."""
         return self._state
 
     def refresh(self) -> RunState:
-        """Read what other processes (worker, command line, web) have appended meanwhile. Raises IntegrityError."""
+        """Read what other processes (worker, command line, web) have appended. Raises IntegrityError."""
         with self._reading:
             return self._read()
 
     def now(self) -> RunRecord:
-        """Events and state as recorded up to now. Raises IntegrityError."""
+        """The record up to now. Raises IntegrityError for an impossible event."""
         with self._reading:
             state = self._read()
             if self._log is None or self._log.state is not state:
@@ -101,9 +101,8 @@ class RunFollower:
     def _read(self) -> RunState:
         leave, looked_s = self._state.leave, time.monotonic()
         for event in self.store.events(self.run_id, after_seq=len(self._events)):
-            self._state = advance(
-                self.protocol, self._state, event
-            )  # it may refuse the event, which is not kept then
+            # Fold first: an event that is refused must not be kept.
+            self._state = advance(self.protocol, self._state, event)
             self._events.append(event)
         if self._state.leave != leave:
             self.leave_not_before_s = self._looked_s
@@ -112,12 +111,12 @@ class RunFollower:
 
 
 def read_log(store: Store, run_id: str, protocol: Protocol) -> RunRecord:
-    """A run's record as of now, for who looks once. Raises IntegrityError for events that cannot have happened."""
+    """A run's record as of now, for a single read. Raises IntegrityError for an impossible event."""
     return RunFollower(store, run_id, protocol).now()
 
 
 def results_to_come(log: RunRecord) -> list[Left]:
-    """What was planned for a registration and has not arrived, with the time left; empty when all has."""
+    """The planned registrations that have not arrived yet, with the time left; empty if all have."""
     started = log.store.jobs_started(log.run_id)
     cores = os.cpu_count() or 1
     left = missing_results(log.protocol, log.state, started, datetime.now(UTC).isoformat(), cores)
@@ -126,7 +125,7 @@ def results_to_come(log: RunRecord) -> list[Left]:
 
 @dataclass
 class StepEvidence:
-    """service.steps.context.Evidence for one execution of one step."""
+    """The evidence interface (service.steps.context.Evidence) for one execution of one step."""
 
     log: RunFollower
     lease: RunLease
@@ -142,29 +141,29 @@ class StepEvidence:
         self.log.store.record(self.log.run_id, payloads, actor=actor, artefacts=artefacts, lease=self.lease)
 
     def put_file(self, path: Path, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
-        """Copy a file into the store."""
+        """Copy a file into the store durably; nothing refers to it until `record`."""
         return self.log.store.put_file(path, kind=kind, media_type=media_type, original_name=original_name)
 
     def put_bytes(self, data: bytes, *, kind: str, media_type: str, original_name: str) -> ArtefactRef:
-        """Write bytes into the store."""
+        """Write bytes into the store durably; nothing refers to them until `record`."""
         return self.log.store.put_bytes(data, kind=kind, media_type=media_type, original_name=original_name)
 
     def path(self, ref: ArtefactRef) -> Path:
-        """Where an artefact's bytes lie."""
+        """The file of an artefact. Raises IntegrityError if it is missing."""
         return self.log.store.artefact_path(ref.sha256)
 
     def holds(self, sha256: str) -> bool:
-        """See service.steps.context.Evidence."""
+        """Whether the run has recorded a file with this content."""
         return self.log.store.holds(self.log.run_id, sha256)
 
     def captures(self, step_id: str) -> tuple[View, ...]:
-        """See service.steps.context.Evidence."""
+        """The valid captures of a step's current attempt, in the order of capture."""
         return self.log.now().captures(step_id)
 
     def run_jobs(self, *requests: JobRequest) -> tuple[JobResult, ...]:
-        """Enqueue jobs, once whatever restarts happen, and wait for their results in order.
+        """Enqueue jobs, each only once also after restarts, and wait for their results, returned in order.
 
-        Raises ComputeError with the worker's words when a job failed for good.
+        Raises ComputeError with the worker's message if a job failed for good.
         """
         keys = [self._key(request) for request in requests]
         jobs = [
@@ -174,7 +173,7 @@ class StepEvidence:
         self.log.store.record(self.log.run_id, [], actor="runner", jobs=jobs, lease=self.lease)
         while True:
             self.checkpoint()
-            self.space()  # a worker begins nothing on a disk that is nearly full
+            self.space()  # workers begin no jobs while the disk is nearly full
             state = self.log.refresh()
             mine = {job.idempotency_key: job for job in state.steps[self.step].jobs.values()}
             if any(key not in mine for key in keys):
@@ -188,7 +187,7 @@ class StepEvidence:
                     raise ComputeError(
                         f"the worker could not do {term(mine[key].kind)}: {mine[key].message}",
                         where=f"step {self.step}",
-                        remedy="Put right what its words name, or take what is missing; then try again",
+                        remedy="Correct what the message names, or take what is missing; then try again",
                     )
             done = sum(mine[key].status == "finished" for key in keys)
             open_kinds = [mine[key].kind for key in keys if mine[key].status != "finished"]
@@ -198,29 +197,29 @@ class StepEvidence:
             self.wait(0.2)
 
     def enqueue(self, request: JobRequest, name: str) -> None:
-        """See service.steps.context.Evidence."""
+        """Enqueue a job without waiting for it, unless the same work is already enqueued under this name."""
         key = job_key(self.log.refresh(), self.step, request.kind, name)
         if all(job.idempotency_key != key for job in self.jobs(self.step)):
             job = NewJob(request.kind, self.step, self.attempt, key, request.arguments, priority=request.priority)
             self.log.store.record(self.log.run_id, [], actor="runner", jobs=[job], lease=self.lease)
 
     def asked(self) -> tuple[Literal["release", "finish"], ...]:
-        """See service.steps.context.Evidence."""
+        """What people at screens have asked of this step, in order."""
         return self.log.refresh().steps[self.step].asked
 
     def jobs(self, step_id: str) -> tuple[JobState, ...]:
-        """See service.steps.context.Evidence."""
+        """The jobs of a step, in the order in which they were enqueued."""
         jobs = self.log.refresh().steps[step_id].jobs.values()
         return tuple(sorted(jobs, key=lambda job: job.enqueued_seq))
 
     def state(self) -> RunState:
-        """See service.steps.context.Evidence."""
+        """The run's state as of now. Raises IntegrityError for an impossible event."""
         return self.log.refresh()
 
     def require_space(self) -> None:
-        """See service.steps.context.Evidence."""
+        """Raise SpaceShortError if the disk is nearly full."""
         self.space()
 
     def _key(self, request: JobRequest) -> str:
-        """The same for the same work: after a restart or a retry its result is used, not computed again."""
+        """A key that is the same for the same work, so that a restart or retry reuses the result."""
         return job_key(self.log.refresh(), self.step, request.kind, arguments_name(request.arguments))

@@ -1,4 +1,4 @@
-"""Beginning and continuing a run: what is recorded first, and what must hold before anything moves."""
+"""Starting and resuming a run: what is recorded first, and what is checked before anything moves."""
 
 from __future__ import annotations
 
@@ -30,10 +30,19 @@ def start_run(
     auto_confirm: bool,
     about: RunAbout | None = None,
 ) -> str:
-    """Record the root of a new run's chain, with what was entered of it; its name.
+    """Record the first event of a new run and return the run's name.
 
-    Raises ConfigurationError when automatic confirmation is asked for on anything but a simulated rig, and
-    SpaceShortError on a disk on which nothing could be captured.
+    Args:
+        store: the data folder.
+        loaded: the protocol.
+        rig: the rig.
+        operator: the person who begins the run.
+        auto_confirm: whether confirmations are automatic, on a simulated rig.
+        about: what was entered about the run.
+
+    Raises:
+        ConfigurationError: automatic confirmation is requested on a rig that is not simulated.
+        SpaceShortError: the disk is too full to capture anything.
     """
     if auto_confirm:
         require_simulated(rig)
@@ -68,7 +77,7 @@ def start_run(
 def record_refusal(
     store: Store, run_id: str, state: RunState, action: OperatorAction, refusal: OrthocaptureError, actor: str
 ) -> None:
-    """Write down that an action was refused: in the run, or, where that has ended, in the site's record."""
+    """Record that an action was refused: in the run's chain, or in the site's if the run has ended."""
     why = str(refusal)
     if state.terminal:
         after = ActionAfterEnd(run=run_id, action=action.action, step=action.step, why=why)
@@ -78,15 +87,15 @@ def record_refusal(
 
 
 def recorded_run(store: Store, run_id: str) -> tuple[Protocol, RunStarted]:
-    """The protocol as it was when the run began, from the evidence; and the run's root."""
+    """The protocol as recorded when the run began, and the payload of the run's first event."""
     root = recorded_root(store, run_id)
     return recorded_protocol(store, root), root
 
 
 def recorded_rig(store: Store, root: RunStarted) -> Rig:
-    """The rig of a run: its file must still be what it was. Of an import the list in the evidence is all there is.
+    """The rig of a run, from its file; for an import, from the recorded list.
 
-    Raises ConfigurationError when the file has changed since the run began.
+    Raises ConfigurationError if the rig file has changed since the run began.
     """
     if root.origin == "imported":
         source = store.artefact_path(root.rig.sha256, verify=True).read_bytes()
@@ -103,21 +112,21 @@ def recorded_rig(store: Store, root: RunStarted) -> Rig:
 
 
 def time_stamp_authority(rig: Rig) -> Authority | None:
-    """Who is asked for a time stamp at the end of a run of this rig; None: nobody."""
+    """The authority that stamps the end of runs of this rig, or None."""
     section = rig.section.timestamp
     return None if section is None else Authority(section.url, rig.folder / section.certificates, section.timeout_s)
 
 
 def signature_copy(rig: Rig) -> Path | None:
-    """The second place of the log of signatures; None: there is none."""
+    """The path of the copy of the log of signatures, or None."""
     named = rig.section.signature_copy
     return None if named is None else rig.folder / named
 
 
 def require_rig_free(store: Store, rig: Path, *, run_id: str = "") -> None:
-    """Refuse to drive a run (`run_id`, or a new one) while a living process drives another with the same rig file.
+    """Raise ConfigurationError while a living process drives another run with the same rig file.
 
-    Raises ConfigurationError, naming the other run.
+    `run_id` is the run to be driven; "" for a new one.
     """
     for other in store.runs():
         if other.run_id == run_id or not store.driven(other.run_id):
@@ -125,14 +134,14 @@ def require_rig_free(store: Store, rig: Path, *, run_id: str = "") -> None:
         theirs = store.events(other.run_id)[0].payload
         if isinstance(theirs, RunStarted) and theirs.rig.original_name == str(rig):
             raise ConfigurationError(
-                f"the rig is in use: run {other.run_id} is driven with it",
+                f"the rig is in use by run {other.run_id}",
                 where=str(rig),
-                remedy="End that run, or let it come to its end; both are recorded",
+                remedy="End that run, or wait until it has ended",
             )
 
 
 def require_simulated(rig: Rig) -> None:
-    """Refuse automatic confirmation unless the rig says that it is simulated and every address is this machine's."""
+    """Raise ConfigurationError unless the rig is simulated and all its addresses are on this machine."""
     remedy = "Leave --auto-confirm out: on a real rig a person confirms every motion"
     if not rig.section.simulated:
         raise ConfigurationError(

@@ -1,4 +1,4 @@
-"""The composition root: opens the concrete drivers of a rig. Nobody else names them."""
+"""The composition root: opens the concrete drivers of a rig; no other module names them."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def _installed() -> dict[str, EntryPoint]:
 
 
 class Station:
-    """The devices of one rig, built on first use and kept open until `close`."""
+    """The devices of one rig, opened on first use and kept open until `close`."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -62,14 +62,14 @@ class Station:
         self._on_open: Callable[[str, DeviceReport], None] | None = None
         self._before_open: Callable[[str], None] | None = None
         self._leave: LeaveToMove | None = None
-        self._told: dict[str, int] = {}  # arm → seq of the leave that it was given last
+        self._told: dict[str, int] = {}  # arm → seq of the last leave to move that it was given
 
     def names(self) -> tuple[str, ...]:
-        """Devices of the rig file, in its order."""
+        """Names of the devices, in the order of the rig file."""
         return tuple(self.rig.section.devices)
 
     def device(self, name: str) -> Device:
-        """An open device. Raises ConfigurationError or DeviceError."""
+        """The device of this name, opened if need be. Raises ConfigurationError or DeviceError."""
         if name not in self._open:
             device = self._build(name)
             self._lock(name)
@@ -82,16 +82,16 @@ class Station:
         return self._open[name]
 
     def opened(self, kind: str) -> dict[str, Device]:
-        """Open devices of a kind by name."""
-        # Copied first: a reporter's thread asks while this one opens devices.
+        """The open devices of a kind, by name."""
+        # Copied first, because the reporter's thread calls this while devices are being opened.
         return {name: device for name, device in tuple(self._open.items()) if self.kind_of(name) == kind}
 
     def watch(self, on_open: Callable[[str, DeviceReport], None], before_open: Callable[[str], None]) -> None:
-        """Have every device that is opened from now on reported, by its name, before and after."""
+        """Call `before_open` with a device's name before it is opened, and `on_open` with name and report after."""
         self._on_open, self._before_open = on_open, before_open
 
     def _connect(self, name: str, device: Device) -> None:
-        """Open a device and make it ready; one that is not ready is not left open."""
+        """Open a device and prepare it; it is closed again if that fails."""
         if self._before_open is not None:
             self._before_open(name)
         try:
@@ -106,72 +106,72 @@ class Station:
             raise
 
     def close(self) -> None:
-        """Let go of every device."""
+        """Close every device and release its lock."""
         for name, device in self._open.items():
             device.close()
             self._unlock(name)
         self._open.clear()
 
-    # --- roles, as steps ask for them (service.steps.context.Devices) ---
+    # --- devices by role, for steps (service.steps.context.Devices) ---
 
     def robot(self, station: str) -> RobotArm:
-        """The arm that stands at a station."""
+        """The arm at a station, with the newest leave to move. Raises ConfigurationError or DeviceError."""
         name, leave = self.layout(station).robot, self._leave
         arm = cast(RobotArm, self.device(name))
         if leave is not None and self._told.get(name) != leave.seq:
             try:
                 arm.let_move(leave.by, leave.not_before_monotonic_s)
-            except DeviceUnavailableError:  # its link died while it had no leave of this person
+            except DeviceUnavailableError:  # its link died before this leave was given
                 self.reopen(arm)
                 arm.let_move(leave.by, leave.not_before_monotonic_s)
             self._told[name] = leave.seq
         return arm
 
     def let_move(self, leave: LeaveToMove) -> None:
-        """See service.steps.context.Devices. What opens an arm anew never renews a leave that it had."""
+        """Give all arms leave to move; each gets it once, and reopening an arm does not renew it."""
         self._leave = leave
 
     def camera(self) -> Camera:
-        """The only camera of the rig."""
+        """The rig's only camera. Raises ConfigurationError unless there is exactly one, DeviceError."""
         return cast(Camera, self.device(self._only("camera")))
 
     def scanner(self, name: str | None = None) -> Scanner:
-        """The scanner of this name, or the only one of the rig."""
+        """The scanner of this name, or the rig's only one. Raises ConfigurationError or DeviceError."""
         return cast(Scanner, self.device(name or self._only("scanner")))
 
     def ct(self) -> CtSource:
-        """The only CT folder of the rig."""
+        """The rig's only CT source. Raises ConfigurationError unless there is exactly one, DeviceError."""
         return cast(CtSource, self.device(self._only("ct")))
 
     def lightbox(self) -> Lightbox | None:
-        """The light box, if the rig has one."""
+        """The rig's light box, or None. Raises DeviceError."""
         names = self._of_kind("lightbox")
         return cast(Lightbox, self.device(names[0])) if names else None
 
     def layout(self, station: str) -> StationLayout:
-        """Where things are at a station of the rig file."""
+        """The layout of a station in the rig file. Raises ConfigurationError if there is no such station."""
         return layout_of(self.rig, station)
 
     def nominal_T_flange_camera(self) -> Transform:
-        """The camera mount's drawing."""
+        """T_flange_camera (4, 4) in metres from the mount's drawing. Raises ConfigurationError without one."""
         return self.rig.nominal_T_flange_camera()
 
     def surroundings(self) -> tuple[CollisionSection, OpticsSection | None]:
-        """What the rig file says of the arm's surroundings and of the lens."""
+        """The arm's surroundings and the lens's optics in the rig file."""
         return self.rig.section.collision, self.rig.section.optics
 
     def lens(self) -> LensSection | None:
-        """Focal length and sensor as the rig file states them."""
+        """Focal length and sensor in the rig file, or None."""
         return self.rig.section.lens
 
     def imported(self) -> ImportList | None:
-        """What was captured earlier, in a run that imports it."""
+        """The file list of an import, or None for a run that captures."""
         return self.rig.section.imported
 
     def reopen(self, device: Device) -> None:
-        """Close and open again, after a link dropped."""
+        """Close and open a device again after its link dropped. Raises DeviceError."""
         name = next(name for name, known in self._open.items() if known is device)
-        del self._open[name]  # if it stays away, whoever asks next begins from scratch
+        del self._open[name]  # if reopening fails, the next caller starts from scratch
         device.close()
         try:
             self._connect(name, device)
@@ -181,7 +181,7 @@ class Station:
         self._open[name] = device
 
     def _lock(self, name: str) -> None:
-        """What acts is driven by one process; folders may be read by many."""
+        """Lock a device that acts for this process; folders may be read by several processes."""
         spec, _ = self._spec(name)
         settings = self._config(name, spec).model_dump()
         where = next((str(settings[field]) for field in _ADDRESS_FIELDS if settings.get(field)), "")
@@ -196,7 +196,7 @@ class Station:
     # --- building ---
 
     def kind_of(self, name: str) -> str:
-        """robot, camera, scanner, ct or lightbox."""
+        """The kind of a device: robot, camera, scanner, ct or lightbox."""
         return self._spec(name)[0].kind
 
     def _of_kind(self, kind: str) -> list[str]:
@@ -240,7 +240,7 @@ class Station:
         settings = {key: value for key, value in self.rig.section.devices[name].items() if key != "driver"}
         for field in _PATH_FIELDS:
             value = settings.get(field)
-            if isinstance(value, str) and ":" not in value:  # addresses such as ptpip:… or socket://… stay
+            if isinstance(value, str) and ":" not in value:  # not for addresses such as ptpip:… or socket://…
                 settings[field] = str(self.rig.folder / value)
         try:
             return spec.config.model_validate(settings)
@@ -252,7 +252,7 @@ class Station:
 
 
 def layout_of(rig: Rig, station: str) -> StationLayout:
-    """Where things are at a station of a rig file. Raises ConfigurationError if it has no such station."""
+    """The layout of a station in a rig file. Raises ConfigurationError if there is no such station."""
     section = rig.section.stations.get(station)
     if section is None:
         known = ", ".join(rig.section.stations) or "none"
