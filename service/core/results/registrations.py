@@ -2,8 +2,8 @@
 
 The run's own registration has the smallest error on the control spheres among those that the evaluation step judged:
 it was signed, and the specimen was released on it. One that arrives later may be better; it is reported as well and
-better; it is reported beside it and does not take its place. Pages, report, exports and audit all go by this rule.
-Before the evaluation, what is shown goes by each registration's own prediction (`best_registration`).
+does not replace it. Pages, report, exports and audit all follow this rule. Before the evaluation, the registration
+with the smallest predicted error is shown (`best_registration`).
 """
 
 from __future__ import annotations
