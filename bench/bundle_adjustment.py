@@ -32,6 +32,7 @@ from service.compute.poses.colmap.convention import (
 )
 from service.compute.poses.hybrid.estimate import HybridOptions, HybridPoses, hybrid_poses
 from service.compute.registration.identity import identify
+from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import register
 from service.core.geometry import Array, align_points, apply
 from tests.support.sphere_images import RADIUS_M, REGISTRATION_M
@@ -111,9 +112,15 @@ def start_s(made: TrackedScene) -> float:
         made.outlines, REGISTRATION_M, made.camera, made.poses, radius_m=RADIUS_M, groups=one, metric=False
     )
     register(
-        made.outlines, assignments, made.poses, one, REGISTRATION_M, RADIUS_M, made.camera, estimate_scale=True,
-        pose_covariance="exact",
-    )  # fmt: skip
+        made.outlines,
+        assignments,
+        made.poses,
+        one,
+        REGISTRATION_M,
+        RADIUS_M,
+        made.camera,
+        RegistrationSettings(estimate_scale=True, pose_covariance="exact"),
+    )
     return time.process_time() - begun
 
 

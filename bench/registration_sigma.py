@@ -22,7 +22,7 @@ from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.records import Evidence, SphereOutline, outline_from_cone
 from service.compute.pipeline import detect_all, register_images
 from service.compute.registration.identity import Assignment
-from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors
+from service.compute.registration.settings import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from simulators.world import RADIUS_M, Scene
@@ -198,12 +198,21 @@ def drawn(seed: int, case: Case, views: int = 18) -> tuple[RegistrationResult, T
     spheres = scan_m + rng.normal(size=scan_m.shape) * case.spheres_m
     stated = np.diag([case.pose[0] ** 2] * 3 + [case.pose[1] ** 2] * 3)
     result = register(
-        outlines, [Assignment(m, inverse(T) @ T_world_scan) for m, T in zip(markers, given, strict=True)],
-        given, [0] * views, spheres, RADIUS_M, CAMERA,
-        pose_covariance=np.tile(stated, (views, 1, 1)) if case.told else "estimate",
-        sphere_covariance_m2=np.tile(np.eye(3) * case.spheres_m**2, (len(scan_m), 1, 1)) if case.spheres_m else None,
-        common_errors=case.common,
-    )  # fmt: skip
+        outlines,
+        [Assignment(m, inverse(T) @ T_world_scan) for m, T in zip(markers, given, strict=True)],
+        given,
+        [0] * views,
+        spheres,
+        RADIUS_M,
+        CAMERA,
+        RegistrationSettings(
+            pose_covariance=np.tile(stated, (views, 1, 1)) if case.told else "estimate",
+            sphere_covariance_m2=np.tile(np.eye(3) * case.spheres_m**2, (len(scan_m), 1, 1))
+            if case.spheres_m
+            else None,
+            common_errors=case.common,
+        ),
+    )
     return result, T_world_scan
 
 

@@ -12,6 +12,7 @@ from service.compute.camera_model import CameraModel
 from service.compute.evaluation.accuracy import evaluate, leave_one_out, radial_errors_m, true_error_m
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.identity import Assignment
+from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError
 from service.core.geometry import inverse, transform
@@ -110,7 +111,14 @@ def test_a_sphere_displaced_in_the_list_stands_out() -> None:
         for f, T in zip(found, made.T_world_camera, strict=True)
     ]
     result = register(
-        [f[0] for f in found], assignments, made.T_world_camera, [0] * 6, listed, RADIUS_M, made.camera, robust=False
+        [f[0] for f in found],
+        assignments,
+        made.T_world_camera,
+        [0] * 6,
+        listed,
+        RADIUS_M,
+        made.camera,
+        RegistrationSettings(robust=False),
     )
     radial = {s: r[0] for s, r in leave_one_out(result).per_sphere().items()}
     assert max(radial, key=lambda s: radial[s]) == 4

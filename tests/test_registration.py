@@ -14,6 +14,7 @@ from service.compute.markers.cones import cone_of_sphere
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost, PointCost, cone_residuals, residuals, residuals_and_derivative
 from service.compute.registration.identity import Assignment
+from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError
 from service.core.geometry import Transform, apply, inverse, rotation_angle_rad, transform
@@ -45,7 +46,14 @@ def solve(
 ) -> RegistrationResult:
     n = len(outlines)
     return register(
-        outlines, assignments, made.T_world_camera, [0] * n, REGISTRATION_M, RADIUS_M, made.camera, cost=cost
+        outlines,
+        assignments,
+        made.T_world_camera,
+        [0] * n,
+        REGISTRATION_M,
+        RADIUS_M,
+        made.camera,
+        RegistrationSettings(cost=cost),
     )
 
 
@@ -116,7 +124,16 @@ def test_scale_is_solved_jointly(seed: int, scale: float) -> None:
     poses = np.array(made.T_world_camera)
     poses[:, :3, 3] /= scale
     start = [Assignment(a.markers, a.T_camera_scan, scale * 1.01) for a in assignments]
-    result = register(outlines, start, poses, [0] * 5, REGISTRATION_M, RADIUS_M, made.camera, estimate_scale=True)
+    result = register(
+        outlines,
+        start,
+        poses,
+        [0] * 5,
+        REGISTRATION_M,
+        RADIUS_M,
+        made.camera,
+        RegistrationSettings(estimate_scale=True),
+    )
     assert result.scale == pytest.approx(scale, rel=1e-6)
     assert result.covariance.shape == (7, 7)
     assert np.allclose(result.T_world_scan, made.T_world_scan, atol=1e-6)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.compute.registration.identity import Assignment, identify
-from service.compute.registration.problem import CommonErrors
+from service.compute.registration.settings import CommonErrors, RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import DataError
 from service.core.geometry import Array, apply, inverse, skew, transform
@@ -35,10 +35,19 @@ def solved(
         Assignment(dict(enumerate(f[1])), inverse(T) @ made.T_world_scan) for f, T in zip(found, poses, strict=True)
     ]
     return register(
-        [f[0] for f in found], assignments, poses, [0] * n, spheres, RADIUS_M, made.camera,
-        pose_covariance="estimate" if any(pose_sigma) else "exact", common_errors=NOTHING_COMMON,
-        sphere_covariance_m2=np.tile(np.eye(3) * sphere_sigma_m**2, (10, 1, 1)) if sphere_sigma_m else None,
-    )  # fmt: skip
+        [f[0] for f in found],
+        assignments,
+        poses,
+        [0] * n,
+        spheres,
+        RADIUS_M,
+        made.camera,
+        RegistrationSettings(
+            pose_covariance="estimate" if any(pose_sigma) else "exact",
+            common_errors=NOTHING_COMMON,
+            sphere_covariance_m2=np.tile(np.eye(3) * sphere_sigma_m**2, (10, 1, 1)) if sphere_sigma_m else None,
+        ),
+    )
 
 
 def chi2(result: RegistrationResult, made: Scene) -> float:
@@ -117,7 +126,7 @@ def test_what_no_view_can_tell_remains() -> None:
                    for f, T in zip(found, made.T_world_camera, strict=True)]  # fmt: skip
     result = register(
         [f[0] for f in found], assignments, made.T_world_camera, [0] * n, REGISTRATION_M, RADIUS_M, made.camera,
-        common_errors=CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=0.1),
+        RegistrationSettings(common_errors=CommonErrors(shift_px=1e-5, growth_px=1e-5, light_px=0.1)),
     )  # fmt: skip
     seen = np.concatenate([made.centres_camera(i, REGISTRATION_M) for i in range(n)])
     distance = float(np.mean(np.linalg.norm(seen, axis=1)))
@@ -133,7 +142,7 @@ def test_covariances_of_the_wrong_shape_are_refused() -> None:
     with pytest.raises(DataError, match="shape"):
         register(
             [f[0] for f in found], assignments, made.T_world_camera, [0] * 4, REGISTRATION_M, RADIUS_M, made.camera,
-            pose_covariance=np.zeros((3, 6, 6)),
+            RegistrationSettings(pose_covariance=np.zeros((3, 6, 6))),
         )  # fmt: skip
 
 
@@ -174,7 +183,7 @@ def test_exact_outlines_and_poses_of_another_unit(seed: int, with_scale: bool) -
     assignments = [Assignment(a.markers, a.T_camera_scan, a.scale if with_scale else None) for a in found]
     result = register(
         made.outlines, assignments, made.poses, [0] * len(made.poses), REGISTRATION_M, RADIUS_M, made.camera,
-        estimate_scale=True,
+        RegistrationSettings(estimate_scale=True),
     )  # fmt: skip
     assert result.scale == pytest.approx(made.scale, rel=1e-3)
     assert result.pose_sigma[0] < 1e-3

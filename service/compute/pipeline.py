@@ -16,6 +16,7 @@ from service.compute.markers.search.image_files import detect_all, locate_outlin
 from service.compute.registration.cost import Cost
 from service.compute.registration.identity import Assignment, identify
 from service.compute.registration.pairing import CONTROL_GATE, paired
+from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import OutlineResidual, RegistrationResult, register
 from service.core.errors import DataError
 from service.core.geometry import Array, Transform, inverse
@@ -168,10 +169,21 @@ def register_images(
             radius_m=radius_m, groups=stations, metric=not estimate_scale, names=labels,
         )  # fmt: skip
     registration = register(
-        outlines, assignments, poses, stations, registration_centres_m, radius_m, camera,
-        estimate_scale=estimate_scale, cost=cost, pose_covariance=pose_covariance,
-        sphere_covariance_m2=sphere_covariance_m2, intrinsics_covariance=intrinsics_covariance,
-    )  # fmt: skip
+        outlines,
+        assignments,
+        poses,
+        stations,
+        registration_centres_m,
+        radius_m,
+        camera,
+        RegistrationSettings(
+            estimate_scale=estimate_scale,
+            cost=cost,
+            pose_covariance=pose_covariance,
+            sphere_covariance_m2=sphere_covariance_m2,
+            intrinsics_covariance=intrinsics_covariance,
+        ),
+    )
     controls = np.zeros((0, 3)) if control_centres_m is None else np.asarray(control_centres_m, dtype=np.float64)
     control = _find_controls(outlines, assignments, registration, controls, radius_m, camera)
     evaluation = None

@@ -7,42 +7,18 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from service.compute.camera_model import CameraModel
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.cost import Cost, PointCost, cone_residuals, residuals_and_derivative
 from service.compute.registration.identity import Assignment
+from service.compute.registration.settings import RegistrationSettings
 from service.core.errors import ComputeError
 from service.core.geometry import Array, skew
 
 _CHUNK = 500  # outlines whose points are expanded at a time
-
-
-@dataclass(frozen=True, slots=True)
-class CommonErrors:
-    """Standard deviations, in px, of errors shared by all outlines of a capture.
-
-    `shift_px`: in x and in y of the image; `growth_px`: of the radius. Views from different sides separate both from
-    the registration, so they are estimated. `light_px`: displacement of all spheres in one direction of space, per
-    coordinate, at their mean distance: under light from one side, the detected edge is biased differently on the lit
-    and on the dark limb. No view separates it from a displacement of the scan, so this part of the predicted error
-    remains however many images are taken.
-    """
-
-    shift_px: float
-    growth_px: float
-    light_px: float
-
-
-# Under light from one side, the detected edge is biased differently on the lit and on the dark limb. The mean of this
-# bias around the outline is growth, the difference between the sides is light; both are similar in size. Truth on ten
-# rendered scenes with outlines of 60 px radius: growth -0.020…-0.031 px, light 0.016 px rms per coordinate, shift
-# 0.003 px in x and 0.008 px in y rms; on three with 150 px radius: growth -0.008 px, light 0.017 px
-# (bench/accuracy.py, bench/registration_sigma.py). Other lights, colours and another renderer (bench/outlines.py)
-# gave growth of -0.04 px and displacements of single images of 0.05 px rms, so light is set above what the first
-# renderer requires.
-EXPECTED_COMMON_ERRORS = CommonErrors(shift_px=0.015, growth_px=0.03, light_px=0.02)
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,11 +140,7 @@ def assemble(
     centres_scan_m: Array,
     radius_m: float,
     camera: CameraModel,
-    *,
-    with_scale: bool,
-    sphere_covariance_m2: Array | None,
-    common_errors: CommonErrors | None,
-    intrinsics_covariance: Array | None,
+    settings: RegistrationSettings,
 ) -> Problem:
     """Assemble the problem from the arguments of `register`.
 
@@ -186,15 +158,7 @@ def assemble(
     order = sorted(set(used_groups), key=lambda g: (g != first, g))
     f = 0.5 * (camera.fx + camera.fy)
     half = [outlines[i][j].cone.half_angle_rad for i, j, _ in members]
-    e = common_errors or EXPECTED_COMMON_ERRORS
-    sigma = np.maximum([e.light_px, e.light_px, e.light_px, e.shift_px, e.shift_px, e.growth_px], 1e-6)
-    prior = np.diag(1 / sigma**2)
-    n_intrinsics = 0
-    if intrinsics_covariance is not None:
-        n_intrinsics = len(intrinsics_covariance)
-        information = np.zeros((6 + n_intrinsics, 6 + n_intrinsics))
-        information[:6, :6], information[6:, 6:] = prior, np.linalg.inv(intrinsics_covariance)
-        prior = information
+    prior = _common_prior(settings)
     empty = Problem(
         members=[],
         image=np.zeros(0, dtype=np.int64),
@@ -213,13 +177,23 @@ def assemble(
         whiten=np.zeros((0, 3, 3)),
         points=[],
         point_sigma=np.zeros(0),
-        common=np.zeros((0, 3, 3 + n_intrinsics)),
+        common=np.zeros((0, 3, len(prior) - 3)),
         common_prior=prior,
-        sphere_prior=None if sphere_covariance_m2 is None else _block_inverse(sphere_covariance_m2),
+        sphere_prior=None if settings.sphere_covariance_m2 is None else _block_inverse(settings.sphere_covariance_m2),
         light_unit_m=float(np.mean(radius_m / np.sin(half))) / f,
-        with_scale=with_scale,
+        with_scale=settings.estimate_scale,
     )
     return with_outlines(empty, outlines, members)
+
+
+def _common_prior(settings: RegistrationSettings) -> Array:
+    """Information (6 + k, 6 + k) of the errors that all outlines share: light, shift and growth, then intrinsics."""
+    e = settings.common_errors
+    sigma = np.maximum([e.light_px, e.light_px, e.light_px, e.shift_px, e.shift_px, e.growth_px], 1e-6)
+    common = np.diag(1 / sigma**2)
+    if settings.intrinsics_covariance is None:
+        return common
+    return np.asarray(block_diag(common, np.linalg.inv(settings.intrinsics_covariance)), dtype=np.float64)
 
 
 def with_outlines(

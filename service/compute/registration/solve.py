@@ -23,8 +23,9 @@ from service.compute.registration.normal_equations import (
     pose_errors,
     solve_symmetric,
 )
-from service.compute.registration.problem import CommonErrors, Linearised, Problem, State, assemble, linearise
+from service.compute.registration.problem import Linearised, Problem, State, assemble, linearise
 from service.compute.registration.result import OutlineResidual, RegistrationResult, Solution
+from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.variance_components import (
     PoseNoise,
     estimate,
@@ -37,8 +38,9 @@ from service.core.geometry import Array, Transform, apply, inverse, transform
 
 _ROUNDS = 8
 _STEPS = 25
+_DEFAULT = RegistrationSettings()
 
-__all__ = ["CommonErrors", "OutlineResidual", "RegistrationResult", "register"]
+__all__ = ["OutlineResidual", "RegistrationResult", "register"]
 
 
 def register(
@@ -49,14 +51,7 @@ def register(
     centres_scan_m: Array,
     radius_m: float,
     camera: CameraModel,
-    *,
-    estimate_scale: bool = False,
-    cost: Cost = "cone",
-    robust: bool = True,
-    pose_covariance: Array | Literal["estimate", "exact"] = "estimate",
-    sphere_covariance_m2: Array | None = None,
-    intrinsics_covariance: Array | None = None,
-    common_errors: CommonErrors | None = None,
+    settings: RegistrationSettings = _DEFAULT,
 ) -> RegistrationResult:
     """Estimate T_world_scan (and scale, and every station's base) by Gauss–Newton over all outlines.
 
@@ -73,31 +68,18 @@ def register(
         centres_scan_m: (M, 3) sphere centres in the scan frame, metres.
         radius_m: radius of the spheres.
         camera: intrinsics of all images.
-        estimate_scale: whether to estimate a scale, for camera positions that are not metric (structure from motion).
-        cost: `cone` uses the three parameters and their covariance; `sampson` the points' geometric distances;
-            `algebraic` is the paper's plain x^T E x.
-        robust: whether to weight outlines robustly and exclude outliers.
-        pose_covariance: (N, 6, 6) of each pose's (position in the unit of the poses, rotation vector in radians) in
-            the axes of its base, independent between images; "estimate": isotropic, estimated from the residuals;
-            "exact": no pose errors.
-        sphere_covariance_m2: (M, 3, 3) of the centres; None takes them as exact.
-        intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for poses whose
-            errors do not depend on the intrinsics'. None leaves them to the error budget.
-        common_errors: prior sizes of errors shared by all outlines of a capture; None: `EXPECTED_COMMON_ERRORS`.
+        settings: what is estimated, by which residual, and how well the inputs are known.
 
     Raises:
         ComputeError: the outlines do not determine the answer, or no convergence.
         DataError: a covariance has the wrong shape.
     """
-    problem = assemble(
-        outlines, assignments, poses, groups, centres_scan_m, radius_m, camera,
-        with_scale=estimate_scale, sphere_covariance_m2=sphere_covariance_m2, common_errors=common_errors,
-        intrinsics_covariance=intrinsics_covariance,
-    )  # fmt: skip
+    problem = assemble(outlines, assignments, poses, groups, centres_scan_m, radius_m, camera, settings)
     _require(problem, np.ones(len(problem.members), dtype=bool))
     start = _start(problem, assignments, poses, np.asarray(groups))
-    noise = _noise(problem, pose_covariance, start.scale)
-    return _result(_solve(problem, start, noise, robust=robust, cost=cost), np.asarray(groups), cost)
+    noise = _noise(problem, settings.pose_covariance, start.scale)
+    solution = _solve(problem, start, noise, robust=settings.robust, cost=settings.cost)
+    return _result(solution, np.asarray(groups), settings.cost)
 
 
 def _noise(problem: Problem, given: Array | Literal["estimate", "exact"], scale: float) -> PoseNoise:

@@ -35,6 +35,7 @@ from service.compute.markers.search.predicted import (
 )
 from service.compute.registration.identity import Assignment, identify
 from service.compute.registration.pairing import paired
+from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import register
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, apply, inverse
@@ -290,7 +291,7 @@ def _provisional(
             )
             solved = register(
                 outlines, assignments, poses, stations, spheres[:n_registration], radius_m, camera,
-                estimate_scale=not metric,
+                RegistrationSettings(estimate_scale=not metric),
             )  # fmt: skip
         except ComputeError:
             continue  # more anchors may help; if not, the search of all images reports the error

@@ -22,7 +22,7 @@ from service.compute.poses.hybrid.bundle import Data, Sigmas, SphereSightings, S
 from service.compute.poses.hybrid.camera_error import camera_share
 from service.compute.poses.sfm.tracks import Tracks
 from service.compute.registration.identity import identify
-from service.compute.registration.problem import EXPECTED_COMMON_ERRORS, CommonErrors
+from service.compute.registration.settings import EXPECTED_COMMON_ERRORS, CommonErrors, RegistrationSettings
 from service.compute.registration.solve import RegistrationResult, register
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, Transform, apply, inverse, skew, transform
@@ -203,8 +203,7 @@ def hybrid_poses(
         centres_scan_m,
         radius_m,
         camera,
-        estimate_scale=True,
-        pose_covariance="exact",
+        RegistrationSettings(estimate_scale=True, pose_covariance="exact"),
     )
     used = tracks.thinned(settings.most_observations)
     sightings = _sightings(outlines, start)

@@ -1,0 +1,62 @@
+"""How a registration is solved, and how well its inputs are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from service.compute.registration.cost import Cost
+from service.core.geometry import Array
+
+
+@dataclass(frozen=True, slots=True)
+class CommonErrors:
+    """Standard deviations, in px, of errors shared by all outlines of a capture.
+
+    `shift_px`: in x and in y of the image; `growth_px`: of the radius. Views from different sides separate both from
+    the registration, so they are estimated. `light_px`: displacement of all spheres in one direction of space, per
+    coordinate, at their mean distance: under light from one side, the detected edge is biased differently on the lit
+    and on the dark limb. No view separates it from a displacement of the scan, so this part of the predicted error
+    remains however many images are taken.
+    """
+
+    shift_px: float
+    growth_px: float
+    light_px: float
+
+
+# Under light from one side, the detected edge is biased differently on the lit and on the dark limb. The mean of this
+# bias around the outline is growth, the difference between the sides is light; both are similar in size. Truth on ten
+# rendered scenes with outlines of 60 px radius: growth -0.020…-0.031 px, light 0.016 px rms per coordinate, shift
+# 0.003 px in x and 0.008 px in y rms; on three with 150 px radius: growth -0.008 px, light 0.017 px
+# (bench/accuracy.py, bench/registration_sigma.py). Other lights, colours and another renderer (bench/outlines.py)
+# gave growth of -0.04 px and displacements of single images of 0.05 px rms, so light is set above what the first
+# renderer requires.
+EXPECTED_COMMON_ERRORS = CommonErrors(shift_px=0.015, growth_px=0.03, light_px=0.02)
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationSettings:
+    """What is estimated, by which residual, and the uncertainty of what is given.
+
+    Attributes:
+        estimate_scale: whether to estimate a scale, for camera positions that are not metric (structure from motion).
+        cost: `cone` uses the three parameters and their covariance; `sampson` the points' geometric distances;
+            `algebraic` is the paper's plain x^T E x.
+        robust: whether to weight outlines robustly and exclude outliers.
+        pose_covariance: (N, 6, 6) of each pose's (position in the unit of the poses, rotation vector in radians) in
+            the axes of its base, independent between images; "estimate": isotropic, estimated from the residuals;
+            "exact": no pose errors.
+        sphere_covariance_m2: (M, 3, 3) of the centres; None takes them as exact.
+        intrinsics_covariance: (4, 4) of fx, fy, cx, cy or (8, 8) of these and k1, k2, p1, p2; only for poses whose
+            errors do not depend on the intrinsics'. None leaves them to the error budget.
+        common_errors: prior sizes of errors shared by all outlines of a capture.
+    """
+
+    estimate_scale: bool = False
+    cost: Cost = "cone"
+    robust: bool = True
+    pose_covariance: Array | Literal["estimate", "exact"] = field(default="estimate", repr=False)
+    sphere_covariance_m2: Array | None = field(default=None, repr=False)
+    intrinsics_covariance: Array | None = field(default=None, repr=False)
+    common_errors: CommonErrors = EXPECTED_COMMON_ERRORS
