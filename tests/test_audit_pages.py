@@ -17,6 +17,7 @@ from service.audit.background.incremental import Progress
 from service.audit.overview import findings, first_page
 from service.audit.overview.corrections import correct
 from service.audit.overview.digest import Digest, digests
+from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.provenance.drawing import draw
 from service.audit.provenance.graph import graphs, origin
 from service.audit.record import artefact_queries, queries
@@ -331,7 +332,7 @@ def test_correction_keeps_the_original_and_reads_the_old_value_itself(tmp_path: 
 
 def test_signature_tells_what_it_binds_and_whether_that_was_altered(large: Path, store: Store, run: str) -> None:
     with store.database.reading() as connection:
-        signed = findings.signatures(connection, run, digest_of(store, run))
+        signed = signatures_of(connection, run, digest_of(store, run))
     assert signed
     for signature in signed:
         assert signature.bound is not None
@@ -342,11 +343,11 @@ def test_signature_tells_what_it_binds_and_whether_that_was_altered(large: Path,
 def test_altered_content_below_a_signature_shows(tmp_path: Path) -> None:
     run = record_run(tmp_path)
     with Store.open(tmp_path / "data") as store, store.database.reading() as connection:
-        bound = findings.signatures(connection, run, None)[-1].bound
+        bound = signatures_of(connection, run, None)[-1].bound
     assert bound is not None
     tamper(tmp_path / "data", f"UPDATE events SET actor = 'Eve' WHERE seq = {bound.seq}")
     with Store.open(tmp_path / "data") as store, store.database.reading() as connection:
-        signature = findings.signatures(connection, run, None)[-1]
+        signature = signatures_of(connection, run, None)[-1]
     assert not signature.unaltered
     assert signature.stands is None
 

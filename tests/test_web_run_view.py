@@ -28,7 +28,8 @@ from service.steps import params_models
 from service.web.page.run_frame import robot_banner
 from service.web.page.run_words import limit, measure_name, planned_views
 from service.web.run.figures import duration, view_intervals_s
-from service.web.run.view import RunView, Viewer, run_view
+from service.web.run.view import run_view
+from service.web.run.view_records import RunView, Viewer
 from tests.support.core import Log
 
 PROTOCOLS = Path(__file__).parents[1] / "protocols"

@@ -1,12 +1,17 @@
-"""What a run's devices said when they were opened, and which camera body its photographs state."""
+"""The devices of a run: camera bodies, clocks, and the starts of the program that drove them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 from sqlalchemy import Connection, text
 
-from service.audit.record.queries import EventRow, plain
+from service.audit.record.queries import (
+    EventRow,
+    plain,
+    read_rows,
+)
 from service.core.equipment.camera_bodies import Bodies, bodies_of
 
 _LOOKED_AT = 500  # photographs, the newest: one that states another body is an image that departs, which is judged
@@ -28,3 +33,78 @@ def bodies_of_run(connection: Connection, run_id: str, opened: Iterable[EventRow
         for row in opened
     )
     return bodies_of(identities, (str(row.body or "") for row in rows))
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSeries:
+    """How a device's clock stood against the host's over a step."""
+
+    step: str
+    captures: int
+    first_s: float
+    last_s: float
+    smallest_s: float
+    largest_s: float
+    over_s: float  # host time between the first and the last
+
+    @property
+    def drift_s(self) -> float:
+        """Change from the first capture to the last."""
+        return self.last_s - self.first_s
+
+
+def clock_offsets(connection: Connection, run_id: str) -> list[ClockSeries]:
+    """The robot controller's clock minus the host's monotonic one, as every capture recorded it."""
+    rows = connection.execute(
+        text(
+            "WITH c AS (SELECT i.step, i.seq, e.monotonic_s AS at, json_extract(e.payload, '$.clock_offset_s') AS o "
+            "FROM event_index AS i JOIN events AS e ON e.run_id = i.run_id AND e.seq = i.seq "
+            "WHERE i.run_id = :run AND i.kind = 'viewpoint_captured') "
+            "SELECT step, count(*) AS n, min(seq) AS first, max(seq) AS last, min(o) AS low, max(o) AS high, "
+            "max(at) - min(at) AS over FROM c GROUP BY step ORDER BY 3"
+        ),
+        {"run": plain(run_id)},
+    ).all()
+    ends = [row.first for row in rows] + [row.last for row in rows]
+    offsets = {
+        event.seq: float(event.payload.get("clock_offset_s") or 0.0) for event in read_rows(connection, run_id, ends)
+    }
+    return [
+        ClockSeries(
+            row.step or "",
+            row.n,
+            offsets[row.first],
+            offsets[row.last],
+            float(row.low or 0.0),
+            float(row.high or 0.0),
+            float(row.over or 0.0),
+        )
+        for row in rows
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """One start of the runner's process."""
+
+    row: EventRow
+    software: Mapping[str, str]
+    changed: Mapping[str, tuple[str, str]]  # against the session before it: distribution → before, now
+
+
+def sessions(rows: Sequence[EventRow]) -> list[Session]:
+    """The starts of a runner, each compared with the one before."""
+    found: list[Session] = []
+    before: dict[str, str] | None = None
+    for row in rows:
+        software = {str(name): str(version) for name, version in dict(row.payload.get("software") or {}).items()}
+        names = sorted({*software, *before}) if before is not None else []
+        earlier = before or {}
+        changed = {
+            name: (earlier.get(name, ""), software.get(name, ""))
+            for name in names
+            if earlier.get(name) != software.get(name)
+        }
+        found.append(Session(row, software, changed))
+        before = software
+    return found

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, Response
 
 from service.audit.overview import findings
-from service.audit.overview.devices import bodies_of_run
+from service.audit.overview.devices import bodies_of_run, clock_offsets, sessions
 from service.audit.record import queries
 from service.core.equipment.clocks import clock_of, clock_readings, offset_told
 from service.web.audit.frame import CurrentAudit, audit_frame
@@ -27,10 +27,10 @@ def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response
     frame = audit_frame(audit, run_id, "/devices")
     with audit.site.store.database.reading() as connection:
         opened = findings.events_of(connection, run_id, "device_opened", newest=True)
-        sessions = findings.events_of(connection, run_id, "session_started", newest=True)
+        started = findings.events_of(connection, run_id, "session_started", newest=True)
         troubles = findings.events_of(connection, run_id, "device_trouble", newest=True)
         trouble_count = queries.count_of_kind(connection, run_id, "device_trouble")
-        clocks = findings.clock_offsets(connection, run_id)
+        clocks = clock_offsets(connection, run_id)
         bodies = bodies_of_run(connection, run_id, opened)
     readings = clock_readings(audit.site.run(run_id).events)
     return render(
@@ -41,7 +41,7 @@ def devices_page(request: Request, audit: CurrentAudit, run_id: str) -> Response
         bodies=bodies,
         offset_told=offset_told,
         clock_of=clock_of,
-        sessions=findings.sessions(sessions),
+        sessions=sessions(started),
         troubles=troubles[-50:],
         trouble_count=trouble_count,
         clocks=clocks,

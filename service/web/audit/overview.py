@@ -14,6 +14,7 @@ from service.audit.overview.devices import bodies_of_run
 from service.audit.overview.digest import Digest
 from service.audit.overview.first_page import GROUPS
 from service.audit.overview.shots import failed_exposures_of, shots_of, together
+from service.audit.overview.signatures import signatures as signatures_of
 from service.audit.record import queries
 from service.run_record import results_to_come
 from service.steps.time_left import Left
@@ -50,7 +51,7 @@ def run_page(request: Request, audit: CurrentAudit, run_id: str) -> Response:
         devices = findings.events_of(connection, run_id, "device_opened", newest=True)
         sessions = findings.events_of(connection, run_id, "session_started", newest=True)
         exports = findings.events_of(connection, run_id, "evidence_exported", newest=True)
-        signatures = findings.signatures(connection, run_id, known)
+        signatures = signatures_of(connection, run_id, known)
         failures = failed_exposures_of(connection, run_id)
         bodies = bodies_of_run(connection, run_id, devices)
     listed = first_page.findings(known) if known else []

@@ -6,7 +6,8 @@ from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
 from service.audit.background.incremental import Progress
-from service.audit.overview import findings, first_page
+from service.audit.overview import first_page
+from service.audit.overview.signatures import signatures
 from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render
 from service.web.security.guards import SignedInPerson, requires
@@ -24,7 +25,7 @@ def signatures_page(request: Request, audit: CurrentAudit, run_id: str) -> Respo
     digest = audit.digests.get(run_id)
     known = first_page.known(digest)
     with audit.site.store.database.reading() as connection:
-        found = findings.signatures(connection, run_id, known)
+        found = signatures(connection, run_id, known)
     return render(
         request,
         "audit/signatures.html.j2",

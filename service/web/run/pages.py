@@ -23,7 +23,8 @@ from service.store.files.space_used import forecast_of
 from service.web.page.rendering import part_names, render
 from service.web.page.run_frame import run_frame
 from service.web.run.notes import notes_of
-from service.web.run.view import Viewer, run_view
+from service.web.run.view import run_view
+from service.web.run.view_records import Viewer
 from service.web.security.guards import SignedInPerson, requires
 from service.web.site import CurrentSite, Site
 

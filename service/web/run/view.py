@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
-from typing import Protocol as Interface
+from dataclasses import replace
 
 from service.core.equipment.clocks import clock_readings
 from service.core.equipment.disk_space import Forecast
 from service.core.gates.acceptance import acceptors, demanded_role, failed_gates
-from service.core.gates.dependence import AcceptedGate, dependent_steps, depends_on
+from service.core.gates.dependence import dependent_steps, depends_on
 from service.core.protocol.models import Protocol, Step
-from service.core.records.events import Event, OperatorVerb
+from service.core.records.events import OperatorVerb
 from service.core.recovery.ways_on import WayOn, takes_words
 from service.core.results.registrations import evaluated
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.run.decide import AskOperator, decide
-from service.core.run.state import Deviation, RunState
+from service.core.run.state import RunState
 from service.monitor.snapshot import STOPS, Snapshot
 from service.web.page.run_words import (
     count,
@@ -33,200 +31,21 @@ from service.web.page.run_words import (
     will_happen,
 )
 from service.web.record.board_images import unused_count
-from service.web.run.figures import GateLine, Progress, Reading, capture_progress, gate_lines, readings
-
-
-class RecordOfRun(Interface):
-    """A run's record: service.run_record.RunRecord."""
-
-    @property
-    def protocol(self) -> Protocol:
-        """As it was when the run began."""
-        ...
-
-    @property
-    def events(self) -> Sequence[Event]:
-        """All of them, in order."""
-        ...
-
-    @property
-    def state(self) -> RunState:
-        """Their fold."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Viewer:
-    """Who looks, and how they stand to the control of this run."""
-
-    may_operate: bool = False
-    may_take_over: bool = False
-    in_control: bool = False  # this screen
-    holder: str = ""  # name of whoever has control; "" for nobody
-    holder_screen: str = ""
-    mine_elsewhere: bool = False  # the same person, on another screen
-    asked_by: str = ""  # who asks for control
-    asked_by_me: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class StepLine:
-    """A step in the list at the side."""
-
-    id: str
-    title: str
-    word: str
-    tone: str
-    icon: str
-    shown: bool
-    reachable: bool  # something of it can be looked at
-
-
-@dataclass(frozen=True, slots=True)
-class ChecklistItem:
-    """An item of the checklist."""
-
-    text: str
-    ticked: bool
-
-
-@dataclass(frozen=True, slots=True)
-class StepView:
-    """The step on the screen."""
-
-    id: str
-    title: str
-    number: int
-    attempt: int
-    kind: str
-    why: str
-    instructions: str
-    drawing: str
-    picture: str  # SHA-256 of the photograph on which the step shows what it found; "" without one
-    station: str
-    status: str
-    current: bool
-    checklist: tuple[ChecklistItem, ...]
-    open_items: int
-    gates: tuple[GateLine, ...]
-    warning: str  # of an irreversible step that has not been done
-    requires: tuple[tuple[str, bool], ...]
-    captured: int
-    unused: int  # of them, board images without use
-    planned: int
-    signed_by: str
-    skipped: bool
-    started_utc: str
-    ended_utc: str
-    table: Sequence[Mapping[str, Any]]  # of an evaluation
-    depends: tuple[AcceptedGate, ...]  # what was accepted outside its limits and this rests on
-
-
-@dataclass(frozen=True, slots=True)
-class MainAction:
-    """The one large target."""
-
-    verb: str  # an operator's verb, or go-on
-    text: str
-    note: str = ""
-    hold: bool = False
-    enabled: bool = True
-    why_not: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Redo:
-    """A step that can be done again, and what that resets."""
-
-    step: str
-    title: str
-    resets: tuple[str, ...]
-    images: int  # whose evidence stays, but which no longer count
-
-
-@dataclass(frozen=True, slots=True)
-class Signature:
-    """What a signature binds."""
-
-    sha256: str
-    title: str
-    figures: tuple[tuple[str, tuple[str, ...]], ...]  # by step
-    meaning: str  # offered; the person may change it
-
-
-@dataclass(frozen=True, slots=True)
-class Acceptance:
-    """What somebody could accept outside its limits now, and who."""
-
-    sha256: str  # of the figures that the acceptance binds
-    title: str
-    figures: tuple[str, ...]
-    role: str
-    another: bool  # neither who began the run nor who confirmed the step
-    affects: tuple[str, ...]  # later steps that will say that they rest on it
-
-
-@dataclass(frozen=True, slots=True)
-class Trouble:
-    """A step that needs a decision."""
-
-    title: str
-    short: str  # why it is stopped, and what is recommended
-    what: str
-    safe: str
-    advice: str
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """A choice of what to do now."""
-
-    verb: OperatorVerb
-    step: str
-    words: str
-    takes: str
-    loses: str
-    why_not: str  # "" where it can be taken
-    button: str
-
-
-@dataclass(frozen=True, slots=True)
-class RunView:
-    """The run page."""
-
-    run_id: str
-    title: str
-    seq: int
-    status: str  # active, paused, completed, aborted
-    mode: str  # ask, sign, recover, work, paused, died, ended
-    headline: str  # news for screen readers when it changes
-    current: str
-    attempt: int
-    steps: tuple[StepLine, ...]
-    passed: int
-    shown: StepView
-    main: MainAction | None
-    options: tuple[OperatorVerb, ...]  # besides the main one
-    can_pause: bool
-    asked_anew: bool  # the program that drove the robot ended: nothing moves before a fresh confirmation
-    standing: bool  # paused, and the robot stands still
-    viewer: Viewer
-    trouble: Trouble | None
-    ways: tuple[Choice, ...]  # where it is stopped, the recommended one first
-    signature: Signature | None
-    acceptance: Acceptance | None
-    redos: tuple[Redo, ...]
-    skip_overrides: bool  # a skip now would set aside figures outside of their limits
-    progress: Progress
-    readings: tuple[Reading, ...]
-    working: tuple[str, int, int]
-    deviations: tuple[Deviation, ...]
-    news: tuple[tuple[str, str], ...]
-    to_come: tuple[str, ...]  # results that are still being computed, with the time left
-    pedal_armed: bool
-    stop_reason: str
-    operator: str
-    released_by: str
+from service.web.run.figures import capture_progress, gate_lines, readings
+from service.web.run.view_records import (
+    Acceptance,
+    ChecklistItem,
+    Choice,
+    MainAction,
+    RecordOfRun,
+    Redo,
+    RunView,
+    Signature,
+    StepLine,
+    StepView,
+    Trouble,
+    Viewer,
+)
 
 
 def run_view(
