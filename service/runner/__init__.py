@@ -1,1 +1,1 @@
-"""Drives a run: the loop, the work of a step, and apart from them lease, foot pedal, disk and signatures."""
+"""Drives a run: the loop, the execution of a step, and separately lease, foot pedal, disk, clocks and signatures."""

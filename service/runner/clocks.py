@@ -1,4 +1,4 @@
-"""Tells the operator, once a session, which clock is beyond its limit."""
+"""Tells the operator, once per session, of each clock beyond its limit."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from service.run_record import RunFollower
 
 @dataclass(frozen=True)
 class ClockWatch:
-    """Compares the clocks as the record has them."""
+    """Checks the recorded clock offsets and tells of those beyond their limits."""
 
     follower: RunFollower
     tell: Callable[[str], None]
     _told: set[str] = field(init=False, default_factory=set[str])
 
     def look(self) -> None:
-        """Tell of each clock that is beyond its limit and was not told of before."""
+        """Tell of each clock beyond its limit that has not been told of yet."""
         for reading in clock_readings(self.follower.now().events):
             if reading.within is False and reading.device not in self._told:
                 self._told.add(reading.device)

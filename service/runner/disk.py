@@ -1,4 +1,4 @@
-"""Follows the room on the disk while a run writes, and stops it before the disk is full."""
+"""Watches free disk space while a run writes, and stops the run before the disk is full."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from service.runner.held_run import HeldRun
 from service.store.files.space_used import forecast_of, require_space
 
 _FORECAST_EVERY_S = 30.0
-_LOOK_EVERY_S = 2.0  # in which a camera fills no more than the room that is kept
+_LOOK_EVERY_S = 2.0  # in this time a camera cannot fill the space that is kept free
 
 
 @dataclass
 class DiskWatch:
-    """Forecasts whether the disk will do for the rest of the run; records and tells when that becomes worse."""
+    """Forecasts whether the disk has room for the rest of the run; records and tells when the forecast gets worse."""
 
     run: HeldRun
     protocol: Protocol
@@ -30,7 +30,7 @@ class DiskWatch:
     _told: Verdict = field(init=False, default="enough")
 
     def require(self) -> None:
-        """Look again when it is time to. Raises SpaceShortError when the run must stop."""
+        """Check the disk if the last check is old enough. Raises SpaceShortError if the run must stop."""
         now_s = self.monotonic_s()
         if now_s < self._due_s:
             return
@@ -43,7 +43,7 @@ class DiskWatch:
         self._due_s = now_s + _LOOK_EVERY_S
 
     def forecast(self) -> Forecast:
-        """The forecast as of now, recorded and told where it is worse than the one before."""
+        """Make a forecast; record and tell it if it is worse than the one before."""
         state = self.run.refresh()
         found = forecast_of(self.run.store, self.protocol, state)
         worse = found.verdict not in ("enough", self._told)

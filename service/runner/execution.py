@@ -1,4 +1,4 @@
-"""The work of one step: its context, its outcome or its failure in the record."""
+"""Executes one step: makes its context, and records its outcome or failure."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.runner.operator import Operator
 from service.steps import step_kinds
 from service.steps.context import Devices, LeaveToMove, StepContext, StepInterruptedError, StepOutcome
 
-_WRITE_NOTHING = ("checklist", "timed_application")  # step kinds that go on when the disk is full
+_WRITE_NOTHING = ("checklist", "timed_application")  # step kinds that may run when the disk is full
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class StepExecution:
     wait: Callable[[float], None]
 
     def execute(self, step_id: str, attempt: int) -> None:
-        """Do the work of a step and record what came of it; an interruption by the operator is only told."""
+        """Execute a step and record its outcome or failure; an interruption by an operator is only told."""
         step = self.protocol.step(step_id)
         at(step=step_id, viewpoint="")
         checkpoint = partial(self._checkpoint, step_id, attempt)
@@ -106,7 +106,7 @@ class StepExecution:
         self.operator.tell(f"{step_id}: {error}. What was {kept} is safe")
 
     def _checkpoint(self, step: str, attempt: int) -> None:
-        """Called by steps wherever they may stop: notices what operators have asked for."""
+        """Called by steps wherever they may stop. Raises StepInterruptedError if an operator paused or ended it."""
         state = self.run.refresh()
         self.operator.attend("pausing" if state.paused else "working", state, pedal_armed=False)
         if state.paused:

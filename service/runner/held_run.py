@@ -1,4 +1,4 @@
-"""A run that this process drives: read by following its events, written under its lease."""
+"""A run that this process drives: its events are followed, and new ones are written under its lease."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LEASE_S = 30.0
 
 @dataclass(frozen=True)
 class HeldRun:
-    """What the runner reads and writes of its run; a write is refused once another process has taken over."""
+    """The runner's access to its run; writing is refused once another process has taken over."""
 
     store: Store
     follower: RunFollower
@@ -27,11 +27,11 @@ class HeldRun:
 
     @property
     def state(self) -> RunState:
-        """The state as it was read last."""
+        """The state as of the last read."""
         return self.follower.state
 
     def refresh(self) -> RunState:
-        """Read what other processes have appended meanwhile. Raises IntegrityError for events that cannot be."""
+        """Read what other processes have appended. Raises IntegrityError for an impossible event."""
         return self.follower.refresh()
 
     def append(self, *payloads: Payload, actor: str = "runner") -> None:
@@ -41,9 +41,9 @@ class HeldRun:
 
 @contextmanager
 def held_run(store: Store, run_id: str, protocol: Protocol) -> Generator[HeldRun]:
-    """Hold the lease of a run, renewed all the time, and release it at the end.
+    """Hold the lease of a run, which renews itself, until the end of this block.
 
-    Raises LeaseHeldError where another process that may still live holds it.
+    Raises LeaseHeldError if another process, which may still be alive, holds it.
     """
     with store.lease(run_id, f"runner on {socket.gethostname()}", _LEASE_S) as lease:
         yield HeldRun(store, RunFollower(store, run_id, protocol), lease)

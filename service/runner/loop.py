@@ -1,4 +1,4 @@
-"""The imperative loop: decide → act → append. The only place that executes decisions and touches hardware."""
+"""The imperative loop: decide → act → append. Only this package executes decisions and drives hardware."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ _POLL_S = 0.1
 
 @dataclass
 class Runner:
-    """Drives one run to its end, or to the next halt.
+    """Drives one run to its end.
 
-    `authority`, where there is one, is asked for a time stamp when the run ends; `signature_copy` is the second place
-    of the log of signatures.
+    `authority`, if given, stamps the record when the run ends; `signature_copy` is the path of the copy of the log of
+    signatures.
     """
 
     store: Store
@@ -78,9 +78,9 @@ class Runner:
     _steps: StepExecution = field(init=False)
 
     def run(self) -> RunState:
-        """Take the lease, record the session, and act on decisions until the run ends or an operator stops it.
+        """Take the lease, record the session, and execute decisions until the run ends; a paused run waits here.
 
-        A paused run waits here for its resumption. Raises LeaseHeldError if another runner drives the run.
+        Raises LeaseHeldError if another runner drives the run, LeaseLostError if one has taken it over.
         """
         operator = self.operator
         with held_run(self.store, self.run_id, self.protocol) as self._run:
@@ -106,7 +106,7 @@ class Runner:
                 self._seal.sign(ended=self._run.state.terminal)
 
     def submit(self, action: OperatorAction, actor: str) -> None:
-        """Append an action if it is allowed now; otherwise append its refusal and say why."""
+        """Record an action if it is allowed now; otherwise record its refusal and tell the operator why."""
         refusal = refuse(self.protocol, self._run.refresh(), action, actor)
         if refusal is None:
             self._run.append(action, actor=actor)
@@ -117,7 +117,7 @@ class Runner:
     def _begin_session(self) -> None:
         resumed = self._run.state.sessions > 0
         if resumed:
-            self._seal.sign(ended=False)  # what the runner before could not sign any more
+            self._seal.sign(ended=False)  # sign what the last runner could not sign any more
         self._run.append(
             SessionStarted(
                 resumed=resumed,
@@ -167,7 +167,7 @@ class Runner:
                 self.operator.tell(f"{due.step}: {describe_judged(verdict)}{outside}")
 
     def _retry(self, decision: Retry, state: RunState) -> None:
-        """Begin again after the wait, unless a pause or an abort is what is to be done by then."""
+        """Begin again after the wait, unless the decision has changed by then, such as by a pause or an abort."""
         left_s = decision.wait_s
         while left_s > 0:
             self.wait(min(_POLL_S, left_s))

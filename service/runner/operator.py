@@ -1,4 +1,4 @@
-"""The person in front of a run, as the runner sees them."""
+"""The interface through which the runner sees the person who operates a run."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from service.monitor.snapshot import Doing
 
 
 class AnswerBy(NamedTuple):
-    """An answer by somebody else than the person who runs the run: a supervisor at the same terminal."""
+    """An answer by another person than the run's operator, such as a supervisor at the same terminal."""
 
     action: OperatorAction
     actor: str
 
 
 class Operator(Interface):
-    """The person in front of the run, or what stands in for one on a simulated rig."""
+    """The person who operates the run, or a stand-in on a simulated rig."""
 
     name: str
 
     def poll(self, question: AskOperator, state: RunState) -> OperatorAction | AnswerBy | None:
-        """An answer if there is one by now; called about ten times a second while a question is open."""
+        """The answer, if there is one yet; called about ten times per second while a question is open."""
         ...
 
     def show(self, what: str, done: int, total: int) -> None:
-        """Show the progress of the work under way."""
+        """Show the progress of the work."""
         ...
 
     def tell(self, message: str) -> None:
@@ -37,11 +37,11 @@ class Operator(Interface):
         ...
 
     def busy(self, what: str) -> None:
-        """Announce a call that takes long, in words; screens show them until the next `attend`."""
+        """Say in words what a long call is about to do; screens show it until the next `attend`."""
         ...
 
     def attend(self, doing: Doing, state: RunState, *, pedal_armed: bool, asked: AskOperator | None = None) -> None:
-        """Update what screens show; called several times a second, whatever the runner does."""
+        """Update what screens show; called several times per second, whatever the runner does."""
         ...
 
     def ticked(self, question: AskOperator, state: RunState) -> tuple[str, ...]:
@@ -49,9 +49,9 @@ class Operator(Interface):
         ...
 
     def prepare(self, step: str, attempt: int) -> None:
-        """The work of a step is about to begin: a simulated technician does now what was confirmed as done."""
+        """Called before a step begins, so that a simulated technician does what was confirmed as done."""
         ...
 
     def mend(self, step: str, attempt: int, hands: Sequence[Mapping[str, Any]]) -> None:
-        """A confirmed retry is about to begin: a simulated technician first does what the step has asked for."""
+        """Called before a confirmed retry, so that a simulated technician does what the step has asked for."""
         ...

@@ -1,4 +1,4 @@
-"""The foot pedal as a confirmation: one press where nothing moves, two within seconds where the robot will move."""
+"""Confirmation by foot pedal: one press if nothing moves, two presses within seconds if the robot will move."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from drivers.errors import DeviceError
 from service.core.run.decide import AskOperator
 
 _RETRY_S = 30.0
-# Where the robot will move, one press arms the pedal and a second one within this time confirms: what holding the
-# button is on a screen. A press that comes sooner is a bounce of the contact, or a foot that slipped.
+# If the robot will move, one press arms the pedal and a second one, this many seconds after it, confirms; on a screen
+# the button is held instead. A press that comes sooner may be a bounce of the contact or a slip of the foot.
 SECOND_PRESS_S = (0.5, 6.0)
 
 
 @dataclass
 class Pedal:
-    """Turns the light box's count of presses into confirmations of the question that is open.
+    """Turns the light box's count of presses into confirmations of the open question.
 
-    `presses` is the count since the box was switched on, 0 where there is no box; it may raise DeviceError. A press
-    counts for the question that was open when it was made: the first look at a question only reads the count.
+    `presses` returns the count since the box was switched on, 0 without a box, and may raise DeviceError. A press
+    confirms only the question that was open at the time: the first call for a question only reads the count.
     """
 
     presses: Callable[[], int]
     monotonic_s: Callable[[], float]
     tell: Callable[[str], None]
     _question: AskOperator | None = field(init=False, default=None)
-    _count: int | None = field(init=False, default=None)  # None until the open question was looked at once
+    _count: int | None = field(init=False, default=None)  # None until the first call for the open question
     _armed_s: float | None = field(init=False, default=None)  # time of the press that armed the pedal
     _silent_until_s: float = field(init=False, default=0.0)
 
@@ -36,7 +36,7 @@ class Pedal:
         return self._armed_s is not None
 
     def confirms(self, question: AskOperator, *, moves_robot: bool) -> bool:
-        """Whether the pedal has confirmed the question since the last call. Called while the question is open."""
+        """Whether the pedal has confirmed the question since the last call; call it while the question is open."""
         if question != self._question:
             self._question, self._count, self._armed_s = question, None, None
         if not self._pressed() or "confirm" not in question.options:
@@ -65,7 +65,7 @@ class Pedal:
             self._silent_until_s = self.monotonic_s() + _RETRY_S
             self.tell(f"the foot pedal does not work: {error}")
             return False
-        if self._count is None or count < self._count:  # a box that was switched off counts from zero
+        if self._count is None or count < self._count:  # a light box that was switched off counts from zero
             self._count = count
         pressed, self._count = count != self._count, count
         return pressed

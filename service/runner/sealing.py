@@ -1,4 +1,4 @@
-"""Signs a run's chain as it stands: after each step that passed, and when the runner ends."""
+"""Signs the end of a run's chain: after each step that passed, and when the runner ends."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from service.store.store import Store
 class Seal:
     """Signs the chain of one run, and keeps the copy of the log of signatures up to date.
 
-    `authority`, where there is one, is asked for a time stamp of the run's end; `signature_copy` is the second place
-    of the log of signatures. `busy` and `tell` are the operator's.
+    `authority`, if given, stamps the run's end; `signature_copy` is the path of the copy. `busy` and `tell` are the
+    operator's methods.
     """
 
     store: Store
@@ -28,9 +28,9 @@ class Seal:
     tell: Callable[[str], None]
 
     def sign(self, *, ended: bool) -> None:
-        """Sign the chain; a run that has `ended` is stamped as well.
+        """Sign the chain's end and, if the run has `ended`, have the signature stamped.
 
-        A failure is told and raises nothing: the next signature covers what this one would have covered.
+        A failure is told to the operator and raises nothing: the next signature covers the same events.
         """
         self.busy("signing the record")
         try:
@@ -41,6 +41,6 @@ class Seal:
         keep_elsewhere(self.store.database_path.parent, self.signature_copy, self.tell, self.store.files)
 
     def sign_if_missing(self) -> None:
-        """Sign and stamp a run that ended before its runner could, or whose authority did not answer."""
+        """Sign and stamp an ended run whose runner died before it could, or whose authority did not answer."""
         if self.authority is None or not self.store.timestamps(self.run_id):
             self.sign(ended=True)

@@ -1,4 +1,4 @@
-"""The software that is installed here, for the record of a session."""
+"""The installed software, for the record of a session."""
 
 from __future__ import annotations
 
