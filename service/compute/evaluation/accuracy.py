@@ -18,7 +18,7 @@ from service.compute.registration.normal_equations import (
     pose_errors,
     solve_symmetric,
 )
-from service.compute.registration.prediction import Foreign, Prediction, foreign_rows, predict
+from service.compute.registration.prediction import HeldOutRows, Prediction, held_out_rows, predict
 from service.compute.registration.result import RegistrationResult, Solution
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply, inverse
@@ -108,7 +108,7 @@ def evaluate(
     stated = None
     if registration is not None:
         refined = bool(np.allclose(T_scan_camera, registration.T_scan_camera_refined, atol=1e-12, equal_nan=True))
-        rows = foreign_rows(registration.solution, outlines, members, centres_scan_m)
+        rows = held_out_rows(registration.solution, outlines, members, centres_scan_m)
         spread = None if centre_covariance_m2 is None else centre_covariance_m2[[s for _, _, s in members]]
         stated = predict(registration.solution, rows, refined=refined, centre_covariance_m2=spread)
     errors: list[ControlError] = []
@@ -146,7 +146,7 @@ def leave_one_out(registration: RegistrationResult, *, refined: bool = False) ->
         mine = np.nonzero(out & (full.weights > 0))[0]
         lines = full.linearised
         r = lines.r[mine] + lines.J[mine] @ rest.step
-        rows = Foreign(problem.image[mine], lines.J[mine], lines.A[mine], r, problem.whiten[mine])
+        rows = HeldOutRows(problem.image[mine], lines.J[mine], lines.A[mine], r, problem.whiten[mine])
         stated = predict(rest.solution, rows, refined=refined)
         T = rest.solution.state.cameras(problem, refined=refined)
         for o, prediction in zip(mine, stated, strict=True):

@@ -15,7 +15,7 @@ from service.core.geometry import Array
 
 
 @dataclass(frozen=True, slots=True)
-class Foreign:
+class HeldOutRows:
     """Whitened rows of O outlines outside the solution: r + J dx + A xi."""
 
     image: NDArray[np.int64]
@@ -36,12 +36,12 @@ class Prediction:
     sigma_rad: float  # predicted rms distance of the outline's points from the prediction
 
 
-def foreign_rows(
+def held_out_rows(
     solution: Solution,
     outlines: Sequence[Sequence[SphereOutline]],
     members: list[tuple[int, int, int]],
     centres_scan_m: Array,
-) -> Foreign:
+) -> HeldOutRows:
     """Rows of outlines of other spheres, (C, 3) in the scan frame; members are (image, outline, sphere)."""
     own = solution.problem
     problem = replace(with_outlines(own, outlines, members), centres=np.asarray(centres_scan_m), sphere_prior=None)
@@ -53,11 +53,11 @@ def foreign_rows(
     position = np.arange(3) + 6 * problem.group[:, None]
     shift = np.take_along_axis(rows.J, position[:, None, :], axis=2)
     by_centre = shift @ solution.state.bases[problem.group, :3, :3]
-    return Foreign(problem.image, J, rows.A, rows.r, problem.whiten, by_centre)
+    return HeldOutRows(problem.image, J, rows.A, rows.r, problem.whiten, by_centre)
 
 
 def predict(
-    solution: Solution, rows: Foreign, *, refined: bool, centre_covariance_m2: Array | None = None
+    solution: Solution, rows: HeldOutRows, *, refined: bool, centre_covariance_m2: Array | None = None
 ) -> list[Prediction]:
     """Residuals of outlines, compared with their predicted covariance.
 
