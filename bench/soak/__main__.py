@@ -86,7 +86,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=60.0, help="captures: duration")
     parser.add_argument("--sample-s", type=float, default=5.0, help="captures: sampling interval")
     parser.add_argument(
-        "--planned", type=int, default=4000, help="captures: planned viewpoints, more than can be taken"
+        "--planned", type=int, default=8000, help="captures: planned viewpoints, more than can be taken"
     )
     parser.add_argument(
         "--uncalibrated", action="store_true", help="captures: skip the calibration; the worker is idle"
