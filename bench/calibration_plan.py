@@ -34,9 +34,9 @@ from service.compute.planning.motion_plan import able_postures
 from service.core.geometry import Array, Transform, apply, inverse
 from service.core.protocol.models import Motion
 from service.rig import CollisionSection, LensSection
-from service.steps.board_plan import START, BoardPoses, PlannedBoard, Planner, Why, nominal_board, nominal_camera
+from service.steps.board.plan import START, BoardPoses, PlannedBoard, Planner, Why, nominal_board, nominal_camera
+from service.steps.capture.planning import known_arm, situation_of, usual_posture
 from service.steps.context import StationLayout
-from service.steps.planning import known_arm, situation_of, usual_posture
 from simulators.world import SCENE_CENTRE_M, Scene, nominal_hand_eye
 
 RESULTS = Path(__file__).parent / "results"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
+from service.core.jobs.references import Each, Reference, read_reference
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import (
     Event,
@@ -71,6 +72,7 @@ class _Jobs:
     store: Store
     run_id: str
     keys: dict[str, str] = field(default_factory=dict[str, str])  # job of the source → idempotency key
+    names: dict[str, str] = field(default_factory=dict[str, str])  # job of the source → job of the new run
     claimed: dict[str, Job] = field(default_factory=dict[str, Job])
 
     def claim(self, payload: JobFinished) -> Job:
@@ -81,6 +83,18 @@ class _Jobs:
             assert job is not None, payload.job
             self.claimed[job.idempotency_key] = job
         return self.claimed.pop(key)
+
+
+def _renamed(value: Any, names: Mapping[str, str]) -> Any:
+    """Arguments whose references are to the jobs of the new run."""
+    reference = read_reference(value)
+    if isinstance(reference, Reference):
+        return replace(reference, job=names[reference.job]).record()
+    if isinstance(reference, Each):
+        return replace(reference, without=tuple(names[job] for job in reference.without)).record()
+    if isinstance(value, dict):
+        return {key: _renamed(item, names) for key, item in cast("dict[str, Any]", value).items()}
+    return [_renamed(item, names) for item in cast("list[Any]", value)] if isinstance(value, list) else value
 
 
 def _tell(
@@ -96,9 +110,16 @@ def _tell(
     payload = event.payload
     actor = event.actor
     if isinstance(payload, JobEnqueued):
-        job = NewJob(payload.job_kind, payload.step, payload.attempt, payload.idempotency_key, payload.arguments)
+        job = NewJob(
+            payload.job_kind,
+            payload.step,
+            payload.attempt,
+            payload.idempotency_key,
+            _renamed(payload.arguments, jobs.names),
+            version=payload.version,
+        )
         jobs.keys[payload.job] = payload.idempotency_key
-        store.enqueue_job(run_id, job, actor=actor)
+        jobs.names[payload.job] = store.enqueue_job(run_id, job, actor=actor).job_id
         return store.events(run_id, store.head(run_id) - 1)[-1].sha256
     if isinstance(payload, JobFinished):
         finished = store.finish_job(

@@ -163,7 +163,7 @@ def _table(summary: RunSummary, truth: Path) -> list[dict[str, Any]]:
         return []
     true_mm = true_errors_mm(summary, truth)
     columns = ("poses", "mean_radial_error_mm", "mean_reprojection_error_px")
-    return [{**{c: row[c] for c in columns}, "true_error_mm": true_mm.get(row["poses"])} for row in rows]
+    return [{**{c: row.plain()[c] for c in columns}, "true_error_mm": true_mm.get(row.poses)} for row in rows]
 
 
 def _release(store: Store, summary: RunSummary) -> None:

@@ -18,10 +18,10 @@ from service.core.protocol.models import Protocol, parse_protocol
 from service.core.records.events import ArtefactRef, Event, Payload, RunStarted, View
 from service.core.run.decide import advance, fold
 from service.core.run.state import JobState, RunState
-from service.core.text.terms import term
+from service.jobs.words import term
 from service.steps import params_models
 from service.steps.context import JobRequest, JobResult
-from service.steps.time_left import Left, missing_results
+from service.steps.poses.time_left import Left, missing_results
 from service.store.database.engine import RESTORE
 from service.store.queue.leases import RunLease
 from service.store.records import NewArtefact, NewJob
@@ -167,7 +167,7 @@ class StepEvidence:
         """
         keys = [self._key(request) for request in requests]
         jobs = [
-            NewJob(r.kind, self.step, self.attempt, key, r.arguments, priority=r.priority)
+            NewJob(r.kind, self.step, self.attempt, key, r.arguments, priority=r.priority, version=r.version)
             for r, key in zip(requests, keys, strict=True)
         ]
         self.log.store.record(self.log.run_id, [], actor="runner", jobs=jobs, lease=self.lease)
@@ -200,7 +200,15 @@ class StepEvidence:
         """Enqueue a job without waiting for it, unless the same work is already enqueued under this name."""
         key = job_key(self.log.refresh(), self.step, request.kind, name)
         if all(job.idempotency_key != key for job in self.jobs(self.step)):
-            job = NewJob(request.kind, self.step, self.attempt, key, request.arguments, priority=request.priority)
+            job = NewJob(
+                request.kind,
+                self.step,
+                self.attempt,
+                key,
+                request.arguments,
+                priority=request.priority,
+                version=request.version,
+            )
             self.log.store.record(self.log.run_id, [], actor="runner", jobs=[job], lease=self.lease)
 
     def asked(self) -> tuple[Literal["release", "finish"], ...]:

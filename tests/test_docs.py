@@ -21,7 +21,7 @@ import pytest
 import trimesh
 
 from docs.generate.measure_words import MEANINGS
-from docs.generate.pages import REFERENCE, pages, shipped_protocols
+from docs.generate.pages import REFERENCE, pages
 from docs.generate.steps import all_measures
 from service.compute.poses.files.pose_files import write_camera_json, write_poses_csv
 from service.core.records.events import JobFailed
@@ -413,7 +413,7 @@ def test_every_key_of_a_file_and_every_measure_is_explained() -> None:
         ]
         assert keys
         assert not [line for line in keys if line.endswith("|  |")], name
-    assert all_measures(shipped_protocols()) == set(MEANINGS)
+    assert all_measures() == set(MEANINGS)
 
 
 def test_links_of_the_documents_lead_somewhere() -> None:

@@ -13,9 +13,8 @@ import pytest
 from service.compute.markers.archive import outline_record
 from service.core.errors import ComputeError
 from service.store.store import Store
-from service.worker.evaluating import evaluate
-from service.worker.job import JobContext
-from service.worker.registering import register
+from service.worker.job import JobContext, RecordedContext
+from service.worker.loop import HANDLERS
 from tests.support.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, exact_outlines, scene
 
 N = 6
@@ -63,18 +62,18 @@ class Bench:
         text = json.dumps(data).encode()
         return self.store.put_bytes(text, kind="x", media_type="application/json", original_name="x.json").sha256
 
-    def context(self, arguments: dict[str, Any]) -> JobContext:
+    def context(self, arguments: dict[str, Any]) -> RecordedContext:
         return JobContext(arguments, self.store, self.scratch, lambda _what, _done, _all: None)
 
     def register(self, **more: Any) -> dict[str, Any]:
-        return dict(register(self.context({**self.shared, "poses": "colmap", **more})).result)
+        return dict(HANDLERS["register"](self.context({**self.shared, "poses": "colmap", **more})).result)
 
     def evaluate(self, registrations: dict[str, Any], **more: Any) -> dict[str, Any]:
         arguments = {
             "images": self.images, "registrations": registrations, "scan": self.scan, "control_scan": None,
             "ct": None, "radius_m": RADIUS_M, **more,
         }  # fmt: skip
-        answer = evaluate(self.context(arguments))
+        answer = HANDLERS["evaluate"](self.context(arguments))
         return {**answer.result, "measures": dict(answer.measures), "artefacts": answer.artefacts}
 
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from service.compute.images.quality import image_quality
-from service.steps.spoilt import IN_A_ROW, LookedAt, last_in_a_row, why_spoilt
+from service.steps.capture.spoilt import IN_A_ROW, LookedAt, last_in_a_row, why_spoilt
 from tests.support.sphere_images import REGISTRATION_M, render, scene
 
 Grey = NDArray[np.uint8]

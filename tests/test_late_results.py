@@ -40,15 +40,15 @@ from service.core.records.events import (
     StepPassed,
     StepStarted,
 )
-from service.core.results.late import late_results
-from service.core.results.registrations import shared_adjustment_note
 from service.core.run.fold import fold
+from service.dataset.late_results import late_results
+from service.dataset.registrations import shared_adjustment_note
 from service.rig import load_rig
 from service.run_record import RunRecord, read_log
 from service.run_start import start_run
 from service.steps import params_models
-from service.steps.sources import PLANNED
-from service.steps.time_left import missing_results
+from service.steps.poses.sources import PLANNED
+from service.steps.poses.time_left import missing_results
 from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store

@@ -11,7 +11,7 @@ import pytest
 
 from service.store.store import Store
 from service.worker.job import JobContext
-from service.worker.layout import layout
+from service.worker.loop import HANDLERS
 from tests.support.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, camera, render
 
 
@@ -34,7 +34,7 @@ def test_a_large_photograph_by_a_lens_that_was_not_calibrated_shows_all_spheres(
             "control": len(CONTROL_M),
             "expected": len(spheres),
         }
-        answer = layout(JobContext(arguments, store, tmp_path, lambda _what, _done, _all: None))
+        answer = HANDLERS["layout"](JobContext(arguments, store, tmp_path, lambda _what, _done, _all: None))
         overlay = cv2.imread(str(store.artefact_path(answer.artefacts[0].sha256)))
     assert answer.measures["spheres_seen"] == len(spheres)
     assert answer.measures["photographs_used"] == 1

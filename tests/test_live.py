@@ -43,11 +43,11 @@ from service.compute.registration.pairing import paired
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse, transform
 from service.core.records.events import GatesEvaluated, StepNote
+from service.jobs.capture import live_view
 from service.store.store import Store
-from service.worker.job import JobAnswer, JobContext
-from service.worker.live import coverage_points, live_summary, live_view
+from service.worker.job import JobAnswer, JobContext, RecordedContext
 from service.worker.loop import HANDLERS, work
-from service.worker.robot_poses import robot_camera_poses
+from service.worker.poses.robot_poses import robot_camera_poses
 from tests.support.bench_rig import BenchRig, answer, other_settings
 from tests.support.bench_run import PROTOCOL, Bench, begin_run
 from tests.support.sphere_images import (
@@ -324,10 +324,10 @@ def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
         "limits": asdict(CoverageLimits()),
     }
 
-    def job(**arguments: Any) -> JobContext:
+    def job(**arguments: Any) -> RecordedContext:
         return JobContext({**shared, **arguments}, store, tmp_path, lambda _what, _done, _total: None)
 
-    surface = coverage_points(job(mesh=mesh.sha256)).artefacts[0].sha256
+    surface = HANDLERS["coverage_points"](job(mesh=mesh.sha256)).artefacts[0].sha256
     earlier: list[str] = []
     uncorrected: list[str] = []
     errors: list[float] = []
@@ -342,9 +342,13 @@ def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
             "sha256": photograph.sha256,
             **reported[i],
         }
-        done = live_view(job(image=taken, surface=surface if i else None, earlier=earlier))
+        done = HANDLERS["live_view"](job(image=taken, surface=surface if i else None, earlier=earlier))
         assert 0.0 <= done.measures["clipped_fraction"] < 0.01
-        raw = live_view(job(image=taken, surface=None, earlier=uncorrected, arm_correction=None)) if i < 2 else None
+        raw = (
+            HANDLERS["live_view"](job(image=taken, surface=None, earlier=uncorrected, arm_correction=None))
+            if i < 2
+            else None
+        )
         if raw is not None:
             uncorrected.append(raw.artefacts[0].sha256)
             raw_errors.append(raw.measures["predicted_target_error_mm"])
@@ -367,7 +371,7 @@ def test_jobs_go_from_images_to_a_gate_and_a_suggestion(
         }
         for i, T in enumerate(extra)
     ]
-    summary = live_summary(
+    summary = HANDLERS["live_summary"](
         job(views=earlier, surface=surface, station=STATION, limit_m=1e-5, min_coverage=1.0, candidates=candidates)
     )
     assert summary.measures["predicted_target_error_mm"] == pytest.approx(errors[2], rel=1e-6)
@@ -479,9 +483,12 @@ def measured_run(
     }
     here: list[Array] = []
 
-    def look(context: JobContext) -> JobAnswer:
-        here[:] = robot_camera_poses(context.arguments, [context.arguments["image"]])
-        return live_view(context)
+    usual = HANDLERS["live_view"]
+
+    def look(context: RecordedContext) -> JobAnswer:
+        arguments = live_view.KIND.read_arguments(context.arguments)
+        here[:] = robot_camera_poses(arguments, [arguments.image])
+        return usual(context)
 
     def exactly(*_args: Any) -> Any:
         seen = exact_outlines(Scene(T_base_scan, np.array(here), made), 0, SPHERES_M, 0.1, margin_px=30)[0]
@@ -493,8 +500,8 @@ def measured_run(
             bench.store.finish_job(job, measures={}, duration_s=0.1, result=known[job.kind])
         work(bench.store, until_idle=True, stop=lambda: False, progress=lambda _what, _done, _total: None)
 
-    monkeypatch.setitem(HANDLERS, "live_view", look)  # pyright: ignore[reportArgumentType] - a Mapping to others
-    monkeypatch.setattr("service.worker.live.find_spheres", exactly)
+    monkeypatch.setitem(HANDLERS, "live_view", look)
+    monkeypatch.setattr("service.worker.capture.live.find_spheres", exactly)
     bench.operator.on_show = serve
     return bench
 

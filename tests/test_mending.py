@@ -25,8 +25,9 @@ from service.monitor.reporter import OpenDevices, Reporter
 from service.rig import load_rig
 from service.run_start import recorded_run, start_run
 from service.runner.loop import Runner
-from service.steps import params_models, viewpoint_capture
+from service.steps import params_models
 from service.steps.context import StepContext
+from service.steps.kinds import viewpoint_capture
 from service.store.store import Store
 from tests.support.bench_rig import other_settings
 from tests.support.bench_run import PROTOCOL, Bench

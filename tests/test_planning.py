@@ -34,11 +34,12 @@ from service.core.geometry import Array, Transform, inverse, look_at, transform
 from service.core.protocol.models import Motion, load_protocol
 from service.rig import CollisionSection, load_rig
 from service.station import layout_of
-from service.steps import params_models, viewpoint_capture
+from service.steps import params_models
+from service.steps.capture.planning import situation_of, usual_posture
+from service.steps.capture.preview import preview_board_poses, preview_plans
+from service.steps.capture.viewpoints import denser_viewpoints, plan_viewpoints
 from service.steps.context import StationLayout
-from service.steps.planning import situation_of, usual_posture
-from service.steps.preview import preview_board_poses, preview_plans
-from service.steps.viewpoints import denser_viewpoints, plan_viewpoints
+from service.steps.kinds import viewpoint_capture
 
 PROTOCOL = Path(__file__).parents[1] / "protocols" / "exvivo_spine.yaml"
 ARM = arm_model("UR10e")

@@ -18,12 +18,14 @@ from service.audit.replay.differences import compare_data, compare_files
 from service.audit.replay.replay import ReplayReport, replay
 from service.cli.main import app
 from service.core.errors import ComputeError, ConfigurationError, IntegrityError
+from service.core.jobs.references import Reference, jobs_of, references_in, resolve
 from service.core.records.events import ArtefactRef
+from service.jobs.records import SpheresFound
 from service.worker import loop
-from service.worker.job import Handler, JobAnswer, JobContext
-from service.worker.registering import register
-from service.worker.surfaces import locate_spheres
+from service.worker.job import Handler, JobAnswer, RecordedContext
 from tests.support.recorded_run import record_run
+
+_locate_spheres = loop.HANDLERS["locate_spheres"]
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +47,15 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def hand(monkeypatch: pytest.MonkeyPatch, kind: str, handler: Handler) -> None:
-    monkeypatch.setitem(loop.HANDLERS, kind, handler)  # pyright: ignore[reportArgumentType] - a Mapping to others
+    monkeypatch.setitem(loop.HANDLERS, kind, handler)
 
 
-def moved_spheres(context: JobContext) -> JobAnswer:
+def moved_spheres(context: RecordedContext) -> JobAnswer:
     """As if the search for spheres had changed: every centre is shifted by 0.1 mm."""
-    answer = locate_spheres(context)
+    answer = _locate_spheres(context)
     spheres = [[x + 1e-4, y, z] for x, y, z in answer.result["spheres_m"]]
     measures = {**answer.measures, "sphere_change_max_mm": 0.4}
-    return JobAnswer(measures, answer.artefacts, {**answer.result, "spheres_m": spheres})
+    return JobAnswer(measures, answer.artefacts, SpheresFound.model_validate({**answer.result, "spheres_m": spheres}))
 
 
 def test_the_same_again_bit_for_bit_and_nothing_written(folder: Path) -> None:
@@ -94,7 +96,19 @@ def test_what_differs_is_named_and_measured(folder: Path, monkeypatch: pytest.Mo
     assert (new.value, new.passed) == (0.4, False)
 
 
-def test_end_to_end_carries_the_change_to_the_registration(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def referring(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same run, whose jobs refer to earlier answers."""
+    made = tmp_path_factory.mktemp("referring")
+    record_run(made, version=2)
+    return made
+
+
+@pytest.mark.parametrize("recorded", ["folder", "referring"])
+def test_end_to_end_carries_the_change_to_the_registration(
+    recorded: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder: Path = request.getfixturevalue(recorded)
     assert again(folder, end_to_end=True).drifts[0].against_cameras_mm == pytest.approx(0, abs=1e-9)
     hand(monkeypatch, "locate_spheres", moved_spheres)
     report = again(folder, end_to_end=True)
@@ -105,12 +119,23 @@ def test_end_to_end_carries_the_change_to_the_registration(folder: Path, monkeyp
     assert drift.against_cameras_mm == pytest.approx(0.1, abs=0.01)
 
 
+def test_a_job_that_refers_to_earlier_answers_holds_none_of_their_numbers(referring: Path) -> None:
+    run = read_run(referring / "data", "latest")
+    (first,), (second,), (registered,) = (tuple(state.jobs.values()) for state in run.state.steps.values())
+    taken = {found.job for found in references_in(second.arguments) if isinstance(found, Reference)}
+    assert taken == {first.job}
+    assert len(json.dumps(registered.arguments["spheres_m"])) < 120
+    assert resolve(registered.arguments, jobs_of(run.state))["spheres_m"] == second.result["spheres_m"]
+    assert again(referring).verdict == "identical"
+
+
 def test_rounding_is_equal_and_said(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def rounded(context: JobContext) -> JobAnswer:
-        answer = register(context)
-        return JobAnswer(
-            {**answer.measures, "rms_px": answer.measures["rms_px"] * (1 + 1e-12)}, answer.artefacts, answer.result
-        )
+    usual = loop.HANDLERS["register"]
+
+    def rounded(context: RecordedContext) -> JobAnswer:
+        answer = usual(context)
+        measures = {**answer.measures, "rms_px": answer.measures["rms_px"] * (1 + 1e-12)}
+        return JobAnswer(measures, answer.artefacts, answer.answer)
 
     hand(monkeypatch, "register", rounded)
     report = again(folder, step="registration")
@@ -131,7 +156,7 @@ def test_an_altered_input_file_is_named_before_anything_is_computed(folder: Path
 
 
 def test_a_job_that_fails_now_could_not_be_replayed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(context: JobContext) -> JobAnswer:
+    def refuse(context: RecordedContext) -> JobAnswer:
         raise ComputeError("no answer")
 
     hand(monkeypatch, "register", refuse)

@@ -15,15 +15,15 @@ from service.core.jobs.priorities import LATER, REDUCED, WAITED
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol, parse_protocol
 from service.core.records.events import ArtefactRef, JobEnqueued, JobFinished, RunStarted
 from service.core.results.arrival import late_s, late_words
-from service.core.results.registrations import better_later, evaluated, own_registration, registrations
 from service.core.run.fold import fold, initial_state
 from service.core.run.state import JobState, Note, RunState
+from service.dataset.registrations import better_later, evaluated, own_registration, registrations
 from service.dataset.summary import RunSummary
 from service.run_record import RunRecord
 from service.run_start import recorded_run
 from service.steps import params_models
-from service.steps.sources import PLANNED, decisive, due, registration_ways
-from service.steps.time_left import missing_results
+from service.steps.poses.sources import PLANNED, decisive, due, registration_ways
+from service.steps.poses.time_left import missing_results
 from service.store.records import NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
@@ -224,13 +224,13 @@ def test_a_later_and_better_registration_is_reported_and_takes_nobodys_place() -
     steps["evaluation"] = replace(steps["evaluation"], jobs={"e": later})
     state = replace(run.state, steps=steps)
     assert own_registration(run.protocol, state) == "robot_corrected"
-    assert [(row["poses"], row["late"]) for row in evaluated(run.protocol, state)] == [
+    assert [(row.poses, row.late) for row in evaluated(run.protocol, state)] == [
         ("robot_corrected", ""),
         ("colmap", "arrived 12 min after the release"),
     ]
     better = better_later(run.protocol, state)
     assert better is not None
-    assert better["poses"] == "colmap"
+    assert better.poses == "colmap"
 
 
 def test_page_report_and_export_show_the_same_registration(tmp_path: Path) -> None:
@@ -238,7 +238,9 @@ def test_page_report_and_export_show_the_same_registration(tmp_path: Path) -> No
 
     def registered(poses: str, variance: float, full: dict[str, Any] | None = None) -> dict[str, Any]:
         return {
-            "poses": poses, "camera": {"width": 640, "height": 360}, "full_camera": full,
+            "poses": poses, "camera": CAMERA | {"width": 640, "height": 360}, "outlines": "0" * 64,
+            "full_camera": None if full is None else CAMERA | full, "T_world_scan": POSE, "scale": 1.0,
+            "rms_px": 0.1, "T_world_station": {}, "T_scan_camera": {}, "components": {},
             "covariance": (variance * np.eye(6)).tolist(),
         }  # fmt: skip
 

@@ -24,9 +24,9 @@ from service.cli.run.hands import SimulatedHands
 from service.cli.run.operators import Display, TerminalOperator
 from service.core.protocol.models import load_protocol
 from service.core.run.decide import AskOperator
-from service.core.text.terms import term
+from service.jobs.words import term
 from service.steps import params_models
-from service.steps.live import seen_words
+from service.steps.capture.live_numbers import seen_words
 
 ROOT = Path(__file__).parents[1]
 COMMAND = Path(sys.executable).with_name("orthocapture")

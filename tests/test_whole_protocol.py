@@ -73,12 +73,12 @@ _VIEWS = (("viewpoint_capture", 8), ("control_capture", 2))
 
 
 def test_errors_are_those_of_a_good_data_set(whole: Whole) -> None:
-    rows = {row["poses"]: row for row in whole.summary.table()}
+    rows = {row.poses: row for row in whole.summary.table()}
     assert {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"} <= set(rows)
     # The arm's errors remain; everything else is fitted to the images, which are small here.
     assert whole.true_mm["robot"] < 0.35
     for source in set(rows) - {"robot"}:
-        assert rows[source]["mean_radial_error_mm"] < 0.1
+        assert rows[source].mean_radial_error_mm < 0.1
         assert whole.true_mm[source] < 0.1
 
 

@@ -20,7 +20,7 @@ from service.store.records import Job, NewJob
 from service.store.store import Store
 from service.store.verification.verify import verify
 from service.worker import loop
-from service.worker.job import JobAnswer, JobContext
+from service.worker.job import JobAnswer, RecordedContext
 from service.worker.loop import work
 from service.worker.pool import Pool, work_side_by_side
 from tests.support.store import start_run
@@ -85,14 +85,14 @@ def test_a_lane_takes_its_own_jobs_alone(store: Store) -> None:
 def test_an_error_that_nobody_foresaw_fails_the_job_with_its_traceback_and_the_worker_goes_on(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def broken(context: JobContext) -> JobAnswer:
+    def broken(context: RecordedContext) -> JobAnswer:
         raise AttributeError("an attribute that is not there")
 
-    def refused(context: JobContext) -> JobAnswer:
+    def refused(context: RecordedContext) -> JobAnswer:
         raise ComputeError("too few spheres")
 
-    monkeypatch.setitem(loop.HANDLERS, "layout", broken)  # pyright: ignore[reportArgumentType] - a Mapping to others
-    monkeypatch.setitem(loop.HANDLERS, "hybrid", refused)  # pyright: ignore[reportArgumentType]
+    monkeypatch.setitem(loop.HANDLERS, "layout", broken)
+    monkeypatch.setitem(loop.HANDLERS, "hybrid", refused)
     run = start_run(store)
     enqueue(store, run, "one")
     enqueue(store, run, "two", kind="hybrid")
@@ -174,7 +174,7 @@ def test_a_lease_is_renewed_although_the_store_failed_for_a_moment(
         renew(job, lease_s)
         renewed.append(job.job_id)
 
-    def slow(_context: JobContext) -> JobAnswer:
+    def slow(_context: RecordedContext) -> JobAnswer:
         deadline_s = time.monotonic() + 10
         while len(renewed) < 2 and time.monotonic() < deadline_s:
             time.sleep(0.02)

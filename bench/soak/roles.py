@@ -25,7 +25,7 @@ from service.logs.file_log import file_log
 from service.store.records import NewJob
 from service.store.store import Store
 from service.worker import loop
-from service.worker.job import JobAnswer, JobContext
+from service.worker.job import JobAnswer, RecordedContext
 from tests.support.bench_run import Bench
 
 KIND = "coverage_points"  # a job kind from which no page reads anything
@@ -119,7 +119,7 @@ def run_it(diary: Diary, store: Store, data: Path, run: str) -> None:
 def compute(diary: Diary, store: Store) -> None:
     """The worker's loop, with a job that writes a small file."""
 
-    def handle(context: JobContext) -> JobAnswer:
+    def handle(context: RecordedContext) -> JobAnswer:
         time.sleep(_COMPUTED_S)
         ref = context.keep_json(dict(context.arguments), kind="coverage_points", name="answer.json")
         return JobAnswer({"number": float(context.arguments["number"])}, (ref,))

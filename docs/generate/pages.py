@@ -8,6 +8,7 @@ from pathlib import Path
 from docs.generate.commands import commands_text
 from docs.generate.events import events_text
 from docs.generate.files import protocol_text, rig_text
+from docs.generate.jobs import jobs_text
 from docs.generate.roles import roles_text
 from docs.generate.steps import steps_text
 from service.core.documents.protocol_docs import lifecycle_text, schema_text
@@ -39,4 +40,5 @@ def pages() -> Mapping[str, str]:
         "protocol.schema.json": schema_text(params_models()),
         "state_machine.md": lifecycle_text(exvivo),
         "ways_on.md": ways_text(exvivo),
+        "jobs.md": jobs_text(),
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 from pydantic import BaseModel
 
@@ -11,7 +12,8 @@ from docs.generate.fields import docstring, field_table, records_below
 from docs.generate.measure_words import MEANINGS
 from service.core.protocol.models import Protocol, Step
 from service.steps import step_kinds
-from service.steps.measures import Measure, measures_of
+from service.steps.context import StepKind
+from service.steps.measured import Measure
 
 _HEAD = """\
 Made from the code by `make reference`.
@@ -39,10 +41,11 @@ def steps_text(protocols: Mapping[str, Protocol]) -> str:
     below: dict[str, type[BaseModel]] = {}
     for name, kind in step_kinds().items():
         module = sys.modules[kind.execute.__module__]
-        example = next(found for found in _examples(protocols, name))
-        lines += [f"## {name}", "", docstring(module), "", f"Example: step `{example[1].id}` of `{example[0]}`.", ""]
+        lines += [f"## {name}", "", docstring(module), ""]
+        for file, step in list(_examples(protocols, name))[:1]:
+            lines += [f"Example: step `{step.id}` of `{file}`.", ""]
         lines += ["### Params", "", docstring(kind.params), "", *field_table(kind.params), ""]
-        lines += ["### Measures", "", *_measures(*example, protocols), ""]
+        lines += ["### Measures", "", *_measures(kind), ""]
         lines += ["### Result", "", docstring(kind.result), "", *field_table(kind.result), ""]
         records_below(kind.params, below)
     lines += ["## Records of the params", ""]
@@ -65,25 +68,20 @@ def _examples(protocols: Mapping[str, Protocol], kind: str) -> Iterator[tuple[st
                 yield file, step
 
 
-def measures_of_kind(file: str, step: Step, protocols: Mapping[str, Protocol]) -> dict[str, Measure]:
-    """The measures of a step's kind, those of a source of camera poses under the name NAME_…."""
-    known = measures_of(step, {s.id: s for s in protocols[file].steps})
-    assert known is not None, step.kind
-    out: dict[str, Measure] = {}
-    for name, measure in known.items():
-        general = next((key for key in MEANINGS if key.startswith("NAME_") and name.endswith(key[4:])), name)
-        out.setdefault(name if name in MEANINGS else general, measure)
-    return out
+def measures_of_kind(kind: StepKind[Any]) -> dict[str, Measure]:
+    """The measures of a kind of step, those of a source of camera poses under the name NAME_…."""
+    named = {f"NAME_{name}": measure for name, measure in kind.measures_of_registrations.items()}
+    return {**kind.measures, **named}
 
 
-def all_measures(protocols: Mapping[str, Protocol]) -> set[str]:
+def all_measures() -> set[str]:
     """The names of all measures of all kinds."""
-    examples = [next(_examples(protocols, name)) for name in step_kinds()]
-    return {name for file, step in examples for name in measures_of_kind(file, step, protocols)}
+    return {name for kind in step_kinds().values() for name in measures_of_kind(kind)}
 
 
-def _measures(file: str, step: Step, protocols: Mapping[str, Protocol]) -> Iterator[str]:
+def _measures(kind: StepKind[Any]) -> Iterator[str]:
     yield "| measure | unit | limits | meaning |"
     yield "|---|---|---|---|"
-    for name, measure in measures_of_kind(file, step, protocols).items():
-        yield f"| `{name}` | {measure.unit} | {measure.least:g} to {measure.most:g} | {MEANINGS[name]} |"
+    for name, measure in measures_of_kind(kind).items():
+        meaning = MEANINGS.get(name, measure.meaning)
+        yield f"| `{name}` | {measure.unit} | {measure.least:g} to {measure.most:g} | {meaning} |"

@@ -17,8 +17,8 @@ from service.core.gates.dependence import accepted_gates
 from service.core.gates.verdict import BOUNDS_HOLD, describe, standing
 from service.core.geometry import Transform
 from service.core.records.import_list import imported_sentence
-from service.core.results.late import late_results
-from service.core.results.registrations import shared_adjustment_note
+from service.dataset.late_results import late_results
+from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary
 
 
@@ -50,7 +50,7 @@ def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] 
     poses: dict[str, Transform] = {}
     sources: dict[str, str] = {}
     for capture in summary.captures():
-        T = registered["T_scan_camera"].get(capture.viewpoint)
+        T = registered.T_scan_camera.get(capture.viewpoint)
         photograph = capture.artefacts[0]
         if T is None or photograph.kind not in ("image", "control_image"):
             continue
@@ -74,13 +74,13 @@ def export_dataset(summary: RunSummary, folder: Path, not_in_yet: Sequence[str] 
         "unit": "m",
         "poses": "poses.csv is T_scan_camera: x right, y down, z forward; transforms.json has OpenGL axes",
         "pose_source": best,
-        "evaluation": list(summary.table()),
+        "evaluation": [row.plain() for row in summary.table()],
         "gates": _gates(summary),
         "gates_explained": BOUNDS_HOLD,
         "accepted_gates": [gate.text for gate in accepted_gates(summary.protocol, summary.state)],
         "evaluation_note": shared_adjustment_note(summary.protocol, summary.state),
         "arrived_later": [late.text for late in late_results(summary.protocol, summary.state)],
-        "arrived_later_and_better": None if later is None else later["poses"],
+        "arrived_later_and_better": None if later is None else later.poses,
         "not_in_yet": list(not_in_yet),
         "deviations": [d.text for d in summary.state.deviations if not d.is_note],
         "head_of_chain_sha256": summary.events[-1].sha256,

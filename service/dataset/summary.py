@@ -13,7 +13,9 @@ import numpy as np
 from service.core.geometry import Array
 from service.core.protocol.models import Protocol
 from service.core.records.events import ArtefactRef, Event, JobFinished, RunStarted, View
-from service.core.results.registrations import (
+from service.core.run.fold import fold
+from service.core.run.state import RunState
+from service.dataset.registrations import (
     better_later,
     budgets,
     evaluated,
@@ -21,8 +23,8 @@ from service.core.results.registrations import (
     own_registration,
     registrations,
 )
-from service.core.run.fold import fold
-from service.core.run.state import RunState
+from service.jobs.registration.evaluate import ErrorBudget, Row
+from service.jobs.registration.register import Answer as Registration
 from service.store.store import Store
 
 
@@ -49,15 +51,15 @@ class RunSummary:
         """The Result of the last passed step of a kind; empty if there is none."""
         return last_result(self.protocol, self.state, kind)
 
-    def registrations(self) -> Mapping[str, Mapping[str, Any]]:
+    def registrations(self) -> Mapping[str, Registration]:
         """Registrations by name, including those that arrived after the step's decision."""
         return registrations(self.protocol, self.state)
 
-    def table(self) -> Sequence[Mapping[str, Any]]:
+    def table(self) -> Sequence[Row]:
         """The paper's table: control sphere errors for each source of poses, including late arrivals."""
         return evaluated(self.protocol, self.state)
 
-    def budgets(self) -> Mapping[str, Mapping[str, Any]]:
+    def budgets(self) -> Mapping[str, ErrorBudget]:
         """The error budget of each evaluated registration."""
         return budgets(self.protocol, self.state)
 
@@ -65,7 +67,7 @@ class RunSummary:
         """Name of the run's own registration: the best that the evaluation step judged (core/registered.py)."""
         return own_registration(self.protocol, self.state)
 
-    def better_later(self) -> Mapping[str, Any] | None:
+    def better_later(self) -> Row | None:
         """The row of a registration that arrived after the evaluation and beats the run's own, if any."""
         return better_later(self.protocol, self.state)
 

@@ -1,22 +1,39 @@
-"""One file a step kind: its Params, its Result, its execute(). A module with a KIND is a step kind."""
+"""The kinds of steps: those of service/steps/kinds, and those of plug-ins."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
 from functools import cache
+from importlib.metadata import entry_points
 from typing import Any
 
+from service.core.errors import ConfigurationError
 from service.core.records.events import Record
 from service.steps.context import StepKind
+
+GROUP = "orthocapture.steps"  # entry points of plug-ins; each names a StepKind
 
 
 @cache
 def step_kinds() -> dict[str, StepKind[Any]]:
-    """All step kinds by name: every module of this package that defines KIND."""
-    modules = (importlib.import_module(f"{__name__}.{m.name}") for m in pkgutil.iter_modules(__path__))
-    kinds: list[StepKind[Any]] = [m.KIND for m in modules if hasattr(m, "KIND")]
-    return {kind.name: kind for kind in sorted(kinds, key=lambda k: k.name)}
+    """All step kinds by name: every module of service/steps/kinds, and those of plug-ins.
+
+    Raises:
+        ConfigurationError: two declare the same name, or an entry point names something else than a StepKind.
+    """
+    package = f"{__name__}.kinds"
+    modules = pkgutil.iter_modules(importlib.import_module(package).__path__)
+    declared: list[object] = [importlib.import_module(f"{package}.{module.name}").KIND for module in modules]
+    declared += [point.load() for point in entry_points(group=GROUP)]
+    kinds: dict[str, StepKind[Any]] = {}
+    for kind in declared:
+        if not isinstance(kind, StepKind):
+            raise ConfigurationError(f"{kind!r} is no StepKind", where=f"entry points {GROUP}")
+        if kind.name in kinds:
+            raise ConfigurationError(f"two step kinds are called {kind.name!r}", where=f"entry points {GROUP}")
+        kinds[kind.name] = kind
+    return dict(sorted(kinds.items()))
 
 
 def params_models() -> dict[str, type[Record]]:

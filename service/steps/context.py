@@ -10,16 +10,21 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 from drivers.interfaces import Camera, CtSource, Device, DeviceReport, Lightbox, RobotArm, Scanner, Transform
 from service.core.errors import OrthocaptureError
 from service.core.jobs.priorities import WAITED
+from service.core.jobs.references import Each, Reference
 from service.core.protocol.models import Protocol as LabProtocol
 from service.core.protocol.models import Step
 from service.core.records.events import ArtefactRef, Payload, Record, StepNote, Uncertainty, View
 from service.core.records.import_list import ImportList
 from service.core.run.decide import RunState, StepState
 from service.core.run.state import JobState
+from service.jobs.kind import JobKind, JobRecord
 from service.rig import CollisionSection, LensSection, OpticsSection
+from service.steps.measured import Measure
 from service.store.records import NewArtefact
 
 P = TypeVar("P", bound=Record)
+A = TypeVar("A", bound=JobRecord)
+_NOTHING: Mapping[str, Reference | Each | None] = {}
 
 
 class StepInterruptedError(OrthocaptureError):
@@ -109,11 +114,40 @@ class Devices(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class JobRequest:
-    """Work for the registration worker; `arguments` is plain JSON data."""
+    """Work for the registration worker; `arguments` as they are recorded, with references to earlier answers."""
 
     kind: str
     arguments: Mapping[str, Any]
     priority: int = WAITED
+    version: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        kind: JobKind[A, Any],
+        arguments: A,
+        taken: Mapping[str, Reference | Each | None] = _NOTHING,
+        priority: int = WAITED,
+    ) -> JobRequest:
+        """A request with typed arguments.
+
+        Args:
+            kind: of the job.
+            arguments: with the values of whatever earlier jobs gave.
+            taken: fields of the arguments (`camera`, `registrations/colmap`) in which such a value stands, and the
+                reference that is recorded in its place; None where nothing can be referred to, so that the value
+                itself is recorded.
+            priority: see service.core.priorities.
+        """
+        recorded = arguments.plain()
+        for path, reference in taken.items():
+            if reference is not None:
+                *parents, field = path.split("/")
+                place = recorded
+                for name in parents:
+                    place = place[name]
+                place[field] = reference.record()
+        return cls(kind.name, recorded, priority, kind.version)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,10 +250,56 @@ class StepOutcome:
 
 
 @dataclass(frozen=True, slots=True)
+class BeforeStep:
+    """What a kind's words may tell: the step's title, how many images are to be taken, and at which stations."""
+
+    title: str
+    views_left: int
+    stations: str  # "station 1 and station 2"; "" for none
+
+    @property
+    def at_stations(self) -> str:
+        """` at station 1`, or nothing."""
+        return f" at {self.stations}" if self.stations else ""
+
+    def images(self, of: str = "") -> str:
+        """`1 image`, `8 images of the board`."""
+        return f"{self.views_left} {'image' if self.views_left == 1 else 'images'}{of}"
+
+
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """What a confirmation does: the large words of its button after `Confirm: `, and a line below."""
+
+    does: str
+    below: str = "Nothing moves."
+
+
+ROBOT_MOVES = "The robot moves. Everybody stays outside of its reach."
+
+
+@dataclass(frozen=True, slots=True)
 class StepKind(Generic[P]):
-    """A step kind: its name in the protocol, its Params, its Result and what it does."""
+    """One kind of step, declared once.
+
+    Attributes:
+        name: in the protocol.
+        params: its section of the protocol.
+        result: what it leaves to later steps.
+        execute: does it.
+        measures: the numbers that it yields, for gates; empty where nobody has described them.
+        measures_of_registrations: those that it yields for each registration, with its name before them.
+        registered_by: the step whose registrations these are; None: this step itself.
+        words: what a person reads who is about to confirm it.
+        drawing: that is shown beside the instructions (service/web/run/drawings), where the protocol names no other.
+    """
 
     name: str
     params: type[P]
     result: type[Record]
     execute: Callable[[StepContext, P], StepOutcome]
+    measures: Mapping[str, Measure] = field(default_factory=dict[str, Measure])
+    measures_of_registrations: Mapping[str, Measure] = field(default_factory=dict[str, Measure])
+    registered_by: Callable[[P, Mapping[str, Step]], Step | None] | None = None
+    words: Callable[[P, BeforeStep], Announcement] | None = None
+    drawing: str = ""

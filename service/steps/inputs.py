@@ -1,13 +1,50 @@
-"""What earlier steps left behind, as plain job arguments."""
+"""What earlier steps left behind, as typed arguments of jobs, with the references that are recorded."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 from service.core.errors import ConfigurationError
+from service.core.jobs.references import Each, Reference
 from service.core.records.events import ArtefactRef, View, ViewHeld, ViewpointCaptured
+from service.core.run.state import JobState, StepState
+from service.jobs.calibration import calibrate
+from service.jobs.capture import hand_board, hand_view
+from service.jobs.kind import JobKind, JobRecord
+from service.jobs.records import ArmCorrection, Mounting, ParameterCovariance, Photograph
 from service.steps.context import StepContext
+
+R = TypeVar("R", bound=JobRecord)
+
+
+@dataclass(frozen=True, slots=True)
+class Taken(Generic[R]):
+    """The answer with which an earlier step ended, and the job that gave it."""
+
+    answer: R
+    job: JobState | None  # None: nobody computed it in this run
+
+    def reference(self, field: str) -> Reference | None:
+        """A part of the answer (`details/spheres/*/covariance_m2`), "" for all of it; None without a job."""
+        path = f"result/{field}" if field else "result"
+        return None if self.job is None else Reference(self.job.job, path)
+
+
+def taken(context: StepContext, step_id: str, kind: JobKind[Any, R]) -> Taken[R]:
+    """What an earlier step's job of a kind answered. Raises ConfigurationError if the step has no result."""
+    result = result_of(context, step_id)
+    return Taken(kind.read_answer(result), answered_by(context.run.steps[step_id]))
+
+
+def answered_by(state: StepState) -> JobState | None:
+    """The newest job whose answer is part of the step's result."""
+    done = [job for job in state.jobs.values() if job.status == "finished" and job.result]
+    for job in sorted(done, key=lambda job: job.enqueued_seq, reverse=True):
+        if all(name in state.result and state.result[name] == value for name, value in job.result.items()):
+            return job
+    return None
 
 
 def result_of(context: StepContext, step_id: str) -> Mapping[str, Any]:
@@ -35,31 +72,22 @@ def artefact_of(context: StepContext, step_id: str, kind: str) -> ArtefactRef:
     return found[-1]
 
 
-def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[dict[str, Any]]:
+def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[Photograph]:
     """Every valid photograph of the given capture steps with its pose, in order of capture.
 
     Events recorded since this step began (its own images) are read through the evidence, not the stale state.
     """
-    images: list[dict[str, Any]] = []
+    images: list[Photograph] = []
     for step_id in step_ids:
         held = held_views(context, step_id)
         for capture in context.evidence.captures(step_id):
             if not all(capture.verdicts.values()):
                 continue
             photograph = capture.artefacts[0]
-            if isinstance(capture, ViewHeld) and not held.get(photograph.sha256, {}).get("used"):
+            look = held.get(photograph.sha256)
+            if isinstance(capture, ViewHeld) and (look is None or not look.used):
                 continue
-            images.append(
-                {
-                    "name": f"{capture.viewpoint}.jpg",
-                    "step": step_id,
-                    "viewpoint": capture.viewpoint,
-                    "station": capture.station,
-                    "sha256": photograph.sha256,
-                    **robot_pose_of(capture),
-                    **_held_pose(held.get(photograph.sha256, {})),
-                }
-            )
+            images.append(_photograph(capture, step_id, look))
     if not images:
         raise ConfigurationError(
             f"no usable image from {', '.join(step_ids)}",
@@ -69,61 +97,75 @@ def captured_images(context: StepContext, step_ids: Iterable[str]) -> list[dict[
     return images
 
 
+def _photograph(capture: View, step_id: str, look: hand_view.Answer | None) -> Photograph:
+    by_spheres = {} if look is None or look.T_scene_camera is None else {"T_scene_camera": look.T_scene_camera}
+    return Photograph.model_validate(
+        {
+            "name": f"{capture.viewpoint}.jpg",
+            "step": step_id,
+            "viewpoint": capture.viewpoint,
+            "station": capture.station,
+            "sha256": capture.artefacts[0].sha256,
+            **robot_pose_of(capture),
+            **by_spheres,
+        }
+    )
+
+
 def robot_pose_of(view: View) -> dict[str, Any]:
-    """The robot's pose at a photograph, as job arguments; empty where there was no robot."""
+    """The robot's pose at a photograph, as fields of a Photograph; empty where there was no robot."""
     if isinstance(view, ViewpointCaptured):
-        return {"T_base_flange": [list(row) for row in view.T_base_flange], "joints_rad": list(view.joints_rad)}
+        return {"T_base_flange": view.T_base_flange, "joints_rad": view.joints_rad}
     return {}
 
 
-def held_views(context: StepContext, step_id: str) -> dict[str, Mapping[str, Any]]:
+def held_views(context: StepContext, step_id: str) -> dict[str, hand_view.Answer]:
     """By photograph: what the worker found in the hand-held images of a step.
 
     Without a CT each image refines where all were: the newest poses count.
     """
-    jobs = [j for j in context.evidence.jobs(step_id) if j.kind in ("hand_view", "hand_board")]
-    done = [job for job in jobs if job.status == "finished"]
-    refined: Mapping[str, Any] = done[-1].result.get("T_scene_cameras", {}) if done else {}
-    found: dict[str, Mapping[str, Any]] = {}
-    for job in done:
-        newest = refined.get(job.result["viewpoint"])
-        found[str(job.arguments["image"]["sha256"])] = (
-            job.result if newest is None else {**job.result, "T_scene_camera": newest}
-        )
-    return found
+    names = (hand_view.KIND.name, hand_board.KIND.name)
+    done = [j for j in context.evidence.jobs(step_id) if j.kind in names and j.status == "finished"]
+    looks = {str(job.arguments["image"]["sha256"]): hand_view.KIND.read_answer(job.result) for job in done}
+    refined = hand_view.KIND.read_answer(done[-1].result).T_scene_cameras if done else {}
+    return {
+        sha256: look
+        if look.viewpoint not in refined
+        else look.model_copy(update={"T_scene_camera": refined[look.viewpoint]})
+        for sha256, look in looks.items()
+    }
 
 
-def _held_pose(found: Mapping[str, Any]) -> dict[str, Any]:
-    return {"T_scene_camera": found["T_scene_camera"]} if found.get("T_scene_camera") else {}
+@dataclass(frozen=True, slots=True)
+class Mounted:
+    """How the camera sat on the arm, and what of it is recorded as a reference."""
+
+    mounting: Mounting
+    taken: Mapping[str, Reference | Each | None]
 
 
-def hand_eye_of(context: StepContext, step_id: str, stations: Iterable[str]) -> dict[str, Any]:
-    """What turns the robot's poses into camera poses, as job arguments (worker/robot_poses.py).
+def mounting_of(context: StepContext, step_id: str, stations: Iterable[str]) -> Mounted:
+    """What turns the robot's poses into camera poses (worker/poses/robot_poses.py).
 
     The arm's correction is of one arm: it names the stations where that arm stood.
     """
-    result = result_of(context, step_id)
-    correction = (result.get("hand_eye") or {}).get("arm_correction")
-    if correction is not None:
-        robots = set(result["robots"])
-        mine = sorted({station for station in stations if context.devices.layout(station).robot in robots})
-        kept = ("model", "arm", "dh_deltas", "gear_cos_rad", "gear_sin_rad", "observed", "T_flange_camera")
-        correction = {key: correction[key] for key in kept} | {"stations": mine}
-    return {"T_flange_camera": result["T_flange_camera"], "arm_correction": correction}
+    found = taken(context, step_id, calibrate.KIND)
+    hand_eye = found.answer.hand_eye
+    correction = None if hand_eye is None else hand_eye.arm_correction
+    references = {"T_flange_camera": found.reference("T_flange_camera")}
+    if correction is None:
+        return Mounted(Mounting(T_flange_camera=found.answer.T_flange_camera, arm_correction=None), references)
+    robots = set(result_of(context, step_id)["robots"])
+    mine = tuple(sorted({station for station in stations if context.devices.layout(station).robot in robots}))
+    mounting = Mounting(
+        T_flange_camera=found.answer.T_flange_camera,
+        arm_correction=ArmCorrection.model_validate(correction.plain()),
+        arm_stations=mine,
+    )
+    return Mounted(mounting, {**references, "arm_correction": found.reference("hand_eye/arm_correction")})
 
 
-def intrinsics_covariance_of(context: StepContext, step_id: str) -> list[list[float]] | None:
-    """(8, 8) of fx, fy, cx, cy, k1, k2, p1, p2 of a calibration; None where its lens model has other parameters."""
-    record = (result_of(context, step_id)["details"].get("intrinsics") or {}).get("covariance")
-    if record is None:
-        return None
-    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-    known = list(record["parameters"])
-    if not set(known) <= set(names):
-        return None
-    rows = record["matrix"]
-    # What the model holds fixed is known exactly; the solver needs a number that is not zero.
-    return [
-        [rows[known.index(a)][known.index(b)] if a in known and b in known else 1e-18 * (a == b) for b in names]
-        for a in names
-    ]
+def intrinsics_covariance_of(found: Taken[calibrate.Answer]) -> ParameterCovariance | None:
+    """Of a calibration, with the names of its parameters; None where nobody has computed it."""
+    record = found.answer.details.intrinsics
+    return None if record is None else record.covariance

@@ -58,6 +58,7 @@ class NewJob:
     arguments: Mapping[str, Any] = field(default_factory=dict[str, Any])
     try_limit: int = 3
     priority: int = WAITED
+    version: int = 1  # of the arguments' form
 
 
 @dataclass(frozen=True, slots=True)

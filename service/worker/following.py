@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial, reduce
+from typing import Any
 
-from service.core.errors import OrthocaptureError, StoreError
+from service.core.errors import IntegrityError, OrthocaptureError, StoreError
+from service.core.jobs.references import jobs_of, references_in, resolve
 from service.core.records.events import Event
 from service.core.results.arrival import late_s
 from service.core.run.fold import advance
 from service.run_record import RunFollower, recorded_protocol, recorded_root
-from service.steps.sources import due
+from service.steps.poses.sources import due
 from service.store.records import Job, NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
@@ -27,6 +29,19 @@ class Following:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._logs: dict[str, RunFollower | None] = {}
+
+    def resolved(self, job: Job) -> Mapping[str, Any]:
+        """A job's arguments with what it takes from earlier jobs in the place of the references to it.
+
+        Raises:
+            IntegrityError: there is no such answer, or none that still counts.
+        """
+        if next(references_in(job.arguments), None) is None:
+            return job.arguments
+        log = self._log_of(job.run_id)
+        if log is None:
+            raise IntegrityError("what the job refers to cannot be read without the run's protocol", where=job.job_id)
+        return resolve(job.arguments, jobs_of(log.refresh()))
 
     def finish(self, job: Job, answer: JobAnswer, duration_s: float) -> None:
         """Record an answer, and in the same transaction enqueue what it makes possible. Raises LeaseLostError.

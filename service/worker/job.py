@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
-from service.compute.camera_model import CameraModel
 from service.core.records.events import ArtefactRef
+from service.jobs.kind import JobKind, JobRecord, NoAnswer
+
+A = TypeVar("A")
 
 
 class ArtefactStore(Protocol):
@@ -26,18 +29,23 @@ class ArtefactStore(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class JobAnswer:
-    """Numbers, files (already in the store) and plain data."""
+    """Numbers, files (already in the store) and the kind's answer."""
 
     measures: Mapping[str, float]
     artefacts: tuple[ArtefactRef, ...] = ()
-    result: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    answer: JobRecord = field(default_factory=NoAnswer)
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """The answer as it is written into the event."""
+        return self.answer.plain()
 
 
 @dataclass(frozen=True, slots=True)
-class JobContext:
+class JobContext(Generic[A]):
     """What a handler may touch: its arguments, verified inputs, a scratch folder and the store for its outputs."""
 
-    arguments: Mapping[str, Any]
+    arguments: A
     store: ArtefactStore
     scratch: Path
     progress: Callable[[str, int, int], None]
@@ -59,9 +67,20 @@ class JobContext:
         """Write any artefact."""
         return self.store.put_bytes(data, kind=kind, media_type=media_type, original_name=name)
 
-    def camera(self) -> CameraModel:
-        """The job's camera."""
-        return CameraModel.from_record(self.arguments["camera"])
+
+RecordedContext = JobContext[Mapping[str, Any]]  # with arguments as plain data, references resolved
+Handler = Callable[[RecordedContext], JobAnswer]
 
 
-Handler = Callable[[JobContext], JobAnswer]
+def handler_of(kind: JobKind[Any, Any]) -> Handler:
+    """The function that computes a kind from arguments without references.
+
+    It is imported at the first such job: a worker is ready at once.
+    """
+
+    def handle(context: RecordedContext) -> JobAnswer:
+        module, _, function = kind.compute.partition(":")
+        compute: Callable[[JobContext[Any]], JobAnswer] = getattr(importlib.import_module(module), function)
+        return compute(replace(context, arguments=kind.read_arguments(context.arguments)))
+
+    return handle

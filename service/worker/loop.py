@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import os
 import socket
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import TracebackType
@@ -18,12 +17,13 @@ from typing import TYPE_CHECKING
 from service.core.equipment.disk_space import LEAST_FREE_BYTES
 from service.core.errors import ComputeError, IntegrityError, OrthocaptureError, StoreError
 from service.core.jobs.priorities import Lane
-from service.core.text.terms import term
+from service.jobs import job_kinds
+from service.jobs.words import term
 from service.logs.where import at
 from service.store.errors import LeaseLostError
 from service.store.records import Job
 from service.store.store import Store
-from service.worker.job import Handler, JobAnswer, JobContext
+from service.worker.job import Handler, JobAnswer, JobContext, handler_of
 
 if TYPE_CHECKING:
     from service.worker.following import Following
@@ -32,39 +32,8 @@ _log = logging.getLogger(__name__)
 _LEASE_S = 30.0
 _POLL_S = 0.2
 
-_MODULES = {
-    "calibrate": "calibrate",
-    "board_view": "board_views",
-    "ct_surface": "surfaces",
-    "locate_spheres": "surfaces",
-    "layout": "layout",
-    "features": "front_end",
-    "match": "front_end",
-    "structure_from_motion": "poses",
-    "hybrid": "poses",
-    "detect_spheres": "registering",
-    "register": "registering",
-    "evaluate": "evaluating",
-    "coverage_points": "live",
-    "live_view": "live",
-    "live_summary": "live",
-    "hand_view": "hand",
-    "hand_board": "hand",
-}
-
-
-def _handler(kind: str) -> Handler:
-    """The function of this name, imported at the first such job: a worker is ready at once."""
-
-    def handle(context: JobContext) -> JobAnswer:
-        module = importlib.import_module(f"service.worker.{_MODULES[kind]}")
-        function: Handler = getattr(module, kind)
-        return function(context)
-
-    return handle
-
-
-HANDLERS: Mapping[str, Handler] = {kind: _handler(kind) for kind in _MODULES}
+# What computes each kind, from arguments without references: tests put others in their place.
+HANDLERS: dict[str, Handler] = {name: handler_of(kind) for name, kind in job_kinds().items()}
 
 
 def work(
@@ -125,7 +94,8 @@ def _do(store: Store, job: Job, progress: Callable[[str, int, int], None], follo
     attempt = _Attempt(store, job)
     progress(term(job.kind), 0, 0)
     with attempt, tempfile.TemporaryDirectory(prefix="orthocapture-job-") as scratch:
-        answer = HANDLERS[job.kind](JobContext(job.arguments, store, Path(scratch), progress))
+        arguments = following.resolved(job)
+        answer = HANDLERS[job.kind](JobContext(arguments, store, Path(scratch), progress))
     try:
         if attempt.error is not None:
             store.fail_job(job, attempt.error, retry=_worth_another_try(attempt.error))

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from service.audit.overview.digest import FOLDED
 from service.core.gates.verdict import evaluate_gates
 from service.core.protocol.models import Step, load_protocol
 from service.core.records.events import (
@@ -32,7 +31,7 @@ from service.core.records.events import (
     ViewpointFailed,
 )
 from service.core.run.actions import record_to_sign
-from service.core.run.fold import advance, initial_state
+from service.core.run.fold import DECISIVE_EVENTS, advance, initial_state
 from service.core.run.state import RunState
 from service.rig import load_rig
 from service.run_start import start_run
@@ -105,7 +104,7 @@ class LargeRun:
         payloads = [payload for payload, _actor, _artefacts in self.waiting]
         artefacts = [artefact for _payload, _actor, brought in self.waiting for artefact in brought]
         for event in self.store.record(self.run_id, payloads, actor=self.waiting[0][1], artefacts=artefacts):
-            if event.payload.kind in FOLDED:
+            if event.payload.kind in DECISIVE_EVENTS:
                 self.state = advance(self.protocol, replace(self.state, seq=event.seq - 1), event)
         self.waiting = []
 

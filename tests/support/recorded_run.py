@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from service.core.gates.verdict import evaluate_gates
+from service.core.jobs.references import Reference
 from service.core.protocol.models import parse_protocol
 from service.core.records.events import (
     ArtefactRef,
@@ -63,8 +64,11 @@ steps:
 """
 
 
-def record_run(folder: Path, *, complete: bool = True) -> str:
-    """Record a run in folder/data, from its first event to its last; returns its id."""
+def record_run(folder: Path, *, complete: bool = True, version: int = 1) -> str:
+    """Record a run in folder/data, from its first event to its last; returns its id.
+
+    With version 1 its jobs hold copies of earlier results, with version 2 references to them.
+    """
     (folder / "rig.yaml").write_text("name: small\nsimulated: true\ndevices: {}\n")
     loaded = parse_protocol(PROTOCOL.encode(), params_models(), name="recorded.yaml")
     with Store.open(folder / "data") as store:
@@ -72,15 +76,15 @@ def record_run(folder: Path, *, complete: bool = True) -> str:
         software = software_versions() | {"numpy": "1.0.0-recorded"}
         session = SessionStarted(resumed=False, software=software, host="here", pid=1)
         store.record(run_id, [session], actor="runner")
-        run = _Recorder(store, run_id, loaded.protocol)
+        run = _Recorder(store, run_id, loaded.protocol, version)
         first = run.scan("first_scan", seed=1)
         run.store.record(run_id, [OperatorAction(action="redo", step="first_scan", reason="a hole")], actor="Ada")
         first = run.scan("first_scan", seed=1, attempt=2)
         second = run.scan(
             "second_scan",
             seed=2,
-            reference_m=first["spheres_m"],
-            reference_covariances_m2=[s["covariance_m2"] for s in first["details"]["spheres"]],
+            reference_m=run.taken("spheres_m", first["spheres_m"]),
+            reference_covariances_m2=run.taken(*_covariances(first)),
         )
         run.register(second)
         if complete:
@@ -90,8 +94,13 @@ def record_run(folder: Path, *, complete: bool = True) -> str:
 
 
 class _Recorder:
-    def __init__(self, store: Store, run_id: str, protocol: Any) -> None:
-        self.store, self.run_id, self.protocol = store, run_id, protocol
+    def __init__(self, store: Store, run_id: str, protocol: Any, version: int) -> None:
+        self.store, self.run_id, self.protocol, self.version = store, run_id, protocol, version
+        self.last_job = ""
+
+    def taken(self, field: str, value: Any) -> Any:
+        """A part of the last job's answer, as it stands in the arguments of the next one."""
+        return value if self.version == 1 else Reference(self.last_job, f"result/{field}").record()
 
     def scan(self, step: str, *, seed: int, attempt: int = 1, **more: Any) -> dict[str, Any]:
         """Record a whole scan_import step; returns the job's result."""
@@ -130,8 +139,8 @@ class _Recorder:
             "outlines": refs[0].sha256,
             "model": refs[1].sha256,
             "poses": "colmap",
-            "spheres_m": scan["spheres_m"],
-            "sphere_covariance_m2": [s["covariance_m2"] for s in scan["details"]["spheres"]],
+            "spheres_m": self.taken("spheres_m", scan["spheres_m"]),
+            "sphere_covariance_m2": self.taken(*_covariances(scan)),
             "radius_m": RADIUS_M,
         }
         measures, result, artefacts = self._compute(step, 1, "register", arguments)
@@ -148,11 +157,12 @@ class _Recorder:
     def _compute(
         self, step: str, attempt: int, kind: str, arguments: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Any], tuple[ArtefactRef, ...]]:
-        job = NewJob(kind, step, attempt, f"{step}/{attempt}/{kind}", arguments)
+        job = NewJob(kind, step, attempt, f"{step}/{attempt}/{kind}", arguments, version=self.version)
         self.store.enqueue_job(self.run_id, job, actor="runner")
         assert work(self.store, until_idle=True, stop=lambda: False, progress=lambda _w, _d, _t: None) == 1
         end: Any = self.store.events(self.run_id)[-1].payload
         assert end.kind == "job_finished", end
+        self.last_job = end.job
         return end.measures, end.result, end.artefacts
 
     def _end(
@@ -174,6 +184,11 @@ class _Recorder:
             self.store.record(self.run_id, [action], actor="Ada")
         if sign or not self.protocol.step(step).sign:
             self.store.record(self.run_id, [StepPassed(step=step, attempt=attempt)], actor="runner")
+
+
+def _covariances(scan: dict[str, Any]) -> tuple[str, Any]:
+    """Where the covariances stand in a scan's result, and what they are."""
+    return "details/spheres/*/covariance_m2", [s["covariance_m2"] for s in scan["details"]["spheres"]]
 
 
 def _mesh(seed: int) -> bytes:

@@ -16,7 +16,7 @@ from typing import Any
 
 from service.core.records.events import ArtefactRef
 from service.store.events import canonical
-from service.worker.job import ArtefactStore, Handler, JobAnswer, JobContext
+from service.worker.job import ArtefactStore, Handler, JobAnswer, RecordedContext
 
 
 @dataclass
@@ -41,7 +41,7 @@ def remembering(handlers: Mapping[str, Handler], folder: Path) -> dict[str, Hand
 
 
 def _remembering(kind: str, handler: Handler, folder: Path) -> Handler:
-    def handle(context: JobContext) -> JobAnswer:
+    def handle(context: RecordedContext) -> JobAnswer:
         named = canonical({"kind": kind, "arguments": dict(context.arguments)})
         known = folder / hashlib.sha256(named.encode()).hexdigest()
         if known.exists():

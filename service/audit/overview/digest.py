@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 from pydantic import TypeAdapter
 from sqlalchemy import Connection, text
@@ -19,45 +19,21 @@ from service.core.records.events import (
     GatesEvaluated,
     GateVerdict,
     Payload,
-    ViewImported,
-    ViewpointCaptured,
+    View,
 )
-from service.core.results.late import LateResult, late_results
-from service.core.run.fold import advance, initial_state
+from service.core.run.fold import DECISIVE_EVENTS, RUN_EVENTS, advance, initial_state
 from service.core.run.state import Deviation, RunState
+from service.dataset.late_results import LateResult, late_results
 from service.store.store import Store
 
 CHUNK = 300  # events between two looks at who waits
-
-# The others change neither the lifecycle nor the deviations; a run of 100 000 events consists mostly of them.
-FOLDED = (
-    "run_started",
-    "operator_action",
-    "action_refused",
-    "gates_evaluated",
-    "step_started",
-    "step_failed",
-    "step_retried",
-    "step_passed",
-    "step_measured",
-    "viewpoint_captured",
-    "view_imported",
-    "viewpoint_failed",
-    "run_completed",
-    "run_aborted",
-    "run_released",
-    "control_taken",
-)
 
 # Of computations only these change what a first page says: results that came after the evaluation.
 _JOB_EVENTS = ("job_enqueued", "job_finished")
 _JOB_KINDS = ("evaluate",)
 
 # Of these the fold needs only step, attempt and name.
-_VIEWS: Mapping[str, type[ViewpointCaptured | ViewImported]] = {
-    "viewpoint_captured": ViewpointCaptured,
-    "view_imported": ViewImported,
-}
+_VIEWS = {kind: payload for kind, payload in RUN_EVENTS.items() if issubclass(payload, View)}
 _PLACE: TypeAdapter[tuple[str, int, str]] = TypeAdapter(tuple[str, int, str])
 
 
@@ -160,7 +136,7 @@ def _chunk_end(connection: Connection, run_id: str, after: int, last: int) -> in
     found = connection.execute(
         text(
             "SELECT seq FROM event_index WHERE run_id = :run AND seq > :after "
-            f"AND kind IN ({_quoted(FOLDED)}) ORDER BY seq LIMIT 1 OFFSET :chunk"
+            f"AND kind IN ({_quoted(DECISIVE_EVENTS)}) ORDER BY seq LIMIT 1 OFFSET :chunk"
         ),
         {"run": run_id, "after": after, "chunk": CHUNK - 1},
     ).scalar_one_or_none()
@@ -184,10 +160,10 @@ def _rows(connection: Connection, run_id: str, after: int, upto: int) -> Sequenc
             "SELECT seq, kind, at_utc, monotonic_s, actor, previous_sha256, sha256, CASE "
             f"WHEN kind IN ('step_measured', 'job_finished') THEN {_WITH_TABLE_ALONE} "
             "WHEN kind = 'job_enqueued' THEN json_set(payload, '$.arguments', json('{}')) "
-            "WHEN kind IN ('viewpoint_captured', 'view_imported') THEN json_array(json_extract(payload, '$.step'), "
+            f"WHEN kind IN ({_quoted(tuple(_VIEWS))}) THEN json_array(json_extract(payload, '$.step'), "
             "json_extract(payload, '$.attempt'), json_extract(payload, '$.viewpoint')) "
             "ELSE payload END AS payload FROM events "
-            f"WHERE run_id = :run AND seq > :after AND seq <= :upto AND (kind IN ({_quoted(FOLDED)}) "
+            f"WHERE run_id = :run AND seq > :after AND seq <= :upto AND (kind IN ({_quoted(DECISIVE_EVENTS)}) "
             f"OR kind IN ({_quoted(_JOB_EVENTS)}) "
             f"AND json_extract(payload, '$.job_kind') IN ({_quoted(_JOB_KINDS)})) "
             "ORDER BY seq"
@@ -234,4 +210,5 @@ def _payload(kind: str, content: str) -> Payload:
     if kind not in _VIEWS:
         return PAYLOAD.validate_json(content)
     step, attempt, viewpoint = _PLACE.validate_json(content)
-    return _VIEWS[kind].model_construct(step=step, attempt=attempt, viewpoint=viewpoint)
+    view = _VIEWS[kind].model_construct(step=step, attempt=attempt, viewpoint=viewpoint)
+    return cast("Payload", view)

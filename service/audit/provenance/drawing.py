@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from service.audit.provenance.graph import Graph, Node
+from service.jobs import job_kinds
 
 BOX_WIDTH = 200
 BOX_HEIGHT = 46
@@ -13,7 +14,7 @@ _ROW = 62
 _MARGIN = 8
 DRAWN = 70  # nodes; a larger graph is read in the list
 # What helps during the capture and leads to no result: among all else it would hide what does.
-_ASIDE = frozenset({"live_view", "live_summary", "coverage_points", "features", "match"})
+_ASIDE = frozenset(name for name, kind in job_kinds().items() if kind.aside)
 
 
 @dataclass(frozen=True, slots=True)

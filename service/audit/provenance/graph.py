@@ -13,11 +13,13 @@ from sqlalchemy import Connection, text
 from service.audit.background.incremental import IncrementalResults, PartialResult
 from service.audit.record.artefact_queries import ArtefactRow, artefacts_of_events, one_artefact
 from service.audit.record.queries import EventRow, head, plain, read_rows
+from service.core.jobs.references import Each, Reference, references_in
+from service.store.events import parse_canonical
 from service.store.store import Store
 
 CHUNK = 500  # events between two looks at who waits
 _HASH = re.compile(r'"([0-9a-f]{64})"')
-# Later jobs hold earlier results by value too (a camera, centres of spheres): so many digits nobody typed.
+# Jobs of version 1 hold copies of earlier results (a camera, centres of spheres): so many digits nobody typed.
 _NUMBER = re.compile(r"-?\d+\.\d{12,}(?:e-?\d+)?")
 _NUMBERS_A_JOB = 3000
 _JOBS_A_KIND = 20  # whose numbers are remembered: views by the thousand give nothing to others by value
@@ -144,9 +146,31 @@ def _add_job(graph: Graph, row: Any) -> None:
     taken = Counter(graph.groups[name] for name in set(_HASH.findall(row.payload)) if name in graph.groups)
     for source, number in taken.items():
         graph.edges[source, key] = max(graph.edges.get((source, key), 0), number)
-    for source in {graph.numbers[name] for name in _NUMBER.findall(row.payload) if name in graph.numbers} - {key}:
+    payload = parse_canonical(row.payload)
+    if payload.get("version", 1) == 1:
+        results = {graph.numbers[name] for name in _NUMBER.findall(row.payload) if name in graph.numbers} - {key}
+    else:
+        results = _referred_to(graph, payload["arguments"], key)
+    for source in results:
         graph.edges.setdefault((source, key), 0)
         graph.by_value.add((source, key))
+
+
+def _referred_to(graph: Graph, arguments: Any, key: str) -> set[str]:
+    """Nodes of the jobs whose results the arguments refer to; files that they refer to become edges here."""
+    results: set[str] = set()
+    for reference in references_in(arguments):
+        if isinstance(reference, Reference):
+            sources = {graph.jobs[reference.job]} if reference.job in graph.jobs else set[str]()
+        else:
+            begun = (stem.split("/") for stem in reference.jobs)
+            sources = {f"job {step} {kind}" for step, _, kind, *_ in begun} & graph.nodes.keys()
+        if not reference.field.startswith("artefacts/"):
+            results |= sources - {key}
+            continue
+        for file in [b for a, b in graph.edges if a in sources and not graph.nodes[b].is_job]:
+            graph.edges[file, key] = max(graph.edges.get((file, key), 0), graph.nodes[file].count)
+    return results
 
 
 def _count(graph: Graph, key: str, row: Any, *, is_job: bool) -> None:
@@ -231,7 +255,7 @@ def _ends(connection: Connection, run_id: str, jobs: Sequence[str]) -> Iterator[
 
 
 def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[ArtefactRow], int]:
-    named = list(dict.fromkeys(_HASH.findall(job.shown)))
+    named = list(dict.fromkeys([*_HASH.findall(job.shown), *_listed(connection, run_id, job)]))
     rows = connection.execute(
         text(
             "SELECT min(seq * 1000 + position) AS place FROM artefacts WHERE run_id = :run "
@@ -242,6 +266,22 @@ def _inputs(connection: Connection, run_id: str, job: EventRow) -> tuple[list[Ar
     places = list(rows)
     first = artefacts_of_events(connection, run_id, sorted({place // 1000 for place in places[:LISTED]}))
     return [row for row in first if row.sha256 in set(named)][:LISTED], len(places)
+
+
+def _listed(connection: Connection, run_id: str, job: EventRow) -> Iterator[str]:
+    """The files of the many earlier jobs that a job refers to at once."""
+    for each in references_in(job.payload.get("arguments", {})):
+        if isinstance(each, Each) and each.field.startswith("artefacts/"):
+            for stem in each.jobs:
+                yield from connection.execute(
+                    text(
+                        "SELECT a.sha256 FROM jobs AS j JOIN artefacts AS a ON a.run_id = j.run_id "
+                        "AND a.seq = j.ended_seq WHERE j.run_id = :run AND j.state = 'finished' "
+                        "AND j.ended_seq <= :upto AND substr(j.idempotency_key, 1, :length) = :stem "
+                        "AND a.position = 0 ORDER BY j.enqueued_seq"
+                    ),
+                    {"run": plain(run_id), "upto": each.upto_seq, "length": len(stem), "stem": stem},
+                ).scalars()
 
 
 def _decoded_from(

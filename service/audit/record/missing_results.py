@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event
 from service.core.run.state import RunState
-from service.steps.time_left import missing_results
+from service.steps.poses.time_left import missing_results
 
 
 def not_in_yet(protocol: Protocol, state: RunState, events: Sequence[Event]) -> list[str]:

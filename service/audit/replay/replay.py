@@ -17,8 +17,10 @@ from service.audit.replay.differences import Comparison, Difference, compare_dat
 from service.audit.replay.recomputed import Drift, Recomputed, drifts
 from service.core.errors import ConfigurationError, IntegrityError, OrthocaptureError
 from service.core.gates.verdict import evaluate_gates
+from service.core.jobs.references import jobs_of, resolve
 from service.core.records.events import ArtefactRef, GateVerdict, JobFinished, SessionStarted
 from service.core.run.state import JobState
+from service.jobs import job_kinds
 from service.runner.software import software_versions
 from service.store.events import parse_canonical, payload_text
 from service.store.verification.verify import verify
@@ -29,19 +31,7 @@ Progress = Callable[[str, int, int], None]
 Verdict = Literal["identical", "within_tolerance", "different", "not_replayed"]
 
 # What a specimen's data set rests on; the looks at each image during the capture are left out unless asked for.
-DEFAULT_KINDS = (
-    "calibrate",
-    "ct_surface",
-    "locate_spheres",
-    "layout",
-    "features",
-    "match",
-    "structure_from_motion",
-    "hybrid",
-    "detect_spheres",
-    "register",
-    "evaluate",
-)
+DEFAULT_KINDS = tuple(name for name, kind in job_kinds().items() if kind.replayed)
 _WORST_FIRST: tuple[Verdict, ...] = ("not_replayed", "different", "within_tolerance")
 _FAILURES = (ValueError, ArithmeticError, LookupError, OSError, MemoryError, np.linalg.LinAlgError)
 
@@ -191,7 +181,8 @@ def replay(
             where=str(run.data_dir),
             remedy="See `orthocapture audit verify`; restore the file from a copy",
         )
-    recomputed = Recomputed()
+    recomputed = Recomputed(run.state)
+    recorded = jobs_of(run.state)
     replays: list[JobReplay] = []
     with tempfile.TemporaryDirectory(prefix="orthocapture-replay-") as folder:
         store = ScratchStore(run.files, Path(folder))
@@ -202,7 +193,7 @@ def replay(
             def show(what: str, done: int, total: int, title: str = title) -> None:
                 progress(f"{title}: {what}", done, total)
 
-            arguments = recomputed.in_place_of_recorded(job.arguments) if end_to_end else job.arguments
+            arguments = recomputed.arguments(job) if end_to_end else resolve(job.arguments, recorded)
             replays.append(_replay_job(run, store, step_id, job, arguments, recomputed, show))
             if out is not None:
                 _keep(store, replays[-1], out / step_id / f"{number:02d}_{job.kind}")
@@ -274,7 +265,7 @@ def _replay_job(
         return replace(about, error=repr(error), duration_s=time.monotonic() - started_s)
     about = replace(about, duration_s=time.monotonic() - started_s)
     before = parse_canonical(payload_text(recorded))
-    recomputed.add(job, before, now, answer)
+    recomputed.add(step, job, now, answer)
     renamed = recomputed.renamed
     artefacts = [
         _compare_artefacts(store, run.files, old, new, renamed)
@@ -309,7 +300,7 @@ def _as_recorded(recorded: JobFinished, answer: JobAnswer) -> Any:
         update={
             "measures": dict(answer.measures),
             "artefacts": tuple(answer.artefacts),
-            "result": dict(answer.result),
+            "result": answer.result,
         }
     )
     return parse_canonical(payload_text(payload))

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from service.audit.report.blocks import Cell
 from service.core.gates.verdict import Standing, figure, limits, standing
 from service.core.records.events import GateVerdict
-from service.core.text.terms import term
+from service.jobs.words import term
 
 
 def utc(text: str) -> str:

@@ -15,9 +15,9 @@ from service.core.gates.verdict import figure, limits, quantity, standing
 from service.core.protocol.models import Protocol
 from service.core.records.entered import ABOUT, RunAbout
 from service.core.records.events import Event, GateVerdict, RunStarted
-from service.core.results.registrations import evaluated
 from service.core.run.state import RunState, StepState
 from service.core.units import mm
+from service.dataset.registrations import evaluated
 from service.people.approvals import difference
 
 _UNITS = {"_px": "px", "_mm": "mm", "_deg": "°", "_min": "min"}  # by the end of a measure's name
@@ -165,7 +165,7 @@ def _change(values: Sequence[float | None], unit: str = "") -> str:
 
 
 def _accuracy(first: ComparedRun, second: ComparedRun) -> Iterable[Row]:
-    tables = [{str(row["poses"]): row for row in evaluated(run.protocol, run.state)} for run in (first, second)]
+    tables = [{row.poses: row.plain() for row in evaluated(run.protocol, run.state)} for run in (first, second)]
     for poses in dict.fromkeys([*tables[0], *tables[1]]):
         rows = [table.get(poses, {}) for table in tables]
         for field, name, unit in (

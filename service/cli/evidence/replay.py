@@ -27,7 +27,7 @@ from service.cli.common import (
 )
 from service.core.errors import OrthocaptureError
 from service.core.gates.verdict import describe
-from service.core.text.terms import term
+from service.jobs.words import term
 from service.worker.loop import HANDLERS
 
 _COULD_NOT = 2

@@ -60,8 +60,8 @@ from service.run_start import (
 from service.runner.loop import Runner
 from service.station import Station, layout_of
 from service.steps import params_models
-from service.steps.live import describe_view
-from service.steps.preview import preview_board_poses, preview_plans
+from service.steps.capture.live_numbers import describe_view
+from service.steps.capture.preview import preview_board_poses, preview_plans
 from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.timestamps import stamp_end
 from service.store.store import Store

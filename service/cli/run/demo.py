@@ -37,9 +37,9 @@ from service.compute.evaluation.accuracy import true_error_m
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.geometry import inverse
 from service.core.protocol.models import load_protocol
-from service.core.results.registrations import shared_adjustment_note
 from service.core.units import mm
 from service.dataset.export import export_dataset
+from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary, summarise
 from service.rig import load_rig
 from service.run_start import start_run
@@ -83,7 +83,7 @@ def demo_command(
             write_html(report_content(read_run(data, run_id), audit, true_error_mm=truth), report)
             dataset = folder / "dataset"
             export_dataset(summary, dataset, not_in_yet(summary.protocol, summary.state, summary.events))
-            table = [{**row, "true_error_mm": truth[row["poses"]]} for row in summary.table()]
+            table = [{**row.plain(), "true_error_mm": truth[row.poses]} for row in summary.table()]
             database = str(store.database_path)
     result = {
         "run": run_id,
@@ -122,7 +122,7 @@ def true_errors_mm(summary: RunSummary, truth_file: Path) -> dict[str, float]:
     centre_scan_m = np.array(summary.result("scan_import")["spheres_m"]).mean(axis=0)
     errors: dict[str, float] = {}
     for source, registration in summary.registrations().items():
-        cameras: Mapping[str, Any] = registration["T_scan_camera"]
+        cameras = registration.T_scan_camera
         estimated = np.array([cameras[name] for name in cameras])
         true = np.array([T_scan_world @ T_world_camera[photographs[name]] for name in cameras])
         errors[source] = mm(true_error_m(estimated, true, centre_scan_m))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import getpass
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,9 +31,10 @@ from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
 from service.core.records.entered import RunAbout, about_run
 from service.core.records.import_list import FileRole, ImportedView, ImportList, PhotographRole
-from service.core.results.registrations import shared_adjustment_note
+from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import summarise
 from service.import_folder import find_places, import_rig, list_import
+from service.jobs.registration.evaluate import Row
 from service.rig import Rig
 from service.run_record import recorded_root
 from service.run_start import start_run
@@ -121,7 +122,13 @@ def import_command(
             table, note = summary.table(), shared_adjustment_note(loaded.protocol, summary.state)
         if json:
             print_json(
-                {"run": run_id, "status": state.status, "table": table, "table_note": note, **listing_record(listing)}
+                {
+                    "run": run_id,
+                    "status": state.status,
+                    "table": [row.plain() for row in table],
+                    "table_note": note,
+                    **listing_record(listing),
+                }
             )
         else:
             _show_result(run_id, state.status, state.deviation_count, table, note)
@@ -238,18 +245,18 @@ def _dates(first: str, last: str) -> str:
     return begin if begin == end else f"{begin} to {end[11:] if end[:10] == begin[:10] else end}"
 
 
-def _show_result(run_id: str, status: str, deviations: int, rows: Sequence[Mapping[str, Any]], note: str) -> None:
+def _show_result(run_id: str, status: str, deviations: int, rows: Sequence[Row], note: str) -> None:
     if rows:
         table = Table(title="Registration error", title_justify="left")
         for heading in ("camera poses", "images", "evaluated on", "mean radial error (mm)", "reprojection (px)"):
             table.add_column(heading, justify="right" if "(" in heading else "left")
         for row in rows:
             table.add_row(
-                row["poses"],
-                str(row["images"]),
-                row["evaluated_on"],
-                f"{row['mean_radial_error_mm']:.3f}",
-                f"{row['mean_reprojection_error_px']:.2f}",
+                row.poses,
+                str(row.images),
+                row.evaluated_on,
+                f"{row.mean_radial_error_mm:.3f}",
+                "–" if row.mean_reprojection_error_px is None else f"{row.mean_reprojection_error_px:.2f}",
             )
         print_table(table)
         if note:

@@ -12,7 +12,7 @@ from service.core.records.events import OperatorAction
 from service.core.records.import_list import FileRole, ImportList, PhotographRole
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
-from service.core.text.terms import term
+from service.jobs.words import term
 from service.runner.operator import AnswerBy
 
 

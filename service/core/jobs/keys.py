@@ -15,9 +15,10 @@ def arguments_name(arguments: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(arguments, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _stem(state: RunState, step: str, kind: str, name: str) -> str:
+def key_stem(state: RunState, step: str, kind: str) -> str:
+    """With what the keys of a kind's jobs begin that were enqueued since the step's last redo."""
     generation = sum(past.step == step and past.viewpoint is None for past in state.superseded)
-    return f"{step}/{generation}/{kind}/{name}/"
+    return f"{step}/{generation}/{kind}/"
 
 
 def job_key(state: RunState, step: str, kind: str, name: str) -> str:
@@ -25,13 +26,13 @@ def job_key(state: RunState, step: str, kind: str, name: str) -> str:
 
     A redo of the step begins a new generation of keys; a failed job is tried again under a new key.
     """
-    stem = _stem(state, step, kind, name)
+    stem = f"{key_stem(state, step, kind)}{name}/"
     jobs = state.steps[step].jobs.values()
     return stem + str(sum(job.idempotency_key.startswith(stem) and job.status == "failed" for job in jobs))
 
 
 def newest_job(state: RunState, step: str, kind: str, name: str) -> JobState | None:
     """The last job for this work enqueued since the step's last redo, or None."""
-    stem = _stem(state, step, kind, name)
+    stem = f"{key_stem(state, step, kind)}{name}/"
     jobs = [job for job in state.steps[step].jobs.values() if job.idempotency_key.startswith(stem)]
     return max(jobs, key=lambda job: job.enqueued_seq, default=None)

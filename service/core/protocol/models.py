@@ -159,6 +159,7 @@ class StepFields(Record):
     confirm: bool = True  # whether a person starts it; a step that moves the robot always waits for one
     skippable: bool = False  # whether a person may skip it, with a reason
     irreversible: bool = False  # whether nothing before it can be done again afterwards
+    cannot_be_undone: str = ""  # what a person reads before an irreversible step: a sentence
     requires: tuple[str, ...] = ()  # earlier steps that must not have been skipped
     recovery: Recovery = Recovery()  # what happens when the work fails
     simulated_hands: tuple[HandAction, ...] = ()  # ignored on a real rig

@@ -35,6 +35,7 @@ def enqueue(
             idempotency_key=job.idempotency_key,
             arguments=dict(job.arguments),
             priority=job.priority,
+            version=job.version,
         )
         (event,) = append(connection, clock, run_id, [payload], actor)
         connection.execute(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from fastapi import APIRouter, Depends, Request
 from fastapi.responses import HTMLResponse, Response
@@ -13,8 +11,8 @@ from service.audit.background.incremental import Progress
 from service.audit.overview import first_page
 from service.audit.overview.digest import Digest
 from service.core.protocol.models import Protocol
-from service.core.results.registrations import evaluated, own_registration
 from service.core.run.state import RunState
+from service.dataset.registrations import evaluated, own_registration
 from service.web.audit.frame import CurrentAudit, audit_frame
 from service.web.page.rendering import render
 from service.web.run.figures import GateLine, gate_lines
@@ -91,23 +89,23 @@ def accuracy_of(digest: Digest | None) -> list[AccuracyRow]:
 
 
 def _accuracy(protocol: Protocol, state: RunState) -> list[AccuracyRow]:
-    rows: Sequence[Mapping[str, Any]] = evaluated(protocol, state)
+    rows = evaluated(protocol, state)
     own = own_registration(protocol, state)
     gates = [gate for step in protocol.steps if step.kind == "evaluation" for gate in step.gates]
     most = next((gate.max for gate in gates if gate.measure.endswith(_ERROR)), None)
     out: list[AccuracyRow] = []
     for row in rows:
-        error = row.get(_ERROR)
+        error = row.mean_radial_error_mm
         out.append(
             AccuracyRow(
-                poses=str(row.get("poses", "")),
+                poses=row.poses,
                 error_mm=error,
-                reprojection_px=row.get(_PIXELS),
-                images=str(row.get("images", "")),
-                late=str(row.get("late", "")),
+                reprojection_px=row.mean_reprojection_error_px,
+                images="" if row.images is None else str(row.images),
+                late=row.late,
                 limit="" if most is None else f"at most {most:g} mm",
-                within=None if most is None or error is None else float(error) <= most,
-                own=str(row.get("poses", "")) == own,
+                within=None if most is None else error <= most,
+                own=row.poses == own,
             )
         )
     return out

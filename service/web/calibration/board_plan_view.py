@@ -10,10 +10,10 @@ from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.text.counts import counted
 from service.rig import Rig
 from service.run_record import RunRecord
-from service.steps.board_plan import NOTE, describe_prediction
-from service.steps.calibration import Params
+from service.steps.board.plan import NOTE, describe_prediction
+from service.steps.capture.preview import preview_board_poses
 from service.steps.context import StationLayout
-from service.steps.preview import preview_board_poses
+from service.steps.kinds.calibration import Params
 from service.web.calibration.board_plan_drawing import board_plan_svg
 from service.web.record.pictures import cached
 from service.web.record.planned_poses import recorded_rig, station_of

@@ -14,7 +14,7 @@ from service.core.protocol.models import Protocol, Step
 from service.core.records.events import DeviceOpened, ViewHeld
 from service.core.run.state import JobState
 from service.run_record import RunRecord
-from service.steps.manual_capture import failure_words
+from service.steps.kinds.manual_capture import failure_words
 from service.web.page.run_words import limit, measure_name
 from service.web.record.images import captures_of
 

@@ -3,38 +3,22 @@
 from __future__ import annotations
 
 from service.core.gates.verdict import Standing, figure, standing
-from service.core.protocol.models import Protocol, Step
+from service.core.protocol.models import MovingParams, Protocol, Step
 from service.core.records.events import GateVerdict
 from service.core.recovery.ways_on import WayOn, planned_sets, planned_views
 from service.core.run.decide import AskOperator
 from service.core.run.state import RunState, StepState
+from service.steps import step_kinds
+from service.steps.context import ROBOT_MOVES, Announcement, BeforeStep
 
-_DRAWINGS_BY_ID = {
-    "fixation": "fixation",
-    "ct_hand_over_out": "transport",
-    "ct_hand_over_back": "transport",
-    "camera_set_up": "camera",
-    "board_removal": "board",
-    "station_change": "stations",
-    "control_sphere_removal": "control_spheres",
-    "specimen_release": "fixation",
-}
-_DRAWINGS_BY_KIND = {
-    "layout_check": "layout_photo",
-    "calibration": "board",
-    "viewpoint_capture": "stations",
-    "manual_capture": "camera",
-    "scan_import": "scan_path",
-    "timed_application": "spray",
-    "ct_import": "transport",
-}
 _ACRONYMS = {"rms": "RMS", "ct": "CT", "colmap": "COLMAP", "five": "Five", "px": "px"}
 _UNITS = frozenset({"px", "mm", "deg", "min", "m", "s", "rad"})
 
 
 def drawing_of(step: Step) -> str:
-    """Name of the drawing that shows the step, "" for none: the protocol's own choice, else by what the step is."""
-    return step.drawing or _DRAWINGS_BY_ID.get(step.id) or _DRAWINGS_BY_KIND.get(step.kind, "")
+    """Name of the drawing that shows the step, "" for none: the protocol's own choice, else that of its kind."""
+    kind = step_kinds().get(step.kind)
+    return step.drawing or (kind.drawing if kind is not None else "")
 
 
 def measure_name(measure: str) -> str:
@@ -69,40 +53,23 @@ def count(amount: int, one: str, many: str = "") -> str:
     return f"{amount} {one if amount == 1 else many or one + 's'}"
 
 
-def will_happen(step: Step, now: StepState) -> tuple[str, str]:  # noqa: PLR0911 - one return a kind
+def will_happen(step: Step, now: StepState) -> tuple[str, str]:
     """What a confirmation of this step does: the large words of its button, and a line below."""
+    kind = step_kinds().get(step.kind)
     left = max(planned_views(step) - len(now.captured), 0)
-    match step.kind:
-        case "viewpoint_capture" | "calibration":
-            what = count(left, "image") + (" of the board" if step.kind == "calibration" else "")
-            where = f" at {station_of(step)}" if station_of(step) else ""
-            return f"Confirm: the robot takes {what}{where}", "The robot moves. Everybody stays outside of its reach."
-        case "manual_capture":
-            return "Confirm: begin to take images by hand", "Nothing moves. The screen says where to hold the camera."
-        case "layout_check":
-            photographs = int(getattr(step.params, "photographs", 1))
-            return f"Confirm: the camera takes {count(photographs, 'photograph')}", "Nothing moves."
-        case "ct_import":
-            return "Confirm: import the CT series", "Nothing moves. The software waits for the series."
-        case "scan_import":
-            return "Confirm: import the scan", "Nothing moves. The software waits for the export."
-        case "timed_application":
-            product = str(getattr(step.params, "product", "the coat"))
-            return f"Confirm: {product} is on, the clock starts", "Nothing moves."
-        case "checklist":
-            return "Confirm: all of this is done", "Nothing moves."
-        case _:
-            return f"Confirm: begin {step.title[:1].lower()}{step.title[1:]}", "Nothing moves."
+    before = BeforeStep(step.title, left, station_of(step))
+    said = kind.words(step.params, before) if kind is not None and kind.words is not None else None
+    if said is None:
+        moves = isinstance(step.params, MovingParams) and step.params.moves_robot
+        begin = f"begin {step.title[:1].lower()}{step.title[1:]}"
+        said = Announcement(begin, ROBOT_MOVES) if moves else Announcement(begin)
+    return f"Confirm: {said.does}", said.below
 
 
 def irreversible_warning(protocol: Protocol, step: Step) -> str:
     """In plain words what cannot be undone after this step."""
     before = [s.title for s in protocol.steps[: protocol.index(step.id)] if s.kind == "viewpoint_capture"]
-    words = {
-        "control_sphere_removal": "Once the control spheres are off, they can never be put back in the same place.",
-        "spraying": "Once the spray is on, the bare anatomy can never be photographed again in this run.",
-        "specimen_release": "Once the K-wires are out, nothing can be measured again in this frame.",
-    }.get(step.id, "This step changes the scene for good.")
+    words = step.cannot_be_undone or "This step changes the scene for good."
     tail = f" None of these can be done again: {', '.join(before)}." if before else ""
     return f"{words}{tail} Read the figures before you go on."
 

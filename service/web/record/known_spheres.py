@@ -12,8 +12,9 @@ import numpy as np
 from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply
-from service.core.results.registrations import best_registration as best_registration_name
-from service.core.results.registrations import registrations
+from service.dataset.registrations import best_registration as best_registration_name
+from service.dataset.registrations import registrations
+from service.jobs.registration.register import Answer as Registration
 from service.run_record import RunRecord
 
 SphereKind = Literal["registration", "control", "sphere"]
@@ -32,10 +33,10 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True)
 class ShownRegistration:
-    """The registration that pages show: see service.core.results.registrations.best_registration."""
+    """The registration that pages show: see service.dataset.registrations.best_registration."""
 
     name: str
-    record: Mapping[str, Any]
+    record: Registration
     step: str
 
 

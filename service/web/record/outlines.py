@@ -16,6 +16,7 @@ from service.compute.markers.archive import outline_from_record
 from service.compute.markers.records import SphereOutline
 from service.compute.registration.pairing import CONTROL_GATE, paired
 from service.core.geometry import Transform, inverse
+from service.core.jobs.references import jobs_of, resolve
 from service.core.units import metres
 from service.run_record import RunRecord
 from service.web.record.images import Capture
@@ -46,25 +47,24 @@ def outlines_of(log: RunRecord, capture: Capture) -> OutlineSource | None:
     """The registration's outlines of a valid image, else what the live numbers found, else None."""
     registered = best_registration(log)
     if registered is not None and capture.replaced is None:
-        T = registered.record["T_scan_camera"].get(capture.payload.viewpoint)
-        artefact = str(registered.record["outlines"])
+        T = registered.record.T_scan_camera.get(capture.payload.viewpoint)
+        artefact = registered.record.outlines
         if T is not None and capture.payload.artefacts[0].kind in ("image", "control_image"):
             return OutlineSource(
                 f"{artefact[:16]}-{registered.name}",
                 artefact,
                 scan_spheres(log, registered),
-                CameraModel.from_record(registered.record["camera"]),
-                CameraModel.from_record(registered.record.get("full_camera") or registered.record["camera"]),
+                CameraModel.from_record(registered.record.camera.plain()),
+                CameraModel.from_record((registered.record.full_camera or registered.record.camera).plain()),
                 inverse(np.array(T, dtype=np.float64)),
                 live=False,
             )
     job = capture.live
     if job is None or job.status != "finished" or not job.artefacts:
         return None
-    camera = CameraModel.from_record(job.arguments["camera"])
-    return OutlineSource(
-        f"live-{job.artefacts[0].sha256[:16]}", job.artefacts[0].sha256, ct_spheres(log), camera, camera, None, True
-    )
+    camera = CameraModel.from_record(resolve(job.arguments["camera"], jobs_of(log.state)))
+    sha256 = job.artefacts[0].sha256
+    return OutlineSource(f"live-{sha256[:16]}", sha256, ct_spheres(log), camera, camera, None, True)
 
 
 def marks_of(log: RunRecord, capture: Capture) -> tuple[DrawnOutline, ...]:

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from service.core.gates.dependence import accepted_gates
 from service.core.records.entered import about_rows
 from service.core.records.events import RunStarted
-from service.core.results.registrations import evaluated, shared_adjustment_note
+from service.dataset.registrations import evaluated, shared_adjustment_note
 from service.monitor.snapshot import read_snapshot
 from service.people.control import Control
 from service.people.person import Person

@@ -12,10 +12,10 @@ from service.core.gates.dependence import dependent_steps, depends_on
 from service.core.protocol.models import Protocol, Step
 from service.core.records.events import OperatorVerb
 from service.core.recovery.ways_on import WayOn, takes_words
-from service.core.results.registrations import evaluated
 from service.core.run.actions import needs_leave, needs_signature_now, record_to_sign, redoable_steps
 from service.core.run.decide import AskOperator, decide
 from service.core.run.state import RunState
+from service.dataset.registrations import evaluated
 from service.monitor.snapshot import STOPS, Snapshot
 from service.web.page.run_words import (
     count,

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 from typing import Protocol as Interface
 
 from service.core.gates.dependence import AcceptedGate
 from service.core.protocol.models import Protocol
 from service.core.records.events import Event, OperatorVerb
 from service.core.run.state import Deviation, RunState
+from service.jobs.registration.evaluate import Row
 from service.web.run.figures import GateLine, Progress, Reading
 
 
@@ -96,7 +96,7 @@ class StepView:
     skipped: bool
     started_utc: str
     ended_utc: str
-    table: Sequence[Mapping[str, Any]]  # of an evaluation
+    table: Sequence[Row]  # of an evaluation
     depends: tuple[AcceptedGate, ...]  # what was accepted outside its limits and this rests on
 
 

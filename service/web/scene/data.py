@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from service.compute.evaluation.closure import Alignment
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import ArtefactRef, ViewpointCaptured
-from service.core.results.registrations import registrations
 from service.core.units import metres, mm
+from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
+from service.jobs.registration.register import Answer as Registration
 from service.run_record import RunRecord
 from service.web.record.images import captures_of
 from service.web.record.known_spheres import (
@@ -81,13 +82,13 @@ def scene_of(log: RunRecord) -> KnownScene:
 
 def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
     record = registered.record
-    cameras = {name: np.array(T, dtype=np.float64) for name, T in record["T_scan_camera"].items()}
+    cameras = {name: np.array(T, dtype=np.float64) for name, T in record.T_scan_camera.items()}
     spheres = scan_spheres(log, registered)
     bases, missing = _bases(log, record)
     scan = log.protocol.step(registered.step).params.model_dump()["scan"]
     meshes = [ref for ref in log.state.steps[scan].artefacts if ref.kind == "scan_mesh"]
-    left_out: Mapping[str, Any] = record.get("leave_one_out") or {}
-    seen = {label: int(row[2]) for label, row in left_out.get("spheres", {}).items()}
+    left_out = record.leave_one_out
+    seen = {} if left_out is None else {label: int(row[2]) for label, row in left_out.spheres.items()}
     scene = Scene(
         cameras=cameras,
         stations=dict.fromkeys(cameras, "")
@@ -109,14 +110,14 @@ def _registered(log: RunRecord, registered: ShownRegistration) -> KnownScene:
     )
 
 
-def _bases(log: RunRecord, record: Mapping[str, Any]) -> tuple[dict[str, Transform], list[str]]:
+def _bases(log: RunRecord, record: Registration) -> tuple[dict[str, Transform], list[str]]:
     """T_scan_base by station: from this registration, or from one of the same run that keeps the stations apart."""
     known_registrations = registrations(log.protocol, log.state)
     known = [record, *(known_registrations[n] for n in _WITH_STATIONS if n in known_registrations)]
     for candidate in known:
-        if candidate["poses"] in _WITH_STATIONS:
-            T_scan_world = inverse(np.array(candidate["T_world_scan"]))
-            return {name: T_scan_world @ np.array(T) for name, T in candidate["T_world_station"].items()}, []
+        if candidate.poses in _WITH_STATIONS:
+            T_scan_world = inverse(np.array(candidate.T_world_scan))
+            return {name: T_scan_world @ np.array(T) for name, T in candidate.T_world_station.items()}, []
     return {}, ["Robot bases: the poses come from the images alone, which do not tell where the robots stood."]
 
 
@@ -231,7 +232,7 @@ def with_mesh(now: KnownScene, log: RunRecord, data: Path) -> Scene:
 
 def predicted_error_mm(registered: ShownRegistration, points_m: Array) -> Array:
     """Standard deviation (N,) of the place of points (N, 3) of the scan in the images, 3D."""
-    placed = Alignment(np.array(registered.record["T_world_scan"]), np.array(registered.record["covariance"])[:6, :6])
+    placed = Alignment(np.array(registered.record.T_world_scan), np.array(registered.record.covariance)[:6, :6])
     return np.asarray(mm(np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2))), dtype=np.float64)
 
 

@@ -67,9 +67,9 @@ def report_scene(summary: RunSummary, *, turning: bool) -> Scene | None:
         return None  # the first page says which file it is
     registered = registrations[best]
     points_m, triangles = scene_view.decimated(*summary.scan_mesh(), most=_FACES)
-    placed = Alignment(np.array(registered["T_world_scan"]), np.array(registered["covariance"])[:6, :6])
+    placed = Alignment(np.array(registered.T_world_scan), np.array(registered.covariance)[:6, :6])
     error_mm = mm(np.sqrt(np.trace(placed.covariance_at_m2(points_m), axis1=1, axis2=2)))
-    cameras = {name: np.array(T) for name, T in registered["T_scan_camera"].items()}
+    cameras = {name: np.array(T) for name, T in registered.T_scan_camera.items()}
     stations = {c.viewpoint: c.station for c in summary.captures() if c.viewpoint in cameras}
     scene = scene_view.Scene(
         cameras=cameras,

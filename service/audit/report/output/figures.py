@@ -41,12 +41,12 @@ def figure_files(report: Report, summary: RunSummary) -> list[FigureFile]:
             found.append(FigureFile(f"{name}.csv", shows, _csv(drawing.rows)))
     table = summary.table()
     if table:
-        rows = [_ERRORS, *(tuple(_text(row, name) for name in _ERRORS) for row in table)]
+        rows = [_ERRORS, *(tuple(_text(row.plain(), name) for name in _ERRORS) for row in table)]
         found.append(FigureFile("registration_error.csv", "Registration error by source of camera poses", _csv(rows)))
     contributions = [
-        (poses, item["name"], f"{item['sigma_mm']:.6f}", "yes" if item["counted"] else "no", item["how"])
+        (poses, item.name, f"{item.sigma_mm:.6f}", "yes" if item.counted else "no", item.how)
         for poses, budget in summary.budgets().items()
-        for item in budget["contributions"]
+        for item in budget.contributions
     ]
     if contributions:
         head = ("poses", "source", "sigma_mm", "in_the_sum", "how")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -11,9 +10,10 @@ from service.audit.record.missing_results import not_in_yet
 from service.audit.report.blocks import Block, Cell, Column, Heading, Paragraph, Section, Table
 from service.audit.report.words import mm, utc, words
 from service.core.gates.dependence import depends_on
-from service.core.results.late import late_results
-from service.core.results.registrations import shared_adjustment_note
+from service.dataset.late_results import late_results
+from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import RunSummary
+from service.jobs.registration.evaluate import Row
 
 PAPER_LIMIT_MM = 0.35
 _LIMITED = "best_mean_radial_error_mm"
@@ -43,17 +43,18 @@ def result_sentence(summary: RunSummary) -> Cell:
     if best is None or row is None:
         return Cell("Not evaluated: nothing can be said about the accuracy of this data set.", "attention")
     limit_mm, whose = _limit(summary)
-    error_mm = float(row["mean_radial_error_mm"])
+    error_mm = row.mean_radial_error_mm
     within = error_mm <= limit_mm
     simulated = " These are figures of a simulated rig." if summary.root.simulated else ""
-    total_mm = summary.budgets().get(best, {}).get("total_mm")
+    known = summary.budgets().get(best)
+    total_mm = None if known is None else known.total_mm
     budget = "" if total_mm is None else f", {total_mm:.3f} mm with the scan's own error"
     on = {"control spheres": "control spheres, which took no part in the registration,"}
     return Cell(
-        f"With {best} poses ({_SOURCES.get(row['source'], words(row['source']))}), the mean error on the "
-        f"{on.get(row['evaluated_on'], 'spheres, each predicted by the others,')} is {error_mm:.3f} mm, "
+        f"With {best} poses ({_SOURCES.get(row.source, words(row.source))}), the mean error on the "
+        f"{on.get(row.evaluated_on, 'spheres, each predicted by the others,')} is {error_mm:.3f} mm, "
         f"{'within' if within else 'OUTSIDE'} the limit of {limit_mm:g} mm ({whose}), with a predicted uncertainty "
-        f"of the registration of {row['predicted_error_mm']:.3f} mm (1σ, 3D){budget}.{simulated}"
+        f"of the registration of {mm(row.predicted_error_mm)} mm (1σ, 3D){budget}.{simulated}"
         + (" It depends on figures that were accepted outside their limits, see below." if rests_on(summary) else ""),
         ("attention" if rests_on(summary) else "ok") if within else "stop",
     )
@@ -72,8 +73,8 @@ def _limit(summary: RunSummary) -> tuple[float, str]:
     return (limits[-1], "the protocol's gate") if limits else (PAPER_LIMIT_MM, "the paper's figure")
 
 
-def _best_row(summary: RunSummary) -> Mapping[str, Any] | None:
-    return next((row for row in summary.table() if row["poses"] == summary.best()), None)
+def _best_row(summary: RunSummary) -> Row | None:
+    return next((row for row in summary.table() if row.poses == summary.best()), None)
 
 
 def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | None) -> Section:
@@ -96,24 +97,24 @@ def accuracy_section(summary: RunSummary, true_error_mm: Mapping[str, float] | N
     shown: list[tuple[Cell | str, ...]] = []
     strong: set[int] = set()
     for number, row in enumerate(rows):
-        best = row["poses"] == summary.best()
+        best = row.poses == summary.best()
         if best:
             strong.add(number)
-        late = f" ({row['late']})" if row["late"] else ""
-        named = row["poses"] + (" (best)" if best else late)
+        late = f" ({row.late})" if row.late else ""
+        named = row.poses + (" (best)" if best else late)
         texts: list[Cell | str] = [
-            f"{named}: {_SOURCES.get(row['source'], words(row['source']))}",
-            str(row["resolution"]).replace(" ", "\N{NO-BREAK SPACE}"),
-            f"{row['mean_radial_error_mm']:.3f}",
-            f"{row['mean_reprojection_error_px']:.2f}",
-            f"{row['predicted_error_mm']:.3f}",
-            str(row["control_outlines"]),
+            f"{named}: {_SOURCES.get(row.source, words(row.source))}",
+            str(row.resolution).replace(" ", "\N{NO-BREAK SPACE}"),
+            f"{row.mean_radial_error_mm:.3f}",
+            "–" if row.mean_reprojection_error_px is None else f"{row.mean_reprojection_error_px:.2f}",
+            mm(row.predicted_error_mm),
+            str(row.control_outlines),
             _paper(row),
         ]
         if true_error_mm is not None:
-            texts.append(mm(true_error_mm.get(row["poses"])))
+            texts.append(mm(true_error_mm.get(row.poses)))
         shown.append(tuple(texts))
-    on = rows[0]["evaluated_on"]
+    on = rows[0].evaluated_on
     explained = (
         f"Measured on {on}. The radial error is how far the sphere seen by the camera lies from the sphere of the "
         "scan, across the line of sight; the reprojection error is the same in the image. The paper's figures are of "
@@ -141,7 +142,7 @@ def later_section(summary: RunSummary) -> Section | None:
         if better is not None:
             blocks.append(
                 Paragraph(
-                    f"{better['poses']} has the smallest error of all, {better['mean_radial_error_mm']:.3f} mm. What "
+                    f"{better.poses} has the smallest error of all, {better.mean_radial_error_mm:.3f} mm. What "
                     f"was judged and signed is {summary.best()}, and the data set has its poses."
                 )
             )
@@ -151,28 +152,28 @@ def later_section(summary: RunSummary) -> Section | None:
     return Section("Results that came later", tuple(blocks))
 
 
-def _paper(row: Mapping[str, Any]) -> str:
+def _paper(row: Row) -> str:
     """What the paper reached with this source, at the width nearest to the row's."""
-    width = int(str(row["resolution"]).split()[0])
-    known = [at for source, at in _PAPER if source == row["source"]]
+    width = int(row.resolution.split()[0])
+    known = [at for source, at in _PAPER if source == row.source]
     if not known:
         return "–"
     at = min(known, key=lambda candidate: abs(np.log(candidate / width)))
-    radial_mm, reprojection_px = _PAPER[row["source"], at]
+    radial_mm, reprojection_px = _PAPER[row.source, at]
     return f"{radial_mm:.2f} / {reprojection_px:.2f} ({at})"
 
 
 def budget_section(summary: RunSummary) -> Section | None:
     """Source by source, and what independent measurements say of it; None without an evaluation."""
     best = summary.best()
-    budget: Mapping[str, Any] | None = summary.budgets().get(best or "")
-    if budget is None:
+    budget = summary.budgets().get(best or "")
+    if budget is None or budget.total_mm is None:
         return None
     contributions = [
-        (c["name"] + ("" if c["counted"] else " (not in the sum)"), f"{c['sigma_mm']:.4f}", c["how"])
-        for c in budget["contributions"]
+        (c.name + ("" if c.counted else " (not in the sum)"), f"{c.sigma_mm:.4f}", c.how)
+        for c in budget.contributions
     ]
-    total = ("sum", f"{budget['total_mm']:.4f}", "root of the sum of squares")
+    total = ("sum", f"{budget.total_mm:.4f}", "root of the sum of squares")
     sources = Table(
         (Column("source", 1.3), Column("σ (mm)", 0.7, "number"), Column("how it was got", 4.5)),
         (*contributions, total),
@@ -189,14 +190,14 @@ def budget_section(summary: RunSummary) -> Section | None:
         ),
         tuple(
             (
-                f"{o['name']}: {o['how']}",
-                str(o["n"]),
-                f"{o['observed_mm']:.4f}",
-                f"{o['predicted_mm']:.4f}",
-                f"{o['normalised_chi2']:.2f}",
-                Cell(o["verdict"], "ok" if _HONEST[0] <= o["normalised_chi2"] <= _HONEST[1] else "attention"),
+                f"{o.name}: {o.how}",
+                str(o.n),
+                f"{o.observed_mm:.4f}",
+                f"{o.predicted_mm:.4f}",
+                f"{o.normalised_chi2:.2f}",
+                Cell(o.verdict, "ok" if _HONEST[0] <= o.normalised_chi2 <= _HONEST[1] else "attention"),
             )
-            for o in budget["observations"]
+            for o in budget.observations
         ),
     )
     return Section(

@@ -14,7 +14,7 @@ from service.core.equipment.camera_bodies import bodies
 from service.core.equipment.clocks import clock_of, clock_readings, offset_told
 from service.core.records.events import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
 from service.core.text.counts import counted
-from service.core.text.terms import term
+from service.jobs.words import term
 
 _COMPUTES = ("orthocapture", "numpy", "scipy", "opencv-python-headless", "pycolmap", "trimesh", "scikit-image")
 

@@ -1,0 +1,59 @@
+"""Records of version 1: the copies of earlier results in their arguments, read as references to these."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+from service.core.jobs.references import Reference
+from service.core.run.state import JobState
+
+_TELLING_DIGITS = 12  # a number of so many digits is found again by its value: nobody typed it
+
+
+@dataclass
+class CopiedResults:
+    """Parts of the answers so far, by their content: what is bit for bit a part of one was copied from there."""
+
+    _parts: dict[str, Reference] = field(default_factory=dict[str, Reference])
+
+    def add(self, job: JobState) -> None:
+        """Note the answer of a finished job."""
+        self._index(job.job, "result", job.result)
+
+    def _index(self, job: str, path: str, value: Any) -> None:
+        if _is_telling(value):
+            self._parts[_key(value)] = Reference(job, path)
+        if isinstance(value, Mapping):
+            for name, item in cast("Mapping[str, Any]", value).items():
+                self._index(job, f"{path}/{name}", item)
+        elif isinstance(value, list | tuple):
+            for index, item in enumerate(cast("Sequence[Any]", value)):
+                self._index(job, f"{path}/{index}", item)
+
+    def as_references(self, arguments: Any) -> Any:
+        """Arguments with a reference in the place of every copy."""
+        if _is_telling(arguments):
+            found = self._parts.get(_key(arguments))
+            if found is not None:
+                return found.record()
+        if isinstance(arguments, Mapping):
+            return {name: self.as_references(item) for name, item in cast("Mapping[str, Any]", arguments).items()}
+        if isinstance(arguments, list | tuple):
+            return [self.as_references(item) for item in cast("Sequence[Any]", arguments)]
+        return arguments
+
+
+def _key(value: Any) -> str:
+    return json.dumps(value, sort_keys=True)
+
+
+def _is_telling(value: Any) -> bool:
+    """Whether this holds a number that can be told from every other."""
+    if isinstance(value, float):
+        return len(repr(value).split("e")[0].replace("-", "").replace(".", "").strip("0")) >= _TELLING_DIGITS
+    if isinstance(value, Mapping):
+        return any(map(_is_telling, cast("Mapping[str, Any]", value).values()))
+    return isinstance(value, list | tuple) and any(map(_is_telling, cast("Sequence[Any]", value)))

@@ -1,0 +1,166 @@
+"""The registrations of a run and their evaluations, early or late, and which of them is the run's own.
+
+The run's own registration has the smallest error on the control spheres among those that the evaluation step judged:
+it was signed, and the specimen was released on it. One that arrives later may be better; it is reported as well and
+does not replace it. Pages, report, exports and audit all follow this rule. Before the evaluation, the registration
+with the smallest predicted error is shown (`best_registration`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+from service.core.jobs.priorities import lane_of
+from service.core.protocol.models import Protocol
+from service.core.results.arrival import late_words
+from service.core.run.state import JobState, RunState
+from service.jobs.registration import evaluate, register
+from service.jobs.registration.evaluate import ErrorBudget, Row
+from service.jobs.registration.register import Answer as Registration
+
+
+def last_result(protocol: Protocol, state: RunState, kind: str) -> Mapping[str, Any]:
+    """The Result, as plain data, of the last step of this kind that has one; empty if there is none."""
+    results = (state.steps[step.id].result for step in reversed(protocol.steps) if step.kind == kind)
+    return next((result for result in results if result), {})
+
+
+def registration_name(record: Registration) -> str:
+    """The name of a registration record: `colmap`, or `colmap_1920x1080` for images reduced to that size."""
+    if record.full_camera is None:
+        return record.poses
+    return f"{record.poses}_{record.camera.width}x{record.camera.height}"
+
+
+def registrations(protocol: Protocol, state: RunState) -> dict[str, Registration]:
+    """Every registration record by its name: those in the step's result, then those that arrived later."""
+    records: Mapping[str, Any] = last_result(protocol, state, "registration").get("registrations", {})
+    found = {name: register.KIND.read_answer(record) for name, record in records.items()}
+    for _, job in _finished(protocol, state, "registration", register.KIND.name) if found else ():
+        answer = register.KIND.read_answer(job.result)
+        found.setdefault(registration_name(answer), answer)
+    return found
+
+
+def evaluated(protocol: Protocol, state: RunState) -> list[Row]:
+    """All rows of the paper's table; `late` says when a late row arrived, and is "" for a row of the evaluation."""
+    rows = [row.model_copy(update={"late": ""}) for row in signed_rows(protocol, state)]
+    known = {row.poses for row in rows}
+    for _, job in later_evaluations(protocol, state) if rows else ():
+        table = evaluate.KIND.read_answer(job.result).table
+        rows += [row.model_copy(update={"late": arrived(job)}) for row in table if row.poses not in known]
+    return rows
+
+
+def arrived(job: JobState) -> str:
+    """`arrived 12 min after the release`, or `arrived after the evaluation` if nothing had been released yet."""
+    return "arrived after the evaluation" if job.late_s is None else late_words(job.late_s)
+
+
+def shared_adjustment_note(protocol: Protocol, state: RunState) -> str:
+    """A note that some rows share one adjustment, so their agreement confirms nothing; "" without two such rows.
+
+    Incremental mapping, global mapping and triangulation each give initial poses from part of the tracks; the final
+    model is one bundle adjustment of all tracks from there (service/compute/poses/sfm/mapping.py).
+    """
+    if not any(
+        job.kind == "structure_from_motion"
+        and "features" in job.arguments  # absent in older runs, which shared nothing
+        for step in state.steps.values()
+        for job in step.jobs.values()
+    ):
+        return ""
+    rows = evaluated(protocol, state)
+    alike = [row for row in rows if row.source in _ADJUSTED]
+    names = {size: [r.poses for r in alike if r.resolution == size] for size in _sizes(alike)}
+    shared = [" and ".join([", ".join(group[:-1]), group[-1]]) for group in names.values() if len(group) > 1]
+    if not shared:
+        return ""
+    return (
+        f"{'; '.join(shared)} come from the same features and matches and end in the same bundle adjustment; they "
+        "differ only in its initial poses. Their agreement shows that the result does not depend on them. They are "
+        "one measurement and do not confirm each other"
+        + (
+            "; hybrid starts from one of them and adds the robot's poses and the spheres"
+            if any(row.source == "hybrid" for row in rows)
+            else ""
+        )
+        + "."
+    )
+
+
+_ADJUSTED = ("triangulated", "colmap", "glomap")
+
+
+def _sizes(rows: Iterable[Row]) -> list[str]:
+    return list(dict.fromkeys(row.resolution for row in rows))
+
+
+def budgets(protocol: Protocol, state: RunState) -> dict[str, ErrorBudget]:
+    """The error budget of each registration, by its name."""
+    records = last_result(protocol, state, "evaluation")
+    found = evaluate.KIND.read_answer(records).budgets if records else {}
+    for _, job in later_evaluations(protocol, state):
+        found = {**evaluate.KIND.read_answer(job.result).budgets, **found}
+    return found
+
+
+def own_registration(protocol: Protocol, state: RunState) -> str | None:
+    """The name of the run's own registration (see the module's docstring); None before the evaluation."""
+    rows = signed_rows(protocol, state)
+    return best_row(rows).poses if rows else None
+
+
+def best_registration(protocol: Protocol, state: RunState) -> str | None:
+    """The name of the registration to show: the run's own; before the evaluation, the most certain one.
+
+    Reduced resolutions are for comparison; before the evaluation they are not shown. None where there is none.
+    """
+    own, found = own_registration(protocol, state), registrations(protocol, state)
+    if own in found:
+        return own
+    full = [name for name, record in found.items() if record.full_camera is None]
+    return min(full, key=lambda name: _predicted_m2(found[name]), default=None)
+
+
+def best_row(rows: Sequence[Row]) -> Row:
+    """The row of an evaluation's table with the smallest error on the control spheres; of equal ones the first."""
+    return min(rows, key=_error_mm)
+
+
+def better_later(protocol: Protocol, state: RunState) -> Row | None:
+    """The table's best row if it arrived after the evaluation and is better than the run's own; else None."""
+    own = own_registration(protocol, state)
+    rows = evaluated(protocol, state)
+    best = best_row(rows) if rows else None
+    signed = {row.poses for row in signed_rows(protocol, state)}
+    return best if own is not None and best is not None and best.poses not in signed else None
+
+
+def signed_rows(protocol: Protocol, state: RunState) -> list[Row]:
+    """The rows of the table that the evaluation step made: those that were judged and signed."""
+    result = last_result(protocol, state, "evaluation")
+    return list(evaluate.KIND.read_answer(result).table) if result else []
+
+
+def _error_mm(row: Row) -> float:
+    return row.mean_radial_error_mm
+
+
+def _predicted_m2(record: Registration) -> float:
+    """Variance of the position that a registration states of itself, over all three axes."""
+    return float(sum(record.covariance[axis][axis] for axis in range(3)))
+
+
+def later_evaluations(protocol: Protocol, state: RunState) -> list[tuple[str, JobState]]:
+    """(step, job) of every evaluation of a registration that arrived after the evaluation step's own."""
+    jobs = _finished(protocol, state, "evaluation", evaluate.KIND.name)
+    return [(step, job) for step, job in jobs if lane_of(job.priority) == "background"]
+
+
+def _finished(protocol: Protocol, state: RunState, step_kind: str, job_kind: str) -> Iterator[tuple[str, JobState]]:
+    for step in protocol.steps:
+        if step.kind == step_kind:
+            jobs = state.steps[step.id].jobs.values()
+            yield from ((step.id, job) for job in jobs if job.kind == job_kind and job.status == "finished")

@@ -1,0 +1,1 @@
+"""Kinds of jobs on images of the calibration board."""

@@ -1,0 +1,33 @@
+"""Job kind `board_view`: the calibration board in one image as soon as it has arrived."""
+
+from __future__ import annotations
+
+from service.jobs.kind import JobKind, JobRecord
+from service.jobs.records import BoardSize, ImageFile
+
+
+class Arguments(BoardSize):
+    """The image and the board."""
+
+    image: ImageFile
+
+
+class Answer(JobRecord):
+    """Whether the whole board was seen; its corners are the job's file. `size` is width and height in pixels."""
+
+    viewpoint: str
+    size: tuple[int, int]
+    seen: bool
+    reason: str
+    black: bool = False
+
+
+KIND = JobKind(
+    name="board_view",
+    arguments=Arguments,
+    answer=Answer,
+    compute="service.worker.calibration.board_view:board_view",
+    words="board images",
+    order=10,
+    replayed=False,
+)

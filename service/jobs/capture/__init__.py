@@ -1,0 +1,1 @@
+"""Kinds of jobs while images are being taken."""

@@ -1,0 +1,60 @@
+"""Job kind `live_summary`: whether the images so far are enough, and which further views would help most."""
+
+from __future__ import annotations
+
+from service.jobs.capture.live_view import LiveArguments
+from service.jobs.kind import JobKind, JobRecord
+from service.jobs.records import Hash, Matrix
+
+
+class CandidateView(JobRecord):
+    """A view that could be taken in addition."""
+
+    name: str
+    T_base_camera: Matrix
+    travel_s: float
+
+
+class Arguments(LiveArguments):
+    """The files of all looks, and what could be taken at the station where the robot stands."""
+
+    views: tuple[Hash, ...]
+    station: str
+    limit_m: float
+    min_coverage: float
+    candidates: tuple[CandidateView, ...]
+
+
+class Suggestion(JobRecord):
+    """A view that helps, with the error and the coverage (0 … 1) once it and those before it are taken."""
+
+    viewpoint: str
+    predicted_error_mm: float
+    coverage: float
+
+
+class StationSoFar(JobRecord):
+    """What the images of a station come to."""
+
+    predicted_target_error_mm: float
+    images: int
+
+
+class Answer(JobRecord):
+    """What to take next, and why a station's images do not determine its registration."""
+
+    next_best_views: tuple[Suggestion, ...]
+    reasons: dict[str, str]
+    stations: dict[str, StationSoFar]
+
+
+KIND = JobKind(
+    name="live_summary",
+    arguments=Arguments,
+    answer=Answer,
+    compute="service.worker.capture.live:live_summary",
+    words="summary of the images",
+    order=32,
+    replayed=False,
+    aside=True,
+)

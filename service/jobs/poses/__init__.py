@@ -1,0 +1,1 @@
+"""Kinds of jobs that find camera poses from images."""

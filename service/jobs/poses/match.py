@@ -1,0 +1,25 @@
+"""Job kind `match`: verified matches of some pairs of images."""
+
+from __future__ import annotations
+
+from service.jobs.kind import JobKind, NoAnswer
+from service.jobs.poses.features import FrontEndArguments
+from service.jobs.records import Hash
+
+
+class Arguments(FrontEndArguments):
+    """Features by viewpoint, and the pairs to match."""
+
+    features: dict[str, Hash]
+    pairs: tuple[tuple[str, str], ...]
+
+
+KIND = JobKind(
+    name="match",
+    arguments=Arguments,
+    answer=NoAnswer,
+    compute="service.worker.poses.front_end:match",
+    words="matches between images",
+    order=41,
+    aside=True,
+)

@@ -1,0 +1,38 @@
+"""Job kind `structure_from_motion`: camera poses and tracks from features and matches."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from service.jobs.kind import JobKind, NoAnswer
+from service.jobs.records import Hash, Matrix, Photograph, Photographed
+
+
+class Arguments(Photographed):
+    """What is mapped, and how.
+
+    Attributes:
+        images: of the captures.
+        mappers: one model each.
+        effort: SfmOptions.
+        prior: T_scan_camera by viewpoint of a registration that is there already; it chooses which pairs are matched.
+        features: files by viewpoint; None in runs that were recorded when one job did everything.
+        matches: files.
+    """
+
+    images: tuple[Photograph, ...] = ()
+    mappers: tuple[Literal["incremental", "global", "triangulated"], ...]
+    effort: dict[str, Any]
+    prior: dict[str, Matrix] | None = None
+    features: dict[str, Hash] | None = None
+    matches: tuple[Hash, ...] = ()
+
+
+KIND = JobKind(
+    name="structure_from_motion",
+    arguments=Arguments,
+    answer=NoAnswer,
+    compute="service.worker.poses.models:structure_from_motion",
+    words="camera poses from images",
+    order=50,
+)

@@ -1,0 +1,42 @@
+"""Job kind `detect_spheres`: outlines of every sphere in every image, as one file that all registrations share."""
+
+from __future__ import annotations
+
+from service.jobs.kind import JobKind, NoAnswer
+from service.jobs.records import Hash, Matrix, Mounting, ParameterCovariance, Photograph, Photographed, Point
+
+
+class SceneArguments(Photographed, Mounting):
+    """What all jobs of a registration have in common.
+
+    Attributes:
+        images: of the captures, control captures included.
+        intrinsics_covariance: (8, 8) of fx, fy, cx, cy, k1, k2, p1, p2, or a covariance with its parameters' names.
+        spheres_m: of the scan.
+        sphere_covariance_m2: of each of them, (3, 3).
+        radius_m: of the spheres.
+    """
+
+    images: tuple[Photograph, ...]
+    intrinsics_covariance: Matrix | ParameterCovariance | None = None
+    spheres_m: tuple[Point, ...]
+    sphere_covariance_m2: tuple[Matrix, ...]
+    radius_m: float
+
+
+class Arguments(SceneArguments):
+    """How the outlines are searched for; `model` has the poses where no robot and no sphere told them."""
+
+    model: Hash | None = None
+    colour: str | None = None
+    detector: str = "classical"
+
+
+KIND = JobKind(
+    name="detect_spheres",
+    arguments=Arguments,
+    answer=NoAnswer,
+    compute="service.worker.registration.outlines:detect_spheres",
+    words="spheres in images",
+    order=60,
+)

@@ -1,0 +1,68 @@
+"""Job kind `register`: T_world_scan for one source of camera poses."""
+
+from __future__ import annotations
+
+from service.jobs.kind import JobKind, JobRecord
+from service.jobs.records import Camera, Hash, Matrix
+from service.jobs.registration.detect_spheres import SceneArguments
+
+
+class Arguments(SceneArguments):
+    """Outlines and the source of the poses, with its model where the images told them."""
+
+    outlines: Hash
+    poses: str
+    model: Hash | None = None
+    tracks: Hash | None = None
+
+
+class LeaveOneOut(JobRecord):
+    """Every sphere as predicted by the others: means, and `[radial error (mm), reprojection error (px)]` of each."""
+
+    mean_radial_error_mm: float
+    mean_reprojection_error_px: float
+    spheres: dict[str, tuple[float, ...]]
+
+
+class Answer(JobRecord):
+    """A registration.
+
+    Attributes:
+        poses: the source of the camera poses.
+        camera: that the outlines were read with.
+        outlines: their file.
+        full_camera: of the photographs, where the images were reduced.
+        T_world_scan: world is the base of the first station, or the reconstruction's own frame.
+        scale: of the reconstruction; 1 for metric poses.
+        rms_px: of the outlines that took part.
+        T_world_station: by station.
+        T_scan_camera: by viewpoint.
+        excluded: outlines left out, in words.
+        covariance: (6, 6) of T_world_scan, m and rad.
+        components: what the covariance is the sum of.
+        leave_one_out: None where a station sees too few spheres to spare one.
+    """
+
+    poses: str
+    camera: Camera
+    outlines: Hash
+    full_camera: Camera | None = None
+    T_world_scan: Matrix
+    scale: float
+    rms_px: float
+    T_world_station: dict[str, Matrix]
+    T_scan_camera: dict[str, Matrix]
+    excluded: tuple[str, ...] = ()
+    covariance: Matrix
+    components: dict[str, Matrix]
+    leave_one_out: LeaveOneOut | None = None
+
+
+KIND = JobKind(
+    name="register",
+    arguments=Arguments,
+    answer=Answer,
+    compute="service.worker.registration.register:register",
+    words="registration",
+    order=61,
+)

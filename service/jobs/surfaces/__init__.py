@@ -1,0 +1,1 @@
+"""Kinds of jobs on surfaces and on the spheres in them."""

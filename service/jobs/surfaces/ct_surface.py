@@ -1,0 +1,27 @@
+"""Job kind `ct_surface`: the CT volume becomes a mesh, which is searched for its spheres."""
+
+from __future__ import annotations
+
+from service.jobs.kind import JobKind, JobRecord
+from service.jobs.records import Hash, Matrix, SpheresFound
+
+
+class Arguments(JobRecord):
+    """The decoded volume: `hounsfield` is a NumPy array, `T_ct_voxel` takes its indices to metres."""
+
+    radius_m: float
+    expected: int
+    slices: tuple[Hash, ...] = ()
+    hounsfield: Hash
+    T_ct_voxel: Matrix
+    threshold_hu: float
+
+
+KIND = JobKind(
+    name="ct_surface",
+    arguments=Arguments,
+    answer=SpheresFound,
+    compute="service.worker.surfaces.mesh_spheres:ct_surface",
+    words="CT surface",
+    order=20,
+)

@@ -1,0 +1,26 @@
+"""Job kind `locate_spheres`: the spheres of a decoded mesh, and how they moved since an earlier measurement."""
+
+from __future__ import annotations
+
+from service.jobs.kind import JobKind, JobRecord
+from service.jobs.records import Hash, Matrix, Point, SpheresFound
+
+
+class Arguments(JobRecord):
+    """The mesh and what to expect in it; `reference_m` are the spheres of an earlier mesh."""
+
+    mesh: Hash
+    radius_m: float
+    expected: int
+    reference_m: tuple[Point, ...] | None = None
+    reference_covariances_m2: tuple[Matrix, ...] | None = None
+
+
+KIND = JobKind(
+    name="locate_spheres",
+    arguments=Arguments,
+    answer=SpheresFound,
+    compute="service.worker.surfaces.mesh_spheres:locate_spheres",
+    words="spheres in the mesh",
+    order=21,
+)

@@ -1,0 +1,332 @@
+"""Board images while they are taken: each is looked at as it arrives; later poses are planned from the first ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board_poses.design import Aims, Prediction, Taken
+from service.compute.calibration.board_poses.knowledge import BoardKnowledge, refined_knowledge
+from service.compute.camera_model import CameraModel
+from service.compute.planning.motion_plan import able_postures
+from service.core.errors import ComputeError
+from service.core.geometry import Array, Transform, apply, inverse
+from service.core.text.counts import counted
+from service.steps.board.looks import BoardLooks, Look
+from service.steps.board.plan import (
+    NOTE,
+    START,
+    BoardPoses,
+    Planner,
+    Why,
+    describe_prediction,
+    nominal_board,
+    nominal_camera,
+    prediction_record,
+)
+from service.steps.capture.planning import known_arm, plan_step, situation_of, usual_posture
+from service.steps.capture.retakes import to_take_again
+from service.steps.capture.viewpoints import Viewpoint
+from service.steps.capture.views import capture_viewpoints
+from service.steps.context import StepContext
+
+_MOST_FIRST = 4  # tries for a first image that shows the board
+_MOVED_M = 0.01  # a board found further from where an earlier step had it has been moved
+_MOST_FOR_LENS = 40  # images that the estimate between captures uses
+
+
+@dataclass
+class BoardCapture:
+    """The board images of one execution of one calibration step.
+
+    Poses come from the protocol (`given`) or are planned; every one that was planned is in a note of the step, so
+    that a restart goes on with the same ones. A pose is recorded as where the nominal mount puts the camera.
+    """
+
+    context: StepContext
+    wanted: BoardPoses
+    board: Board
+    solve: tuple[str, ...]
+    given: tuple[Viewpoint, ...] = ()  # the protocol's own poses; then nothing is planned but replacements
+    camera: Mapping[str, float] | None = None  # calibrated by an earlier step
+    earlier: str | None = None  # step whose board images tell where board and mount are
+    _known: BoardKnowledge | None = None
+    _notes: list[Mapping[str, Any]] = field(default_factory=list[Mapping[str, Any]])
+    _replaced: int = 0  # in this attempt
+
+    def __post_init__(self) -> None:
+        self._mount = self.context.devices.nominal_T_flange_camera()
+        self._notes = [note.data for note in self.context.state.notes if note.note == NOTE]
+        self._replaced = sum(
+            len(n["poses"]) for n in self._notes if n["why"] == "replacement" and n["attempt"] == self.context.attempt
+        )
+        self._looks = BoardLooks(self.context, self.board, self.earlier)
+
+    # --- the loop ---
+
+    def take(self) -> dict[str, float]:
+        """Capture, look, plan what comes next, until nothing is missing; the measures of the capture."""
+        begun = False
+        while True:
+            fresh = self.poses() if not begun else self._new
+            begun = True
+            if fresh:
+                self._capture(fresh)
+            looks = self.looks()
+            self._looks.stop_where_spoilt()
+            planned = self._more(looks)
+            if not planned:
+                return self._measures(looks)
+            self._new = planned
+
+    def poses(self) -> tuple[Viewpoint, ...]:
+        """All poses of the step so far."""
+        return (*self.given, *self._recorded())
+
+    def _recorded(self) -> tuple[Viewpoint, ...]:
+        return tuple(
+            Viewpoint(str(pose["viewpoint"]), self.wanted.station, np.array(pose["T_base_camera"]))
+            for note in self._notes
+            for pose in note["poses"]
+        )
+
+    def _more(self, looks: Sequence[Look]) -> tuple[Viewpoint, ...]:
+        """Which poses to add now; none when all that is wanted is there, or no more may be replaced."""
+        seen = [look for look in looks if look.seen]
+        planned = sum(len(n["poses"]) for n in self._notes if n["why"] != "replacement")
+        if self.given or planned >= self.wanted.count:
+            missing = len(self.given) + planned - len(seen)
+            missing = min(missing, self.wanted.replacements - self._replaced)
+            if missing <= 0 or len(seen) < 3:
+                return ()
+            return self._plan("replacement", missing, looks)
+        if not planned:
+            return self._plan("first", 1, looks) if self._knowledge(looks).measured == 0 else self._rest(looks)
+        if not seen:
+            now = [look for look in looks if not look.seen and look.capture.attempt == self.context.attempt]
+            unseen = [f"{look.capture.viewpoint}: {look.reason}" for look in now]
+            if len(unseen) >= _MOST_FIRST or self.wanted.replacements <= self._replaced:
+                raise ComputeError(
+                    f"the first images show no board ({'; '.join(unseen)})",
+                    where=f"step {self.context.step.id}",
+                    remedy="Lay the whole board where the protocol says, uncovered and lit, and take the cap off",
+                )
+            return self._plan("replacement", 1, looks)
+        if planned < START < self.wanted.count:
+            return self._plan("start", START - planned, looks)
+        return self._rest(looks)
+
+    def _rest(self, looks: Sequence[Look]) -> tuple[Viewpoint, ...]:
+        planned = sum(len(n["poses"]) for n in self._notes if n["why"] != "replacement")
+        return self._plan("rest", self.wanted.count - planned, looks)
+
+    # --- planning ---
+
+    def mend(
+        self, count: int, enough: Callable[[Prediction, Prediction], bool], advise: Callable[[int, str, str], str]
+    ) -> bool:
+        """Plan up to `count` further poses that would mend what falls short, for the next attempt.
+
+        Args:
+            count: at most.
+            enough: judges the prediction with further poses, given also that of the images so far.
+            advise: words for the operator from the number of poses, their names and what they are predicted to reach.
+
+        Returns:
+            whether any were found.
+        """
+        looks = self.looks()
+        return bool(self._plan("mend", count, looks, enough=enough, advise=advise))
+
+    def _plan(
+        self,
+        why: Why,
+        count: int,
+        looks: Sequence[Look],
+        *,
+        enough: Callable[[Prediction, Prediction], bool] | None = None,
+        advise: Callable[[int, str, str], str] | None = None,
+    ) -> tuple[Viewpoint, ...]:
+        """Plan, record and tell; none where the arm can take no further pose that holds the board."""
+        self.context.progress("planning board poses", 0, 1)
+        self.context.busy("planning board poses")
+        known = self._knowledge(looks)
+        planner = self.planner(known, coverage=1.0 if why == "mend" else self.wanted.coverage)
+        taken = self._taken(looks, known, planner)
+        before = planner.prediction(taken, known)
+        judged = None if enough is None else lambda after: enough(before, after)
+        number = len(self.poses())
+        found = planner.next(why, count, known, taken, enough=judged, seed=number)
+        poses = tuple(
+            Viewpoint(f"{self.wanted.prefix}{number + i + 1:03d}", self.wanted.station, planner.sent(T, known))
+            for i, T in enumerate(found.T_base_camera)
+        )
+        if not poses:
+            return ()
+        prediction = prediction_record(found.prediction)
+        words = describe_prediction(prediction, self.solve)
+        data: dict[str, Any] = {
+            "why": why,
+            "attempt": self.context.attempt,
+            "poses": [
+                {"viewpoint": v.name, "T_base_camera": [[round(float(x), 9) for x in row] for row in v.T_base_camera]}
+                for v in poses
+            ],
+            "prediction": prediction,
+            "from_images": known.measured,
+        }
+        if why == "replacement":
+            data["instead_of"] = {look.capture.viewpoint: look.reason for look in looks if not look.seen}
+            self._replaced += len(poses)
+        text = f"{counted(len(poses), 'board pose')} ({_WORDS[why]}): {words}"
+        if advise is not None:
+            names = poses[0].name if len(poses) == 1 else f"{poses[0].name} … {poses[-1].name}"
+            text = data["advice"] = advise(len(poses), names, words)
+        self.context.note(NOTE, text=text, **data)
+        self.context.tell(text)
+        self._notes.append(data)
+        return poses
+
+    def planner(self, known: BoardKnowledge, *, coverage: float) -> Planner:
+        """For this station, from where the arm stands."""
+        layout = self.context.devices.layout(self.wanted.station)
+        return Planner(
+            self.wanted,
+            self.board,
+            Aims("intrinsics" in self.solve, "hand_eye" in self.solve, coverage),
+            np.array(layout.approach),
+            self._mount,
+            self._feasible(known),
+        )
+
+    def _feasible(self, known: BoardKnowledge) -> Callable[[Transform], bool]:
+        collision, optics = self.context.devices.surroundings()
+        robot = self.context.devices.robot(self.wanted.station)
+        model = known_arm(collision.arm or robot.report().identity.model)
+        if model is None:
+            return lambda _T: True
+        layout = self.context.devices.layout(self.wanted.station)
+        start = usual_posture(model, layout, self._mount)
+        situation = situation_of(
+            self._mount, layout, model, collision, optics, self.context.protocol.motion, start,
+            sharp_at_m=apply(known.T_base_board, self.board.points()),
+        )  # fmt: skip
+        return lambda T: bool(able_postures(T, situation))
+
+    def _taken(self, looks: Sequence[Look], known: BoardKnowledge, planner: Planner) -> Taken:
+        """The images with a board, and poses that are decided and not taken yet."""
+        seen = [look for look in looks if look.seen and look.view is not None]
+        poses = np.array([np.array(look.capture.T_base_flange) @ known.T_flange_camera for look in seen])
+        pixels = tuple(look.view.corners for look in seen if look.view is not None)
+        taken = Taken(poses.reshape(-1, 4, 4), pixels)
+        there = {look.capture.viewpoint for look in looks}
+        given_up = set(self.context.state.skipped_viewpoints)
+        waiting = [v for v in self.poses() if v.name not in there and v.name not in given_up]
+        back = inverse(self._mount) @ known.T_flange_camera
+        return planner.with_planned(taken, np.array([v.T_base_camera @ back for v in waiting]), known)
+
+    # --- what is known ---
+
+    def knowledge(self) -> BoardKnowledge:
+        """Where camera, mount and board are, by all images of the board so far, of earlier attempts too."""
+        return self._knowledge(self.looks())
+
+    def _knowledge(self, looks: Sequence[Look]) -> BoardKnowledge:
+        """From the images so far; before them from an earlier step's, or as rig file and protocol state it."""
+        seen = [look for look in looks if look.seen]
+        if self._known is not None and self._known.measured == len(seen) > 0:
+            return self._known
+        before = [look for look in self._looks.of(self.earlier) if look.seen] if self.earlier is not None else []
+        size = next((look.size for look in (*seen, *before)), None)
+        if self.camera is None:
+            camera, focal = nominal_camera(self.context.devices.lens(), size)
+        else:
+            camera, focal = CameraModel.from_record(dict(self.camera)), 0.002
+        layout = self.context.devices.layout(self.wanted.station)
+        nominal = nominal_board(self.wanted, self.board, layout, self._mount, camera, focal)
+        calibrated = self.camera is not None
+        known = nominal
+        if before and _same_base(before, self.wanted.station, seen):
+            known = _refine(nominal, before, self.board, lens_known=calibrated)
+            if seen:
+                own = _refine(nominal, seen, self.board, lens_known=calibrated)
+                apart = np.linalg.norm(_middle(own, self.board) - _middle(known, self.board))
+                both = _refine(nominal, [*before, *seen], self.board, lens_known=calibrated)
+                known = own if apart > _MOVED_M else both
+        elif seen:
+            known = _refine(nominal, seen, self.board, lens_known=calibrated)
+        self._known = known
+        return known
+
+    # --- capture and looks ---
+
+    def _capture(self, poses: Sequence[Viewpoint]) -> None:
+        there = {capture.viewpoint for capture in self.context.evidence.captures(self.context.step.id)}
+        todo = [v for v in poses if v.name not in there]
+        refused: Mapping[str, str] = {}
+        if todo and not self.given:
+            board = self._knowledge(self.looks(wait=False)).T_base_board
+            planned = plan_step(
+                self.context, todo, self._mount, "shortest", sharp_at_m=apply(board, self.board.points())
+            )
+            todo, refused = list(planned.viewpoints), planned.refused
+        capture_viewpoints(
+            self.context,
+            [*todo, *(v for v in poses if v.name in there)],
+            self._mount,
+            image_kind="board_image",
+            refused=refused,
+            on_captured=self._looks.begin,
+            until=lambda: bool(self._looks.spoilt_in_a_row()),
+            again=to_take_again(self.context),
+        )
+
+    def looks(self, *, wait: bool = True) -> list[Look]:
+        """Every valid image with what was found in it."""
+        if wait:
+            self._looks.wait()
+        return self._looks.of(self.context.step.id)
+
+    def _measures(self, looks: Sequence[Look]) -> dict[str, float]:
+        poses, captures = self.poses(), self.context.evidence.captures(self.context.step.id)
+        return {
+            "viewpoints_planned": float(len(poses)),
+            "viewpoints_captured": float(len(captures)),
+            "viewpoints_given_up": float(len({v.name for v in poses} - {c.viewpoint for c in captures})),
+            "settings_departures": float(sum(not capture.verdicts["settings"] for capture in captures)),
+            "moved_during_exposure": float(sum(not capture.verdicts["still"] for capture in captures)),
+            "boards_unseen": float(sum(not look.seen for look in looks)),
+        }
+
+
+_WORDS: Mapping[Why, str] = {
+    "first": "the first, to see where the board lies",
+    "start": "to find lens, mount and board",
+    "rest": "the rest",
+    "replacement": "instead of images without a board",
+    "mend": "to mend what falls short",
+}
+
+
+def _refine(nominal: BoardKnowledge, looks: Sequence[Look], board: Board, *, lens_known: bool) -> BoardKnowledge:
+    pick = np.unique(np.linspace(0, len(looks) - 1, min(len(looks), _MOST_FOR_LENS)).round().astype(int))
+    some = [looks[k] for k in pick]
+    views = [look.view for look in some if look.view is not None]
+    flanges: Array = np.array([look.capture.T_base_flange for look in some])
+    known, _ = refined_knowledge(nominal, views, flanges, board, lens_known=lens_known)
+    return BoardKnowledge(
+        known.camera, known.T_flange_camera, known.T_base_board, known.spread, known.focal, known.centre, len(looks)
+    )
+
+
+def _middle(known: BoardKnowledge, board: Board) -> Array:
+    return apply(known.T_base_board, board.points().mean(axis=0))
+
+
+def _same_base(before: Sequence[Look], station: str, seen: Sequence[Look]) -> bool:
+    """Whether an earlier step's images were taken from this station."""
+    return all(look.capture.station == station for look in (*before, *seen))

@@ -1,0 +1,148 @@
+"""Board images as they arrive: a job looks at each, and tells whether it shows the whole board, and sharp."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import TypedDict
+
+import numpy as np
+
+from service.compute.calibration.board.board import Board, BoardView
+from service.core.records.events import ViewpointCaptured
+from service.core.run.state import JobState
+from service.jobs.calibration import board_view
+from service.jobs.records import ImageFile
+from service.steps.capture.spoilt import LookedAt, row_to_stop_for, stop_for_lens, why_spoilt
+from service.steps.context import JobRequest, StepContext
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One board image and what was found in it."""
+
+    capture: ViewpointCaptured
+    seen: bool
+    reason: str
+    corners_sha256: str | None = None
+    view: BoardView | None = None
+    size: tuple[int, int] = (0, 0)
+    spoilt: bool = False  # blurred or black: not to be calibrated from, whatever is seen in it
+
+
+@dataclass
+class BoardLooks:
+    """The looks at the board images of a step, and of the earlier step whose board they show again."""
+
+    context: StepContext
+    board: Board
+    earlier: str | None = None
+    _read: dict[str, Look] = field(default_factory=dict[str, Look])
+    _told: set[str] = field(default_factory=set[str])
+
+    def begin(self) -> None:
+        """Have every new image looked at. Returns at once."""
+        begun = {job.arguments["image"]["sha256"] for job in self._jobs(self.context.step.id)}
+        for capture in self.context.evidence.captures(self.context.step.id):
+            sha256 = capture.artefacts[0].sha256
+            if sha256 not in begun:
+                arguments = board_view.Arguments(
+                    image=ImageFile(viewpoint=capture.viewpoint, sha256=sha256), **board_arguments(self.board)
+                )
+                self.context.evidence.enqueue(JobRequest.of(board_view.KIND, arguments), sha256)
+
+    def wait(self) -> None:
+        """Until every image has been looked at."""
+        self.begin()
+        while True:
+            self.context.checkpoint()
+            jobs = self._jobs(self.context.step.id)
+            left = sum(job.status == "enqueued" for job in jobs)
+            if not left:
+                return
+            self.context.progress("looking for the board", len(jobs) - left, len(jobs))
+            self.context.wait(0.05)
+
+    def of(self, step: str) -> list[Look]:
+        """Every valid image of a step that has been looked at, with what was found in it."""
+        jobs = self._by_image(step)
+        spoilt = why_spoilt(self._looked_at(step))
+        out: list[Look] = []
+        for capture in self.context.evidence.captures(step):
+            sha256 = capture.artefacts[0].sha256
+            job = jobs.get(sha256)
+            if job is None or not isinstance(capture, ViewpointCaptured):
+                continue
+            look = self._look(capture, job)
+            if not all(capture.verdicts.values()):
+                departs = [name for name, passed in capture.verdicts.items() if not passed]
+                look = Look(capture, False, f"not as wanted: {', '.join(departs)}")
+            elif sha256 in spoilt:
+                look = Look(capture, False, spoilt[sha256], spoilt=True)
+            if not look.seen:
+                self._tell(look)
+            out.append(look)
+        return out
+
+    def spoilt_in_a_row(self) -> list[LookedAt]:
+        """Blurred or black images with which this step's images end, where they are to stop it.
+
+        Where all so far are black, whoever looks for the first board says so.
+        """
+        mine = self._looked_at(self.context.step.id)
+        others = self._looked_at(self.earlier) if self.earlier is not None else []
+        row = row_to_stop_for(self.context, mine, others)
+        from_the_start = len(row) == len(mine) and all(image.black for image in row)
+        return [] if from_the_start else row
+
+    def stop_where_spoilt(self) -> None:
+        """Raises ImagesSpoiltError after several spoilt images in a row."""
+        row = self.spoilt_in_a_row()
+        if row:
+            stop_for_lens(self.context, row)
+
+    def _jobs(self, step: str) -> list[JobState]:
+        return [job for job in self.context.evidence.jobs(step) if job.kind == "board_view"]
+
+    def _by_image(self, step: str) -> dict[str, JobState]:
+        return {str(j.arguments["image"]["sha256"]): j for j in self._jobs(step) if j.status != "enqueued"}
+
+    def _looked_at(self, step: str) -> list[LookedAt]:
+        """In the order of capture."""
+        jobs = self._by_image(step)
+        ordered = [jobs.get(capture.artefacts[0].sha256) for capture in self.context.evidence.captures(step)]
+        return [LookedAt.of(j, int(j.result["size"][0])) for j in ordered if j is not None and "size" in j.result]
+
+    def _look(self, capture: ViewpointCaptured, job: JobState) -> Look:
+        sha256 = capture.artefacts[0].sha256
+        if sha256 not in self._read:
+            self._read[sha256] = self._as_read(capture, job)
+        return self._read[sha256]
+
+    def _as_read(self, capture: ViewpointCaptured, job: JobState) -> Look:
+        if job.status == "failed" or not job.result.get("seen"):
+            why = job.message if job.status == "failed" else str(job.result.get("reason", "not looked at"))
+            return Look(capture, False, why)
+        ref = job.artefacts[0]
+        record = json.loads(self.context.evidence.path(ref).read_bytes())
+        view = BoardView(np.array(record["indices"], dtype=np.int64), np.array(record["corners"], dtype=np.float64))
+        return Look(capture, True, "", ref.sha256, view, (int(record["size"][0]), int(record["size"][1])))
+
+    def _tell(self, look: Look) -> None:
+        sha256 = look.capture.artefacts[0].sha256
+        if sha256 not in self._told:
+            self._told.add(sha256)
+            self.context.tell(f"{look.capture.viewpoint}: not used, {look.reason}")
+
+
+class BoardFields(TypedDict):
+    """A board as fields of a job's arguments."""
+
+    columns: int
+    rows: int
+    square_m: float
+
+
+def board_arguments(board: Board) -> BoardFields:
+    """A board as job arguments."""
+    return {"columns": board.columns, "rows": board.rows, "square_m": board.square_m}

@@ -1,0 +1,258 @@
+"""One exposure with a robot: the picture, the arm's pose during it, the verdicts, and all of it into the evidence."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from drivers.errors import DeviceBusyError, DeviceUnavailableError
+from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, RobotSample, SettleReport
+from drivers.stillness import PoseSpread, pose_spread
+from service.core.errors import ConfigurationError, DataError
+from service.core.geometry import Array, Transform
+from service.core.records.events import ArtefactRef, Matrix4, ViewpointCaptured
+from service.steps.capture.motion import settle_criteria
+from service.steps.capture.viewpoints import Viewpoint
+from service.steps.context import StepContext
+from service.store.records import NewArtefact
+
+#: How long a busy camera is left alone before the next try: nearly a minute in all.
+_BUSY_PAUSES_S = (0.5, 1.0, 2.0, 4.0, *(8.0,) * 6)
+_BUSY_AGAIN_PAUSES_S = _BUSY_PAUSES_S[:3]  # of a camera that was opened again because it stayed busy
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """An image that has arrived from the camera, with all that belongs to it, before it is recorded."""
+
+    viewpoint: Viewpoint
+    image: CapturedImage
+    folder: tempfile.TemporaryDirectory[str]  # holds the image's files until they are in the store
+    window: tuple[RobotSample, ...]  # of the pose stream, over the exposure
+    pose: ExposurePose
+    environment: dict[str, float]
+    verdicts: dict[str, bool]
+    image_kind: str
+    ringing_s: float
+
+
+def expose(
+    context: StepContext,
+    camera: Camera,
+    robot: RobotArm,
+    viewpoint: Viewpoint,
+    settled: SettleReport,
+    environment: dict[str, float],
+    wanted: CameraSettings,
+    image_kind: str,
+    *,
+    was_busy: bool = False,
+) -> Shot:
+    """Take the picture and judge it. Nothing is recorded yet: `record_shot` does that while the arm moves on.
+
+    Raises DeviceError, DeviceUnavailableError when no pose of the arm is known for the exposure.
+    """
+    folder = tempfile.TemporaryDirectory(prefix="orthocapture-")
+    try:
+        image = expose_when_free(context, camera, Path(folder.name), was_busy=was_busy)
+        window = robot.samples(image.trigger_monotonic_s, image.trigger_monotonic_s + wanted.exposure_s + 0.3)
+        pose = exposure_pose(window)
+    except BaseException:
+        folder.cleanup()
+        raise
+    verdicts = {
+        "still": pose.spread.within(settle_criteria(context)),
+        "settings": settings_agree(image.exif, wanted),
+    }
+    return Shot(viewpoint, image, folder, window, pose, environment, verdicts, image_kind, settled.ringing_s)
+
+
+def record_shot(context: StepContext, shot: Shot) -> None:
+    """Write a shot down: files first, then one transaction with rows and event."""
+    viewpoint, image, pose = shot.viewpoint, shot.image, shot.pose
+    with shot.folder:
+        refs = [
+            context.evidence.put_file(
+                file.path,
+                kind=shot.image_kind if file.media_type == "image/jpeg" else "raw",
+                media_type=file.media_type,
+                original_name=file.camera_name,
+            )
+            for file in image.files
+        ]
+    refs.append(_pose_log(context, viewpoint, shot.window))
+    rows = tuple(
+        NewArtefact(
+            ref=ref,
+            device="robot" if ref.kind == "pose_log" else "camera",
+            step=context.step.id,
+            attempt=context.attempt,
+            viewpoint=viewpoint.name,
+            who=context.operator,
+            monotonic_s=image.trigger_monotonic_s,
+        )
+        for ref in refs
+    )
+    context.evidence.record(
+        ViewpointCaptured(
+            step=context.step.id,
+            attempt=context.attempt,
+            viewpoint=viewpoint.name,
+            station=viewpoint.station,
+            artefacts=tuple(refs),
+            T_base_flange=_rows(pose.spread.T_base_flange),
+            pose_sigma_m=pose.spread.position_sigma_m,
+            pose_sigma_rad=pose.spread.rotation_sigma_rad,
+            joints_rad=tuple(float(q) for q in pose.joints_rad),
+            pose_samples=pose.spread.samples,
+            trigger_monotonic_s=image.trigger_monotonic_s,
+            arrival_monotonic_s=image.arrival_monotonic_s,
+            controller_time_s=pose.controller_time_s,
+            clock_offset_s=pose.clock_offset_s,
+            ringing_s=shot.ringing_s,
+            camera=camera_record(image),
+            environment=shot.environment,
+            verdicts=shot.verdicts,
+        ),
+        artefacts=rows,
+    )
+
+
+def expose_when_free(context: StepContext, camera: Camera, folder: Path, *, was_busy: bool = False) -> CapturedImage:
+    """Release the shutter, and wait up to a minute for a camera that is still busy with what came before.
+
+    Args:
+        was_busy: that minute has passed before; it is waited for a few seconds only.
+    """
+    for pause_s in _BUSY_AGAIN_PAUSES_S if was_busy else _BUSY_PAUSES_S:
+        try:
+            return camera.capture(folder)
+        except DeviceBusyError:
+            context.checkpoint()
+            context.progress("waiting for the camera, which is busy", 0, 1)
+            context.wait(pause_s)
+    return camera.capture(folder)
+
+
+@dataclass(frozen=True, slots=True)
+class ExposurePose:
+    """The mean pose of the flange over an exposure, how far it strayed, and the clocks in the middle of it."""
+
+    spread: PoseSpread
+    joints_rad: Array  # (6,) or (7,), mean
+    controller_time_s: float
+    clock_offset_s: float  # controller time minus host monotonic time
+
+
+def exposure_pose(window: Sequence[RobotSample]) -> ExposurePose:
+    """The pose of the flange over the samples of an exposure, oldest first.
+
+    Raises DeviceUnavailableError when there is none.
+    """
+    if not window:
+        raise DeviceUnavailableError(
+            "the robot's pose stream has no sample during the exposure",
+            where="robot",
+            remedy="The image cannot be used without its pose; the viewpoint is taken again",
+        )
+    middle = window[len(window) // 2]
+    return ExposurePose(
+        spread=pose_spread(window),
+        joints_rad=np.mean([s.joints_rad for s in window], axis=0),
+        controller_time_s=middle.controller_time_s,
+        clock_offset_s=middle.controller_time_s - middle.monotonic_s,
+    )
+
+
+def settings_agree(actual: CameraSettings, wanted: CameraSettings) -> bool:
+    """Whether an image's EXIF shows the protocol's settings (aperture and time to 2 %, ISO exactly)."""
+    return (
+        abs(actual.aperture_f / wanted.aperture_f - 1) < 0.02
+        and abs(actual.exposure_s / wanted.exposure_s - 1) < 0.02
+        and actual.iso == wanted.iso
+    )
+
+
+def wanted_settings(context: StepContext) -> CameraSettings:
+    """The camera settings of the protocol. Raises ConfigurationError when it has none."""
+    camera = context.protocol.camera
+    if camera is None:
+        raise ConfigurationError(
+            "the protocol has no section `camera`",
+            where=context.protocol.id,
+            remedy="Say there which aperture, exposure time and ISO the camera is set to",
+        )
+    return CameraSettings(
+        aperture_f=camera.aperture_f,
+        exposure_s=camera.exposure_s,
+        iso=camera.iso,
+        focus_mode=camera.focus_mode,
+        image_quality=camera.image_quality,
+    )
+
+
+def environment_now(context: StepContext) -> dict[str, float]:
+    """Light and temperature, where a light box measures them."""
+    lightbox = context.devices.lightbox()
+    if lightbox is None:
+        return {}
+    try:
+        reading = lightbox.read()
+    except DeviceUnavailableError:
+        context.devices.reopen(lightbox)
+        reading = lightbox.read()
+    return {"light_lux": reading.light_lux, "temperature_c": reading.temperature_c}
+
+
+def _pose_log(context: StepContext, viewpoint: Viewpoint, window: Sequence[RobotSample]) -> ArtefactRef:
+    """The pose stream over the exposure, as it was received."""
+    lines = [
+        json.dumps(
+            {
+                "controller_time_s": s.controller_time_s,
+                "monotonic_s": s.monotonic_s,
+                "joints_rad": s.joints_rad.tolist(),
+                "T_base_flange": s.T_base_flange.tolist(),
+                "tcp_speed_m_s": s.tcp_speed_m_s,
+                "safety": s.safety.value,
+            }
+        )
+        for s in window
+    ]
+    return context.evidence.put_bytes(
+        ("\n".join(lines) + "\n").encode(),
+        kind="pose_log",
+        media_type="application/x-ndjson",
+        original_name=f"{viewpoint.name}.poses.jsonl",
+    )
+
+
+def camera_record(image: CapturedImage) -> dict[str, object]:
+    """What the event of an exposure says of the camera."""
+    return {
+        **dataclasses.asdict(image.exif),
+        "counter": image.counter,
+        "exif_time": image.exif_time,
+        "lens": image.lens,
+        "focal_length_mm": image.focal_length_mm,
+        "width": image.width,
+        "height": image.height,
+        "lens_serial": image.lens_serial,
+        "body_serial": image.body_serial,
+        "focus_distance_m": image.focus_distance_m,
+        "focus_position": image.focus_position,
+    }
+
+
+def _rows(T: Transform) -> Matrix4:
+    if T.shape != (4, 4):
+        raise DataError(
+            f"a pose is a 4×4 matrix, not {T.shape}", where="robot", remedy="Report this: the driver is at fault"
+        )
+    return tuple((float(r[0]), float(r[1]), float(r[2]), float(r[3])) for r in T)

@@ -1,0 +1,374 @@
+"""What the images say while they are being taken: one job an image, none of which the capture waits for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from service.core.errors import ComputeError, ConfigurationError
+from service.core.gates.verdict import limits as gate_text
+from service.core.jobs.keys import key_stem
+from service.core.jobs.priorities import LIVE
+from service.core.jobs.references import Each, Reference, jobs_of, resolve
+from service.core.protocol.models import Gate
+from service.core.records.events import Record, View
+from service.core.run.state import JobState
+from service.jobs.calibration import calibrate
+from service.jobs.capture import live_summary, live_view
+from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Photograph, Point
+from service.jobs.surfaces import coverage_points, locate_spheres
+from service.steps.capture.spoilt import SPOILT, LookedAt, row_to_stop_for, stop_for_lens, why_spoilt
+from service.steps.capture.viewpoints import Viewpoint
+from service.steps.context import JobRequest, StepContext
+from service.steps.inputs import artefact_of, mounting_of, robot_pose_of, taken
+
+ERROR, COVERAGE = "predicted_target_error_mm", "specimen_coverage"
+SUGGESTION = "suggested_viewpoints"  # name of the note that a retry of the step reads
+
+
+class CoverageRule(Record):
+    """When a view counts for a point of the specimen's surface."""
+
+    min_views: Annotated[int, Field(ge=1)] = 2  # that must see the point
+    # Between the viewing ray and the normal of the surface.
+    max_angle_deg: Annotated[float, Field(gt=0, lt=90)] = 65.0
+    max_distance_m: Annotated[float, Field(gt=0)] = 1.0  # from the camera
+
+
+class Live(Record):
+    """What the numbers after each image are computed from."""
+
+    calibration: str  # step with the intrinsics
+    hand_eye: str  # step with T_flange_camera
+    spheres_of: str  # step with the spheres and, for the coverage, the surface: the CT
+    images_of: tuple[str, ...] = ()  # earlier capture steps that count too
+    aim_mm: Annotated[float, Field(gt=0)] = 0.35  # of the suggestions, where no gate says it
+    # Scatter of the camera's poses before any image tells; without them what the hand-eye calibration's held-out
+    # views show.
+    arm_sigma_mm: Annotated[float, Field(gt=0)] | None = None
+    arm_sigma_mrad: Annotated[float, Field(gt=0)] | None = None  # of the camera's rotation
+    coverage: CoverageRule = CoverageRule()  # when a view counts for a point of the specimen's surface
+    wait_s: Annotated[float, Field(ge=0)] = 60.0  # at the end of the step, for images still being looked at
+
+
+@dataclass
+class LiveAnalysis:
+    """The live numbers of one execution of one capture step."""
+
+    context: StepContext
+    params: Live
+    shared: Shared
+    told: set[str] = field(default_factory=set[str])
+
+    @classmethod
+    def begin(cls, context: StepContext, params: Live | None) -> LiveAnalysis | None:
+        """Gather what earlier steps found; None, with a note, where one of them was skipped."""
+        if params is None:
+            return None
+        try:
+            shared = Shared.of(context, params)
+            mesh = artefact_of(context, params.spheres_of, "ct_mesh").sha256
+        except ConfigurationError as error:
+            context.note("no_live_numbers", why=str(error))
+            context.tell(f"no numbers while capturing: {error}")
+            return None
+        analysis = cls(context, params, shared)
+        if not any(job.kind == "coverage_points" for job in analysis._jobs("coverage_points")):
+            arguments = coverage_points.Arguments(
+                mesh=mesh, spheres_m=shared.spheres_m, radius_m=shared.radius_m, limits=shared.limits
+            )
+            references = {"spheres_m": shared.taken["spheres_m"]}
+            request = JobRequest.of(coverage_points.KIND, arguments, references, LIVE)
+            context.evidence.enqueue(request, "specimen")
+        analysis.told = {job.job for job in analysis._jobs("live_view") if job.status != "enqueued"}
+        return analysis
+
+    def look(self) -> None:
+        """Have every new image looked at, and tell what is known of the earlier ones. Returns at once."""
+        begun = {job.arguments["image"]["sha256"] for job in self._jobs("live_view")}
+        for capture in self.context.evidence.captures(self.context.step.id):
+            sha256 = capture.artefacts[0].sha256
+            if sha256 in begun or not all(capture.verdicts.values()):
+                continue
+            image = Photograph.model_validate(
+                {
+                    "viewpoint": capture.viewpoint,
+                    "station": capture.station,
+                    "sha256": sha256,
+                    **robot_pose_of(capture),
+                }
+            )
+            mounted = mounting_of(self.context, self.params.hand_eye, [capture.station])
+            earlier, looks = self._earlier()
+            arguments = live_view.Arguments(
+                **self.shared.fields(mounted.mounting), image=image, surface=self._surface(), earlier=earlier
+            )
+            references = {**self.shared.taken, **mounted.taken, "earlier": looks}
+            request = JobRequest.of(live_view.KIND, arguments, references, LIVE)
+            self.context.evidence.enqueue(request, sha256)
+        self._tell()
+
+    def summary(
+        self, station: str, candidates: Sequence[tuple[Viewpoint, float]], retakes: str = "", again: int = 0
+    ) -> dict[str, float]:
+        """Wait, up to a limit, for the last images; the measures of the gate. A shortfall becomes a suggestion.
+
+        Args:
+            station: where the robot stands.
+            candidates: viewpoints that could be taken there in addition, with the time to get there.
+            retakes: what the same confirmation takes again, in words; the suggestion is added to it.
+            again: how many images that are.
+        """
+        self._wait()
+        error_gate, coverage_gate = self._gate(ERROR), self._gate(COVERAGE)
+        limit_mm = error_gate.max if error_gate and error_gate.max is not None else self.params.aim_mm
+        least = coverage_gate.min if coverage_gate and coverage_gate.min is not None else 0.0
+        views, looks = self._earlier()
+        arguments = live_summary.Arguments(
+            **self.shared.fields(self.shared.mounting),
+            surface=self._surface(),
+            views=views,
+            station=station,
+            limit_m=limit_mm / 1000,
+            min_coverage=least,
+            candidates=tuple(
+                live_summary.CandidateView(name=v.name, T_base_camera=v.T_base_camera.tolist(), travel_s=travel_s)
+                for v, travel_s in candidates
+            ),
+        )
+        request = JobRequest.of(live_summary.KIND, arguments, {**self.shared.taken, "views": looks})
+        try:
+            (answer,) = self.context.evidence.run_jobs(request)
+        except ComputeError as error:
+            self.context.note("no_live_numbers", why=str(error))
+            return {}
+        found = live_summary.KIND.read_answer(answer.result)
+        for why in found.reasons.values():
+            self.context.tell(why)
+        failed = [gate for gate in self.context.step.gates if _fails(gate, answer.measures)]
+        if failed and found.next_best_views:
+            self._suggest(failed, answer.measures, found.next_best_views, retakes, again)
+        return dict(answer.measures)
+
+    def spoilt_in_a_row(self) -> list[LookedAt]:
+        """Blurred or black images with which this step's images end, where they are to stop it."""
+        mine = self._looked_at(self.context.step.id)
+        return row_to_stop_for(self.context, mine, self._looked_at(*self.params.images_of))
+
+    def spoilt(self) -> dict[str, str]:
+        """Wait, up to a limit, for the last images: the reason of each spoilt one, by its SHA-256.
+
+        Raises ImagesSpoiltError after several in a row.
+        """
+        self._wait()
+        row = self.spoilt_in_a_row()
+        if row:
+            stop_for_lens(self.context, row)
+        return why_spoilt(self._looked_at(self.context.step.id), self._looked_at(*self.params.images_of))
+
+    def note_spoilt(self, reasons: Mapping[str, str]) -> None:
+        """Images that are spoilt although they were taken again: a retry of the step takes them once more."""
+        captures = self.context.evidence.captures(self.context.step.id)
+        names = [capture.viewpoint for capture in captures if capture.artefacts[0].sha256 in reasons]
+        if names:
+            self.context.note(SPOILT, viewpoints=names, attempt=self.context.attempt)
+
+    def suggested(self) -> set[str]:
+        """Names of the viewpoints that earlier attempts of this step found wanting."""
+        notes = [note for note in self.context.state.notes if note.note == SUGGESTION]
+        return {str(view["viewpoint"]) for note in notes for view in note.data["viewpoints"]}
+
+    def _suggest(
+        self,
+        failed: Sequence[Gate],
+        measures: Mapping[str, float],
+        suggestions: Sequence[live_summary.Suggestion],
+        retakes: str,
+        again: int,
+    ) -> None:
+        last = suggestions[-1]
+        names = ", ".join(view.viewpoint for view in suggestions)
+        short = "; ".join(
+            f"{gate.measure} is {measures[gate.measure]:.3g} {gate.unit}, needed {gate_text(gate.min, gate.max)}"
+            for gate in failed
+            if gate.measure in measures
+        )
+        confirm = "The same confirmation also takes" if retakes else "Confirm to take"
+        advice = (
+            f"{short}. {confirm} {len(suggestions)} more views ({names}): the error is then predicted to be "
+            f"{last.predicted_error_mm:.3f} mm and the coverage {100 * last.coverage:.0f} %"
+        )
+        self.context.tell(advice)  # of what is taken again it was told before
+        # The newest note with advice is what a person is shown: it holds all that the confirmation does.
+        both = f"{retakes}. {advice}" if retakes else advice
+        # What is to be done for the retakes is to be done for this newer note, which takes their place.
+        mend = self.context.evidence.state().steps[self.context.step.id].mend if retakes else {}
+        views = [view.plain() for view in suggestions]
+        self.context.note(SUGGESTION, advice=both, viewpoints=views, images=again, hands=list(mend.get("hands", ())))
+
+    def _gate(self, measure: str) -> Gate | None:
+        return next((gate for gate in self.context.step.gates if gate.measure == measure), None)
+
+    def _jobs(self, kind: str) -> list[JobState]:
+        steps = dict.fromkeys((*self.params.images_of, self.context.step.id))
+        return [job for step in steps for job in self.context.evidence.jobs(step) if job.kind == kind]
+
+    def _earlier(self) -> tuple[tuple[Hash, ...], Each | None]:
+        """The files of the looks at images that still count, in the order of capture, and the reference to them."""
+        steps = dict.fromkeys((*self.params.images_of, self.context.step.id))
+        state = self.context.evidence.state()
+        captures: list[View] = []
+        for step in steps:
+            captures += self.context.evidence.captures(step)
+        hashes = [capture.artefacts[0].sha256 for capture in captures]
+        jobs = jobs_of(state)
+        done = [job for job in jobs.values() if job.kind == "live_view" and job.status == "finished"]
+        by_image = {job.arguments["image"]["sha256"]: job for job in done}
+        mine = [by_image[sha256] for sha256 in hashes if sha256 in by_image]
+        files = tuple(job.artefacts[0].sha256 for job in mine)
+        keys = tuple(key_stem(state, step, "live_view") for step in steps)
+        every = Each(keys, state.seq, "artefacts/0/sha256")
+        counted = {job.job for job in mine}
+        without = tuple(job.job for job in every.members(jobs) if job.job not in counted)
+        each = replace(every, without=without)
+        return files, each if resolve(each.record(), jobs) == list(files) else None
+
+    def _looked_at(self, *steps: str) -> list[LookedAt]:
+        """The images of these steps that have been looked at, in the order of capture."""
+        by_image = {j.arguments["image"]["sha256"]: j for j in self._jobs("live_view") if j.status == "finished"}
+        captures = [capture for step in steps for capture in self.context.evidence.captures(step)]
+        hashes = [capture.artefacts[0].sha256 for capture in captures]
+        width = self.shared.camera.width
+        return [LookedAt.of(by_image[sha256], width) for sha256 in hashes if sha256 in by_image]
+
+    def _surface(self) -> str | None:
+        done = [job for job in self._jobs("coverage_points") if job.status == "finished"]
+        return done[-1].artefacts[0].sha256 if done else None
+
+    def _wait(self) -> None:
+        deadline_s = self.context.monotonic_s() + self.params.wait_s
+        while True:
+            self.context.checkpoint()
+            self.look()
+            waiting = [j for kind in ("live_view", "coverage_points") for j in self._jobs(kind)]
+            left = sum(job.status == "enqueued" for job in waiting)
+            if not left:
+                return
+            if self.context.monotonic_s() > deadline_s:
+                self.context.note("live_numbers_late", images=left)
+                return
+            self.context.progress("looking at the last images", len(waiting) - left, len(waiting))
+            self.context.wait(0.1)
+
+    def _tell(self) -> None:
+        for job in self._jobs("live_view"):
+            if job.status != "enqueued" and job.job not in self.told:
+                self.told.add(job.job)
+                self.context.tell(describe_view(job))
+
+
+def seen_words(seen: float, expected: float | None) -> str:
+    """`9/10 spheres`; of more than are expected here, `13 spheres (10 expected in this image)`."""
+    if expected is None:
+        return f"{seen:.0f} spheres"
+    if seen > expected:
+        return f"{seen:.0f} spheres ({expected:.0f} expected in this image)"
+    return f"{seen:.0f}/{expected:.0f} spheres"
+
+
+def describe_view(job: JobState) -> str:
+    """`v1_005: 9/10 spheres, 0.18 px, predicted error 0.210 mm, coverage 74 %`: one line on one image."""
+    if job.status == "failed":
+        return f"{job.arguments['image']['viewpoint']}: could not be looked at: {job.message}"
+    m = job.measures
+    parts = [seen_words(m["spheres_seen"], m.get("spheres_expected"))]
+    if "outline_rms_px" in m:
+        parts.append(f"{m['outline_rms_px']:.2f} px")
+    if ERROR in m:
+        parts.append(f"predicted error {m[ERROR]:.3f} mm")
+    if COVERAGE in m:
+        parts.append(f"coverage {100 * m[COVERAGE]:.0f} %")
+    if job.result.get("reason"):
+        parts.append(str(job.result["reason"]))
+    return f"{job.result['viewpoint']}: {', '.join(parts)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """What all jobs of a capture have in common, and what of it is recorded as a reference.
+
+    The covariance of T_flange_camera and the scatter of the camera's poses are as the hand-eye calibration states
+    them: with the arm's correction, where there is one, because the images get corrected poses.
+    """
+
+    camera: Camera
+    mounting: Mounting
+    hand_eye_covariance: Matrix
+    arm_sigma_m: float
+    arm_sigma_rad: float
+    spheres_m: tuple[Point, ...]
+    radius_m: float
+    limits: Limits
+    taken: Mapping[str, Reference | Each | None]
+
+    @classmethod
+    def of(cls, context: StepContext, params: Live) -> Shared:
+        """From what earlier steps found. Raises ConfigurationError where one of them did not."""
+        scan = taken(context, params.spheres_of, locate_spheres.KIND)
+        calibration = taken(context, params.calibration, calibrate.KIND)
+        hand_eye = taken(context, params.hand_eye, calibrate.KIND)
+        record = hand_eye.answer.hand_eye
+        if record is None:
+            raise ConfigurationError(
+                f"step {params.hand_eye!r} gives no hand_eye",
+                where=f"step {context.step.id}, live",
+                remedy="Do that step first",
+            )
+        best = record.best
+        sigma_m = _rms(best.residuals.held_out_mm.values()) / 1e3
+        sigma_rad = float(np.radians(_rms(best.residuals.held_out_deg.values())))
+        at = "hand_eye" if record.arm_correction is None else "hand_eye/arm_correction"
+        return cls(
+            camera=calibration.answer.camera,
+            mounting=Mounting(T_flange_camera=best.T_flange_camera),
+            hand_eye_covariance=best.sigma.covariance,
+            arm_sigma_m=sigma_m if params.arm_sigma_mm is None else params.arm_sigma_mm / 1e3,
+            arm_sigma_rad=sigma_rad if params.arm_sigma_mrad is None else params.arm_sigma_mrad / 1e3,
+            spheres_m=scan.answer.spheres_m,
+            radius_m=context.protocol.spheres.radius_mm / 1000,
+            limits=Limits.model_validate(params.coverage.model_dump()),
+            taken={
+                "camera": calibration.reference("camera"),
+                "spheres_m": scan.reference("spheres_m"),
+                "hand_eye_covariance": hand_eye.reference(f"{at}/sigma/covariance"),
+                "T_flange_camera": hand_eye.reference(f"{at}/T_flange_camera"),
+            },
+        )
+
+    def fields(self, mounting: Mounting) -> dict[str, Any]:
+        """Of the arguments of a job, with the mounting at a station."""
+        return {
+            "camera": self.camera,
+            **mounting.set_fields(),
+            "hand_eye_covariance": self.hand_eye_covariance,
+            "arm_sigma_m": self.arm_sigma_m,
+            "arm_sigma_rad": self.arm_sigma_rad,
+            "spheres_m": self.spheres_m,
+            "radius_m": self.radius_m,
+            "limits": self.limits,
+        }
+
+
+def _rms(values: Iterable[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(list(values)))))
+
+
+def _fails(gate: Gate, measures: Mapping[str, float]) -> bool:
+    if gate.measure not in (ERROR, COVERAGE):
+        return False
+    value = measures.get(gate.measure)
+    return value is None or (gate.max is not None and value > gate.max) or (gate.min is not None and value < gate.min)

@@ -1,0 +1,55 @@
+"""Images that a gate refuses although they are there: on a retry only those are taken again, all others are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from service.core.gates.verdict import describe, evaluate_gates
+from service.steps.capture.spoilt import CLEAN, spoilt_before
+from service.steps.context import StepContext
+
+DEPARTING = "images depart from the calibration"  # name of the note
+#: Gates that are about how images were taken, and what a person looks at before they are taken again.
+TAKEN_AGAIN: Mapping[str, str] = {
+    "viewpoints_captured": "look at why the arm could not take the viewpoints that are missing",
+    "settings_departures": "set the camera as the protocol has it",
+    "moved_during_exposure": "look for what shook the arm or its mount",
+    "images_spoilt": "clean the lens, and look whether something stands before it or in the light",
+    "optics_departures": "set zoom, focus and lens as they were for the calibration, or redo the calibration",
+}
+
+
+def to_take_again(context: StepContext) -> set[str]:
+    """SHA-256 of images that departed from the calibration's optics, or were spoilt, in an earlier attempt."""
+    captures = context.evidence.captures(context.step.id)
+    notes = [note.data for note in context.state.notes if note.note == DEPARTING and "attempt" in note.data]
+    if not notes or notes[-1]["attempt"] >= context.attempt:
+        return spoilt_before(context)
+    departed, attempt = set(notes[-1]["viewpoints"]), notes[-1]["attempt"]
+    departing = {c.artefacts[0].sha256 for c in captures if c.viewpoint in departed and c.attempt <= attempt}
+    return departing | spoilt_before(context)
+
+
+def advise_retakes(context: StepContext, measures: Mapping[str, float], images: int) -> str:
+    """Where such a gate fails, note what a retry will do: the failed images only.
+
+    Returns the advice; "" where none is needed.
+
+    Args:
+        measures: of the capture.
+        images: how many will be taken again.
+    """
+    verdicts = evaluate_gates(context.step, context.attempt, measures, context.run.skipped).verdicts
+    failed = [verdict for verdict in verdicts if not verdict.passed and verdict.measure in TAKEN_AGAIN]
+    if not failed:
+        return ""
+    short = "; ".join(describe(verdict) for verdict in failed)
+    words = "; ".join(TAKEN_AGAIN[verdict.measure] for verdict in failed)
+    confirm = "No image has to be taken again: confirm to judge the step anew"
+    if images:
+        confirm = f"Confirm to take {images} image{'s'[: images > 1]} again; all others are kept"
+    advice = f"{short}. First {words}. {confirm}"
+    hands = CLEAN if any(verdict.measure == "images_spoilt" for verdict in failed) else []
+    context.note("retakes", advice=advice, images=images, hands=hands)
+    context.tell(advice)
+    return advice

@@ -1,0 +1,314 @@
+"""The capture loop: move, settle, expose, record, for each viewpoint; an image is recorded while the arm moves on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence, Set
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from drivers.errors import (
+    DeviceBusyError,
+    DeviceError,
+    DeviceTimeoutError,
+    DeviceUnavailableError,
+    StaleImageError,
+    UnreachablePoseError,
+    UnreadableFileError,
+)
+from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, SettleReport
+from service.core.geometry import Array, Transform
+from service.core.records.events import ViewpointFailed
+from service.logs.where import at
+from service.steps.capture.exposure import (
+    Shot,
+    environment_now,
+    expose,
+    expose_when_free,
+    record_shot,
+    wanted_settings,
+)
+from service.steps.capture.motion import MotionLimits, move_and_settle, settle_criteria
+from service.steps.capture.viewpoints import Viewpoint, flange_target
+from service.steps.context import StepContext
+
+#: Errors after which the same viewpoint may be tried again on a reopened device.
+WORTH_ANOTHER_TRY = (
+    DeviceUnavailableError,
+    DeviceTimeoutError,
+    DeviceBusyError,
+    StaleImageError,
+    UnreadableFileError,
+)
+NONE_REFUSED: Mapping[str, str] = {}
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureTotals:
+    """What a capture loop came to, the earlier part of a resumed one included."""
+
+    planned: int
+    captured: int
+    given_up: int
+    settings_departures: int
+    moved: int
+
+    def measures(self) -> dict[str, float]:
+        """As numbers for gates."""
+        return {
+            "viewpoints_planned": float(self.planned),
+            "viewpoints_captured": float(self.captured),
+            "viewpoints_given_up": float(self.given_up),
+            "settings_departures": float(self.settings_departures),
+            "moved_during_exposure": float(self.moved),
+        }
+
+
+def capture_viewpoints(
+    context: StepContext,
+    viewpoints: Sequence[Viewpoint],
+    T_flange_camera: Transform,
+    *,
+    image_kind: str,
+    refused: Mapping[str, str] = NONE_REFUSED,
+    on_captured: Callable[[], None] = lambda: None,
+    until: Callable[[], bool] = lambda: False,
+    again: Collection[str] = (),
+) -> CaptureTotals:
+    """Capture every viewpoint that this attempt has not captured yet, in order.
+
+    Args:
+        T_flange_camera: the best known mounting; decides only where the camera goes, not where it was.
+        image_kind: artefact kind of the photographs (`image`, `board_image`, `control_image`).
+        refused: viewpoints that the plan has given up, with the reason; recorded as such, not tried.
+        on_captured: called after each image that is in the record; must return at once.
+        until: asked before each viewpoint; where it says so, the rest is not taken.
+        again: SHA-256 of images that are to be taken again.
+
+    Raises DeviceError when a viewpoint fails for good, StepInterruptedError on pause.
+    """
+    camera = context.devices.camera()
+    wanted = wanted_settings(context)
+    _apply(context, camera, wanted)
+    loop = _CaptureLoop(
+        context, camera, viewpoints, T_flange_camera, wanted, image_kind, on_captured, until, set(again)
+    )
+    try:
+        loop.run(refused)
+    finally:
+        loop.keep()  # whatever ends the loop, an image that has arrived is recorded
+        at(viewpoint="")
+    context.progress("viewpoints", len(viewpoints), len(viewpoints))
+    captures = context.evidence.captures(context.step.id)
+    return CaptureTotals(
+        planned=len(viewpoints),
+        captured=len(captures),
+        given_up=len(loop.given_up),
+        settings_departures=sum(not capture.verdicts["settings"] for capture in captures),
+        moved=sum(not capture.verdicts["still"] for capture in captures),
+    )
+
+
+@dataclass
+class _CaptureLoop:
+    """One pass over the viewpoints.
+
+    Storing an image takes as long as moving a joint by a degree, so an image is held until the arm is on its way to
+    the next viewpoint and is recorded then.
+    """
+
+    context: StepContext
+    camera: Camera
+    viewpoints: Sequence[Viewpoint]
+    T_flange_camera: Transform
+    wanted: CameraSettings
+    image_kind: str
+    on_captured: Callable[[], None]
+    until: Callable[[], bool]
+    again: Set[str]
+    given_up: set[str] = field(init=False)
+    _taken: set[str] = field(init=False, default_factory=set[str])  # in this execution, successful or not
+    _held: Shot | None = field(init=False, default=None)
+    _size: str = field(init=False, default="")  # of an image, in words, once one is there
+    _targets: dict[str, Array] = field(init=False, default_factory=dict[str, Array])  # joints (6,) asked ahead
+
+    def __post_init__(self) -> None:
+        self.given_up = set(self.context.state.skipped_viewpoints)
+
+    def run(self, refused: Mapping[str, str]) -> None:
+        """Take what is still to be taken. The last image may be left to `keep`."""
+        # Looked up anew each time: an operator may send a viewpoint back while the arm moves.
+        while todo := self._next():
+            self.context.checkpoint()
+            if self.until():
+                return
+            self.context.evidence.require_space()
+            self.context.progress("viewpoints", len(self.viewpoints) - len(todo), len(self.viewpoints))
+            viewpoint = todo[0]
+            if viewpoint.name in refused:
+                self._give_up(viewpoint, _left_out(viewpoint, refused[viewpoint.name]))
+                continue
+            try:
+                shot = self._capture_with_retries(viewpoint, todo[1:])
+            except UnreachablePoseError as error:
+                self._give_up(viewpoint, error)
+            else:
+                self._held = shot
+                if not all(shot.verdicts.values()):
+                    self.keep()  # it is taken again from where the arm stands
+            self._taken.add(viewpoint.name)
+
+    def keep(self) -> None:
+        """Record the image that is held, if there is one."""
+        shot, self._held = self._held, None
+        if shot is not None:
+            self._size = f", {shot.image.width * shot.image.height / 1e6:.0f} MP"
+            self.context.busy(f"storing {shot.viewpoint.name}{self._size}")
+            record_shot(self.context, shot)
+            self.on_captured()
+
+    def _next(self) -> list[Viewpoint]:
+        """What is still to be captured, in order.
+
+        An image whose verdicts failed is taken again, once an execution.
+        """
+        captures = {capture.viewpoint: capture for capture in self.context.evidence.captures(self.context.step.id)}
+        old = {name for name, capture in captures.items() if capture.artefacts[0].sha256 in self.again}
+        good = {name for name, c in captures.items() if all(c.verdicts.values())} - old
+        done = good | (self._taken & captures.keys())
+        if self._held is not None:
+            done.add(self._held.viewpoint.name)
+        left = [v for v in self.viewpoints if v.name not in done and v.name not in self.given_up]
+        if left or self._held is None:
+            return left
+        self.keep()
+        return self._next()
+
+    def _give_up(self, viewpoint: Viewpoint, error: DeviceError) -> None:
+        self.keep()
+        self._record_failure(viewpoint, error, skipped=True)
+        self.given_up.add(viewpoint.name)
+
+    def _capture_with_retries(self, viewpoint: Viewpoint, later: Sequence[Viewpoint]) -> Shot:
+        context = self.context
+        at(viewpoint=viewpoint.name)
+        robot = context.devices.robot(viewpoint.station)
+        was_busy = False
+        for tries_left in range(context.step.recovery.retries, -1, -1):
+            arrived = False
+            try:
+                settled = self._go_to(robot, viewpoint)
+                arrived = True
+                environment = self._dwell(robot, later)
+                context.busy(f"taking {viewpoint.name} and fetching it from the camera{self._size}")
+                return expose(
+                    context, self.camera, robot, viewpoint, settled, environment, self.wanted, self.image_kind,
+                    was_busy=was_busy,
+                )  # fmt: skip
+            except WORTH_ANOTHER_TRY as error:
+                was_busy = isinstance(error, DeviceBusyError)
+                self.keep()
+                self._record_failure(viewpoint, error, skipped=False)
+                if tries_left == 0:
+                    raise
+                context.checkpoint()
+                if arrived:
+                    context.devices.reopen(self.camera)
+                    context.busy("setting the camera")
+                    self.camera.apply(self.wanted)
+                if not arrived or not _streams(robot):
+                    context.devices.reopen(robot)
+        raise AssertionError
+
+    def _go_to(self, robot: RobotArm, viewpoint: Viewpoint) -> SettleReport:
+        context = self.context
+        target = self._targets.pop(viewpoint.name, None)
+        if target is None:
+            target = self._solve(robot, viewpoint)
+        motion = context.protocol.motion
+        limits = MotionLimits(motion.speed_rad_s, motion.acceleration_rad_s2, context.protocol.settle.timeout_s)
+        return move_and_settle(context, robot, target, limits, settle_criteria(context), meanwhile=self.keep)
+
+    def _dwell(self, robot: RobotArm, later: Sequence[Viewpoint]) -> dict[str, float]:
+        """Let the arm rest before the exposure, and use the time; returns the environment."""
+        dwell_s = self.context.protocol.motion.dwell_s
+        ends_s = self.context.monotonic_s() + dwell_s
+        if dwell_s > 0:
+            self._solve_ahead(robot, later)
+        environment = environment_now(self.context)
+        self.context.wait(max(0.0, ends_s - self.context.monotonic_s()))
+        return environment
+
+    def _solve(self, robot: RobotArm, viewpoint: Viewpoint) -> Array:
+        """Joints (6,) for a viewpoint, of the controller. Raises UnreachablePoseError."""
+        near = robot.state().sample.joints_rad if viewpoint.joints_rad is None else viewpoint.joints_rad
+        return robot.solve_ik(flange_target(viewpoint.T_base_camera, self.T_flange_camera), near)
+
+    def _solve_ahead(self, robot: RobotArm, later: Sequence[Viewpoint]) -> None:
+        """Ask for the next viewpoint's joints while the arm rests before the exposure: the answer takes 0.1 s."""
+        following = next(iter(later), None)
+        if following is None or self.context.devices.robot(following.station) is not robot:
+            return
+        with suppress(DeviceError):  # it comes again when the viewpoint's turn has come, and counts then
+            self._targets[following.name] = self._solve(robot, following)
+
+    def _record_failure(self, viewpoint: Viewpoint, error: DeviceError, *, skipped: bool) -> None:
+        self.context.evidence.record(
+            ViewpointFailed(
+                step=self.context.step.id,
+                attempt=self.context.attempt,
+                viewpoint=viewpoint.name,
+                error=type(error).__name__,
+                message=str(error),
+                skipped=skipped,
+            )
+        )
+
+
+def _left_out(viewpoint: Viewpoint, why: str) -> UnreachablePoseError:
+    return UnreachablePoseError(
+        f"the plan leaves it out: {why}",
+        where=viewpoint.name,
+        remedy="Move what stands in the way, or choose another viewpoint",
+    )
+
+
+def photograph(context: StepContext, camera: Camera, wanted: CameraSettings, folder: Path) -> CapturedImage:
+    """One exposure without a robot; repeated, on a reopened camera, as often as the step's recovery allows.
+
+    Raises DeviceError when it fails for good, StepInterruptedError on pause.
+    """
+    was_busy = False
+    for tries_left in range(context.step.recovery.retries, -1, -1):
+        inside = folder / str(tries_left)  # what an earlier try has left behind is not in the way
+        inside.mkdir()
+        try:
+            _apply(context, camera, wanted)
+            context.busy("taking a photograph and fetching it from the camera")
+            return expose_when_free(context, camera, inside, was_busy=was_busy)
+        except WORTH_ANOTHER_TRY as error:
+            was_busy = isinstance(error, DeviceBusyError)
+            if tries_left == 0:
+                raise
+            context.note("photograph_repeated", why=str(error))
+            context.checkpoint()
+            context.devices.reopen(camera)
+    raise AssertionError
+
+
+def _apply(context: StepContext, camera: Camera, wanted: CameraSettings) -> None:
+    """Set the camera, which may have dropped its link since it was last used."""
+    context.busy("setting the camera")
+    try:
+        camera.apply(wanted)
+    except WORTH_ANOTHER_TRY:
+        context.devices.reopen(camera)
+        camera.apply(wanted)
+
+
+def _streams(robot: RobotArm) -> bool:
+    try:
+        robot.state()
+    except WORTH_ANOTHER_TRY:
+        return False
+    return True

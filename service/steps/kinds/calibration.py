@@ -1,0 +1,172 @@
+"""Step kind `calibration`: board images from the robot give the intrinsics and the hand-eye transform."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from service.compute.calibration.board.board import Board
+from service.core.errors import ConfigurationError
+from service.core.jobs.references import Reference
+from service.core.protocol.models import MovingParams
+from service.core.records.events import Record
+from service.jobs.calibration import calibrate
+from service.jobs.records import Camera
+from service.steps.board.capture import BoardCapture
+from service.steps.board.looks import board_arguments
+from service.steps.board.mend import mend_calibration
+from service.steps.board.plan import BoardPoses
+from service.steps.capture.optics import departing_images, optics_departures
+from service.steps.capture.viewpoints import ViewpointSet, plan_viewpoints
+from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome
+from service.steps.inputs import captured_images, result_of, taken
+from service.steps.measured import CALIBRATION
+
+_FEWEST_KNOWN = 3  # whole boards, before a part of one may count
+
+
+class Params(MovingParams):
+    """Which board images, and what is computed from them."""
+
+    solve: tuple[Literal["intrinsics", "hand_eye"], ...]  # what is computed
+    board_poses: BoardPoses | None = None  # planned by the software
+    viewpoints: tuple[ViewpointSet, ...] = ()  # or: as listed here
+    images_of: str | None = None  # use the images of this earlier calibration step instead of new ones
+    intrinsics_of: str | None = None  # hand-eye alone: the step that solved the intrinsics
+
+    @property
+    def moves_robot(self) -> bool:
+        """Not with images that are there."""
+        return self.images_of is None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.board_poses is not None and (self.viewpoints or self.images_of is not None):
+            raise ValueError("a calibration needs one of board_poses, viewpoints and images_of, not two")
+        return self
+
+
+class Result(Record):
+    """The camera and, where solved, where it sits on the flange (4×4, metres)."""
+
+    camera: dict[str, float]
+    T_flange_camera: tuple[tuple[float, ...], ...] | None = None
+    T_base_board: tuple[tuple[float, ...], ...] | None = None
+    hand_eye: dict[str, Any] | None = None  # the whole record: covariance, residuals, methods, the arm's correction
+    robots: tuple[str, ...] = ()  # devices whose flange carried the camera
+    details: dict[str, object]
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Capture the board and let the worker solve; what falls short is answered with the views that would mend it."""
+    board = board_of_protocol(context)
+    camera = _camera(context, params)
+    measures: dict[str, float] = {}
+    capture = None
+    if params.images_of is None:
+        capture = _board_capture(context, params, board, camera)
+        measures |= capture.take()
+        departures = optics_departures(context)
+        if departures is not None:
+            measures["optics_departures"] = float(departing_images(departures))
+    answer = _solve(context, params, board, camera, capture)
+    images = captured_images(context, [params.images_of or context.step.id])
+    robots = {context.devices.layout(image.station).robot for image in images if image.station}
+    result = Result.model_validate({**answer.result, "robots": sorted(robots)})
+    measures |= answer.measures
+    if capture is not None:
+        mend_calibration(context, capture, measures)
+    return StepOutcome(measures, answer.artefacts, result.model_dump(mode="json"))
+
+
+def board_of_protocol(context: StepContext) -> Board:
+    """The protocol's board. Raises ConfigurationError if it describes none."""
+    board = context.protocol.board
+    if board is None:
+        raise ConfigurationError(
+            "the protocol describes no calibration board", where=context.protocol.id, remedy="Add a section `board`"
+        )
+    return Board(board.columns, board.rows, board.square_mm / 1000)
+
+
+def _camera(context: StepContext, params: Params) -> Mapping[str, float] | None:
+    """Intrinsics of an earlier step, where this one does not solve them."""
+    if "intrinsics" in params.solve:
+        return None
+    if params.intrinsics_of is None:
+        raise ConfigurationError(
+            "hand-eye needs intrinsics", where=f"step {context.step.id}", remedy="Name the step in intrinsics_of"
+        )
+    return result_of(context, params.intrinsics_of)["camera"]
+
+
+def _board_capture(
+    context: StepContext, params: Params, board: Board, camera: Mapping[str, float] | None
+) -> BoardCapture:
+    given = tuple(
+        viewpoint
+        for viewpoint_set in params.viewpoints
+        for viewpoint in plan_viewpoints(viewpoint_set, context.devices.layout(viewpoint_set.station))
+    )
+    wanted = params.board_poses or _as_board_poses(params.viewpoints)
+    return BoardCapture(context, wanted, board, params.solve, given, camera, params.intrinsics_of)
+
+
+def _as_board_poses(sets: tuple[ViewpointSet, ...]) -> BoardPoses:
+    """What replacements of listed viewpoints are planned by."""
+    arcs = [arc for one in sets for arc in one.arcs]
+    offset = sets[-1].aim_offset_m[2]
+    return BoardPoses(
+        station=sets[-1].station,
+        prefix=sets[-1].prefix,
+        count=max(4, sum(one.count for one in sets)),
+        tilts_deg=tuple(sorted({arc.tilt_deg for arc in arcs})),
+        distances_m=(float(np.median([arc.distance_m for arc in arcs])),),
+        above_scene_m=offset,
+    )
+
+
+def _solve(
+    context: StepContext,
+    params: Params,
+    board: Board,
+    camera: Mapping[str, float] | None,
+    capture: BoardCapture | None,
+) -> JobResult:
+    images = captured_images(context, [params.images_of or context.step.id])
+    looks = {} if capture is None else {look.capture.artefacts[0].sha256: look for look in capture.looks()}
+    images = [image for image in images if image.sha256 not in looks or not looks[image.sha256].spoilt]
+    arguments = calibrate.Arguments(
+        solve=params.solve,
+        images=tuple(images),
+        **board_arguments(board),
+        camera=None if camera is None else Camera.model_validate(camera),
+    )
+    references: dict[str, Reference | None] = {}
+    if camera is not None and params.intrinsics_of is not None:
+        references["camera"] = taken(context, params.intrinsics_of, calibrate.KIND).reference("camera")
+    if capture is not None:
+        corners = tuple(looks[image.sha256].corners_sha256 if image.sha256 in looks else None for image in images)
+        known = capture.knowledge() if None in corners else None
+        if known is not None and known.measured < _FEWEST_KNOWN:
+            known = None
+        more = {"corners": corners, "known": None if known is None else known.record()}
+        arguments = arguments.model_copy(update=more)
+    (answer,) = context.evidence.run_jobs(JobRequest.of(calibrate.KIND, arguments, references))
+    return answer
+
+
+KIND = StepKind(
+    "calibration",
+    Params,
+    Result,
+    execute,
+    measures=CALIBRATION,
+    words=lambda _params, before: Announcement(
+        f"the robot takes {before.images(' of the board')}{before.at_stations}", ROBOT_MOVES
+    ),
+    drawing="board",
+)

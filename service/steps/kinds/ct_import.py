@@ -1,0 +1,97 @@
+"""Step kind `ct_import`: the CT series arrives, is kept slice by slice, and becomes a surface with its spheres."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from drivers.interfaces import CtSource
+from service.core.records.events import ArtefactRef, Record
+from service.jobs.surfaces import ct_surface, locate_spheres
+from service.steps.arrivals import keep, keep_array, keep_mesh, wait_for
+from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.layouts import layout_uncertainties
+from service.steps.measured import COUNT, SPHERES, Measure
+
+
+class Params(Record):
+    """What to expect from the CT suite."""
+
+    source: Literal["dicom", "mesh"] = "dicom"  # mesh: segmented elsewhere (Mimics STL)
+    threshold_hu: float = -450.0  # half way between air and soft tissue or plastic: neither grows nor shrinks
+    spheres: int  # registration and control spheres in the volume
+    wait_s: float = 600.0  # for the series to appear and be complete
+
+
+class Result(Record):
+    """The spheres in the CT frame, metres."""
+
+    spheres_m: tuple[tuple[float, float, float], ...]
+    details: dict[str, Any]
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Wait for one sound series (or mesh), keep its files, let the worker make the surface."""
+    ct = context.devices.ct()
+    radius_m = context.protocol.spheres.radius_mm / 1000
+    measures: dict[str, float] = {}
+    kept: tuple[ArtefactRef, ...]
+    if params.source == "mesh":
+        scan = ct.read_mesh(wait_for(context, ct.segmented_meshes, params.wait_s, "a segmented CT mesh"))
+        mesh, kept = keep_mesh(context, scan, device="ct", kind="ct_mesh")
+        request = JobRequest.of(
+            locate_spheres.KIND,
+            locate_spheres.Arguments(mesh=mesh.sha256, radius_m=radius_m, expected=params.spheres),
+        )
+    else:
+        series = wait_for(context, lambda: _sound(ct), params.wait_s, "a CT series without faults")
+        volume = ct.read(series)
+        kept = tuple(
+            keep(context, path, device="ct", kind="ct_slice", media_type="application/dicom") for path in series.files
+        )
+        array = keep_array(context, volume.hounsfield, device="ct", kind="ct_volume", name="hounsfield.npy")
+        request = JobRequest.of(
+            ct_surface.KIND,
+            ct_surface.Arguments(
+                radius_m=radius_m,
+                expected=params.spheres,
+                slices=tuple(ref.sha256 for ref in kept),
+                hounsfield=array.sha256,
+                T_ct_voxel=volume.T_ct_voxel.tolist(),
+                threshold_hu=params.threshold_hu,
+            ),
+        )
+        measures = {
+            "slices": float(series.slices),
+            "slice_spacing_mm": round(volume.spacing_m[2] * 1000, 6),  # positions are decimal text of six places
+            "voxel_mm": round(max(volume.spacing_m) * 1000, 6),
+        }
+    (answer,) = context.evidence.run_jobs(request)
+    result = Result.model_validate(answer.result)
+    uncertainties = layout_uncertainties(result.details["layout"]) if "layout" in result.details else {}
+    return StepOutcome(
+        {**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"), uncertainties
+    )
+
+
+def _sound(ct: CtSource) -> tuple[Any, ...]:
+    return tuple(series for series in ct.series() if not series.problems and series.slices > 1)
+
+
+KIND = StepKind(
+    "ct_import",
+    Params,
+    Result,
+    execute,
+    measures={
+        **SPHERES,
+        "slices": COUNT,
+        "slice_spacing_mm": Measure("mm", 0.01, 10),
+        "voxel_mm": Measure("mm", 0.01, 10),
+        "vertices": COUNT,
+        "faces": COUNT,
+    },
+    words=lambda _params, _before: Announcement(
+        "import the CT series", "Nothing moves. The software waits for the series."
+    ),
+    drawing="transport",
+)

@@ -1,0 +1,84 @@
+"""Step kind `evaluation`: the paper's errors on the control spheres, for each source of camera poses.
+
+It judges the registrations that are there; one that arrives later is evaluated then (service/steps/poses/sources.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from service.core.errors import ConfigurationError
+from service.core.jobs.references import Reference
+from service.core.records.events import Record
+from service.jobs.registration import evaluate, register
+from service.jobs.surfaces import locate_spheres
+from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.inputs import captured_images, result_of, taken
+from service.steps.measured import COUNT, EVALUATED, Measure
+from service.steps.poses.sources import registration_ways
+
+
+class Params(Record):
+    """Where the control spheres were seen and measured."""
+
+    registration: str  # step whose registrations are judged
+    images_of: tuple[str, ...]  # control captures
+    scan: str  # the registered scan
+    control_scan: str | None = None  # scan or CT that still holds the control spheres; None: spheres left out in turn
+    ct: str | None = None  # CT import, for the loop closures of the error budget
+
+
+class Result(Record):
+    """The paper's table, one row a registration, and the error budget of each."""
+
+    table: tuple[dict[str, Any], ...]
+    budgets: dict[str, dict[str, Any]]
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Let the worker evaluate every registration that has arrived on the control captures."""
+    registered: Mapping[str, Any] = result_of(context, params.registration)["registrations"]
+    registrations = {name: register.KIND.read_answer(record) for name, record in registered.items()}
+    references: dict[str, Reference | None] = {}
+    found = registration_ways(context.protocol, context.run, context.protocol.step(params.registration))
+    arrived = {} if found is None else found.arrived
+    registrations |= {name: register.KIND.read_answer(job.result) for name, job in arrived.items()}
+    references |= {f"registrations/{name}": Reference(job.job, "result") for name, job in arrived.items()}
+    scans = {"scan": params.scan, "control_scan": params.control_scan, "ct": params.ct}
+    measured = {
+        name: None if step is None or step in context.run.skipped else taken(context, step, locate_spheres.KIND)
+        for name, step in scans.items()
+    }
+    references |= {name: found.reference("") for name, found in measured.items() if found is not None}
+    spheres = {name: None if found is None else found.answer for name, found in measured.items()}
+    scan = spheres["scan"]
+    if scan is None:
+        raise ConfigurationError("an evaluation needs the registered scan", where=f"step {context.step.id}")
+    arguments = evaluate.Arguments(
+        images=tuple(captured_images(context, params.images_of)),
+        registrations=registrations,
+        scan=scan,
+        control_scan=spheres["control_scan"],
+        ct=spheres["ct"],
+        radius_m=context.protocol.spheres.radius_mm / 1000,
+    )
+    (answer,) = context.evidence.run_jobs(JobRequest.of(evaluate.KIND, arguments, references))
+    result = Result.model_validate(answer.result)
+    return StepOutcome(answer.measures, answer.artefacts, result.model_dump(mode="json"))
+
+
+KIND = StepKind(
+    "evaluation",
+    Params,
+    Result,
+    execute,
+    measures={
+        "best_mean_radial_error_mm": Measure("mm", 1e-3, 20),
+        "best_predicted_error_mm": Measure("mm", 1e-3, 20),
+        "control_normalised_chi2": Measure("", 0, 1e4),
+        "control_spheres": COUNT,
+    },
+    measures_of_registrations=EVALUATED,
+    registered_by=lambda params, steps: steps.get(params.registration),
+)

@@ -1,0 +1,136 @@
+"""Step kind `image_import`: photographs that were captured earlier come into the evidence, as imported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from service.core.errors import ConfigurationError, DataError
+from service.core.protocol.models import CameraSection
+from service.core.records.events import ArtefactRef, Record, ViewImported
+from service.core.records.import_list import ImportedFile, ImportedView, ImportList, PhotographRole
+from service.steps.capture.optics import departing_images, optics_departures
+from service.steps.context import StepContext, StepKind, StepOutcome
+from service.steps.measured import COUNT
+from service.store.records import NewArtefact
+
+_KINDS = {"calibration": "board_image", "image": "image", "control_image": "control_image"}
+
+
+class Params(Record):
+    """Which of the photographs that were brought."""
+
+    photographs: PhotographRole  # of which part of the import
+
+
+class Result(Record):
+    """What was imported; the images themselves are in the events of the views."""
+
+    photographs: str
+    imported: int
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Bring in every photograph that is not in the evidence yet; a restart goes on where it stopped."""
+    listed = context.devices.imported()
+    views = () if listed is None else listed.of(params.photographs)
+    if listed is None or not views:
+        raise ConfigurationError(
+            f"there are no photographs to import ({params.photographs.replace('_', ' ')})",
+            where=f"step {context.step.id}",
+            remedy="Begin the run with `orthocapture import`, with a folder that holds them",
+        )
+    there = {view.viewpoint for view in context.evidence.captures(context.step.id)}
+    for number, view in enumerate(views):
+        context.checkpoint()
+        context.progress("photographs", number, len(views))
+        if view.name not in there:
+            _bring_in(context, params, listed, view)
+    context.progress("photographs", len(views), len(views))
+    imported = context.evidence.captures(context.step.id)
+    measures = {
+        "images_imported": float(len(imported)),
+        "raw_files": float(sum(len(view.artefacts) - 1 for view in imported)),
+        "settings_departures": float(sum(not view.verdicts.get("settings", True) for view in imported)),
+        "settings_not_stated": float(sum("settings" not in view.verdicts for view in imported)),
+    }
+    departures = optics_departures(context, against_itself=params.photographs == "calibration")
+    if departures is not None:
+        measures["optics_departures"] = float(departing_images(departures))
+    result = Result(photographs=params.photographs, imported=len(imported))
+    return StepOutcome(measures=measures, result=result.model_dump())
+
+
+def _bring_in(context: StepContext, params: Params, listed: ImportList, view: ImportedView) -> None:
+    """Files first, then one transaction with rows and event."""
+    photograph = _put(context, listed, view.photograph, _KINDS[params.photographs])
+    refs = (photograph, *(_put(context, listed, raw, "raw") for raw in view.raws))
+    settings = settings_agree(view.camera, context.protocol.camera)
+    rows = tuple(
+        NewArtefact(
+            ref=ref,
+            device="import",
+            step=context.step.id,
+            attempt=context.attempt,
+            viewpoint=view.name,
+            who=context.operator,
+            monotonic_s=context.monotonic_s(),
+        )
+        for ref in refs
+    )
+    context.evidence.record(
+        ViewImported(
+            step=context.step.id,
+            attempt=context.attempt,
+            viewpoint=view.name,
+            station="",
+            artefacts=refs,
+            camera=view.camera,
+            verdicts={} if settings is None else {"settings": settings},
+            imported_by=context.operator,
+            file_name=view.photograph.path,
+            modified_utc=view.photograph.modified_utc,
+        ),
+        artefacts=rows,
+    )
+
+
+def _put(context: StepContext, listed: ImportList, file: ImportedFile, kind: str) -> ArtefactRef:
+    path = Path(listed.absolute(file))
+    if not path.is_file():
+        raise DataError(
+            "the photograph is no longer there", where=str(path), remedy="Put it back, then resume the run"
+        )
+    ref = context.evidence.put_file(path, kind=kind, media_type=file.media_type, original_name=path.name)
+    listed.check(str(path), ref.sha256)
+    return ref
+
+
+def settings_agree(stated: dict[str, Any], wanted: CameraSection | None) -> bool | None:
+    """Whether what a photograph states of aperture, time and ISO is what the protocol wants (as of a capture).
+
+    None where the protocol wants nothing in particular, or the file states none of the three.
+    """
+    if wanted is None:
+        return None
+    agree: list[bool] = []
+    for name, tolerance in (("aperture_f", 0.02), ("exposure_s", 0.02), ("iso", 0.0)):
+        value = stated.get(name)
+        if value:
+            agree.append(abs(float(value) / getattr(wanted, name) - 1) <= tolerance)
+    return all(agree) if agree else None
+
+
+KIND = StepKind(
+    "image_import",
+    Params,
+    Result,
+    execute,
+    measures={
+        "images_imported": COUNT,
+        "raw_files": COUNT,
+        "settings_departures": COUNT,
+        "settings_not_stated": COUNT,
+        "optics_departures": COUNT,
+    },
+)

@@ -1,0 +1,181 @@
+"""Step kind `layout_check`: photographs of the placed spheres, taken by hand, tell whether they are too symmetric."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field
+
+from drivers.errors import ReleasedElsewhereError
+from service.core.gates.verdict import evaluate_gates
+from service.core.records.events import ArtefactRef, GateVerdict, Record
+from service.jobs.surfaces import layout
+from service.steps.arrivals import keep
+from service.steps.capture.exposure import wanted_settings
+from service.steps.capture.held_camera import awaited_images
+from service.steps.capture.views import photograph
+from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.layouts import layout_uncertainties
+from service.steps.measured import COUNT, LAYOUT
+
+PHOTOGRAPH = "layout_photograph"
+PHOTOGRAPH_WANTED = "layout_photograph_wanted"
+MOVE_WANTED = "layout_move_wanted"
+# Where the camera is held for one photograph after the other; edges are those of the first photograph.
+_SIDES: tuple[tuple[str, str], ...] = (
+    ("above", "nearly above the scene"),
+    ("left", "on the side of the left edge of the first photograph, about 30° lower than it was"),
+    ("right", "on the side of the right edge of the first photograph, about 30° lower than at first"),
+    ("near", "on the side of the lower edge of the first photograph, about 30° lower than at first"),
+    ("far", "on the side of the upper edge of the first photograph, about 30° lower than at first"),
+)
+
+
+class Params(Record):
+    """What the photographs must show."""
+
+    photographs: int = 1  # to begin with; the camera is moved in between
+    most_photographs: int = 5  # of one layout, as long as the number is not known well enough
+    between_s: float = 5.0  # for moving the camera
+    wait_s: Annotated[float, Field(gt=0)] = 600.0  # for a photograph that comes as a file
+    sensor_width_mm: float = 35.7  # with the focal length of the file, a camera that is not calibrated yet
+
+
+class Result(Record):
+    """The spheres as the photographs show them, in the frame of the photograph with most spheres, metres."""
+
+    spheres_m: tuple[tuple[float, float, float], ...]
+    details: dict[str, Any]
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Take a photograph, find the spheres in it and in the earlier ones, search for near-symmetries; nothing moves.
+
+    The first attempt takes `photographs`, each further one another, until a sphere was moved: then it begins anew.
+    """
+    images = _earlier(context)
+    kept: list[ArtefactRef] = []
+    needed = max(len(images) + 1, params.photographs)
+    while len(images) < needed:
+        context.checkpoint()
+        context.progress("photographs of the spheres", len(images), needed)
+        if kept:
+            context.wait(params.between_s)
+        kept += _photographs(context, images, params.wait_s)
+    spheres = context.protocol.spheres
+    arguments = layout.Arguments(
+        images=tuple(layout.LayoutPhotograph.model_validate(image) for image in images),
+        sensor_width_mm=params.sensor_width_mm,
+        radius_m=spheres.radius_mm / 1000,
+        expected=spheres.registration + spheres.control,
+        control=spheres.control,
+    )
+    (answer,) = context.evidence.run_jobs(JobRequest.of(layout.KIND, arguments))
+    result = Result.model_validate(answer.result)
+    uncertainties = layout_uncertainties(result.details)
+    judged = evaluate_gates(
+        context.step, context.attempt, answer.measures, context.run.skipped, uncertainties
+    ).verdicts
+    _advise(context, judged, result.details, images, params)
+    return StepOutcome(answer.measures, (*kept, *answer.artefacts), result.model_dump(mode="json"), uncertainties)
+
+
+def _earlier(context: StepContext) -> list[dict[str, Any]]:
+    """The photographs of the layout as it stands: those taken since a sphere was last moved."""
+    images: list[dict[str, Any]] = []
+    for note in context.state.notes:
+        if note.note == MOVE_WANTED:
+            images = []
+        elif note.note == PHOTOGRAPH:
+            images.append({key: note.data[key] for key in ("sha256", "focal_mm")})
+    return images
+
+
+def _photographs(context: StepContext, images: list[dict[str, Any]], wait_s: float) -> list[ArtefactRef]:
+    """Take one, or wait for those of a camera without a cable; keep them, note them and add them to `images`."""
+    camera = context.devices.camera()
+    refs: list[ArtefactRef] = []
+    with tempfile.TemporaryDirectory(prefix="orthocapture-") as name:
+        folder = Path(name)
+        try:
+            taken = (photograph(context, camera, wanted_settings(context), folder),)
+        except ReleasedElsewhereError:
+            taken = awaited_images(context, camera, folder, wait_s)
+        for image in taken:
+            media_type = image.jpeg.media_type
+            ref = keep(context, image.jpeg.path, device="camera", kind="layout_image", media_type=media_type)
+            found = {"found_at": image.found_at} if image.found_at else {}
+            data = {"sha256": ref.sha256, "focal_mm": image.focal_length_mm}
+            context.note(PHOTOGRAPH, **data, **found)
+            images.append(data)
+            refs.append(ref)
+    return refs
+
+
+def _advise(
+    context: StepContext,
+    verdicts: Sequence[GateVerdict],
+    details: Mapping[str, Any],
+    images: Sequence[Mapping[str, Any]],
+    params: Params,
+) -> None:
+    """Where the layout has not passed, say what to do: one more photograph as long as that may decide, or a move."""
+    short = [verdict for verdict in verdicts if not verdict.passed]
+    if not short:
+        return
+    unseen = any(verdict.measure == "spheres_seen" for verdict in short)
+    bad = [v for v in short if not v.undecided and v.measure != "spheres_seen"]
+    if not bad and len(images) < params.most_photographs:
+        _ask_for_photograph(context, len(images), unseen=unseen)
+        return
+    moves = details["moves"]
+    if not moves:
+        remedy = "; ".join(details["problems"]) or "what the photographs show does not decide it"
+        advice = f"{remedy[0].upper()}{remedy[1:]}. Set the spheres up less regularly and photograph them anew"
+        context.note(MOVE_WANTED, advice=advice)
+    else:
+        steps = "; then ".join(str(move["words"]) for move in moves)
+        advice = (
+            f"{steps}. The picture of this step shows the spheres with their numbers, and arrows. Then hold the "
+            "camera nearly above the scene again and confirm"
+        )
+        hands = [_move_hand(move) for move in moves]
+        context.note(MOVE_WANTED, advice=advice, hands=[*hands, {"action": "hold_camera", "side": "above"}])
+    context.tell(advice)
+
+
+def _ask_for_photograph(context: StepContext, taken: int, *, unseen: bool) -> None:
+    side, where = _SIDES[taken % len(_SIDES)]
+    why = "not every sphere is seen" if unseen else "the photographs do not decide it yet"
+    advice = (
+        f"One more photograph is needed, {why}: hold the camera {where}, so that it shows all spheres, "
+        "and confirm. What was photographed before is kept"
+    )
+    context.note(PHOTOGRAPH_WANTED, advice=advice, hands=[{"action": "hold_camera", "side": side}])
+    context.tell(advice)
+
+
+def _move_hand(move: Mapping[str, Any]) -> dict[str, Any]:
+    """For the simulated technician: he points at the sphere in the photograph, as a person does."""
+    return {
+        "action": "move_sphere",
+        "from": move["from"],
+        "to": move["to"],
+        "higher_m": move["higher_mm"] / 1000,
+    }
+
+
+KIND = StepKind(
+    "layout_check",
+    Params,
+    Result,
+    execute,
+    measures={**LAYOUT, "spheres_seen": COUNT, "photographs_used": COUNT},
+    words=lambda params, _before: Announcement(
+        f"the camera takes {params.photographs} {'photograph' if params.photographs == 1 else 'photographs'}"
+    ),
+    drawing="layout_photo",
+)

@@ -1,0 +1,165 @@
+"""Step kind `registration`: T_world_scan from every image and marker, for each source of camera poses.
+
+The step decides by the sources that its gates and those of the evaluation name, and by the robot's poses, which take
+seconds. All others are computed afterwards, beside whatever the run does next (service/steps/poses/sources.py).
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any, Literal
+
+from pydantic import field_validator
+
+from service.core.errors import ComputeError, ConfigurationError
+from service.core.jobs.keys import arguments_name
+from service.core.records.events import Record
+from service.jobs.calibration import calibrate
+from service.jobs.records import Mounting, Photograph
+from service.jobs.registration import detect_spheres
+from service.jobs.surfaces import locate_spheres
+from service.jobs.words import term
+from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
+from service.steps.inputs import Mounted, captured_images, intrinsics_covariance_of, mounting_of, taken
+from service.steps.measured import COUNT, REGISTERED
+from service.steps.poses.sources import DEFAULT_SOURCES, PLANNED, Source, Wanted, Ways, decisive, posed, ways
+
+
+class StructureFromMotion(Record):
+    """How much effort structure from motion makes."""
+
+    max_image_size: int = 3200  # longer side that features are looked for at, px
+    max_features: int = 8000  # features of an image
+    neighbours: int = 12  # pairs an image, chosen by the robot's poses
+
+
+class Params(Record):
+    """Which images, which scan, which camera poses."""
+
+    images_of: tuple[str, ...]  # capture steps with the images
+    control_images_of: tuple[str, ...] = ()  # these see the control spheres and are kept for the evaluation too
+    calibration: str  # step with the intrinsics
+    hand_eye: str | None = None  # step with T_flange_camera; None: no robot carried the camera
+    scan: str  # step that imported the scan
+    poses: tuple[Source, ...] = DEFAULT_SOURCES  # where the camera poses come from; each gives a registration
+    structure_from_motion: StructureFromMotion = StructureFromMotion()  # sizes and numbers of features
+    detector: Literal["classical", "paper"] = "classical"  # "paper" searches every image whole, for comparison
+    reduced: tuple[str, ...] = ()  # "1920x1080": lower resolutions, for the comparison that the paper makes
+    reduced_poses: tuple[Literal["colmap", "glomap"], ...] = ("colmap",)  # sources of poses for the reduced images
+
+    @field_validator("reduced")
+    @classmethod
+    def _sizes(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        for size in value:
+            if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", size):
+                raise ValueError(f"a resolution reads 1920x1080, not {size!r}")
+        return value
+
+
+class Result(Record):
+    """The registrations that were there when the step decided, by source and resolution; outlines at full size."""
+
+    outlines_sha256: str
+    registrations: dict[str, dict[str, Any]]
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Detect the spheres and register the sources that the decision needs; whatever else is due goes on its way."""
+    wanted, waited = Wanted.of(params), decisive(context.protocol, context.step)
+    outlines = _search(context, params)
+    root = arguments_name(outlines.arguments)
+    later = [name for name in wanted.registrations if name not in waited]
+    context.note(PLANNED, decisive=list(waited), later=later)
+    seen = -1
+    while True:
+        context.checkpoint()
+        state = context.evidence.state()
+        if state.seq == seen:
+            context.wait(0.2)
+            continue
+        seen = state.seq
+        found = ways(state, context.step.id, wanted, waited, outlines, root)
+        for name in waited:
+            if name in found.failed:
+                raise ComputeError(
+                    f"no registration with {name} poses: {found.failed[name]}",
+                    where=context.step.id,
+                    remedy="Put right what these words name, or take what is missing; then try again",
+                )
+        context.progress(_words(found), len(found.arrived.keys() & set(waited)), len(waited))
+        if all(name in found.arrived for name in waited):
+            return _outcome(found)
+        for task in found.due:
+            context.evidence.enqueue(task.request, task.name)
+
+
+def _search(context: StepContext, params: Params) -> JobRequest:
+    """The search for outlines: everything that the jobs after it have in common, and how to search."""
+    images = captured_images(context, [*params.images_of, *params.control_images_of])
+    if not posed(images) and not set(params.poses) <= {"colmap", "glomap"}:
+        raise ConfigurationError(
+            "no image has a pose, and the registration asks for others than those of the images alone",
+            where=f"step {context.step.id}",
+            remedy="Let its `poses` be colmap and glomap",
+        )
+    scan = taken(context, params.scan, locate_spheres.KIND)
+    calibration = taken(context, params.calibration, calibrate.KIND)
+    mounted = _mounting(context, params, images)
+    lens = intrinsics_covariance_of(calibration)
+    known: dict[str, Any] = {} if lens is None else {"intrinsics_covariance": lens}
+    if context.protocol.spheres.colour is not None:
+        known["colour"] = context.protocol.spheres.colour
+    arguments = detect_spheres.Arguments(
+        images=tuple(images),
+        camera=calibration.answer.camera,
+        spheres_m=scan.answer.spheres_m,
+        sphere_covariance_m2=tuple(sphere.covariance_m2 for sphere in scan.answer.details.spheres),
+        radius_m=context.protocol.spheres.radius_mm / 1000,
+        detector=params.detector,
+    ).model_copy(update={**mounted.mounting.set_fields(), **known})
+    references = {
+        **mounted.taken,
+        "camera": calibration.reference("camera"),
+        "spheres_m": scan.reference("spheres_m"),
+        "sphere_covariance_m2": scan.reference("details/spheres/*/covariance_m2"),
+    }
+    if lens is not None:
+        references["intrinsics_covariance"] = calibration.reference("details/intrinsics/covariance")
+    return JobRequest.of(detect_spheres.KIND, arguments, references)
+
+
+def _mounting(context: StepContext, params: Params, images: list[Photograph]) -> Mounted:
+    """Where the camera sat on the arm; nothing where a person held it."""
+    if params.hand_eye is None:
+        return Mounted(Mounting(), {})
+    return mounting_of(context, params.hand_eye, (image.station for image in images))
+
+
+def _words(found: Ways) -> str:
+    working = [task.request.kind for task in found.tasks if task.job and task.job.status == "enqueued"]
+    return ", ".join(map(term, dict.fromkeys(working))) or "registration"
+
+
+def _outcome(found: Ways) -> StepOutcome:
+    """What is there by now; a source that nobody waited for is among it if it has come."""
+    done = [(task, task.job) for task in found.tasks if task.job is not None and task.job.status == "finished"]
+    outlines = next(job for task, job in done if task.request.kind == "detect_spheres")
+    measures = dict(outlines.measures)
+    for name, job in found.arrived.items():
+        measures |= {f"{name}_{measure}": value for measure, value in job.measures.items()}
+    result = Result(
+        outlines_sha256=outlines.artefacts[0].sha256,
+        registrations={name: dict(job.result) for name, job in found.arrived.items()},
+    )
+    artefacts = tuple(ref for _, job in done for ref in job.artefacts)
+    return StepOutcome(measures, artefacts, result.model_dump(mode="json"))
+
+
+KIND = StepKind(
+    "registration",
+    Params,
+    Result,
+    execute,
+    measures={"outlines": COUNT, "outlines_an_image": COUNT, "images_searched_whole": COUNT},
+    measures_of_registrations=REGISTERED,
+)

@@ -1,0 +1,61 @@
+"""Step kind `timed_application`: a coat that is applied once and fades, such as scanning spray."""
+
+from __future__ import annotations
+
+from service.core.records.events import Record
+from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
+from service.steps.measured import COUNT
+
+
+class Params(Record):
+    """What is applied and how long it lasts."""
+
+    product: str  # what is applied
+    sublimates_after_s: float  # when it is gone
+    scan_within_s: float  # latest time for the scan, counted from the application
+    settle_s: float = 0.0  # wait this long before the next step
+
+
+class Result(Record):
+    """When the coat was applied, on the host's clock."""
+
+    product: str
+    applied_monotonic_s: float
+    scan_within_s: float
+    sublimates_after_s: float
+
+
+def execute(context: StepContext, params: Params) -> StepOutcome:
+    """Start the timer at the operator's confirmation and let the coat settle."""
+    earlier = [note.data for note in context.state.notes if "applied_monotonic_s" in note.data]
+    applied = float(earlier[0]["applied_monotonic_s"]) if earlier else context.monotonic_s()
+    if not earlier:  # a restart does not apply the coat again
+        context.note(
+            f"{params.product} applied: scan within {params.scan_within_s / 60:.0f} min, "
+            f"gone after {params.sublimates_after_s / 3600:.1f} h",
+            applied_monotonic_s=applied,
+        )
+    remaining = params.settle_s
+    while remaining > 0:
+        context.checkpoint()
+        context.progress("letting the coat settle", int(params.settle_s - remaining), int(params.settle_s))
+        context.wait(min(0.2, remaining))
+        remaining -= 0.2
+    result = Result(
+        product=params.product,
+        applied_monotonic_s=applied,
+        scan_within_s=params.scan_within_s,
+        sublimates_after_s=params.sublimates_after_s,
+    )
+    return StepOutcome(measures={"applications": 1.0}, result=result.model_dump())
+
+
+KIND = StepKind(
+    "timed_application",
+    Params,
+    Result,
+    execute,
+    measures={"applications": COUNT},
+    words=lambda params, _before: Announcement(f"{params.product} is on, the clock starts"),
+    drawing="spray",
+)

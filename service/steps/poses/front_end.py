@@ -1,0 +1,176 @@
+"""Features and matches of images: begun while the images arrive, completed when a registration wants them.
+
+Both are functions of the images alone, so that it changes nothing in the result when or in which process they were
+made. Which pairs are matched early follows from where the images are to be taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from service.compute.poses.sfm.front_end import pairs_of
+from service.compute.poses.sfm.options import SfmOptions
+from service.core.errors import ConfigurationError
+from service.core.geometry import Transform
+from service.core.jobs.keys import job_key
+from service.core.jobs.priorities import EARLY
+from service.core.jobs.references import Jobs, resolve
+from service.core.protocol.models import Protocol, Step
+from service.core.records.events import ViewpointCaptured
+from service.core.run.state import JobState, RunState
+from service.jobs.calibration import calibrate
+from service.jobs.poses import features, match
+from service.jobs.records import ImageFile
+from service.steps.capture.viewpoints import Viewpoint
+from service.steps.context import JobRequest, StepContext
+from service.steps.inputs import Taken, taken
+from service.store.records import NewJob
+
+_SOURCES_OF_IMAGES = frozenset({"colmap", "glomap", "hybrid", "triangulated"})
+IMAGES_A_JOB, PAIRS_A_JOB = 8, 100  # of what is left for the registration
+
+
+@dataclass
+class EarlyFeatures:
+    """Has every image's features found as soon as it is captured. The capture never waits for them."""
+
+    context: StepContext
+    camera: Taken[calibrate.Answer]
+    effort: Mapping[str, Any]
+    neighbours: Mapping[str, Sequence[str]]  # by viewpoint, as planned
+    asked: set[str] = field(default_factory=set[str])
+
+    @classmethod
+    def begin(cls, context: StepContext, plan: Sequence[Viewpoint]) -> EarlyFeatures | None:
+        """None where no registration of the protocol will match these images, or the camera is not calibrated yet."""
+        registration = _registration_of(context.protocol, context.step.id)
+        if registration is None:
+            return None
+        params = registration.params.model_dump(mode="json")
+        try:
+            camera = taken(context, params["calibration"], calibrate.KIND)
+        except ConfigurationError:
+            return None
+        effort = params["structure_from_motion"]
+        options = SfmOptions(**effort)
+        nominal = context.devices.nominal_T_flange_camera()
+        neighbours: dict[str, list[str]] = {}
+        for station in dict.fromkeys(v.station for v in plan):
+            poses = {v.name: v.T_base_camera for v in plan if v.station == station}
+            poses |= _taken(context, registration, station, nominal)
+            for a, b in pairs_of(poses, poses, options):
+                neighbours.setdefault(a, []).append(b)
+                neighbours.setdefault(b, []).append(a)
+        begun = cls(context, camera, effort, neighbours)
+        jobs = context.evidence.jobs(context.step.id)
+        begun.asked = {job.arguments["images"][0]["sha256"] for job in jobs if job.kind == "features"}
+        return begun
+
+    def look(self) -> None:
+        """Enqueue the features of every new image. Returns at once."""
+        for capture in self.context.evidence.captures(self.context.step.id):
+            sha256 = capture.artefacts[0].sha256
+            if sha256 in self.asked or not all(capture.verdicts.values()):
+                continue
+            self.asked.add(sha256)
+            arguments = features.Arguments(
+                camera=self.camera.answer.camera,
+                effort=dict(self.effort),
+                images=(ImageFile(viewpoint=capture.viewpoint, sha256=sha256),),
+                match_with=tuple(sorted(self.neighbours.get(capture.viewpoint, ()))),
+            )
+            references = {"camera": self.camera.reference("camera")}
+            self.context.evidence.enqueue(JobRequest.of(features.KIND, arguments, references, EARLY), sha256)
+
+
+def _registration_of(protocol: Protocol, capture: str) -> Step | None:
+    """The step that will register the images of a capture by what is seen in them."""
+    for step in protocol.steps:
+        if step.kind == "registration":
+            params = step.params.model_dump(mode="json")
+            images = (*params["images_of"], *params["control_images_of"])
+            if capture in images and _SOURCES_OF_IMAGES.intersection(params["poses"]):
+                return step
+    return None
+
+
+def _taken(context: StepContext, registration: Step, station: str, nominal: Transform) -> dict[str, Transform]:
+    """T_base_camera, about, of the images of earlier steps at a station."""
+    params = registration.params.model_dump(mode="json")
+    earlier = [s for s in (*params["images_of"], *params["control_images_of"]) if s != context.step.id]
+    captures = [c for step in earlier for c in context.evidence.captures(step) if isinstance(c, ViewpointCaptured)]
+    return {c.viewpoint: np.array(c.T_base_flange) @ nominal for c in captures if c.station == station}
+
+
+def early_matches(protocol: Protocol, state: RunState) -> list[NewJob]:
+    """The matches that can be made now: of every image whose features are there with its planned neighbours."""
+    found: dict[str, tuple[str, JobState]] = {}
+    pairs_done: set[tuple[str, str]] = set()
+    matched: set[str] = set()
+    for step in protocol.steps:
+        for job in state.steps[step.id].jobs.values():
+            if job.kind == "features" and job.priority == EARLY and job.status == "finished":
+                found[job.arguments["images"][0]["viewpoint"]] = (step.id, job)
+            elif job.kind == "match" and job.priority == EARLY:
+                pairs_done |= {(a, b) for a, b in job.arguments["pairs"]}
+                matched.add(job.idempotency_key.split("/")[3])
+    jobs: list[NewJob] = []
+    for name, (step_id, job) in found.items():
+        sha256 = job.artefacts[0].sha256
+        if sha256 in matched or not job.arguments["match_with"]:
+            continue
+        there = [other for other in job.arguments["match_with"] if other in found]
+        pairs = sorted({(min(name, other), max(name, other)) for other in there} - pairs_done)
+        pairs_done |= set(pairs)
+        if not pairs:
+            continue
+        named = {n: found[n][1].artefacts[0].sha256 for pair in pairs for n in pair}
+        shared = {key: job.arguments[key] for key in ("camera", "effort")}
+        arguments = {**shared, "features": named, "pairs": [list(pair) for pair in pairs]}
+        key = job_key(state, step_id, "match", sha256)
+        attempt = state.steps[step_id].attempt
+        jobs.append(NewJob("match", step_id, attempt, key, arguments, priority=EARLY, version=match.KIND.version))
+    return jobs
+
+
+# --- what a registration finds there -------------------------------------------------------------------------------
+
+
+@dataclass
+class Early:
+    """Jobs of one camera and effort; some may still be computed."""
+
+    features: dict[str, JobState] = field(default_factory=dict[str, JobState])  # by the image's hash
+    matches: list[JobState] = field(default_factory=list[JobState])
+
+    def matching(self, features: Mapping[str, str]) -> list[JobState]:
+        """The jobs that matched exactly these features (by viewpoint)."""
+        return [job for job in self.matches if job.arguments["features"].items() <= features.items()]
+
+
+def found_early(state: RunState, jobs: Jobs, camera: Mapping[str, Any], effort: Mapping[str, Any]) -> Early:
+    """The features and matches that were made with this camera and this effort while the images arrived."""
+    early = Early()
+    for step in state.steps.values():
+        for job in step.jobs.values():
+            if job.priority != EARLY or job.kind not in ("features", "match"):
+                continue
+            if job.status == "failed" or job.arguments["effort"] != effort:
+                continue
+            if resolve(job.arguments["camera"], jobs) != camera:
+                continue
+            if job.kind == "features":
+                early.features[job.arguments["images"][0]["sha256"]] = job
+            else:
+                early.matches.append(job)
+    return early
+
+
+def chunks(items: Iterable[Any], size: int) -> list[list[Any]]:
+    """In order, `size` at a time."""
+    listed = list(items)
+    return [listed[i : i + size] for i in range(0, len(listed), size)]

@@ -1,0 +1,192 @@
+"""How long what is being computed for a registration will still take, from what such work took in this run.
+
+What the run has not done yet is guessed from other runs: seconds an image of 1920 × 1280 px on one core, in
+proportion to the pixels where the pixels are what is looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from service.core.jobs.priorities import WAITED
+from service.core.jobs.references import Jobs, jobs_of, resolve
+from service.core.protocol.models import Protocol, Step
+from service.core.run.state import JobState, RunState
+from service.steps.poses.sources import Task, Wanted, Ways, evaluation_tasks, registration_ways
+
+_NAMES = {
+    "robot": "robot poses as reported",
+    "robot_corrected": "robot poses, corrected",
+    "spheres": "poses by the spheres in each image",
+    "triangulated": "triangulation from corrected robot poses",
+    "colmap": "COLMAP from nothing",
+    "glomap": "GLOMAP from nothing",
+    "hybrid": "images, robot and spheres together",
+}
+_GUESS_S = {  # an image
+    "detect_spheres": 0.3,
+    "register": 0.15,
+    "features": 1.5,
+    "match": 0.4,
+    "structure_from_motion": 1.5,
+    "hybrid": 0.5,
+    "evaluate": 0.1,
+}
+_BY_PIXELS = frozenset({"detect_spheres", "features"})
+_PIXELS = 1920 * 1280
+_SEVERAL_CORES = frozenset({"detect_spheres"})
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """A result that is still to come. `seconds` until then, by estimate; the failed ones say why and never come."""
+
+    name: str
+    what: str
+    seconds: float
+    failed: str = ""
+    waits: bool = False  # nothing of the run is being computed now: no worker runs, or it is busy with other runs
+
+    @property
+    def text(self) -> str:
+        """`COLMAP from nothing: still computing, about 4 min left`."""
+        if self.failed:
+            return f"{self.what}: there will be none, {self.failed}"
+        takes = f"about {duration_words(self.seconds)}"
+        return f"{self.what}: " + (
+            f"waits for a worker, then {takes}" if self.waits else f"still computing, {takes} left"
+        )
+
+
+def duration_words(seconds: float) -> str:
+    """Rounded as such an estimate deserves: `20 s`, `4 min`."""
+    if seconds < 90:
+        return f"{max(10, 10 * round(seconds / 10))} s"
+    return f"{round(seconds / 60)} min"
+
+
+def missing_results(
+    protocol: Protocol, state: RunState, started_utc: Mapping[str, str], now_utc: str, cores: int
+) -> list[Left]:
+    """What was planned and has not arrived, in the order in which it is expected; empty when all has.
+
+    Args:
+        protocol: of the run.
+        state: of the run.
+        started_utc: when each job that is being computed was begun.
+        now_utc: the time.
+        cores: how many jobs are computed side by side.
+    """
+    left: list[Left] = []
+    for step in protocol.steps if state.status != "aborted" else ():  # nothing follows in an aborted run
+        found = registration_ways(protocol, state, step)
+        if found is not None:
+            evaluation = next((s for s in protocol.steps if _evaluates(s, step)), None)
+            left += _left_of(protocol, state, step, evaluation, found, _Clock(state, started_utc, now_utc, cores))
+    return sorted(left, key=lambda one: one.seconds)
+
+
+def _evaluates(step: Step, registration: Step) -> bool:
+    return step.kind == "evaluation" and step.params.model_dump()["registration"] == registration.id
+
+
+@dataclass(frozen=True, slots=True)
+class _Clock:
+    state: RunState
+    started_utc: Mapping[str, str]
+    now_utc: str
+    cores: int
+
+    def seconds(self, task: Task) -> float:
+        """Until a task is done once it has begun; none where it is done."""
+        job = task.job
+        if job is not None and job.status != "enqueued":
+            return 0.0
+        expected_s = self.expected_s(task.request.kind, task.request.arguments)
+        begun = None if job is None else self.started_utc.get(job.job)
+        if begun is None:
+            return expected_s
+        gone_s = (datetime.fromisoformat(self.now_utc) - datetime.fromisoformat(begun)).total_seconds()
+        return max(expected_s - gone_s, 0.1 * expected_s)
+
+    def expected_s(self, kind: str, arguments: Mapping[str, Any]) -> float:
+        """Of a job, by the jobs of its kind that this run has done, or by a guess."""
+        done = [
+            job for step in self.state.steps.values() for job in step.jobs.values() if _tells_of(job, kind, arguments)
+        ]
+        jobs = jobs_of(self.state)
+        size = _size(kind, arguments, jobs)
+        if done:
+            return size * sum(job.duration_s for job in done) / sum(_size(kind, job.arguments, jobs) for job in done)
+        return size * _GUESS_S.get(kind, 0.0) / (self.cores if kind in _SEVERAL_CORES else 1)
+
+
+def _tells_of(job: JobState, kind: str, arguments: Mapping[str, Any]) -> bool:
+    same = all(job.arguments.get(name) == arguments.get(name) for name in ("poses", "mappers"))
+    return job.kind == kind and job.status == "finished" and same and _count(kind, job.arguments) > 0
+
+
+def _size(kind: str, arguments: Mapping[str, Any], jobs: Jobs) -> float:
+    """Images (or pairs of them), weighed by their pixels where these are what takes the time."""
+    camera = resolve(arguments.get("camera"), jobs) if kind in _BY_PIXELS else None
+    if camera is None:
+        return _count(kind, arguments)
+    width, height = arguments.get("reduced_to") or (camera["width"], camera["height"])
+    return _count(kind, arguments) * width * height / _PIXELS
+
+
+def _count(kind: str, arguments: Mapping[str, Any]) -> int:
+    return len(arguments.get("pairs" if kind == "match" else "images", ()))
+
+
+def _left_of(
+    protocol: Protocol, state: RunState, step: Step, evaluation: Step | None, found: Ways, clock: _Clock
+) -> list[Left]:
+    """The tasks known by now, and what follows from them, laid out over the cores in the order of their priority."""
+    wanted = Wanted.of(step.params)
+    evaluations = {} if evaluation is None else evaluation_tasks(protocol, state, evaluation)
+    free_s = [0.0] * clock.cores
+    ready_s: dict[tuple[str, str], float] = {}
+    left: list[Left] = []
+    for name, (source, size) in wanted.registrations.items():
+        what = _NAMES.get(source, source) + (f" at {size.replace('x', ' × ')}" if size else "")
+        if name in found.failed:
+            left.append(Left(name, what, 0.0, found.failed[name]))
+            continue
+        evaluating = evaluations.get(name)
+        if name in found.arrived and (evaluating is None or (evaluating.job and evaluating.job.status != "enqueued")):
+            continue
+        steps = found.ways_to.get(name, ())
+        at_s = 0.0
+        for task in steps:
+            key = (task.request.kind, task.name)
+            if key not in ready_s:
+                core = free_s.index(min(free_s))
+                begin_s = max(at_s, free_s[core])
+                ready_s[key] = begin_s + clock.seconds(task)
+                if ready_s[key] > begin_s:
+                    free_s[core] = ready_s[key]
+            at_s = max(at_s, ready_s[key])
+        last = steps[-1].request if steps else None
+        if last is not None and name not in found.arrived:
+            images = found.tasks[0].request.arguments["images"]
+            at_s += sum(
+                clock.expected_s(kind, {"images": images, "poses": source}) for kind in _rest(source, last.kind)
+            )
+        if evaluation is not None and any(task.request.priority != WAITED for task in steps):
+            at_s += clock.expected_s("evaluate", found.tasks[0].request.arguments)
+        left.append(Left(name, what, at_s))
+    return left
+
+
+_MODELLED = ("features", "match", "structure_from_motion")
+_WAYS = {"triangulated": _MODELLED, "colmap": _MODELLED, "glomap": _MODELLED, "hybrid": (*_MODELLED, "hybrid")}
+
+
+def _rest(source: str, last: str) -> tuple[str, ...]:
+    """The kinds of jobs that follow on the last one that can be named."""
+    way = ("detect_spheres", *_WAYS.get(source, ()), "register")
+    return way[way.index(last) + 1 :] if last in way else ()

@@ -1,0 +1,1 @@
+"""Jobs on images of the calibration board."""

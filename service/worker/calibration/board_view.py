@@ -1,0 +1,108 @@
+"""Job `board_view`: the calibration board in one image as soon as it has arrived; what a calibration takes of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+
+from service.compute.calibration.board.board import Board, BoardView, find_board
+from service.compute.calibration.board.images import BoardImage, find_boards
+from service.compute.calibration.board.parts import with_parts
+from service.compute.calibration.board_poses.knowledge import BoardKnowledge
+from service.compute.images.files import read_grey
+from service.compute.images.quality import image_quality
+from service.core.errors import ComputeError
+from service.jobs.calibration import board_view as job
+from service.jobs.calibration import calibrate as calibrate_job
+from service.jobs.records import BoardSize
+from service.worker.job import JobAnswer, JobContext
+
+_WHITE = 245.0  # grey level that nearly all pixels must lie beyond
+
+
+def board_of(size: BoardSize) -> Board:
+    """The board of a job's arguments."""
+    return Board(size.columns, size.rows, size.square_m)
+
+
+def board_view(context: JobContext[job.Arguments]) -> JobAnswer:
+    """Find the whole board in one image, without it the reason is the answer; and tell how sharp the image is."""
+    image = context.arguments.image
+    cv2.setNumThreads(1)  # beside a capture
+    grey = read_grey(context.input(image.sha256))
+    size = (grey.shape[1], grey.shape[0])
+    quality = image_quality(grey)
+    measures = {} if np.isnan(quality.edge_px) else {"image_edge_px": quality.edge_px}
+
+    def answer(reason: str = "") -> job.Answer:
+        return job.Answer(viewpoint=image.viewpoint, size=size, seen=not reason, reason=reason, black=quality.black)
+
+    try:
+        view = find_board(grey, board_of(context.arguments))
+    except ComputeError as error:
+        bright = float(np.percentile(grey, 1)) > _WHITE
+        reason = "the image is black" if quality.black else "the image is white" if bright else plain_reason(error)
+        return JobAnswer(measures, (), answer(reason))
+    record = {"size": list(size), "indices": view.indices.tolist(), "corners": np.round(view.corners, 4).tolist()}
+    ref = context.keep_json(record, kind="board_corners", name=f"{image.viewpoint}.corners.json")
+    return JobAnswer(measures | {"corners": float(len(view.indices))}, (ref,), answer())
+
+
+def plain_reason(error: ComputeError) -> str:
+    """Why no board was found, without what only tells how it was searched."""
+    return error.what.partition(" (searched")[0]
+
+
+def read_corners(record: Mapping[str, Any]) -> BoardImage:
+    """What `board_view` kept of an image with a board."""
+    indices, corners = np.array(record["indices"], dtype=np.int64), np.array(record["corners"], dtype=np.float64)
+    return BoardImage((record["size"][0], record["size"][1]), BoardView(indices, corners))
+
+
+def boards_of(
+    context: JobContext[calibrate_job.Arguments], board: Board
+) -> tuple[tuple[BoardImage, ...], dict[int, int]]:
+    """The board in every image of a `calibrate` job, and the corners of those that show it in part, by index.
+
+    An image that has been looked at before is not searched again. Where camera, mount and board are known well enough
+    (`known`), a part of the board counts.
+    """
+    arguments = context.arguments
+    images = arguments.images
+    looked = arguments.corners or [None] * len(images)
+    search = [k for k, sha256 in enumerate(looked) if sha256 is None]
+    files = [context.input(images[k].sha256) for k in search]
+    searched = dict(
+        zip(
+            search,
+            find_boards(
+                files,
+                board,
+                workers=os.cpu_count() or 1,
+                progress=lambda done, total: context.progress("board images", done, total),
+            ),
+            strict=True,
+        )
+    )
+    found = tuple(
+        searched[k] if sha256 is None else read_corners(context.input_json(sha256)) for k, sha256 in enumerate(looked)
+    )
+    if arguments.known is None or board.pattern != "checkerboard":
+        return found, {}
+    known = BoardKnowledge.from_record(arguments.known)
+    greys = [
+        read_grey(context.input(image.sha256)) if one.view is None and one.size != (0, 0) else None
+        for image, one in zip(images, found, strict=True)
+    ]
+    flanges = np.array([image.T_base_flange for image in images])
+    whole = with_parts(found, greys, board, known, flanges)
+    parts = {
+        k: len(now.view.indices)
+        for k, (before, now) in enumerate(zip(found, whole, strict=True))
+        if before.view is None and now.view is not None
+    }
+    return whole, parts

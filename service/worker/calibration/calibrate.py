@@ -1,0 +1,137 @@
+"""Job `calibrate`: board images → intrinsics, hand-eye, or both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from service.compute.arm.kinematics import matching_arm
+from service.compute.calibration.board.board import Board
+from service.compute.calibration.board.images import UsableViews, usable_views
+from service.compute.calibration.hand_eye.estimate import calibrate_hand_eye
+from service.compute.calibration.hand_eye.record import board_corners, hand_eye_record
+from service.compute.calibration.intrinsics.estimate import calibrate_intrinsics, locate_view
+from service.compute.calibration.intrinsics.record import intrinsics_record
+from service.compute.calibration.intrinsics.uncertainty import board_distance_m, projection_uncertainty
+from service.compute.calibration.intrinsics.validation import (
+    MIN_VIEWS_TO_VALIDATE,
+    calibration_warnings,
+    cross_validate,
+)
+from service.compute.camera_model import CameraModel
+from service.core.errors import DataError
+from service.jobs.calibration import calibrate as job
+from service.jobs.records import Photograph
+from service.worker.calibration.board_view import board_of, boards_of
+from service.worker.camera import camera_of
+from service.worker.job import JobAnswer, JobContext
+
+
+def calibrate(context: JobContext[job.Arguments]) -> JobAnswer:
+    """Detect the board in every image, then solve what the step asks for."""
+    arguments = context.arguments
+    images = arguments.images
+    names = [image.viewpoint for image in images]
+    board = board_of(arguments)
+    found, parts = boards_of(context, board)
+    usable = usable_views(found)
+    seen = usable.indices
+    missed = [names[k] for k in usable.excluded]
+    measures: dict[str, float] = {"views": float(len(seen)), "views_without_board": float(len(missed))}
+    details: dict[str, Any] = {"views_without_board": missed}
+    if arguments.known is not None:
+        measures["views_partial"] = float(len(parts))
+        details["partial_views"] = {names[k]: count for k, count in parts.items()}
+        details["reasons"] = {names[k]: reason for k, reason in usable.excluded.items()}
+    if "intrinsics" in arguments.solve:
+        camera, intrinsics_measures, details["intrinsics"] = _intrinsics(usable, board, names)
+        measures |= intrinsics_measures
+    elif arguments.camera is not None:
+        camera = camera_of(arguments.camera)
+    else:
+        raise DataError("a hand-eye calibration alone needs the camera's intrinsics")
+    result: dict[str, Any] = {"camera": camera.record(), "details": details}
+    if "hand_eye" in arguments.solve:
+        answer, hand_eye_measures = _hand_eye(images, usable, board, camera)
+        result |= answer
+        measures |= hand_eye_measures
+    ref = context.keep_json({**result, "measures": measures}, kind="calibration", name="calibration.json")
+    return JobAnswer(measures, (ref,), job.Answer.model_validate(result))
+
+
+def _hand_eye(
+    images: Sequence[Photograph], usable: UsableViews, board: Board, camera: CameraModel
+) -> tuple[dict[str, Any], dict[str, float]]:
+    """What later steps need and the whole record, and measures for gates."""
+    used = [images[i] for i in usable.indices]
+    T_base_flange = np.array([image.T_base_flange for image in used])
+    T_camera_board = np.array([locate_view(view, board, camera)[0] for view in usable.views])
+    joints = np.array([image.joints_rad for image in used], dtype=np.float64)
+    arm = matching_arm(joints, T_base_flange) if joints.shape == (len(used), 6) else None
+    solved = calibrate_hand_eye(
+        T_base_flange,
+        T_camera_board,
+        corners=board_corners(usable.views, board, camera),
+        joints_rad=None if arm is None else joints,
+        arm=arm,
+        T_board_turned=board.half_turn(),
+    )
+    record = hand_eye_record(solved, [image.viewpoint for image in used])
+    best = solved if solved.corrected is None else solved.corrected
+    measures = {
+        # Of the answer that the registration uses: with the arm's correction, where there is one.
+        "hand_eye_sigma_mm": best.sigma_mm,
+        "hand_eye_sigma_deg": best.sigma_deg,
+        "hand_eye_held_out_mm": float(np.median(best.held_out_mm)),
+        "hand_eye_held_out_deg": float(np.median(best.held_out_deg)),
+        "hand_eye_uncorrected_held_out_mm": float(np.median(solved.held_out_mm)),
+        "hand_eye_arm_corrected": float(solved.corrected is not None),
+        "hand_eye_excluded": float(len(solved.excluded)),
+        "hand_eye_methods_spread_mm": solved.spread_mm,
+        "hand_eye_condition": solved.condition,
+        "rotation_spread_deg": solved.rotation_spread_deg,
+    }
+    if best.robot_noise_mm is not None and best.robot_noise_deg is not None:
+        measures |= {"robot_noise_mm": best.robot_noise_mm, "robot_noise_deg": best.robot_noise_deg}
+    if solved.corner_sigma_px is not None:
+        measures["corner_sigma_px"] = solved.corner_sigma_px
+    answer = {
+        "T_flange_camera": record["T_flange_camera"],
+        "T_base_board": record["T_base_board"],
+        "hand_eye": record,
+    }
+    return answer, measures
+
+
+def _intrinsics(
+    usable: UsableViews, board: Board, names: Sequence[str]
+) -> tuple[CameraModel, dict[str, float], dict[str, Any]]:
+    """The camera, measures for gates, and all that is known of the calibration (`intrinsics_record`)."""
+    solved = calibrate_intrinsics(usable.views, board, usable.size)
+    validation = cross_validate(solved) if len(solved.views) >= MIN_VIEWS_TO_VALIDATE else None
+    uncertainty = projection_uncertainty(solved, board_distance_m(solved))
+    excluded = dict(usable.excluded) | {usable.indices[view.index]: view.reason for view in solved.excluded}
+    record = intrinsics_record(
+        solved,
+        validation,
+        uncertainty,
+        calibration_warnings(solved, validation, uncertainty),
+        [names[usable.indices[k]] for k in map(int, solved.views)],
+        {names[k]: excluded[k] for k in sorted(excluded)},
+    )
+    measures = {
+        "views": float(len(solved.views)),
+        "views_excluded": float(len(solved.excluded)),
+        "rms_px": solved.rms_px,
+        "coverage": solved.coverage,
+        "tilt_deg": float(solved.tilt_deg.max()),
+        "uncertainty_px": uncertainty.worst_px,
+        "uncertainty_mm": uncertainty.worst_mm,
+        "uncertainty_centre_mm": uncertainty.centre_mm,
+    }
+    if validation is not None:
+        measures["five_fold_rms_px"] = validation.five_fold_rms_px
+        measures["leave_one_out_rms_px"] = validation.leave_one_out_rms_px
+    return solved.camera, measures, record

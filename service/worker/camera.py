@@ -1,0 +1,25 @@
+"""The camera of a job's record as a model that computes."""
+
+from __future__ import annotations
+
+from service.compute.camera_model import CameraModel
+from service.compute.images.resolution import camera_at
+from service.jobs.records import Camera, Photographed
+
+
+def camera_of(record: Camera) -> CameraModel:
+    """The camera model of a record."""
+    return CameraModel.from_record(record.plain())
+
+
+def camera_used(arguments: Photographed) -> CameraModel:
+    """The camera at the size of the images that a job uses."""
+    camera = camera_of(arguments.camera)
+    return camera if arguments.reduced_to is None else camera_at(camera, *arguments.reduced_to)
+
+
+def camera_reduced(arguments: Photographed) -> CameraModel | None:
+    """The camera at the size of the photographs, where the job uses reduced copies of them; else None."""
+    if arguments.reduced_to is not None:
+        return camera_of(arguments.camera)
+    return None if arguments.full_camera is None else camera_of(arguments.full_camera)

@@ -1,0 +1,1 @@
+"""Jobs while images are being taken, by the robot or by hand."""

@@ -1,0 +1,1 @@
+"""Jobs that find camera poses from images, and the poses of the robot."""

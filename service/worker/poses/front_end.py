@@ -1,0 +1,95 @@
+"""Jobs `features` and `match`: the pieces that structure from motion is made of, as images arrive or afterwards."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import cv2
+
+from service.compute.poses.colmap.process import ColmapProcess
+from service.compute.poses.sfm.features import ImageFeatures, PairMatches, pack_matches, unpack_matches
+from service.compute.poses.sfm.front_end import FrontEnd, pairs_of
+from service.compute.poses.sfm.options import SfmOptions
+from service.core.geometry import Transform
+from service.jobs.poses import features as features_job
+from service.jobs.poses import match as match_job
+from service.jobs.poses.features import FrontEndArguments
+from service.jobs.records import Hash
+from service.worker.camera import camera_used
+from service.worker.job import JobAnswer, JobContext
+from service.worker.poses.photographs import photographs
+
+
+def features(context: JobContext[features_job.Arguments]) -> JobAnswer:
+    """SIFT features of some images, an artefact each, in the order of the images."""
+    cv2.setNumThreads(1)  # jobs run side by side
+    images = context.arguments.images
+    files = photographs(context, images)
+    refs = []
+    count = 0
+    with _front_end(context.arguments) as front:
+        for number, (image, file) in enumerate(zip(images, files, strict=True)):
+            context.progress("features", number, len(images))
+            found = front.extract_features(file)
+            count += len(found.pixels)
+            name = f"{image.viewpoint}.features.npz"
+            media_type = "application/octet-stream"
+            refs.append(context.keep_bytes(found.to_bytes(), kind="sfm_features", media_type=media_type, name=name))
+    return JobAnswer({"features_an_image": count / len(images)}, tuple(refs))
+
+
+def match(context: JobContext[match_job.Arguments]) -> JobAnswer:
+    """Verified matches of some pairs of images."""
+    arguments = context.arguments
+    with _front_end(arguments) as front:
+        found = front.match_pairs(read_features(context, arguments.features), arguments.pairs, context.progress)
+    media_type = "application/octet-stream"
+    ref = context.keep_bytes(pack_matches(found), kind="sfm_matches", media_type=media_type, name="matches.npz")
+    return JobAnswer(
+        {"pairs": float(len(found)), "pairs_matched": float(sum(len(m.features) > 0 for m in found))}, (ref,)
+    )
+
+
+def read_features(context: JobContext[Any], wanted: Mapping[str, Hash]) -> dict[str, ImageFeatures]:
+    """Features from their files, by image."""
+    return {name: ImageFeatures.from_bytes(context.input(sha256).read_bytes()) for name, sha256 in wanted.items()}
+
+
+def read_matches(
+    context: JobContext[Any],
+    files: Iterable[Hash],
+    names: Iterable[str],
+    prior: Mapping[str, Transform],
+    options: SfmOptions,
+) -> list[PairMatches]:
+    """The matches that count for these images: of the pairs that their poses choose, whenever they were made.
+
+    Args:
+        context: of the job.
+        files: of matches.
+        names: of the images.
+        prior: T_world_camera by image, which choose the pairs; empty where none are known.
+        options: of structure from motion.
+    """
+    wanted = set(pairs_of(names, prior or None, options))
+    found = (m for sha256 in files for m in unpack_matches(context.input(sha256).read_bytes()))
+    by_pair = {m.pair: m for m in found}
+    return [by_pair[pair] for pair in sorted(wanted & by_pair.keys())]
+
+
+class _Kept(threading.local):
+    """COLMAP's child of each thread that does jobs, by seed: starting one takes as long as an image's features."""
+
+    def __init__(self) -> None:
+        self.children: dict[int, ColmapProcess] = {}
+
+
+_KEPT = _Kept()
+
+
+def _front_end(arguments: FrontEndArguments) -> FrontEnd:
+    options = SfmOptions(**arguments.effort)
+    child = _KEPT.children.setdefault(options.seed, ColmapProcess(seed=options.seed))
+    return FrontEnd(camera_used(arguments), options, child=child)

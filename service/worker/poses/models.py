@@ -1,0 +1,194 @@
+"""Jobs on camera poses: structure from motion, and hybrid poses of it with the robot and the spheres."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from service.compute.markers.archive import outline_from_record
+from service.compute.poses.files.pose_covariance import blocks
+from service.compute.poses.hybrid.estimate import HybridPoses, hybrid_poses
+from service.compute.poses.sfm.estimate import SfmModel, reconstruct, reconstruct_from
+from service.compute.poses.sfm.options import Mapper, SfmOptions
+from service.compute.poses.sfm.tracks import Tracks
+from service.core.geometry import Array
+from service.jobs.poses import hybrid as hybrid_job
+from service.jobs.poses import structure_from_motion as sfm_job
+from service.jobs.records import Hash, Photograph
+from service.worker.camera import camera_used
+from service.worker.job import JobAnswer, JobContext
+from service.worker.poses.front_end import read_features, read_matches
+from service.worker.poses.photographs import photographs
+from service.worker.poses.robot_poses import robot_camera_poses
+
+
+def structure_from_motion(context: JobContext[sfm_job.Arguments]) -> JobAnswer:
+    """Run each wanted mapper on shared features; the robot's poses only choose which pairs are matched."""
+    arguments = context.arguments
+    options = SfmOptions(**arguments.effort)
+    reconstructed = (
+        _from_images(context, options)
+        if arguments.features is None
+        else _from_pieces(context, arguments.features, options)
+    )
+    measures: dict[str, float] = {}
+    artefacts = []
+    for mapper in arguments.mappers:
+        model = reconstructed(mapper)
+        measures[f"{mapper}_images"] = float(model.n_registered)
+        measures[f"{mapper}_missing"] = float(len(model.missing))
+        measures[f"{mapper}_reprojection_px"] = model.mean_reprojection_error_px
+        joint = model.joint_pose_covariance()
+        data = {
+            "mapper": mapper,
+            "T_world_camera": {name: T.tolist() for name, T in model.T_world_camera.items()},
+            "pose_covariance": {
+                name: C.tolist() for name, C in zip(model.T_world_camera, blocks(joint), strict=True)
+            },
+            "mean_reprojection_error_px": model.mean_reprojection_error_px,
+            "mean_track_length": model.mean_track_length,
+            "missing": list(model.missing),
+            "models": model.n_models,
+            "points": len(model.points_world),
+        }
+        artefacts.append(context.keep_json(data, kind="sfm_model", name=f"{mapper}.json"))
+        packed = _packed(model, joint)
+        media_type = "application/octet-stream"
+        name = f"{mapper}_tracks.npz"
+        artefacts.append(context.keep_bytes(packed, kind="sfm_tracks", media_type=media_type, name=name))
+    return JobAnswer(measures, tuple(artefacts))
+
+
+def _from_pieces(
+    context: JobContext[sfm_job.Arguments], files: Mapping[str, Hash], options: SfmOptions
+) -> Callable[[Mapper], SfmModel]:
+    arguments, prior = context.arguments, _prior(context.arguments)
+    features = read_features(context, files)
+    matches = read_matches(context, arguments.matches, features, prior, options)
+
+    def reconstructed(mapper: Mapper) -> SfmModel:
+        return reconstruct_from(
+            features,
+            matches,
+            camera_used(arguments),
+            context.scratch,
+            mapper,
+            T_world_camera_start=prior if mapper == "triangulated" else None,
+            options=options,
+            progress=context.progress,
+        )
+
+    return reconstructed
+
+
+def _from_images(context: JobContext[sfm_job.Arguments], options: SfmOptions) -> Callable[[Mapper], SfmModel]:
+    """All at once, as runs were recorded before features and matches were jobs of their own."""
+    images = context.arguments.images
+    files = dict(zip((image.viewpoint for image in images), photographs(context, images), strict=True))
+    return partial(
+        reconstruct,
+        files,
+        camera_used(context.arguments),
+        context.scratch,
+        T_world_camera_prior=_prior(context.arguments) or None,
+        options=options,
+        progress=context.progress,
+    )
+
+
+def _prior(arguments: sfm_job.Arguments) -> dict[str, Array]:
+    return {name: np.array(T) for name, T in (arguments.prior or {}).items()}
+
+
+def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
+    """Adjust the tracks of a model, the robot's poses and the registration spheres together."""
+    arguments = context.arguments
+    camera = camera_used(arguments)
+    model = context.input_json(arguments.model)["T_world_camera"]
+    images = [image for image in arguments.images if image.viewpoint in model]
+    names = [image.viewpoint for image in images]
+    found = context.input_json(arguments.outlines)
+    stations = sorted({image.station for image in images})
+    context.progress("hybrid poses", 0, 1)
+    answer = hybrid_poses(
+        np.array([model[name] for name in names]),
+        _unpacked(context.input(arguments.tracks).read_bytes(), names),
+        [[outline_from_record(record, camera) for record in found[name]] for name in names],
+        camera,
+        np.array(arguments.spheres_m),
+        arguments.radius_m,
+        T_base_camera=None if _held(images) else robot_camera_poses(arguments, images),
+        groups=[stations.index(image.station) for image in images],
+        # The camera is held: overlays and control spheres are read with the calibrated one, which must fit the poses.
+        sphere_covariance_m2=np.array(arguments.sphere_covariance_m2),
+        names=names,
+    )
+    measures = {
+        "track_sigma_px": answer.sigma_track_px,
+        "robot_sigma_mm": 1e3 * (answer.sigma_robot_m or 0.0),
+        "robot_sigma_deg": float(np.degrees(answer.sigma_robot_rad or 0.0)),
+    }
+    ref = context.keep_json(_record(answer, names, stations), kind="hybrid_poses", name="hybrid_poses.json")
+    return JobAnswer(measures, (ref,))
+
+
+def _held(images: Sequence[Photograph]) -> bool:
+    return any(image.T_scene_camera is not None for image in images)
+
+
+def _record(answer: HybridPoses, names: list[str], stations: list[str]) -> dict[str, Any]:
+    return {
+        "T_world_camera": {name: T.tolist() for name, T in zip(names, answer.T_world_camera, strict=True)},
+        "pose_covariance": {name: C.tolist() for name, C in zip(names, answer.scan_pose_covariance, strict=True)},
+        "pose_covariance_frame": "scan",
+        "T_world_scan": answer.T_world_scan.tolist(),
+        "T_world_station": {stations[g]: T.tolist() for g, T in answer.T_world_group.items()},
+        "scan_covariance": answer.scan_covariance.tolist(),
+        "predicted_error_mm": 1e3 * answer.sigma_at_m(answer.centre_scan_m),
+        "sigma_track_px": answer.sigma_track_px,
+        "sphere_factor": answer.sphere_factor,
+        "sigma_robot_m": answer.sigma_robot_m,
+        "sigma_robot_rad": answer.sigma_robot_rad,
+        "chi2": answer.chi2,
+    }
+
+
+def _packed(model: SfmModel, joint_pose_covariance: Array) -> bytes:
+    """The tracks and the joint covariance of the poses as a compressed NumPy archive, images by name."""
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        names=np.array(json.dumps(list(model.T_world_camera))),
+        image=model.tracks.image.astype(np.int32),
+        point=model.tracks.point.astype(np.int32),
+        pixels=model.tracks.pixels.astype(np.float32),
+        points=model.tracks.points,
+        pose_covariance=joint_pose_covariance,
+    )
+    return buffer.getvalue()
+
+
+def joint_pose_covariance(data: bytes, names: Sequence[str]) -> Array:
+    """(6 N, 6 N) of a packed model, for the images named, in their order."""
+    with np.load(io.BytesIO(data)) as archive:
+        order = json.loads(str(archive["names"]))
+        rows = (6 * np.array([order.index(name) for name in names])[:, None] + np.arange(6)).ravel()
+        return np.asarray(archive["pose_covariance"][np.ix_(rows, rows)], dtype=np.float64)
+
+
+def _unpacked(data: bytes, names: list[str]) -> Tracks:
+    """The tracks again, images numbered as in `names`."""
+    with np.load(io.BytesIO(data)) as archive:
+        order = json.loads(str(archive["names"]))
+        number = np.array([names.index(name) for name in order], dtype=np.int64)
+        return Tracks(
+            number[archive["image"].astype(np.int64)],
+            archive["point"].astype(np.int64),
+            archive["pixels"].astype(np.float64),
+            archive["points"],
+        )

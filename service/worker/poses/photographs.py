@@ -1,0 +1,46 @@
+"""The photographs of a job as files, at their own size or at the resolution that the job asks for."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+
+from service.compute.camera_model import CameraModel
+from service.compute.images.files import read_image
+from service.compute.images.resolution import resample
+from service.jobs.records import ImageFile, Photographed
+from service.worker.camera import camera_reduced, camera_used
+from service.worker.job import JobContext
+
+_A = TypeVar("_A", bound=Photographed)
+_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 97, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+
+
+def photographs(context: JobContext[_A], images: Sequence[ImageFile]) -> list[Path]:
+    """One file an image. Where the job asks for a smaller size, reduced copies."""
+    originals = [context.input(image.sha256) for image in images]
+    full = camera_reduced(context.arguments)
+    if full is None:
+        return originals
+    camera = camera_used(context.arguments)
+    folder = context.scratch / f"{camera.width}x{camera.height}"
+    folder.mkdir(exist_ok=True)
+    copies = [folder / f"{image.viewpoint}.jpg" for image in images]
+    reduce = partial(_reduce, full=full, width=camera.width, height=camera.height)
+    with ProcessPoolExecutor(min(len(images), os.cpu_count() or 1), mp_context=get_context("spawn")) as pool:
+        for done, _ in enumerate(pool.map(reduce, originals, copies), 1):
+            context.progress(f"images at {camera.width} × {camera.height}", done, len(images))
+    return copies
+
+
+def _reduce(original: Path, copy: Path, full: CameraModel, width: int, height: int) -> None:
+    cv2.setNumThreads(1)  # the pool already uses every core
+    _, data = cv2.imencode(".jpg", resample(read_image(original), full, width, height), _JPEG)
+    copy.write_bytes(data.tobytes())

@@ -1,0 +1,1 @@
+"""Jobs that bring images and scan into one frame, and judge how well."""

@@ -1,0 +1,298 @@
+"""Job `evaluate`: the paper's errors on the control spheres, and the error budget, for every registration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+
+from service.compute.camera_model import CameraModel
+from service.compute.evaluation.accuracy import evaluate as evaluate_controls
+from service.compute.evaluation.closure import Alignment, compare_shapes, locate_in_images
+from service.compute.evaluation.error_budget import (
+    CONTROL_SPHERES,
+    ErrorBudget,
+    MeasuredSpheres,
+    Observation,
+    contributions,
+    control_observation,
+    loop_observations,
+)
+from service.compute.images.files import read_image
+from service.compute.images.resolution import resample
+from service.compute.markers.archive import outline_from_record
+from service.compute.markers.records import SphereOutline
+from service.compute.overlay import draw_overlay
+from service.compute.pipeline import Detection
+from service.compute.registration.identity import Assignment
+from service.compute.registration.pairing import CONTROL_GATE, paired
+from service.compute.surfaces.constellations import match_constellations
+from service.core.errors import ComputeError
+from service.core.geometry import Array, apply, inverse
+from service.core.records.events import ArtefactRef
+from service.dataset.registrations import best_row
+from service.jobs.records import Hash, Photograph, SpheresFound
+from service.jobs.registration import evaluate as job
+from service.jobs.registration.register import Answer as Registration
+from service.worker.camera import camera_of
+from service.worker.job import JobAnswer, JobContext
+
+_COMMON = ("common", "intrinsics")  # components that move all spheres alike
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """What scanner and CT say of the spheres, in the frame of the registered scan."""
+
+    scan: MeasuredSpheres
+    control: MeasuredSpheres
+    ct: MeasuredSpheres | None  # in its own frame, one row for each sphere of the scan, NaN where it has none
+
+
+@dataclass(frozen=True, slots=True)
+class _Registered:
+    """One registration and the images that it has a pose for."""
+
+    name: str
+    record: Registration
+    camera: CameraModel
+    images: Sequence[Photograph]
+    outlines: Sequence[Sequence[SphereOutline]]
+    T_scan_camera: Array
+    markers: Sequence[Assignment]
+    controls: Sequence[Assignment]
+
+
+def evaluate(context: JobContext[job.Arguments]) -> JobAnswer:
+    """One row a registration: errors on the control spheres, which took no part in it, and its budget."""
+    arguments = context.arguments
+    measured = _measured(arguments)
+    radius_m = arguments.radius_m
+    table: list[job.Row] = []
+    budgets: dict[str, job.ErrorBudget] = {}
+    pictures: dict[str, Callable[[], list[ArtefactRef]]] = {}
+    found: dict[str, Any] = {}
+    for name, record in arguments.registrations.items():
+        registered = _registered(context, name, record, measured, radius_m, found)
+        budget = _budget(registered, measured, radius_m)
+        budgets[name] = job.ErrorBudget.model_validate(budget.as_json())
+        table.append(_row(registered, budget, _errors(registered, measured, radius_m)))
+        pictures[name] = partial(_overlays, context, registered, measured, radius_m)
+    best = best_row(table)
+    # The best source, and beside it the robot's own poses: the eye sees the difference.
+    refs = [ref for name in dict.fromkeys((best.poses, "robot")) if name in pictures for ref in pictures[name]()]
+    numbers: dict[str, float | None] = {
+        f"{row.poses}_mean_radial_error_mm": row.mean_radial_error_mm for row in table
+    }
+    numbers |= {f"{row.poses}_mean_reprojection_error_px": row.mean_reprojection_error_px for row in table}
+    numbers["best_mean_radial_error_mm"] = best.mean_radial_error_mm
+    numbers["best_predicted_error_mm"] = best.predicted_error_mm
+    numbers["control_normalised_chi2"] = best.control_normalised_chi2
+    measures = {name: number for name, number in numbers.items() if number is not None}
+    measures["control_spheres"] = float(len(measured.control.centres_m))
+    answer = job.Answer(table=tuple(table), budgets=budgets)
+    refs.append(context.keep_json(answer.plain()["table"], kind="evaluation", name="evaluation.json"))
+    refs.append(context.keep_json(answer.plain()["budgets"], kind="error_budget", name="error_budget.json"))
+    return JobAnswer(measures, tuple(refs), answer)
+
+
+def _row(registered: _Registered, budget: ErrorBudget, errors: _Errors) -> job.Row:
+    control = next((o for o in budget.observations if o.name == CONTROL_SPHERES), None)
+    registration = [c.sigma_m for c in budget.contributions if c.counted and c.name != "scan"]
+    return job.Row(
+        poses=registered.name,
+        source=registered.record.poses,
+        resolution=f"{registered.camera.width} × {registered.camera.height}",
+        images=len(registered.images),
+        predicted_error_mm=1e3 * float(np.sqrt(np.sum(np.square(registration)))),
+        control_error_mm=None if control is None else 1e3 * control.observed_m,
+        control_normalised_chi2=None if control is None else control.normalised_chi2,
+        mean_radial_error_mm=errors.mean_radial_mm,
+        mean_reprojection_error_px=errors.mean_reprojection_px,
+        evaluated_on=errors.evaluated_on,
+        control_outlines=errors.control_outlines,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Errors:
+    """The paper's two errors, and on what they were evaluated."""
+
+    mean_radial_mm: float
+    mean_reprojection_px: float
+    evaluated_on: str
+    control_outlines: int
+
+
+def _errors(registered: _Registered, measured: _Measured, radius_m: float) -> _Errors:
+    """The paper's two errors, on control spheres where there are any, else on each sphere predicted by the others."""
+    if not len(measured.control.centres_m):
+        left_out = registered.record.leave_one_out
+        if left_out is None:
+            raise ComputeError(
+                "there are no control spheres, and too few registration spheres to predict one from the others",
+                remedy="Place control spheres, or more registration spheres",
+            )
+        return _Errors(left_out.mean_radial_error_mm, left_out.mean_reprojection_error_px, "each sphere left out", 0)
+    answer = evaluate_controls(
+        registered.outlines,
+        registered.controls,
+        registered.T_scan_camera,
+        measured.control.centres_m,
+        radius_m,
+        registered.camera,
+    )
+    return _Errors(
+        answer.mean_radial_error_mm, answer.mean_reprojection_error_px, "control spheres", len(answer.errors)
+    )
+
+
+def _measured(arguments: job.Arguments) -> _Measured:
+    """Scan, control scan and CT brought together by their spheres."""
+    scan = _spheres(arguments.scan)
+    control = _control(scan, arguments.control_scan)
+    if arguments.ct is None:
+        return _Measured(scan, control, None)
+    ct = _spheres(arguments.ct)
+    shared = match_constellations(scan.centres_m, ct.centres_m).pairs
+    centres, covariance = np.full_like(scan.centres_m, np.nan), np.zeros((len(scan.centres_m), 3, 3))
+    for a, b in shared:
+        centres[a], covariance[a] = ct.centres_m[b], ct.covariance_m2[b]
+    return _Measured(scan, control, MeasuredSpheres(centres, covariance, ct.surface_rms_m))
+
+
+def _control(scan: MeasuredSpheres, control_scan: SpheresFound | None) -> MeasuredSpheres:
+    """The control spheres in the frame of the registered scan; none without a control scan."""
+    if control_scan is None:
+        return MeasuredSpheres(np.zeros((0, 3)), np.zeros((0, 3, 3)), 0.0)
+    both = _spheres(control_scan)
+    found = match_constellations(scan.centres_m, both.centres_m)
+    pairs = np.array(found.pairs)
+    here, there = pairs[:, 0], pairs[:, 1]
+    _, alignment = compare_shapes(
+        scan.centres_m[here], scan.covariance_m2[here], both.centres_m[there], both.covariance_m2[there]
+    )
+    extra = list(found.missing_b)
+    if not extra:
+        raise ComputeError("the control scan shows no sphere beside the registration spheres")
+    R = alignment.T_a_b[:3, :3]
+    return MeasuredSpheres(
+        apply(alignment.T_a_b, both.centres_m[extra]),
+        R @ both.covariance_m2[extra] @ R.T + alignment.covariance_at_m2(both.centres_m[extra]),
+        both.surface_rms_m,
+    )
+
+
+def _spheres(found: SpheresFound) -> MeasuredSpheres:
+    records = found.details.spheres
+    rms_m = [1e-3 * record.rms_mm for record in records]
+    return MeasuredSpheres(
+        np.array([record.centre_m for record in records]),
+        np.array([record.covariance_m2 for record in records]),
+        float(np.sqrt(np.mean(np.square(rms_m)))),
+    )
+
+
+def _registered(
+    context: JobContext[job.Arguments],
+    name: str,
+    record: Registration,
+    measured: _Measured,
+    radius_m: float,
+    found: dict[Hash, Any],
+) -> _Registered:
+    camera = camera_of(record.camera)
+    sha256 = record.outlines
+    if sha256 not in found:
+        found[sha256] = context.input_json(sha256)
+    cameras = record.T_scan_camera
+    images = [image for image in context.arguments.images if image.viewpoint in cameras]
+    if not images:
+        raise ComputeError(f"registration {name!r} has a pose for none of the control images")
+    outlines = [[outline_from_record(r, camera) for r in found[sha256][image.viewpoint]] for image in images]
+    T_scan_camera = np.array([cameras[image.viewpoint] for image in images])
+    n = len(measured.scan.centres_m)
+    centres = np.vstack([measured.scan.centres_m, measured.control.centres_m])
+    markers: list[Assignment] = []
+    controls: list[Assignment] = []
+    for mine, T in zip(outlines, T_scan_camera, strict=True):
+        pairs = paired(mine, inverse(T), centres, radius_m, camera, CONTROL_GATE).items()
+        markers.append(Assignment({outline: m for outline, m in pairs if m < n}, inverse(T)))
+        controls.append(Assignment({outline: m - n for outline, m in pairs if m >= n}, inverse(T)))
+    return _Registered(name, record, camera, images, outlines, T_scan_camera, markers, controls)
+
+
+def _budget(registered: _Registered, measured: _Measured, radius_m: float) -> ErrorBudget:
+    """Contributions where the control spheres are: in the middle of the anatomy."""
+    record = registered.record
+    T_world_scan = np.array(record.T_world_scan)
+    target = (measured.control if len(measured.control.centres_m) else measured.scan).centres_m.mean(axis=0)
+    components = {
+        name: Alignment(T_world_scan, np.array(covariance)[:6, :6]) for name, covariance in record.components.items()
+    }
+    sigma_m = {
+        name: float(np.sqrt(np.trace(component.covariance_at_m2(target[None])[0])))
+        for name, component in components.items()
+    }
+    # Each sphere alone needs three images; control captures are few, so two must do where there are no more.
+    least = min(3, len(registered.images))
+    controls = locate_in_images(
+        registered.outlines,
+        registered.controls,
+        registered.T_scan_camera,
+        measured.control.centres_m,
+        radius_m,
+        least_images=least,
+    )
+    observations: list[Observation] = []
+    if controls:
+        own = [c.covariance for name, c in components.items() if name not in _COMMON] or [np.zeros((6, 6))]
+        placed = Alignment(T_world_scan, np.sum(own, axis=0))
+        observations.append(control_observation(placed, controls, measured.control))
+    places = locate_in_images(
+        registered.outlines,
+        registered.markers,
+        registered.T_scan_camera,
+        measured.scan.centres_m,
+        radius_m,
+        least_images=least,
+    )
+    observations += loop_observations(places, measured.scan, measured.ct)
+    return ErrorBudget(contributions(sigma_m, measured.scan, measured.ct), tuple(observations))
+
+
+def _overlays(
+    context: JobContext[job.Arguments], registered: _Registered, measured: _Measured, radius_m: float
+) -> list[ArtefactRef]:
+    """Pictures of one image a station, with detected and predicted outlines drawn over it."""
+    first: dict[str, int] = {}
+    for i, image in enumerate(registered.images):
+        first.setdefault(image.station, i)
+    refs: list[ArtefactRef] = []
+    for i in first.values():
+        markers, controls = registered.markers[i].markers, registered.controls[i].markers
+        detections = [
+            Detection(outline, markers.get(j), controls.get(j), None)
+            for j, outline in enumerate(registered.outlines[i])
+        ]
+        photograph = read_image(context.input(registered.images[i].sha256))
+        if registered.record.full_camera is not None:
+            full = camera_of(registered.record.full_camera)
+            photograph = resample(photograph, full, registered.camera.width, registered.camera.height)
+        picture = draw_overlay(
+            photograph,
+            registered.camera,
+            detections,
+            T_scan_camera=registered.T_scan_camera[i],
+            registration_centres_m=measured.scan.centres_m,
+            control_centres_m=measured.control.centres_m,
+            radius_m=radius_m,
+        )
+        jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])[1].tobytes()
+        name = f"{registered.name}_{registered.images[i].viewpoint}.jpg"
+        refs.append(context.keep_bytes(jpeg, kind="overlay", media_type="image/jpeg", name=name))
+    return refs

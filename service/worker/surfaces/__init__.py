@@ -1,0 +1,1 @@
+"""Jobs on meshes, and on the spheres in them and in photographs of the layout."""

@@ -1,0 +1,93 @@
+"""Jobs on surfaces: the CT volume becomes a mesh, and every mesh is searched for its spheres."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+
+from service.compute.layout.ambiguity import SUBSET as LAYOUT_SUBSET
+from service.compute.layout.ambiguity import check_layout, layout_measures, layout_record
+from service.compute.surfaces.constellations import match_constellations
+from service.compute.surfaces.isosurface import surface
+from service.compute.surfaces.loop_closure import LoopClosure, close_loop
+from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres
+from service.compute.surfaces.sphere_records import sphere_record
+from service.core.geometry import Array
+from service.jobs.records import SpheresFound
+from service.jobs.surfaces import ct_surface as ct_job
+from service.jobs.surfaces import locate_spheres as locate_job
+from service.worker.job import JobAnswer, JobContext
+
+
+def ct_surface(context: JobContext[ct_job.Arguments]) -> JobAnswer:
+    """Hounsfield volume → surface at the threshold → spheres in the CT frame."""
+    arguments = context.arguments
+    hounsfield = np.load(context.input(arguments.hounsfield), allow_pickle=False, mmap_mode="r")
+    vertices_m, faces = surface(hounsfield, np.array(arguments.T_ct_voxel), arguments.threshold_hu)
+    buffer = io.BytesIO()
+    np.savez(buffer, vertices_m=vertices_m, faces=faces)
+    mesh = context.keep_bytes(
+        buffer.getvalue(), kind="ct_mesh", media_type="application/x-npz", name="ct_surface.npz"
+    )
+    answer = _search(arguments, vertices_m, faces)
+    return JobAnswer({**answer.measures, "surface_faces": float(len(faces))}, (mesh,), answer.answer)
+
+
+def locate_spheres(context: JobContext[locate_job.Arguments]) -> JobAnswer:
+    """Spheres of a decoded mesh; with `reference_m`, how they moved against an earlier measurement."""
+    with np.load(context.input(context.arguments.mesh), allow_pickle=False) as mesh:
+        return _search(context.arguments, mesh["vertices_m"], mesh["faces"])
+
+
+def _search(arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Array, faces: Any) -> JobAnswer:
+    radius_m = arguments.radius_m
+    spheres = find_spheres(vertices_m, faces, radius_m, arguments.expected)
+    centres = np.array([s.centre_m for s in spheres])
+    covariances = np.array([s.covariance for s in spheres])
+    layout = check_layout(centres, covariances, radius_m=radius_m) if len(spheres) >= LAYOUT_SUBSET else None
+    measures = {
+        "spheres_found": float(len(spheres)),
+        "radius_residual_max_mm": 1e3 * max(abs(s.radius_residual_m) for s in spheres),
+        "sphere_rms_max_mm": 1e3 * max(s.rms_m for s in spheres),
+        "sphere_sigma_max_mm": 1e3 * max(float(np.sqrt(np.trace(s.covariance))) for s in spheres),
+    }
+    details: dict[str, Any] = {"spheres": [sphere_record(s) for s in spheres]}
+    if layout is not None:
+        measures |= layout_measures(layout)
+        details["layout"] = layout_record(layout)
+    if isinstance(arguments, locate_job.Arguments) and arguments.reference_m is not None:
+        reference = np.array(arguments.reference_m)
+        match = match_constellations(reference, centres)
+        measures["spheres_compared"] = float(len(match.pairs))
+        measures["sphere_change_rms_mm"] = 1e3 * match.rms_m
+        measures["sphere_change_max_mm"] = 1e3 * float(match.residuals_m.max())
+        details["T_reference_mesh"] = match.T_a_b.tolist()
+        if arguments.reference_covariances_m2 is not None:
+            closure = close_loop(reference, np.array(arguments.reference_covariances_m2), centres, covariances, match)
+            measures["spheres_moved"] = float(len(closure.moved))
+            measures["loop_closure_chi2"] = closure.chi2_per_dof
+            details["loop_closure"] = _closure_record(closure)
+    found = {"spheres_m": centres.tolist(), "details": details}
+    return JobAnswer(measures, (), SpheresFound.model_validate(found))
+
+
+def _closure_record(closure: LoopClosure) -> dict[str, Any]:
+    return {
+        "T_reference_mesh": closure.T_a_b.tolist(),
+        "chi2_per_dof": closure.chi2_per_dof,
+        "rms_mm": 1e3 * closure.rms_m,
+        "sigma_rms_mm": 1e3 * closure.sigma_rms_m,
+        "spheres": [
+            {
+                "reference": s.pair[0],
+                "sphere": s.pair[1],
+                "difference_mm": (1e3 * s.difference_m).tolist(),
+                "sigma_mm": 1e3 * s.sigma_m,
+                "z": s.z,
+                "moved": s.moved,
+            }
+            for s in closure.spheres
+        ],
+    }
