@@ -255,6 +255,17 @@ def test_what_is_missing_or_of_another_kind_is_a_difference() -> None:
     assert compare_data({"a": 1}, {"a": 1.0}).identical, "JSON has one kind of number"
 
 
+def test_another_wording_of_an_explanation_is_told_and_is_no_other_result() -> None:
+    old = {"contributions": [{"name": "outlines", "how": "what they have in common", "sigma_mm": 0.01}]}
+    new = {"contributions": [{"name": "outlines", "how": "errors that they share", "sigma_mm": 0.01}]}
+    found = compare_data(old, new)
+    assert [d.path for d in found.differences] == ["contributions[0].how"]
+    assert found.equal
+    assert not found.identical
+    assert not compare_data({"name": "outlines"}, {"name": "poses"}).equal
+    assert not compare_data({"how": "by hand"}, {"how": 1}).equal
+
+
 def test_many_entries_by_name_are_one_field() -> None:
     old = {"views": {f"v{n}": [1.0, float(n)] for n in range(20)}}
     new = {"views": {f"v{n}": [1.0, n + 0.001 * n] for n in range(20)}}

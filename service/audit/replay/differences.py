@@ -32,6 +32,8 @@ _UNITS: Mapping[str, tuple[str, float]] = {
     "_lux": ("lx", 1.0),
 }
 
+_EXPLANATIONS = ("how", "verdict")  # of the error budget: words about numbers that stand beside them
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
@@ -46,9 +48,15 @@ class Difference:
     values: int = 1  # that differ in this field
 
     @property
+    def wording(self) -> bool:
+        """Whether only the wording of an explanation differs: the numbers that it explains are compared."""
+        texts = isinstance(self.recorded, str) and isinstance(self.recomputed, str)
+        return texts and self.path.rpartition(".")[2] in _EXPLANATIONS
+
+    @property
     def within_tolerance(self) -> bool:
-        """Whether nothing but rounding differs."""
-        return self.relative is not None and self.relative <= TOLERANCE
+        """Whether nothing but rounding, or the wording of an explanation, differs."""
+        return self.wording or (self.relative is not None and self.relative <= TOLERANCE)
 
 
 @dataclass(frozen=True, slots=True)
