@@ -53,6 +53,7 @@ from service.store.records import NewArtefact, NewJob
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.store.verification.verify import verify
+from tests.support.registration_record import registration_record
 from tests.support.reported_run import evaluation
 from tests.support.rig import REPOSITORY, command, orthocapture
 from tests.support.store import rows
@@ -135,7 +136,7 @@ def record(folder: Path, store: Store) -> Run:
     planned = StepNote(step="registration", attempt=1, note=PLANNED, data={"later": ["triangulated", "colmap"]})
     run.add(StepStarted(step="registration", attempt=1), planned)
     run.job("detect_spheres", "registration", "root", 1, images=IMAGES, camera=CAMERA)
-    run.measure("registration", {}, {"registrations": {"robot": {"poses": "robot"}}})
+    run.measure("registration", {}, {"registrations": {"robot": registration_record("robot")}})
     run.add(StepPassed(step="registration", attempt=1), StepStarted(step="evaluation", attempt=1))
     judged = run.measure("evaluation", {"best_mean_radial_error_mm": 0.02}, table(robot=0.02))
     signed = OperatorAction(action="sign", step="evaluation", meaning="reviewed", signed_sha256=judged)

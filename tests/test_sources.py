@@ -30,6 +30,7 @@ from service.store.verification.verify import verify
 from service.web.record.known_spheres import best_registration as shown_registration
 from service.worker.loop import work
 from tests.support.recorded_run import record_run
+from tests.support.registration_record import registration_record
 
 DEMO = Path(__file__).parents[1] / "protocols" / "demo.yaml"
 CAMERA = {
@@ -237,12 +238,12 @@ def test_page_report_and_export_show_the_same_registration(tmp_path: Path) -> No
     """Before the evaluation the most certain of full resolution, then what was signed, whatever its resolution."""
 
     def registered(poses: str, variance: float, full: dict[str, Any] | None = None) -> dict[str, Any]:
-        return {
-            "poses": poses, "camera": CAMERA | {"width": 640, "height": 360}, "outlines": "0" * 64,
-            "full_camera": None if full is None else CAMERA | full, "T_world_scan": POSE, "scale": 1.0,
-            "rms_px": 0.1, "T_world_station": {}, "T_scan_camera": {}, "components": {},
-            "covariance": (variance * np.eye(6)).tolist(),
-        }  # fmt: skip
+        return registration_record(
+            poses,
+            camera=CAMERA | {"width": 640, "height": 360},
+            full_camera=None if full is None else CAMERA | full,
+            covariance=(variance * np.eye(6)).tolist(),
+        )
 
     run = _Run(protocol())
     steps = dict(run.state.steps)

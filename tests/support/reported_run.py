@@ -36,6 +36,7 @@ from service.store.records import NewArtefact
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from tests.support.core import EYE
+from tests.support.registration_record import registration_record
 
 PROTOCOL = """\
 id: reported
@@ -256,7 +257,7 @@ class _Writer:
         self.measure("scan", 1, {}, {"spheres_m": vertices_m.tolist()}, (mesh,))
         self.add(StepPassed(step="scan", attempt=1), StepStarted(step="registration", attempt=1))
         cameras = {"v001": [list(row) for row in EYE], "v002": T_SCAN_CAMERA}
-        result = {"T_world_scan": EYE, "covariance": (1e-9 * np.eye(6)).tolist(), "T_scan_camera": cameras}
+        result = registration_record("colmap", T_scan_camera=cameras)
         self.measure("registration", 1, {}, {"registrations": {"colmap": result}})
         self.add(StepPassed(step="registration", attempt=1))
 
