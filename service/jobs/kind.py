@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from service.core.errors import DataError
+from service.core.errors import IntegrityError
 from service.core.jobs.references import Jobs, resolve
 
 
@@ -67,11 +67,11 @@ class JobKind(Generic[A, R]):
     aside: bool = False
 
     def read_arguments(self, recorded: Mapping[str, Any], jobs: Jobs = _NO_JOBS) -> A:
-        """The arguments of a recorded job of any version. Raises DataError, IntegrityError."""
+        """The arguments of a recorded job of any version. Raises IntegrityError."""
         return self._read(self.arguments, resolve(recorded, jobs), "arguments")
 
     def read_answer(self, recorded: Mapping[str, Any]) -> R:
-        """The answer of a recorded job of any version. Raises DataError."""
+        """The answer of a recorded job of any version. Raises IntegrityError."""
         return self._read(self.answer, recorded, "answer")
 
     def _read(self, model: type[_T], data: Mapping[str, Any], what: str) -> _T:
@@ -80,4 +80,4 @@ class JobKind(Generic[A, R]):
         except ValidationError as error:
             first = error.errors()[0]
             path = "/".join(map(str, first["loc"]))
-            raise DataError(f"the {what} of a job {self.name}: {path}: {first['msg']}") from error
+            raise IntegrityError(f"the {what} of a job {self.name}: {path}: {first['msg']}") from error
