@@ -92,6 +92,6 @@ def test_a_board_that_is_cut_by_the_frame_is_said_to_be_cut(photographs: BoardFo
     cv2.imwrite(str(cut), np.ascontiguousarray(whole[:, : whole.shape[1] // 2 + 40]))
     (found,) = find_boards([cut], BOARD)
     assert found.view is None
-    assert "cut by the frame" in found.reason
+    assert "cropped by the image's edge" in found.reason
     (other,) = find_boards([photographs.images / "b0.jpg"], dataclasses.replace(BOARD, columns=10, rows=7))
     assert "9 × 6 inner corners, not 10 × 7" in other.reason

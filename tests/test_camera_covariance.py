@@ -93,5 +93,5 @@ def test_camera_json_is_read_for_it(tmp_path: Path) -> None:
     assert sum((c.cx - CAMERA.cx) ** 2 for c in found.deviations(CAMERA)) == pytest.approx(4.0)
     for wrong in ({"parameters": ["fx"], "matrix": [[1, 2]]}, {"parameters": ["zoom"], "matrix": [[1]]}, []):
         path.write_text(json.dumps({**CAMERA.record(), "covariance": wrong}))
-        with pytest.raises(DataError, match="no square matrix"):
+        with pytest.raises(DataError, match="not a square matrix"):
             read_camera_covariance(path)

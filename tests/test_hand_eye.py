@@ -109,12 +109,12 @@ def test_motions_that_determine_nothing_are_refused() -> None:
 
 def test_data_that_do_not_belong_together_are_refused() -> None:
     hands, boards = _session(8)
-    with pytest.raises(DataError, match="belong together"):
+    with pytest.raises(DataError, match="do not match"):
         calibrate_hand_eye(hands, boards[:-1])
     boards[2, 0, 3] = np.nan
     with pytest.raises(DataError, match="finite"):
         calibrate_hand_eye(hands, boards)
-    with pytest.raises(DataError, match="belong together"):
+    with pytest.raises(DataError, match="do not match"):
         place_board(hands[:0], boards[:0], T_FLANGE_CAMERA)
 
 

@@ -239,7 +239,7 @@ def test_an_empty_correction_changes_nothing(q: Array) -> None:
     ("text", "what"),
     [
         ("name,q1,q2,q3,q4,q5,q6\n", "first line"),
-        ("image,q1,q2,q3,q4,q5,q6\na.jpg,90,0,0,0,0,0\n", "no joint angle"),
+        ("image,q1,q2,q3,q4,q5,q6\na.jpg,90,0,0,0,0,0\n", "not a joint angle"),
         ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0\n", "six finite"),
         ("image,q1,q2,q3,q4,q5,q6\na.jpg,0,0,0,0,0,x\n", "not a number"),
         ("image,q1,q2,q3,q4,q5,q6\nb.jpg,0,0,0,0,0,0\n", "no joints: a.jpg"),

@@ -100,7 +100,7 @@ def test_boards_that_cannot_be_are_refused() -> None:
         Board(2, 9, 0.015)
     with pytest.raises(DataError, match="smaller than its square"):
         Board(8, 9, 0.015, "charuco", marker_m=0.02)
-    with pytest.raises(DataError, match="no marker dictionary"):
+    with pytest.raises(DataError, match="not a marker dictionary"):
         Board(8, 9, 0.015, "charuco", dictionary="DICT_X").charuco()
     with pytest.raises(DataError, match="fewer than this board"):
         Board(16, 23, 0.015, "charuco", dictionary="DICT_4X4_50").charuco()

@@ -121,7 +121,7 @@ def test_images_without_the_board_end_with_the_reason(folder: Path, tmp_path: Pa
     (poor / "empty.jpg").write_bytes((folder / "empty.jpg").read_bytes())
     done = _run(poor, tmp_path / "c.json", "--json")
     assert done.exit_code == 1
-    assert "seen in none of 1 images" in json.loads(done.stdout)["error"]["what"]
+    assert "found in none of 1 images" in json.loads(done.stdout)["error"]["what"]
     for k in (0, 3):
         (poor / f"b{k}.jpg").write_bytes((folder / f"b{k}.jpg").read_bytes())
     done = _run(poor, tmp_path / "c.json", "--json")

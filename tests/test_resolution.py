@@ -37,5 +37,5 @@ def test_pixels_stay_square() -> None:
 
 
 def test_an_enlargement_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="no reduction"):
+    with pytest.raises(ConfigurationError, match="not a reduction"):
         camera_at(CAMERA, 1600, 900)

@@ -168,7 +168,7 @@ def test_rough_metric_poses_are_triangulated_and_adjusted(
     adjusted = [(done, total) for stage, done, total in seen if stage == "adjust"]
     assert adjusted == sorted(adjusted)
     assert adjusted[-1][0] == adjusted[-1][1]
-    with pytest.raises(ComputeError, match="poses to begin with"):
+    with pytest.raises(ComputeError, match="initial poses"):
         reconstruct(images, camera, tmp_path / "work", "triangulated", options=OPTIONS)
 
 

@@ -49,7 +49,7 @@ def read_camera_covariance(path: Path) -> CameraCovariance | None:
     if stated is None:
         return None
     wrong = DataError(
-        "the covariance of the camera is no square matrix of its parameters",
+        "the covariance of the camera is not a square matrix of its parameters",
         where=f"{path}: covariance",
         remedy="Calibrate again, or remove the key: the camera then counts as exactly known",
     )

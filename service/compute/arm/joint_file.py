@@ -39,7 +39,9 @@ def read_joints_csv(path: Path, images: Sequence[str]) -> dict[str, Array]:
         if values.shape != (6,) or not np.isfinite(values).all():
             raise DataError("not six finite numbers after the name", where=where, remedy="correct the line")
         if np.abs(values).max() > _LARGEST_RAD:
-            raise DataError(f"{np.abs(values).max():.0f} rad is no joint angle", where=where, remedy="write radians")
+            raise DataError(
+                f"{np.abs(values).max():.0f} rad is not a joint angle", where=where, remedy="write radians"
+            )
         if row[0].strip() in joints:
             raise DataError(f"image {row[0].strip()} has two rows", where=where, remedy="remove one of them")
         joints[row[0].strip()] = values

@@ -79,7 +79,9 @@ def arm_model(name: str) -> ArmModel:
         near = get_close_matches(name.lower(), _ARMS, n=1)
         hint = f"did you mean {_ARMS[near[0]].name}? " if near else ""
         known = ", ".join(ARM_MODELS)
-        raise ConfigurationError(f"no kinematics of an arm {name!r}", remedy=f"{hint}known are {known}") from None
+        raise ConfigurationError(
+            f"no kinematics are known for an arm {name!r}", remedy=f"{hint}known are {known}"
+        ) from None
 
 
 def matching_arm(joints_rad: Array, T_base_flange: Array, *, within_m: float = 0.02) -> ArmModel | None:

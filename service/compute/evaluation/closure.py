@@ -147,7 +147,7 @@ def compare_shapes(a: Array, covariance_a: Array, b: Array, covariance_b: Array)
         ComputeError: fewer than four spheres, which leave nothing to compare.
     """
     if len(a) < 4:
-        raise ComputeError(f"{len(a)} common spheres close no loop; four are needed")
+        raise ComputeError(f"{len(a)} common spheres do not close a loop; four are needed")
 
     def parts(T: Transform) -> tuple[Array, Array, Array]:
         R = T[:3, :3]

@@ -78,7 +78,7 @@ def strict_refusal(reasons: dict[str, str], folder: Path) -> DataError:
     return DataError(
         f"{len(reasons)} files are odd: " + "; ".join(f"{name}: {reason}" for name, reason in reasons.items()),
         where=str(folder),
-        remedy="Take them out of the folder, or leave out --strict: they are left out then",
+        remedy="Remove them from the folder, or omit --strict to skip them",
     )
 
 

@@ -42,7 +42,7 @@ def _whole(camera: CameraModel, width: int, height: int) -> CameraModel:
     scale = max(width / camera.width, height / camera.height)
     if scale > 1 or width < 1 or height < 1:
         raise ConfigurationError(
-            f"{width} × {height} is no reduction of {camera.width} × {camera.height}",
+            f"{width} × {height} is not a reduction of {camera.width} × {camera.height}",
             remedy="Name resolutions that are smaller than the photographs, or none",
         )
     return camera.scaled(max(width, round(camera.width * scale)), max(height, round(camera.height * scale)))

@@ -71,7 +71,7 @@ def colour_of(text: str) -> tuple[Colour, float]:
         r, g, b = (int(word[i : i + 2], 16) for i in (1, 3, 5))
         return (float(b), float(g), float(r)), _HEX_TOLERANCE
     raise ConfigurationError(
-        f"{text!r} is no colour of spheres", remedy=f"Give one of {', '.join(NAMED_BGR)}, or #rrggbb"
+        f"{text!r} is not a known sphere colour", remedy=f"Give one of {', '.join(NAMED_BGR)}, or #rrggbb"
     )
 
 

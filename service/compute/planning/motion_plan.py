@@ -117,7 +117,7 @@ def _blurred(T_base_camera: Transform, situation: Situation) -> str:
         if near < situation.sharp.near_m or far > situation.sharp.far_m:
             return (
                 f"the scene lies {near:.2f} to {far:.2f} m from the camera, "
-                f"sharp is {situation.sharp.near_m:.2f} to {situation.sharp.far_m:.2f} m"
+                f"the sharp range is {situation.sharp.near_m:.2f} to {situation.sharp.far_m:.2f} m"
             )
     return ""
 

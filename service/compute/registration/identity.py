@@ -163,7 +163,7 @@ def _solve_group(
     solved.sort(key=lambda r: (-r.total, r.cost))
     if not solved:
         raise ComputeError(
-            "no reading of the spheres agrees with the camera poses",
+            "no assignment of the spheres agrees with the camera poses",
             where=where,
             remedy="Check that the poses are T_world_camera in the stated unit (--estimate-scale for poses without a "
             "metric scale) and belong to these images",
@@ -172,7 +172,7 @@ def _solve_group(
     for other in solved[1:]:
         if _differ(best, other) and other.total >= 0.9 * best.total and other.cost < 3 * best.cost + 0.02:
             raise ComputeError(
-                f"the arrangement of spheres is ambiguous: two readings explain {best.total} and {other.total} "
+                f"the arrangement of spheres is ambiguous: two assignments explain {best.total} and {other.total} "
                 f"of the detections, in one image {' and '.join(map(_named, _first_difference(best, other)))}",
                 where=where,
                 remedy="Place the spheres less symmetrically, or show more of them in an image",
@@ -193,7 +193,7 @@ def _solve_group(
 
 def _scale_unknown(where: str, counts: str) -> ComputeError:
     return ComputeError(
-        "the scale of the poses cannot be told from one image",
+        "the scale of the poses cannot be determined from one image",
         where=where,
         remedy=f"At least two images must show four or more registration spheres (spheres found: {counts})",
     )

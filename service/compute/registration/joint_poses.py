@@ -31,7 +31,7 @@ def with_joint_pose_covariance(registration: RegistrationResult, covariance: Arr
     s = registration.solution
     n = len(s.blocks.JA)
     if covariance.shape != (6 * n, 6 * n):
-        raise DataError(f"a joint covariance of the shape {covariance.shape} is not of {n} poses")
+        raise DataError(f"a joint covariance of shape {covariance.shape} does not fit {n} poses")
     unit = np.tile([registration.scale] * 3 + [1.0] * 3, n)
     metric = covariance * np.outer(unit, unit)
     f = s.outline_factor

@@ -153,7 +153,7 @@ def _scale(problem: Problem, assignments: Sequence[Assignment], poses: Array, gr
         lower += float(np.sum(position**2))
     if upper <= 0.0 or lower <= 0.0:
         raise ComputeError(
-            "the scale of the camera positions cannot be told from the images' own readings",
+            "the scale of the camera positions cannot be determined from the images alone",
             remedy="Use poses of several images of the same scene, from different places",
         )
     return upper / lower

@@ -67,7 +67,7 @@ def match_constellations(a: Array, b: Array, tolerance_m: float = 2e-3) -> Const
     spread = np.linalg.svd(a[rows] - a[rows].mean(axis=0), compute_uv=False)
     if spread[2] < 2 * tolerance_m:
         raise ComputeError(
-            "the matched spheres lie in a plane, so that a mirrored mesh could not be told from a true one",
+            "the matched spheres lie in a plane, so that a mirrored mesh could not be distinguished from a true one",
             remedy="mount at least one sphere at another height",
         )
     if any(len(other) == len(best) for other in rival):

@@ -45,7 +45,7 @@ def surface(
     if not low < level < high:
         raise ComputeError(
             f"no surface at {threshold_hu:g} HU: the volume holds {low} to {high} HU",
-            remedy="Choose a threshold between air and the material that is wanted",
+            remedy="Choose a threshold between air and the wanted material",
         )
     depth = max(2, slab_voxels // (volume_hu.shape[1] * volume_hu.shape[2]))
     vertices: list[Array] = []

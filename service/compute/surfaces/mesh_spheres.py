@@ -229,9 +229,9 @@ def _shape_reasons(fit: SphereFit, radius: float, limits: SphereLimits) -> list[
     if fit.rms > limits.max_rms * radius:
         reasons.append(f"rms {mm(fit.rms):.2f} mm, at most {mm(limits.max_rms * radius):.2f}")
     if fit.flank > limits.max_flank:
-        reasons.append("the surface goes on smoothly beyond it: not a sphere of this radius")
+        reasons.append("the surface continues smoothly beyond it: not a sphere of this radius")
     if fit.form > limits.max_form * radius:
-        reasons.append(f"departs from a sphere's form by {mm(fit.form):.2f} mm")
+        reasons.append(f"deviates from a sphere's shape by {mm(fit.form):.2f} mm")
     return reasons
 
 
@@ -248,7 +248,7 @@ def _cap_deg(fit: SphereFit) -> float:
 
 def _radius_reasons(fit: SphereFit, sigma: float, radius: float, limits: SphereLimits) -> list[str]:
     if not np.isfinite(fit.radius_residual) or sigma > _MAX_RADIUS_SIGMA * radius:
-        return ["too small a cap for its noise to tell the radius"]
+        return ["the cap is too small for its noise to determine the radius"]
     most = max(limits.max_radius_residual, limits.most_radius_residual)
     if abs(fit.radius_residual) > max(limits.max_radius_residual * radius, min(3 * sigma, most * radius)):
         return [f"radius {mm(fit.radius_residual):+.2f} ± {mm(sigma):.2f} mm off"]
@@ -286,7 +286,7 @@ def _judge(
             sound.append(fit)
     accepted = _oriented(sound, expected)
     refused += [
-        _Candidate(fit, ("concave: its normals point the other way than the other spheres'",))
+        _Candidate(fit, ("concave: its normals point opposite to the other spheres'",))
         for fit in sound
         if all(fit is not other for other in accepted)
     ]

@@ -169,7 +169,7 @@ class _Walk:
         # Else at least one side is cut only, at the full scale.
         if width < camera["width"] and height < camera["height"]:
             return ""
-        return f"{width} × {height} is no reduction of photographs of {camera['width']:g} × {camera['height']:g} px"
+        return f"{width} × {height} does not reduce photographs of {camera['width']:g} × {camera['height']:g} px"
 
     def _registered(self, source: str, size: str) -> JobState | None:
         search = self._arguments(size)

@@ -87,7 +87,7 @@ class Board:
         """
         identifier = getattr(cv2.aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(identifier, int):
-            raise DataError(f"{self.dictionary} is no marker dictionary of OpenCV", remedy="such as DICT_5X5_1000")
+            raise DataError(f"{self.dictionary} is not a marker dictionary of OpenCV", remedy="such as DICT_5X5_1000")
         dictionary = cv2.aruco.getPredefinedDictionary(identifier)
         if len(dictionary.bytesList) < (self.columns + 1) * (self.rows + 1) // 2:
             raise DataError(
@@ -276,7 +276,7 @@ def _find_charuco(image: Grey, board: Board) -> BoardView:
 def _charuco_view(image: Grey, board: Board, indices: NDArray[np.int64], corners: Array) -> BoardView:
     H, _ = cv2.findHomography(board.points()[indices, :2], corners, cv2.RANSAC, 0.3 * _scatter(corners))
     if H is None:  # pyright: ignore[reportUnnecessaryComparison]
-        raise ComputeError("the ChArUco corners lie on no plane", remedy="more of the board must be visible")
+        raise ComputeError("the ChArUco corners do not lie on a plane", remedy="more of the board must be visible")
     grid = cv2.perspectiveTransform(board.points()[None, :, :2], H)[0].reshape(board.rows, board.columns, 2)
     row, column = np.divmod(indices, board.columns)
     part = np.asarray(grid, dtype=np.float64)[row.min() : row.max() + 1, column.min() : column.max() + 1]

@@ -106,7 +106,9 @@ def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
     wanted, given = sorted((board.columns, board.rows)), f"{board.columns} × {board.rows}"
     if seen is None:
         if _best_dictionary(_small(image, _CHARUCO_WIDTH))[1] >= _FEWEST_MARKERS:
-            return Diagnosis("markers lie in the squares: it is a ChArUco board", "Give --pattern charuco", True)
+            return Diagnosis(
+                "there are markers in the squares: it is a ChArUco board", "Give --pattern charuco", True
+            )
         return None
     (columns, rows), corners = seen
     found = sorted((columns, rows))
@@ -114,7 +116,7 @@ def _checkerboard(image: Grey, board: Board) -> Diagnosis | None:
         return None  # the board is there; find_board's own reason holds
     if _at_frame(corners, small.shape) and all(a <= b for a, b in zip(found, wanted, strict=True)):
         return Diagnosis(
-            f"the board is cut by the frame: {columns} × {rows} of its {given} inner corners are seen",
+            f"the board is cropped by the image's edge: {columns} × {rows} of its {given} inner corners are seen",
             "The whole board must be in the image",
             False,
         )
@@ -153,7 +155,7 @@ def _charuco(image: Grey, board: Board) -> Diagnosis | None:
     if own < _FEWEST_MARKERS:
         seen = _seen(_small(image, _WIDTH))
         if seen is not None and min(seen[0]) > _LEAST:
-            return Diagnosis("a board without markers is seen", "Give --pattern checkerboard", True)
+            return Diagnosis("the image shows a board without markers", "Give --pattern checkerboard", True)
         return None
     now = _corners(small, board)
     for other, words, remedy in _variants(board):

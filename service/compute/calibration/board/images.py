@@ -106,7 +106,7 @@ def usable_views(found: Sequence[BoardImage]) -> UsableViews:
     if not sizes:
         reasons = Counter(image.reason for image in found)
         raise ComputeError(
-            f"the board is seen in none of {len(found)} images: "
+            f"the board was found in none of {len(found)} images: "
             + "; ".join(f"{reason} ({count})" for reason, count in reasons.most_common(3)),
             remedy="check the board's pattern, its inner corners, light and focus",
         )

@@ -66,7 +66,7 @@ def find_part(image: Grey, board: Board, known: BoardKnowledge, T_base_camera: T
     shift = np.linalg.norm(np.median(found - expected[which], axis=0))
     if shift > _NEAR * spacing:
         raise ComputeError(
-            f"the board is {shift / spacing:.2f} squares from where it must be: which corner is which?"
+            f"the board is {shift / spacing:.2f} squares from its predicted place, so its corners cannot be numbered"
         )
     view = _one_plane(BoardView(which, found), board, known)
     rows, columns = np.divmod(view.indices, board.columns)

@@ -171,7 +171,7 @@ def refined_knowledge(
         ComputeError: a view has no pose.
     """
     if not views:
-        raise DataError("no image of the board so far")
+        raise DataError("there is no image of the board yet")
     camera, focal, centre = known.camera, known.focal, known.centre
     if not lens_known and len(views) >= _LENS_VIEWS:
         camera, focal, centre = _lens(known, views, board)

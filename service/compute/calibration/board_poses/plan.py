@@ -73,7 +73,7 @@ def suggest_board_poses(
         DataError: no pose has been taken yet.
     """
     if len(T_base_flange) == 0:
-        raise DataError("no board pose so far")
+        raise DataError("there is no board pose yet")
     X, B = answer.T_flange_camera, answer.T_base_board
     candidates = _candidates(B, T_base_flange @ X, points_m, camera)
     noise = np.diag(

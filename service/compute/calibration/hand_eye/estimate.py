@@ -315,7 +315,7 @@ def _measured(
     hands = np.asarray(T_base_flange, dtype=np.float64)
     boards = np.asarray(T_camera_board, dtype=np.float64)
     if hands.ndim != 3 or hands.shape[1:] != (4, 4) or hands.shape != boards.shape:
-        raise DataError(f"robot poses {hands.shape} and board poses {boards.shape} do not belong together")
+        raise DataError(f"robot poses {hands.shape} and board poses {boards.shape} do not match")
     if not (np.isfinite(hands).all() and np.isfinite(boards).all()):
         raise DataError("a robot pose or a board pose is not finite")
     if corners is not None and len(corners.corners_px) != len(hands):
@@ -382,9 +382,7 @@ def place_board(T_base_flange: Array, T_camera_board: Array, T_flange_camera: Tr
         DataError: no view, or array shapes do not match.
     """
     if T_base_flange.shape != T_camera_board.shape or len(T_base_flange) == 0:
-        raise DataError(
-            f"robot poses {T_base_flange.shape} and board poses {T_camera_board.shape} do not belong together"
-        )
+        raise DataError(f"robot poses {T_base_flange.shape} and board poses {T_camera_board.shape} do not match")
     placed = T_base_flange @ T_flange_camera @ T_camera_board
     mean = mean_pose(placed)
     residual_mm, residual_deg = deviation(placed, mean)

@@ -203,7 +203,7 @@ def fit_method(data: Measured, method: Method, start: Answer | None = None) -> A
     X, B = park.T_flange_camera, park.T_base_board
     if method == "reprojection":
         if data.corners is None:
-            raise ComputeError("the method reprojection needs the corners, not only the board's poses")
+            raise ComputeError("the method `reprojection` needs the corners, not only the board's poses")
         return Answer(*solve_reprojection(data.hands, data.corners, X, B))
     views = data.views("none")
     noise = start.noise if start is not None else None

@@ -32,7 +32,7 @@ class BoardCorners:
 
     def __post_init__(self) -> None:
         if self.corners_px.ndim != 3 or self.corners_px.shape[1:] != (len(self.points_m), 2):
-            raise DataError(f"{self.corners_px.shape} corners of boards with {len(self.points_m)}")
+            raise DataError(f"{self.corners_px.shape} corners for a board of {len(self.points_m)} points")
 
     def take(self, which: NDArray[np.bool_]) -> BoardCorners:
         """Only these views."""

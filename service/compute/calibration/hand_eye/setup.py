@@ -84,8 +84,8 @@ def check_setup(hands: Array, boards: Array, point_m: Array, setup: Setup) -> No
             )
     if not as_read.fits:
         raise ComputeError(
-            f"the robot's poses do not fit the images: half of them place the board by more than {as_read} beside "
-            "its place, also with the poses inverted or in millimetres",
+            f"the robot's poses do not fit the images: half of them place the board more than {as_read} from "
+            "its place, even with the poses inverted or in millimetres",
             remedy="check that each image has its own pose (order, names), that the pose is the flange's, the "
             "order qx,qy,qz,qw, the board's square, camera.json, and that the board lay still",
         )

@@ -253,9 +253,9 @@ def _check_view(view: BoardView, count: int, index: int) -> None:
     if corners.ndim != 2 or corners.shape != (len(indices), 2) or len(indices) > count:
         raise DataError(f"{corners.shape} corners instead of ({count}, 2)", where=f"view {index}")
     if not np.isfinite(corners).all() or len(np.unique(indices)) != len(indices):
-        raise DataError("a corner is not finite, or is there twice", where=f"view {index}")
+        raise DataError("a corner is not finite, or occurs twice", where=f"view {index}")
     if len(indices) and (indices.min() < 0 or indices.max() >= count):
-        raise DataError(f"a corner's index is outside of the board's {count}", where=f"view {index}")
+        raise DataError(f"a corner's index is outside the board's {count} points", where=f"view {index}")
 
 
 def _inverse_root(normal: Array) -> Array:

@@ -126,7 +126,7 @@ def calibration_warnings(
     for name, sigma in result.sigma.items():
         if name in ("k2", "k3", "k4", "k5", "k6") and sigma > abs(getattr(result.camera, name)):
             found.append(
-                f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): fewer terms do"
+                f"{name} is not determined ({getattr(result.camera, name):.3g} ± {sigma:.2g}): use fewer terms"
             )
     if result.board.pattern == "circles":
         found.append("the middle of a tilted circle's image is not its centre: a checkerboard is more accurate")

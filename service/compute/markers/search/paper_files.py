@@ -47,7 +47,7 @@ def read_boxes(path: Path, names: Sequence[str]) -> dict[str, list[Box]]:
     """
     data = parse_json(file_text(path), name=str(path), remedy=_FORM)
     if not isinstance(data, dict):
-        raise DataError("the file holds no boxes by image name", where=str(path), remedy=_FORM)
+        raise DataError("the file does not hold boxes by image name", where=str(path), remedy=_FORM)
     known = cast(dict[str, Any], data)
     strange = sorted(set(known) - set(names))
     if strange:
@@ -59,7 +59,7 @@ def read_boxes(path: Path, names: Sequence[str]) -> dict[str, list[Box]]:
 
 def _list(entries: Any, path: Path) -> list[Any]:
     if not isinstance(entries, list):
-        raise DataError("the boxes of an image are no list", where=str(path), remedy=_FORM)
+        raise DataError("the boxes of an image are not a list", where=str(path), remedy=_FORM)
     return cast(list[Any], entries)
 
 
@@ -67,7 +67,7 @@ def _box(entry: Any, where: str) -> Box:
     try:
         left, top, right, bottom = (float(value) for value in entry)
     except (TypeError, ValueError) as error:
-        raise DataError(f"{entry!r} is no box", where=where, remedy=_FORM) from error
+        raise DataError(f"{entry!r} is not a box", where=where, remedy=_FORM) from error
     if not (left < right and top < bottom):  # NaN fails too
         raise DataError(f"the box {entry!r} has no area", where=where, remedy=_FORM)
     return left, top, right, bottom

@@ -158,7 +158,7 @@ def _attempt(
         if outline is None:
             missing[m] = "no outline where it is predicted"
         elif not expected.tone.admits(outline):
-            missing[m] = "another colour than the markers'"
+            missing[m] = "not of the markers' colour"
         else:
             outlines[m] = outline
     cones = {m: o.cone for m, o in outlines.items()}
@@ -169,7 +169,7 @@ def _attempt(
         part = max(outline.coverage, 0.2)
         if place > _PLACE_GATE / part or size > _SIZE_GATE / part:
             del outlines[m]
-            missing[m] = "not where the image's other spheres put it"
+            missing[m] = "not where the image's other spheres predict it"
     return Located(outlines, missing, pose)
 
 

@@ -177,7 +177,7 @@ def read_poses_csv(path: Path) -> dict[str, Transform]:
             raise DataError(f"image {name} has two poses", where=where, remedy="remove one of them")
         poses[name] = from_quaternion(values[:3], values[3:])
     if not poses:
-        raise DataError("the file holds no pose", where=str(path), remedy="give one line an image")
+        raise DataError("the file holds no pose", where=str(path), remedy="write one line per image")
     return poses
 
 
@@ -323,7 +323,9 @@ def read_camera_json(path: Path, image_size: tuple[int, int] | None = None) -> C
         values[key] = value
     if min(values["fx"], values["fy"]) <= 0 or any(values[k] < 1 or values[k] % 1 for k in ("width", "height")):
         raise DataError(
-            "width, height, fx and fy must be positive, the size whole", where=str(path), remedy="correct them"
+            "width, height, fx and fy must be positive, width and height whole numbers",
+            where=str(path),
+            remedy="correct them",
         )
     size = (int(values["width"]), int(values["height"]))
     if image_size is not None and size != image_size:

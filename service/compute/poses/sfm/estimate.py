@@ -176,7 +176,7 @@ def reconstruct_from(
     names = sorted(features)
     _check_count(len(names))
     if mapper == "triangulated" and not T_world_camera_start:
-        raise ComputeError("triangulation needs poses to begin with", remedy="give T_world_camera_start")
+        raise ComputeError("triangulation needs initial poses", remedy="give T_world_camera_start")
     for name in names:
         if (features[name].width, features[name].height) != (camera.width, camera.height):
             raise DataError(
@@ -293,7 +293,7 @@ def _by_name(images: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
     else:
         files = {path.name: Path(path) for path in images}
         if len(files) != len(images):
-            raise DataError("two images have the same file name", remedy="give each image a name of its own")
+            raise DataError("two images have the same file name", remedy="rename one of them")
     for name, path in files.items():
         if not path.is_file():
             raise DataError(f"image {name} does not exist", where=str(path))
