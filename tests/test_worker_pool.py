@@ -109,7 +109,7 @@ def test_a_worker_computes_side_by_side_and_ends_when_nothing_is_left(store: Sto
         enqueue(store, run, name, EARLY if name == "c" else WAITED)  # a job without its arguments fails at once
     assert work_side_by_side(tmp_path / "data", at_once=2, until_idle=True, stop=lambda: False, progress=silent) == 3
     ends = [e.payload for e in store.events(run) if isinstance(e.payload, JobFailed)]
-    assert [end.error for end in ends] == ["KeyError"] * 3
+    assert [end.error for end in ends] == ["IntegrityError"] * 3
 
 
 def test_a_child_that_is_killed_is_replaced_and_its_job_done_again(store: Store, tmp_path: Path) -> None:
