@@ -44,6 +44,7 @@ class _Child:
     lane: Lane
     scratch: Path
     died_s: float | None = None
+    busy: bool = False  # it has begun a job and has not said that it ended
 
 
 class Pool:
@@ -68,6 +69,7 @@ class Pool:
             assert isinstance(ready, Connection)
             with contextlib.suppress(EOFError, OSError):  # it has died, which is seen below
                 what, done, total = ready.recv()
+                by_pipe[ready].busy = total >= 0
                 if total < 0:
                     self.done += 1
                 else:
@@ -86,6 +88,11 @@ class Pool:
         if not by_pipe:
             time.sleep(timeout_s)
         return bool(heard)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a living child has begun a job and has not said that it ended."""
+        return any(child.busy and child.died_s is None for child in self._children)
 
     def pids(self) -> list[int]:
         """The children's processes, in the order in which they were started."""
@@ -145,7 +152,7 @@ def work_side_by_side(
                 pool.tend(progress)
                 sign.give(pool.done)
                 if until_idle and not store.open_jobs():
-                    while pool.tend(progress, 1.0):  # a job's end is in the store before its child says so
+                    while pool.tend(progress) or pool.busy:  # a job's end is in the store before its child says so
                         pass
                     break
             return pool.done
