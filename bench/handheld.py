@@ -107,9 +107,9 @@ def summary(data: Path, truth: Path) -> dict[str, Any]:
         "images": {name: {k: m[k] for k in ("images_taken", "images_used")} for name, m in measures.items()},
         "predicted_target_error_mm": measures["handheld_capture"]["predicted_target_error_mm"],
         "table": {
-            row["poses"]: {
-                **{key: row[key] for key, _ in MEASURES if key in row},
-                "true_error_mm": true[row["poses"]],
+            row.poses: {
+                **{key: value for key, _ in MEASURES if (value := getattr(row, key, None)) is not None},
+                "true_error_mm": true[row.poses],
             }
             for row in run.table()
         },

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,8 @@ class Jobs:
     def run(self, kind: str, **arguments: Any) -> tuple[ArtefactRef, ...]:
         scratch = self.folder / f"scratch{len(list(self.folder.iterdir()))}"
         scratch.mkdir()
-        context = JobContext({**self.common, **arguments}, self.store, scratch, lambda _w, _d, _t: None)
+        given: Mapping[str, Any] = {**self.common, **arguments}
+        context = JobContext(given, self.store, scratch, lambda _w, _d, _t: None)
         return tuple(HANDLERS[kind](context).artefacts)
 
 
