@@ -40,7 +40,7 @@ class Jobs:
         scratch = self.folder / f"scratch{len(list(self.folder.iterdir()))}"
         scratch.mkdir()
         given: Mapping[str, Any] = {**self.common, **arguments}
-        context = JobContext(given, self.store, scratch, lambda _w, _d, _t: None)
+        context = JobContext[Mapping[str, Any]](given, self.store, scratch, lambda _w, _d, _t: None)
         return tuple(HANDLERS[kind](context).artefacts)
 
 
