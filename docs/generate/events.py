@@ -6,7 +6,7 @@ from typing import get_args
 
 from pydantic import BaseModel
 
-from docs.generate.fields import docstring, field_table, records_below
+from docs.generate.fields import docstring, field_table, record_sections, records_below
 from service.core.records.base import ArtefactRef
 from service.core.records.events import Event, Payload
 
@@ -40,6 +40,5 @@ def events_text() -> str:
         lines += [f"## {kind}", "", docstring(payload), "", *field_table(payload, without=("kind",)), ""]
         records_below(payload, below)
     lines += ["## Records within events", ""]
-    for name, model in below.items():
-        lines += [f"### {name}", "", docstring(model), "", *field_table(model), ""]
+    lines += record_sections(below)
     return "\n".join(lines)

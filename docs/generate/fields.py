@@ -25,6 +25,7 @@ UNITS: Mapping[str, str] = {
 }  # fmt: skip
 _PLAIN = {float: "number", int: "whole number", str: "text", bool: "yes or no", Any: "anything", object: "anything"}
 _BOUNDS = (("gt", ">"), ("ge", "≥"), ("lt", "<"), ("le", "≤"))
+_ATTRIBUTES = re.compile(r"\n\nAttributes:\n")
 _HEAD = ("| key | type | default | unit | meaning |", "|---|---|---|---|---|")
 
 
@@ -40,8 +41,16 @@ def field_table(model: type[BaseModel], *, without: tuple[str, ...] = ()) -> lis
 
 
 def docstring(model: Any) -> str:
-    """The docstring as one paragraph a blank line; "" where it has none of its own."""
-    return inspect.cleandoc(model.__doc__) if model.__doc__ else ""
+    """The docstring without its attributes, which stand in the table; "" where it has none of its own."""
+    return _ATTRIBUTES.split(inspect.cleandoc(model.__doc__))[0] if model.__doc__ else ""
+
+
+def record_sections(below: Mapping[str, type[BaseModel]], level: str = "###") -> list[str]:
+    """Lines with a heading, the docstring and the table of each record that `records_below` found."""
+    lines: list[str] = []
+    for name, model in below.items():
+        lines += [f"{level} {name}", "", docstring(model), "", *field_table(model), ""]
+    return lines
 
 
 def unit_of(name: str) -> str:
@@ -64,16 +73,24 @@ def records_below(
 
 
 def field_comments(model: type[BaseModel]) -> dict[str, str]:
-    """What the code says beside or right above each field, in its own class and in those that it comes from."""
+    """What the code says of each field: among the docstring's attributes, or beside or right above it."""
     out: dict[str, str] = {}
     for base in reversed(model.__mro__):
         if issubclass(base, BaseModel) and base is not BaseModel:
+            out |= _attributes_of(base)
             out |= _comments_in(textwrap.dedent(inspect.getsource(base)))
     for name, field in model.model_fields.items():
         if field.description:
             out[name] = field.description
     said = {name: re.sub(r"\bNone: ", "without it: ", text) for name, text in out.items()}
     return {name: text.replace("|", "\\|") for name, text in said.items()}
+
+
+def _attributes_of(model: type[BaseModel]) -> dict[str, str]:
+    _, *attributes = _ATTRIBUTES.split(inspect.cleandoc(model.__doc__ or ""))
+    lines = re.split(r"\n(?! {5})", "".join(attributes))  # what is indented further goes on with the line before
+    pairs = (line.strip().partition(": ") for line in lines)
+    return {name: re.sub(r"\s+", " ", text) for name, found, text in pairs if found}
 
 
 def _comments_in(source: str) -> dict[str, str]:

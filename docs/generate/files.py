@@ -6,7 +6,7 @@ from importlib.metadata import entry_points
 
 from pydantic import BaseModel
 
-from docs.generate.fields import docstring, field_table, records_below
+from docs.generate.fields import docstring, field_table, record_sections, records_below
 from drivers.plugin import DriverSpec
 from service.core.protocol.models import ProtocolFields, StepFields
 from service.rig import RigSection
@@ -66,6 +66,5 @@ def _page(title: str, about: str, models: dict[str, type[BaseModel]], more: dict
         lines += [f"## {heading}", "", docstring(model), "", *field_table(model, without=_NOT_WRITTEN), ""]
         lines += more.get(heading, [])
         records_below(model, below, without=_NOT_WRITTEN)
-    for name, model in below.items():
-        lines += [f"## {name}", "", docstring(model), "", *field_table(model), ""]
+    lines += record_sections(below, "##")
     return "\n".join(lines)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from docs.generate.fields import docstring, field_table
+from pydantic import BaseModel
+
+from docs.generate.fields import docstring, field_table, record_sections, records_below
 from service.jobs import job_kinds
 from service.jobs.kind import JobRecord
 
@@ -18,6 +20,7 @@ points `orthocapture.jobs`). What a job took from an earlier one stands in its a
 def jobs_text() -> str:
     """A Markdown page of all kinds, those of installed plug-ins included."""
     lines = ["# Job kinds", "", _HEAD]
+    below: dict[str, type[BaseModel]] = {}
     for kind in job_kinds().values():
         replayed = "A replay computes it" if kind.replayed else "A replay computes it if asked to"
         drawn = "the provenance drawing leaves it out" if kind.aside else "the provenance drawing shows it"
@@ -25,9 +28,10 @@ def jobs_text() -> str:
         lines += [f"## {kind.name}", "", f"{words}. {replayed}; {drawn}.", ""]
         for title, model in (("Arguments", kind.arguments), ("Answer", kind.answer)):
             lines += [f"**{title}**", "", *_record(model), ""]
+            records_below(model, below)
+    lines += ["## Records within arguments and answers", "", *record_sections(below)]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def _record(model: type[JobRecord]) -> list[str]:
-    said, _, _ = docstring(model).partition("\n\nAttributes:")
-    return [said, "", *field_table(model)] if model.model_fields else [said]
+    return [docstring(model), "", *field_table(model)] if model.model_fields else [docstring(model)]

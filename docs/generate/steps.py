@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from docs.generate.fields import docstring, field_table, records_below
+from docs.generate.fields import docstring, field_table, record_sections, records_below
 from docs.generate.measure_words import MEANINGS
 from service.core.protocol.models import Protocol, Step
 from service.steps import step_kinds
@@ -49,8 +49,7 @@ def steps_text(protocols: Mapping[str, Protocol]) -> str:
         lines += ["### Result", "", docstring(kind.result), "", *field_table(kind.result), ""]
         records_below(kind.params, below)
     lines += ["## Records of the params", ""]
-    for name, model in below.items():
-        lines += [f"### {name}", "", docstring(model), "", *field_table(model), ""]
+    lines += record_sections(below)
     return _unique_headings("\n".join(lines))
 
 

@@ -17,7 +17,7 @@ from service.core.results.arrival import late_words
 from service.core.run.state import JobState, RunState
 from service.jobs.registration import evaluate, register
 from service.jobs.registration.evaluate import ErrorBudget, Row
-from service.jobs.registration.register import Answer as Registration
+from service.jobs.registration.register import Registration
 
 
 def last_result(protocol: Protocol, state: RunState, kind: str) -> Mapping[str, Any]:

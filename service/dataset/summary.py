@@ -24,7 +24,7 @@ from service.dataset.registrations import (
     registrations,
 )
 from service.jobs.registration.evaluate import ErrorBudget, Row
-from service.jobs.registration.register import Answer as Registration
+from service.jobs.registration.register import Registration
 from service.store.store import Store
 
 

@@ -68,7 +68,7 @@ class Intrinsics(JobRecord):
     warnings: tuple[str, ...] = ()
 
 
-class Details(JobRecord):
+class CalibrationDetails(JobRecord):
     """Of the images and of the intrinsics, where they were solved."""
 
     views_without_board: tuple[str, ...] = ()
@@ -79,7 +79,7 @@ class Answer(JobRecord):
     """The camera and, where solved, the hand-eye transform."""
 
     camera: Camera
-    details: Details = Details()
+    details: CalibrationDetails = CalibrationDetails()
     T_flange_camera: Matrix | None = None
     T_base_board: Matrix | None = None
     hand_eye: HandEye | None = None

@@ -6,7 +6,7 @@ from pydantic import Field
 
 from service.jobs.kind import JobKind, JobRecord
 from service.jobs.records import Photograph, SpheresFound
-from service.jobs.registration.register import Answer as Registration
+from service.jobs.registration.register import Registration
 
 
 class Arguments(JobRecord):

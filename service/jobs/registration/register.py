@@ -24,7 +24,7 @@ class LeaveOneOut(JobRecord):
     spheres: dict[str, tuple[float, ...]]
 
 
-class Answer(JobRecord):
+class Registration(JobRecord):
     """A registration.
 
     Attributes:
@@ -61,7 +61,7 @@ class Answer(JobRecord):
 KIND = JobKind(
     name="register",
     arguments=Arguments,
-    answer=Answer,
+    answer=Registration,
     compute="service.worker.registration.register:register",
     words="registration",
     order=61,

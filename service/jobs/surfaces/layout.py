@@ -25,7 +25,7 @@ class Arguments(JobRecord):
     control: int = 0
 
 
-class Details(JobRecord):
+class LayoutDetails(JobRecord):
     """Near-symmetries (compute/registration/layout.py), and what to do about them."""
 
     problems: tuple[str, ...] = ()
@@ -36,7 +36,7 @@ class Answer(JobRecord):
     """The spheres in the frame of the photograph with most of them, metres."""
 
     spheres_m: tuple[Point, ...]
-    details: Details
+    details: LayoutDetails
 
 
 KIND = JobKind(

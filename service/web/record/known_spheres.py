@@ -14,7 +14,7 @@ from service.core.errors import ComputeError
 from service.core.geometry import Array, align_points, apply
 from service.dataset.registrations import best_registration as best_registration_name
 from service.dataset.registrations import registrations
-from service.jobs.registration.register import Answer as Registration
+from service.jobs.registration.register import Registration
 from service.run_record import RunRecord
 
 SphereKind = Literal["registration", "control", "sphere"]

@@ -19,7 +19,7 @@ from service.core.records.events import ArtefactRef, ViewpointCaptured
 from service.core.units import metres, mm
 from service.dataset.registrations import registrations
 from service.dataset.scene_view import FACES_SHOWN, Scene, SceneMesh, SceneSphere, decimated
-from service.jobs.registration.register import Answer as Registration
+from service.jobs.registration.register import Registration
 from service.run_record import RunRecord
 from service.web.record.images import captures_of
 from service.web.record.known_spheres import (

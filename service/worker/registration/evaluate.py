@@ -37,7 +37,7 @@ from service.core.records.events import ArtefactRef
 from service.dataset.registrations import best_row
 from service.jobs.records import Hash, Photograph, SpheresFound
 from service.jobs.registration import evaluate as job
-from service.jobs.registration.register import Answer as Registration
+from service.jobs.registration.register import Registration
 from service.worker.camera import camera_of
 from service.worker.job import JobAnswer, JobContext
 

@@ -102,7 +102,7 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
     if left_out is not None:
         measures["leave_one_out_mm"] = left_out["mean_radial_error_mm"]
     ref = context.keep_json({**result, **_residuals(answer, names)}, kind="registration", name=f"{source}.json")
-    return JobAnswer(measures, (ref,), job.Answer.model_validate(result))
+    return JobAnswer(measures, (ref,), job.Registration.model_validate(result))
 
 
 def _cameras(names: Sequence[str], T_scan_camera: Array) -> dict[str, list[list[float]]]:
