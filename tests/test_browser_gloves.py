@@ -31,7 +31,7 @@ from tests.support.web import password_of, web_site
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 BADGE = "0004711815"
 DENSE = PROTOCOL.replace("count: 4", "count: 54")  # as many viewpoints as a station of the paper's protocol
-AT_THE_LENS = PROTOCOL.replace("id: fixation", "id: camera_set_up")
+AT_THE_LENS = PROTOCOL.replace("id: fixation", "id: camera_set_up\n    drawing: camera")
 # A badge reader's keys: far faster than the test could press them; the letters end in the focused field.
 READ = """(badge) => {
     for (const key of badge) {

@@ -152,7 +152,9 @@ class StepFields(Record):
     title: Text  # what people read
     why: str = ""  # the reason, for the technician
     instructions: str = ""  # what the technician should do
-    drawing: str = ""  # in service/web/run/drawings, shown beside the instructions; "": that of the step kind
+    # In service/web/run/drawings, shown beside the instructions; "": that of the step kind. A checklist with `camera`
+    # offers the live view, because the lens is focused there.
+    drawing: str = ""
     checklist: tuple[Text, ...] = ()  # items to tick before the step can be confirmed
     gates: tuple[Gate, ...] = ()  # measured numbers with their limits
     sign: bool = False  # whether a person signs before the step passes
