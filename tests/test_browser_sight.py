@@ -120,7 +120,7 @@ def test_sound_and_notification_are_by_choice(server: Served, browser: Browser) 
         record(server, run_id, go, StepStarted(step="capture", attempt=1), failed)
         expect(page.get_by_role("heading", name="Capture did not work")).to_be_visible(timeout=20_000)
         assert page.evaluate("heard") == [880, 440, 880, 440]
-        assert page.evaluate("noted") == [["Stopped: Capture: No link → look at the device.", f"Run {run_id}"]]
+        assert page.evaluate("noted") == [["Stopped: Capture: No link → check the device.", f"Run {run_id}"]]
         expect(page).to_have_title(re.compile("^Stopped: Capture: No link"))
         # The choice belongs to the screen: another page of it also reports, here that the run has ended.
         tablet.go("/account")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from service.audit.replay.replay import ScratchStore
 from service.compute.poses.sfm.front_end import pairs_of
 from service.compute.poses.sfm.options import SfmOptions
 from service.core.records.events import ArtefactRef
-from service.worker.job import JobContext
+from service.worker.job import JobContext, RecordedContext
 from service.worker.loop import HANDLERS
 from tests.support.textured_scene import camera_of_width, render, ring_of_poses, slabs
 
@@ -39,8 +38,8 @@ class Jobs:
     def run(self, kind: str, **arguments: Any) -> tuple[ArtefactRef, ...]:
         scratch = self.folder / f"scratch{len(list(self.folder.iterdir()))}"
         scratch.mkdir()
-        given: Mapping[str, Any] = {**self.common, **arguments}
-        context = JobContext[Mapping[str, Any]](given, self.store, scratch, lambda _w, _d, _t: None)
+        given = {**self.common, **arguments}
+        context: RecordedContext = JobContext(given, self.store, scratch, lambda _w, _d, _t: None)
         return tuple(HANDLERS[kind](context).artefacts)
 
 

@@ -180,7 +180,7 @@ def test_joints_of_another_arm_are_refused() -> None:
     assert matching_arm(session.joints_rad, session.T_base_flange) is UR10E
     wrong = Session(session.T_base_flange, session.T_camera_board, session.corners, np.degrees(session.joints_rad))
     assert matching_arm(wrong.joints_rad, wrong.T_base_flange) is None
-    with pytest.raises(DataError, match="what the joints of a UR10e give"):
+    with pytest.raises(DataError, match="off the forward kinematics of a UR10e"):
         _with_joints(wrong)
 
 

@@ -54,7 +54,11 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     spheres = {name: None if found is None else found.answer for name, found in measured.items()}
     scan = spheres["scan"]
     if scan is None:
-        raise ConfigurationError("an evaluation needs the registered scan", where=f"step {context.step.id}")
+        raise ConfigurationError(
+            "an evaluation needs the registered scan",
+            where=f"step {context.step.id}",
+            remedy=f"Repeat step {params.scan}, which was skipped, then this one",
+        )
     arguments = evaluate.Arguments(
         images=tuple(captured_images(context, params.images_of)),
         registrations=registrations,
