@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from service.core.errors import ConfigurationError
+from service.core.errors import ConfigurationError, IntegrityError
 from service.core.jobs.references import Each, Reference
 from service.core.records.events import ArtefactRef, View, ViewHeld, ViewpointCaptured
 from service.core.run.state import JobState, StepState
@@ -33,9 +33,17 @@ class Taken(Generic[R]):
 
 
 def taken(context: StepContext, step_id: str, kind: JobKind[Any, R]) -> Taken[R]:
-    """What an earlier step's job of a kind answered. Raises ConfigurationError if the step has no result."""
+    """What an earlier step's job of a kind answered. Raises ConfigurationError if the step has no such answer."""
     result = result_of(context, step_id)
-    return Taken(kind.read_answer(result), answered_by(context.run.steps[step_id]))
+    try:
+        answer = kind.read_answer(result)
+    except IntegrityError as error:
+        raise ConfigurationError(
+            f"step {context.step.id!r} needs {kind.words} of step {step_id!r}, which has none",
+            where=f"step {context.step.id}",
+            remedy="Name a step that gives it in the protocol",
+        ) from error
+    return Taken(answer, answered_by(context.run.steps[step_id]))
 
 
 def answered_by(state: StepState) -> JobState | None:
