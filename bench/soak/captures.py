@@ -78,7 +78,7 @@ def protocol_of(folder: Path, planned: int, *, calibrated: bool) -> Path:
 
     If `calibrated`, a camera calibration precedes the capture and a registration is planned after it but never
     reached, so the worker computes features and matches for every image. Live predictions are left out: each of their
-    jobs names all the images before it, so their cost is not linear (docs/howto/soak.md).
+    jobs reads what was found in all images before it, so their cost is not linear (docs/howto/soak.md).
     """
     whole = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
     steps: dict[str, dict[str, Any]] = {step["id"]: step for step in whole["steps"]}
