@@ -84,7 +84,7 @@ def test_the_verdict_at_the_edges() -> None:
 def test_without_any_figures_it_says_that_it_guesses() -> None:
     found = forecast(protocol(108), None, Usage(), None, 5 * GB, simulated=False)
     assert (found.known_from, found.verdict) == ("a guess", "short")
-    assert "by a guess" in found.words
+    assert "from a guess" in found.words
     assert "5.0 GB are free, and the run needs about 11.8 GB more (108 views of 100 MB each" in found.words
 
 

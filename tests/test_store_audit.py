@@ -358,4 +358,4 @@ def test_cli_errors_say_what_to_do(data: Path, tmp_path: Path) -> None:
 def test_cli_reads_the_folder_from_the_environment(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ORTHOCAPTURE_DATA", str(data))
     assert run_cli("verify")[0] == 0
-    assert "Check the evidence" in run_cli("verify", "--help")[1]
+    assert "Verify the evidence" in run_cli("verify", "--help")[1]
