@@ -21,10 +21,10 @@ from bench.machine import commit, machine
 from service.core.records.events import StepNote
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.large_run import Sizes, write_large_run
-from tests.support.store import captured
-from tests.support.store import start_run as start_small_run
-from tests.support.web import Browser, web_site
+from tests.support.pages.web import Browser, web_site
+from tests.support.record.store import captured
+from tests.support.record.store import start_run as start_small_run
+from tests.support.runs.large_run import Sizes, write_large_run
 
 RESULTS = Path(__file__).parent / "results"
 LIMIT_MS = 200.0

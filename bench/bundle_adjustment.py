@@ -35,8 +35,8 @@ from service.compute.registration.identity import identify
 from service.compute.registration.settings import RegistrationSettings
 from service.compute.registration.solve import register
 from service.core.geometry import Array, align_points, apply
-from tests.support.sphere_images import RADIUS_M, REGISTRATION_M
-from tests.support.tracked_scene import TrackedScene, pose_errors, tracked_scene
+from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M
+from tests.support.scenes.tracked_scene import TrackedScene, pose_errors, tracked_scene
 
 RESULTS = Path(__file__).parent / "results"
 # Images x points, of which seven images of ten see each; 40x30 is a scene with next to no texture.

@@ -21,7 +21,7 @@ from service.compute.calibration.board.board import Board, find_board
 from service.compute.camera_model import CameraModel
 from service.compute.images.files import read_grey
 from service.core.geometry import apply, transform
-from tests.support.board_images import Photography, checkerboard, photograph
+from tests.support.scenes.board_images import Photography, checkerboard, photograph
 
 RESULTS = Path(__file__).parent / "results"
 BOARD = Board(16, 23, 0.015)

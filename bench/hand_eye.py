@@ -19,7 +19,7 @@ from service.compute.arm.kinematics import arm_model
 from service.compute.calibration.hand_eye.estimate import HandEyeResult, calibrate_hand_eye
 from service.core.geometry import Array
 from simulators.world import Scene
-from tests.support.board_sessions import (
+from tests.support.scenes.board_sessions import (
     T_FLANGE_CAMERA,
     OddScene,
     Session,

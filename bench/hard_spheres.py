@@ -26,8 +26,8 @@ from service.compute.markers.detect import detect_spheres
 from service.compute.markers.detectors import options_for
 from service.compute.markers.records import DetectionOptions
 from service.core.geometry import Array
-from tests.support.sphere_conditions import Look, render_look
-from tests.support.sphere_images import RADIUS_M, camera
+from tests.support.scenes.sphere_conditions import Look, render_look
+from tests.support.scenes.sphere_images import RADIUS_M, camera
 
 RESULTS = Path(__file__).parent / "results"
 RIGHT = 0.05  # in radii: an outline within this distance and size difference counts as correct
@@ -183,10 +183,10 @@ def main() -> None:
     file.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
     text = f"""# Spheres that were missed or mistaken
 
-`python -m bench.hard_spheres --label NAME`, rendered by tests/support/sphere_conditions.py with exact outlines, 280
-and 600 px wide; {document["machine"]["processor"]}, {document["machine"]["cores"]} cores, shared with other work. CPU
-seconds of one thread an image. Right: place and radius within {RIGHT:.0%} of the radius; ring: at a sphere, but of
-another size; false: where none is. The largest radius is told (0.4 of the width) where spheres are large or glossy.
+`python -m bench.hard_spheres --label NAME`, rendered by tests/support/scenes/sphere_conditions.py with exact
+outlines, 280 and 600 px wide; {document["machine"]["processor"]}, {document["machine"]["cores"]} cores, shared with
+other work. CPU seconds of one thread an image. Right: place and radius within {RIGHT:.0%} of the radius; ring: at a
+sphere, but of another size; false: where none is. The largest radius is told (0.4 of the width) where spheres are large or glossy.
 
 {_table(document["hard"], ("right", "ring", "false", "radius_off_px", "cpu_s"))}
 

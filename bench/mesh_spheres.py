@@ -15,7 +15,7 @@ import numpy as np
 
 from service.compute.surfaces.mesh_spheres import locate_spheres
 from service.core.errors import ComputeError
-from tests.support.sphere_meshes import RADIUS_M, MeshBuilder, cap, clutter, scattered_centres
+from tests.support.scenes.sphere_meshes import RADIUS_M, MeshBuilder, cap, clutter, scattered_centres
 
 # name: half angle of the caps (°), white and correlated noise (m), correlation length (m), subdivisions, cloud
 CASES: dict[str, tuple[float, float, float, float, int, bool]] = {

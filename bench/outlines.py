@@ -1,6 +1,6 @@
 """Outlines against ground truth by condition: bias, rms, common shift, covariance consistency, recall, precision.
 
-Two renderers: the project's scenes (bench/scenes.py) and tests/support/sphere_conditions.py.
+Two renderers: the project's scenes (bench/scenes.py) and tests/support/scenes/sphere_conditions.py.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import DEFAULTS, DetectionOptions
 from service.core.geometry import Array
-from tests.support.sphere_conditions import Look, render_look
-from tests.support.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, camera, scene
+from tests.support.scenes.sphere_conditions import Look, render_look
+from tests.support.scenes.sphere_images import CONTROL_M, RADIUS_M, REGISTRATION_M, camera, scene
 
 RESULTS = Path(__file__).parent / "results"
 TWO_LAMPS = (((0.8, -0.2, -0.5), 0.45), ((-0.7, -0.4, -0.6), 0.4))

@@ -23,8 +23,8 @@ from service.people.sessions import People
 from service.rig import Rig, load_rig
 from service.run_start import recorded_run
 from service.store.store import Store
-from tests.support.attended import attended
-from tests.support.browser import DESKTOP, PASSWORD, TABLET, Screen, add_people, chromium, screen, served
+from tests.support.pages.browser import DESKTOP, PASSWORD, TABLET, Screen, add_people, chromium, screen, served
+from tests.support.runs.attended import attended
 
 FOLDER = Path(__file__).parents[1] / "docs" / "screens"
 PEOPLE: tuple[tuple[str, Role], ...] = (("tina", "technician"), ("sam", "supervisor"), ("otto", "auditor"))

@@ -23,8 +23,8 @@ from service.compute.markers.cones import Cone, cone_of_sphere
 from service.compute.markers.detectors import DETECTORS
 from service.compute.markers.records import DEFAULTS, SphereOutline
 from service.core.geometry import Array
-from tests.support.sphere_conditions import COLOURS_BGR, Look, Picture, picture_of
-from tests.support.sphere_images import RADIUS_M, camera
+from tests.support.scenes.sphere_conditions import COLOURS_BGR, Look, Picture, picture_of
+from tests.support.scenes.sphere_images import RADIUS_M, camera
 
 RESULTS = Path(__file__).parent / "results"
 CONDITIONS = LOOKS | {
@@ -167,7 +167,7 @@ def main() -> None:
     lines = [
         "# Spheres under many conditions", "",
         f"{options.images} images a condition, {options.width} px wide, {options.spheres} spheres each at random "
-        f"places (tests/support/sphere_conditions.py); expected: {EXPECTED:.0%} of the outline in sight. "
+        f"places (tests/support/scenes/sphere_conditions.py); expected: {EXPECTED:.0%} of the outline in sight. "
         "Errors in px: axis (each direction) and radius together. Overconfident: beyond "
         f"{WRONG_PX} px and {WRONG_SIGMA:.0f} sigma.", "",
         "| condition | found | recall | false | precision | rms px | median px | chi² median / 95 % | overconfident "

@@ -16,7 +16,7 @@ from typing import Any
 
 from bench.machine import REPOSITORY, commit, machine
 from bench.whole_run import whole_run
-from tests.support.shortened import shortened
+from tests.support.runs.shortened import shortened
 
 RESULTS = Path(__file__).parent / "results"
 PROTOCOL = REPOSITORY / "protocols" / "exvivo_spine.yaml"

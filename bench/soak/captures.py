@@ -26,8 +26,8 @@ from service.run_record import RunFollower
 from service.run_start import recorded_run
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
-from tests.support.serving import Server, serving
+from tests.support.pages.serving import Server, serving
+from tests.support.rig.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
 
 _HOST = "127.0.0.81"
 _SPEED_UP = 20

@@ -21,7 +21,7 @@ from bench.soak.large_record import STEP, TIMED, LargeRecord
 from service.cli.main import app
 from service.core.records.events import StepNote
 from service.store.verification.verify import verify
-from tests.support.web import Browser, web_site
+from tests.support.pages.web import Browser, web_site
 
 MOST_EXPONENT = 1.15
 PAGE_S = 1.0  # limit for a page of the largest run, requested again or following the run

@@ -21,7 +21,7 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.records import NewArtefact, NewJob
 from service.store.store import Store
-from tests.support.bench_run import PROTOCOL, Bench
+from tests.support.runs.bench_run import PROTOCOL, Bench
 
 STEP = "capture"
 TIMED = 200  # viewpoints before each size that are recorded with every fsync and timed

@@ -26,7 +26,7 @@ from service.store.records import NewJob
 from service.store.store import Store
 from service.worker import loop
 from service.worker.job import JobAnswer, RecordedContext
-from tests.support.bench_run import Bench
+from tests.support.runs.bench_run import Bench
 
 KIND = "coverage_points"  # a job kind from which no page reads anything
 _COMPUTED_S = 0.02  # computing time of a job

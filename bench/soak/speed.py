@@ -20,7 +20,7 @@ from typing import Any
 from service.store.records import NewArtefact
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.store import captured, start_run
+from tests.support.record.store import captured, start_run
 
 LEAST = 0.8  # minimum speed as a fraction of the tools' speed
 

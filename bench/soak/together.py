@@ -25,8 +25,8 @@ from service.run_start import start_run
 from service.steps import params_models
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.bench_run import PROTOCOL
-from tests.support.serving import serving
+from tests.support.pages.serving import serving
+from tests.support.runs.bench_run import PROTOCOL
 
 WAIT_S = 10.0
 WORKERS = 4

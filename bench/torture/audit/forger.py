@@ -26,7 +26,7 @@ from service.store.signatures.checkpoints import RowsDigest, key_fingerprint
 from service.store.signatures.checkpoints import statement as signed_text
 from service.store.signatures.keys import public_bytes
 from service.store.signatures.log import NAME, SignatureLog
-from tests.support.tampering import WORDS_AGAIN
+from tests.support.record.tampering import WORDS_AGAIN
 
 CAN_WRITE = ("database", "site's chain", "log", "second place")
 KEYS = ("no key", "a key of his own", "the key in use", "every key")

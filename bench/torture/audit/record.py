@@ -27,9 +27,9 @@ from service.store.signatures.log_copy import bring_up_to_date
 from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.signatures.timestamps import Authority
 from service.store.store import Store
-from tests.support.bench_run import PROTOCOL, begin_run
-from tests.support.time_stamp_authority import time_stamp_authority
-from tests.support.web import PIN, QUICK_HASHES, password_of, populate
+from tests.support.pages.web import PIN, QUICK_HASHES, password_of, populate
+from tests.support.record.time_stamp_authority import time_stamp_authority
+from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 COPY = "second_place.jsonl"
 WAL_NAME = "orthocapture.sqlite-wal"

@@ -34,7 +34,7 @@ from service.steps import params_models
 from service.store.files.leftovers import leftovers, remove_leftovers
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
+from tests.support.rig.rig import REPOSITORY, command, simulated_rig, without_calibration_and_ct
 
 _HOST = "127.0.0.71"
 _VIEWS = 6

@@ -30,7 +30,7 @@ from service.store.signatures.log_copy import keep_elsewhere
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.worker import loop
-from tests.support.bench_rig import ScriptedOperator
+from tests.support.rig.bench_rig import ScriptedOperator
 
 _SOFTWARE = software_versions()
 Role = Literal["begin", "runner", "worker", "web"]

@@ -22,9 +22,9 @@ from service.core.records.import_list import ImportedFile, ImportedView, ImportL
 from service.steps.capture.viewpoints import Arc, Viewpoint, ViewpointSet, plan_viewpoints
 from service.steps.context import StationLayout
 from service.store.durable_effects import utc_text
-from tests.support.bench_rig import BenchArm, BenchCamera, BenchRig, numbered
-from tests.support.sphere_images import REGISTRATION_M, camera, render
-from tests.support.sphere_meshes import MeshBuilder, cap
+from tests.support.rig.bench_rig import BenchArm, BenchCamera, BenchRig, numbered
+from tests.support.scenes.sphere_images import REGISTRATION_M, camera, render
+from tests.support.scenes.sphere_meshes import MeshBuilder, cap
 
 WIDTH = 600
 CAMERA = camera(WIDTH)

@@ -21,7 +21,7 @@ from service.rig import load_rig
 from service.station import Station
 from service.steps.context import LeaveToMove, StationLayout
 from simulators.__main__ import main as simulate
-from tests.support.bench_rig import BenchArm, BenchCamera, numbered
+from tests.support.rig.bench_rig import BenchArm, BenchCamera, numbered
 
 _READY_S = 30.0
 _STATION = {"robot": "robot", "scene_centre_m": [0.75, 0.0, -0.1], "approach_azimuth_deg": 180}

@@ -12,8 +12,8 @@ from service.core.geometry import Array, transform
 from simulators.ct_suite import write_series
 from simulators.ct_volume import Grid
 from simulators.faults import Fault, FaultPlan
-from tests.support.sphere_images import REGISTRATION_M
-from tests.support.sphere_meshes import MeshBuilder, cap
+from tests.support.scenes.sphere_images import REGISTRATION_M
+from tests.support.scenes.sphere_meshes import MeshBuilder, cap
 
 SCAN, CT = "scan.ply", "ct"
 FIVE = "five.ply"

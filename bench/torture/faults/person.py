@@ -13,8 +13,8 @@ from service.core.run.decide import AskOperator
 from service.core.run.state import RunState
 from service.monitor.snapshot import Doing
 from service.runner.operator import AnswerBy
-from tests.support.bench_rig import ScriptedOperator, agree, answer
-from tests.support.ur_rtde_protocol import RtdeClient
+from tests.support.rig.bench_rig import ScriptedOperator, agree, answer
+from tests.support.rig.ur_rtde_protocol import RtdeClient
 
 _MAY_MOVE = 0b11  # safety_status_bits: normal, reduced
 

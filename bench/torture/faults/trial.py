@@ -33,7 +33,7 @@ from service.steps import params_models
 from service.store.database.engine import database_path
 from service.store.store import Store
 from service.worker import loop
-from tests.support.bench_rig import BenchArm, BenchCamera
+from tests.support.rig.bench_rig import BenchArm, BenchCamera
 
 _UNSIGNED = "the record could not be signed"
 _SESSIONS = 3  # programs that drive the run in turn, if an error ends them

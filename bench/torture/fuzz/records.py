@@ -37,9 +37,9 @@ from service.store.signatures.signing import checkpoint, rotate_key
 from service.store.signatures.timestamps import stamped_bytes, timestamp_findings
 from service.store.store import Store
 from service.store.verification.verify import verify
-from tests.support.bench_run import PROTOCOL, begin_run
-from tests.support.time_stamp_authority import time_stamp_authority
-from tests.support.web import Browser, web_site
+from tests.support.pages.web import Browser, web_site
+from tests.support.record.time_stamp_authority import time_stamp_authority
+from tests.support.runs.bench_run import PROTOCOL, begin_run
 
 MEMBERS = ("manifest.json", "events.jsonl", "site_events.jsonl", "artefacts.jsonl", "jobs.jsonl", "checkpoints.jsonl",
            "keys.jsonl", "ro-crate-metadata.json", "manifest.sig")  # fmt: skip

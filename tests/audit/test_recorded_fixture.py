@@ -1,0 +1,52 @@
+"""A run recorded by an earlier version opens, verifies and replays with the current one."""
+
+from __future__ import annotations
+
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from service.audit.record.run import read_run
+from service.audit.replay.replay import replay
+from service.core.records.events import JobEnqueued
+from service.store.verification.verify import verify
+
+RECORDED = Path(__file__).parents[1] / "data" / "recorded"
+
+pytestmark = pytest.mark.timeout(300)
+
+
+def quiet(_what: str, _done: int, _total: int) -> None:
+    """Ignore the progress."""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data folder of 2026-11-23, whose jobs hold copies of earlier results."""
+    folder = tmp_path_factory.mktemp("recorded")
+    with tarfile.open(RECORDED / "2026-11-23.tar.xz") as archive:
+        archive.extractall(folder, filter="data")
+    return folder / "data"
+
+
+def test_it_opens_and_its_events_add_up(data: Path) -> None:
+    run = read_run(data, "latest")
+    assert run.state.status == "completed"
+    kinds = {event.payload.job_kind for event in run.events if isinstance(event.payload, JobEnqueued)}
+    assert {"calibrate", "live_view", "live_summary", "locate_spheres", "register", "evaluate"} <= kinds
+    assert run.summary().best() == "robot_corrected"
+
+
+def test_it_verifies(data: Path) -> None:
+    report = verify(data)
+    assert report.first_fault is None
+    assert report.ok
+
+
+def test_its_computations_give_the_same_again(data: Path) -> None:
+    kinds = ("locate_spheres", "live_summary", "evaluate")  # others take minutes
+    report = replay(read_run(data, "latest"), kinds=kinds, end_to_end=True, progress=quiet)
+    assert report.verdict in ("identical", "within_tolerance")
+    assert {job.kind for job in report.jobs} == set(kinds)
+    assert not any(gate.changed for gate in report.gates)

@@ -1,0 +1,267 @@
+"""The light box over a pseudo-terminal and a socket: readings, noise, silence, unplugging."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import threading
+import time
+import tty
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import serial
+
+from drivers.errors import DeviceFaultError, DeviceRefusedError, DeviceTimeoutError, DeviceUnavailableError
+from drivers.interfaces import TowerLight
+from drivers.lightbox import DRIVER, LightboxConfig, SerialLightbox
+from tests.support.rig.simulator_process import simulator
+
+
+def box(port: str | Path, timeout_s: float = 0.4) -> SerialLightbox:
+    return SerialLightbox(LightboxConfig(port=str(port), timeout_s=timeout_s))
+
+
+@contextmanager
+def opened(port: str | Path, timeout_s: float = 0.4) -> Generator[SerialLightbox]:
+    driver = box(port, timeout_s)
+    try:
+        driver.open()
+        yield driver
+    finally:
+        driver.close()
+
+
+def faults(**fields: object) -> tuple[str, str]:
+    return "--faults", json.dumps([{"device": "lightbox", **fields}])
+
+
+def test_the_signal_tower(tmp_path: Path) -> None:
+    link = tmp_path / "lightbox"
+    with simulator("lightbox", "--link", str(link)) as running, opened(link) as driver:
+        assert all(driver.show_tower(light) for light in TowerLight)
+        with serial.Serial(str(link), timeout=1) as other:
+            other.write(b"TOWER?\nTOWER BLUE\n")
+            assert other.read_until(b"\n") + other.read_until(b"\n") == b"TOWER RED\r\nERR 2 wrong argument\r\n"
+        assert running.process.poll() is None
+
+
+def test_a_box_without_a_tower_is_no_error_and_is_asked_once(tmp_path: Path) -> None:
+    link = tmp_path / "lightbox"
+    with simulator("lightbox", "--link", str(link), "--without-tower"), opened(link) as driver:
+        assert driver.open().firmware == "1.2"
+        assert not driver.show_tower(TowerLight.STOPPED)
+        assert driver.read().light_lux == 45_000.0
+    asked: list[bytes] = []
+
+    def old(line: bytes) -> bytes:
+        asked.append(line)
+        return b"*IDN a,b,c,1.0\n" if line.startswith(b"*IDN") else b"ERR 1 unknown request\n"
+
+    with answering(old) as port, opened(port) as driver:
+        assert not driver.show_tower(TowerLight.WORKING)
+        assert not driver.show_tower(TowerLight.STOPPED)
+        assert sum(line.startswith(b"TOWER") for line in asked) == 1
+
+
+def test_a_tower_that_stays_dark_is_a_fault() -> None:
+    dark = answering(lambda line: b"*IDN a,b,c,1.3\n" if line[:1] == b"*" else b"TOWER OFF\n")
+    with dark as port, opened(port) as driver, pytest.raises(DeviceFaultError, match="it shows OFF"):
+        driver.show_tower(TowerLight.STOPPED)
+
+
+@contextmanager
+def answering(reply: Callable[[bytes], bytes]) -> Generator[str]:
+    """A pseudo-terminal on which every line that arrives is answered with `reply`."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    done = threading.Event()
+
+    def serve() -> None:
+        while not done.is_set():
+            line = os.read(master, 256)
+            if not done.is_set():
+                os.write(master, reply(line))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        done.set()
+        os.write(slave, b"\n")  # wakes the reader
+        thread.join()
+        os.close(slave)
+        os.close(master)
+
+
+def test_reads_switches_and_counts(tmp_path: Path) -> None:
+    link = tmp_path / "lightbox"
+    with simulator("lightbox", "--link", str(link)) as running, opened(link) as driver:
+        identity = driver.open()
+        assert (identity.kind, identity.serial, identity.firmware) == ("lightbox", "LB-0001", "1.3")
+        reading = driver.read()
+        assert (reading.light_lux, reading.temperature_c) == (45_000.0, 21.5)
+        assert not reading.shutter_relay_closed
+        driver.set_shutter_relay(True)
+        assert driver.read().shutter_relay_closed
+        assert driver.pedal_presses() == 0
+        running.process.send_signal(signal.SIGUSR1)
+        deadline = time.monotonic() + 5
+        while driver.pedal_presses() == 0 and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert driver.pedal_presses() == 1
+        report = driver.report()
+        assert report.details["light"] == "45000.0 lx"
+        assert report.problems == ()
+    assert not link.is_symlink()
+
+
+@pytest.mark.parametrize("kind", ["drop", "truncate", "corrupt", "banner"])
+def test_one_spoiled_reply_is_overcome(tmp_path: Path, kind: str) -> None:
+    link = tmp_path / "lightbox"
+    plan = faults(on="LIGHT?", nth=1, kind=kind)
+    with simulator("lightbox", "--link", str(link), *plan), opened(link) as driver:
+        assert driver.read().light_lux == 45_000.0
+        assert driver.read().temperature_c == 21.5
+
+
+def test_a_late_reply_is_not_taken_for_another(tmp_path: Path) -> None:
+    link = tmp_path / "lightbox"
+    plan = faults(on="LIGHT?", nth=1, kind="stall", value=0.6)
+    with simulator("lightbox", "--link", str(link), *plan), opened(link) as driver:
+        reading = driver.read()
+        assert (reading.light_lux, reading.temperature_c) == (45_000.0, 21.5)
+
+
+def test_silence_is_a_timeout(tmp_path: Path) -> None:
+    link = tmp_path / "lightbox"
+    plan = faults(on="TEMP?", nth=1, times=3, kind="drop")
+    with simulator("lightbox", "--link", str(link), *plan), opened(link, 0.1) as driver:
+        with pytest.raises(DeviceTimeoutError, match="TEMP") as caught:
+            driver.read()
+        assert caught.value.remedy
+        assert driver.read().temperature_c == 21.5
+
+
+def test_a_sensor_fault_is_a_refusal_and_a_problem_in_the_report(tmp_path: Path) -> None:
+    link = tmp_path / "lightbox"
+    plan = faults(on="LIGHT?", nth=1, times=2, kind="reject")
+    with simulator("lightbox", "--link", str(link), *plan), opened(link) as driver:
+        with pytest.raises(DeviceRefusedError, match="sensor fault"):
+            driver.read()
+        assert "sensor fault" in driver.report().problems[0]
+
+
+def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
+    link = tmp_path / "lightbox"
+    plan = faults(on="LIGHT?", nth=1, kind="unplug", value=0.3)
+    with simulator("lightbox", "--link", str(link), *plan), opened(link) as driver:
+        with pytest.raises(DeviceUnavailableError) as caught:
+            driver.read()
+        assert str(link) in caught.value.where
+        deadline = time.monotonic() + 5
+        while not link.exists() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert driver.read().light_lux == 45_000.0
+
+
+def test_a_box_goes_on_after_a_client_that_asked_and_never_read(tmp_path: Path) -> None:
+    """Its answers filled the line, and the box blocked for ever (found by bench/torture/fuzz)."""
+    with simulator("lightbox", "--link", str(tmp_path / "box")):
+        with serial.Serial(str(tmp_path / "box"), timeout=0.5, write_timeout=5) as rude:
+            for _ in range(400):
+                rude.write(b"*IDN?\n" * 10)
+                time.sleep(0.001)
+            rude.reset_input_buffer()
+        with opened(tmp_path / "box", timeout_s=2) as driver:
+            assert driver.read().light_lux == 45_000.0
+
+
+def test_no_such_port() -> None:
+    for port in ("/dev/does-not-exist", "socket://127.0.0.1:1", "nonsense://x"):
+        driver = DRIVER.build(DRIVER.config.model_validate({"port": port}))
+        with pytest.raises(DeviceUnavailableError) as caught:
+            driver.open()
+        assert caught.value.where == port
+        driver.close()
+
+
+def test_another_device_on_the_port() -> None:
+    with answering(lambda _: b"*IDN Acme,Power supply\n") as port:
+        driver = box(port)
+        with pytest.raises(DeviceFaultError, match="not a light box"):
+            driver.open()
+        driver.close()
+    with answering(lambda _: b"\xff\xfe\x00garbage") as port:
+        driver = box(port, 0.1)
+        with pytest.raises(DeviceTimeoutError, match="no usable reply"):
+            driver.open()
+        driver.close()
+
+
+def test_a_relay_that_does_not_switch_is_a_fault() -> None:
+    with answering(lambda _: b"SHUTTER 0\n") as port:
+        driver = box(port)
+        with pytest.raises(DeviceFaultError, match="did not switch"):
+            driver.set_shutter_relay(True)
+        driver.close()
+
+
+def test_values_that_are_not_numbers_are_skipped() -> None:
+    replies = iter([b"LIGHT nan\n", b"LIGHT 4x\nLIGHT 12.5\n", b"TEMP 20\n", b"SHUTTER 1.5\n", b"SHUTTER 1\n"])
+    with answering(lambda _: next(replies)) as port:
+        driver = box(port, 0.15)
+        reading = driver.read()
+        assert (reading.light_lux, reading.shutter_relay_closed) == (12.5, True)
+        driver.close()
+
+
+def test_over_a_socket() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            link, _ = server.accept()
+            with link, link.makefile("rb") as lines:
+                link.sendall(b"# banner\r\n")
+                for line in lines:
+                    link.sendall(b"*IDN a,b,c,d\r\n" if line.startswith(b"*IDN?") else b"PEDAL 7\r\n")
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with opened(f"socket://127.0.0.1:{server.getsockname()[1]}") as driver:
+            assert driver.pedal_presses() == 7
+        thread.join()
+
+
+def test_the_box_asks_the_world(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        answer = {"light_lux": 1234.5, "temperature_c": 19.25, "pedal_presses": 3, "T_world_camera": []}
+        done = threading.Event()
+
+        def serve() -> None:
+            server.settimeout(0.2)
+            while not done.is_set():
+                try:
+                    link, _ = server.accept()
+                except TimeoutError:
+                    continue
+                with link, link.makefile("rb") as lines:
+                    assert json.loads(lines.readline()) == {"op": "view"}
+                    link.sendall(json.dumps(answer).encode() + b"\n")
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        try:
+            world = f"127.0.0.1:{server.getsockname()[1]}"
+            with simulator("lightbox", "--world", world) as running, opened(running.ready["port"]) as driver:
+                reading = driver.read()
+                assert (reading.light_lux, reading.temperature_c) == (1234.5, 19.25)
+                assert driver.pedal_presses() == 3
+        finally:
+            done.set()
+            thread.join()

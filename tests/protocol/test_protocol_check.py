@@ -1,0 +1,56 @@
+"""`orthocapture protocol check` knows each kind's measures, their units, and plausible limits."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from service.cli.main import app
+
+PROTOCOLS = Path(__file__).parents[2] / "protocols"
+
+
+def _check(file: Path, *more: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["protocol", "check", str(file), *more], catch_exceptions=False)
+    return done.exit_code, done.output
+
+
+@pytest.mark.parametrize("file", sorted(PROTOCOLS.glob("*.yaml")), ids=lambda file: file.stem)
+def test_our_protocols_are_credible(file: Path) -> None:
+    status, words = _check(file)
+    assert status == 0, words
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("measure: rms_px,", "measure: rms_pix,", "calibration measures no 'rms_pix'; did you mean 'rms_px'?"),
+        ("max: 0.5, unit: px", "max: 0.5, unit: mm", "rms_px is in px, not in mm"),
+        ("radius_mm: 15", "radius_mm: 0.015", "0.015 mm is not credible: 1 to 100 mm"),
+        ("square_mm: 15", "square_mm: 0.015", "0.015 mm is not credible: 0.5 to 1000 mm"),
+        ("measure: coverage, min: 0.9", "measure: coverage, min: 90", "a limit of 90 on coverage is not credible"),
+        ("measure: robot_corrected_rms_px", "measure: robo_rms_px", "registration measures no 'robo_rms_px'"),
+    ],
+)
+def test_what_cannot_be_meant_is_said_by_line(tmp_path: Path, old: str, new: str, words: str) -> None:
+    text = (PROTOCOLS / "exvivo_spine.yaml").read_text()
+    assert old in text
+    file = tmp_path / "protocol.yaml"
+    file.write_text(text.replace(old, new, 1))
+    status, said = _check(file)
+    assert status == 1
+    assert words in said
+    assert f"{file}:{text[: text.index(old)].count(chr(10)) + 1}" in said
+
+
+def test_a_station_that_the_rig_has_not_is_said(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    station = "{robot: robot, scene_centre_m: [0, 0, 0], approach_azimuth_deg: 0}"
+    rig.write_text(f"name: r\ndevices:\n  robot: {{driver: ur}}\nstations: {{station_1: {station}}}\n")
+    file = PROTOCOLS / "exvivo_spine.yaml"
+    assert _check(file)[0] == 0
+    status, said = _check(file, "--rig", str(rig))
+    assert status == 1
+    assert "the rig has no station 'station_2'; did you mean 'station_1'?" in said

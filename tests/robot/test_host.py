@@ -1,0 +1,221 @@
+"""drivers.host: a driver in a child process that may crash, hang, misbehave or lose its parent."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from drivers import heartbeat
+from drivers.errors import DeviceFaultError, DeviceTimeoutError, DeviceUnavailableError, SafetyStopError
+from drivers.host import HostedDevice, hosted
+from service.core.errors import ConfigurationError
+from tests.support.processes.waiting import until
+from tests.support.rig.host_fake_driver import Fake, FakeConfig
+
+SPEC = "tests.support.rig.host_fake_driver:DRIVER"
+
+
+@pytest.fixture
+def fake(tmp_path: Path) -> Iterator[Fake]:
+    device = hosted(Fake, SPEC, FakeConfig(trace=tmp_path / "trace"), call_timeout_s=20.0, name="fake one")
+    device.open()
+    yield device
+    device.close()
+
+
+def test_calls_run_in_another_process_and_arrays_cross(fake: Fake) -> None:
+    identity = fake.open()
+    assert int(identity.serial) != os.getpid()
+    assert identity.model == "hello"
+    assert identity.firmware == "2", "the second open must reach the same driver object"
+    np.testing.assert_array_equal(fake.double(np.arange(6.0), offset=1.0), 2 * np.arange(6.0) + 1)
+
+
+def test_proxy_has_the_methods_of_the_interface_and_no_others(fake: Fake) -> None:
+    public = {n for n in dir(type(fake)) if not n.startswith("_")}
+    expected = {n for n in dir(Fake) if not n.startswith("_")}
+    assert public == expected
+
+
+def test_stdin_is_dev_null(fake: Fake) -> None:
+    assert fake.stdin_target() == os.devnull
+
+
+def test_errors_of_our_tree_cross_unchanged(fake: Fake) -> None:
+    with pytest.raises(SafetyStopError) as caught:
+        fake.refuse()
+    assert (caught.value.what, caught.value.where) == ("protective stop", "joint 3")
+    assert caught.value.remedy == "Clear the cause"
+
+
+def test_any_other_exception_is_wrapped(fake: Fake) -> None:
+    with pytest.raises(DeviceFaultError, match="VendorError in blunder: the vendor says -7"):
+        fake.blunder()
+    with pytest.raises(DeviceFaultError, match="unpicklable"):
+        fake.unpicklable()
+    np.testing.assert_array_equal(fake.double(np.ones(2)), [2, 2])
+
+
+def test_segfault_names_the_signal_and_open_restarts(fake: Fake) -> None:
+    before = fake.open().serial
+    with pytest.raises(DeviceUnavailableError, match="SIGSEGV"):
+        fake.crash(signal.SIGSEGV)
+    with pytest.raises(DeviceUnavailableError, match="SIGSEGV"):
+        fake.double(np.ones(1))
+    assert fake.open().serial != before
+    np.testing.assert_array_equal(fake.double(np.ones(1)), [2])
+
+
+def test_call_timeout_kills_the_child(tmp_path: Path) -> None:
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=0.5, name="slow")
+    pid = int(device.open().serial)
+    start = time.monotonic()
+    with pytest.raises(DeviceTimeoutError, match=r"hang did not return within 0\.5 s"):
+        device.hang(60)
+    assert time.monotonic() - start < 3
+    assert not psutil.pid_exists(pid)
+    with pytest.raises(DeviceUnavailableError, match="killed after hang"):
+        device.double(np.ones(1))
+    assert int(device.open().serial) != pid
+    device.close()
+
+
+def test_heartbeat_finds_a_child_that_died_between_calls(caplog: pytest.LogCaptureFixture) -> None:
+    device = HostedDevice(SPEC, FakeConfig(), call_timeout_s=5, name="mortal", heartbeat_s=0.1)
+    device.open()
+    device.call("crash_later", 0.1)
+    until(lambda: device.pid is None, "the death is noticed", 10)
+    until(
+        lambda: any("SIGSEGV" in r.message for r in caplog.records if r.levelno == logging.ERROR), "it is logged", 10
+    )
+    device.close()
+
+
+def test_the_child_is_told_that_its_parent_lives_during_long_calls_too(fake: Fake) -> None:
+    fake.beats()
+    fake.hang(1.0)
+    time.sleep(1.0)
+    beats = fake.beats()
+    assert len(beats) > 10
+    assert all(0.0 <= arrived_s - sent_s < 1.0 for sent_s, arrived_s in beats)
+    gaps = np.diff([sent_s for sent_s, _ in beats])
+    assert np.all(gaps > 0)
+    assert np.median(gaps) < 0.1
+
+
+def test_no_beat_while_the_parent_stands_still() -> None:
+    program = (
+        "import sys\n"
+        "from drivers.host import hosted\n"
+        "from tests.support.rig.host_fake_driver import Fake, FakeConfig\n"
+        f"d = hosted(Fake, {SPEC!r}, FakeConfig(), call_timeout_s=20, name='watched')\n"
+        "d.open()\n"
+        "print('open', flush=True)\n"
+        "sys.stdin.readline()\n"
+        "beats = list(d.beats())\n"
+        "until_now = len(beats)\n"
+        "while len(beats) == until_now: beats += d.beats()\n"  # the first one after the pause may still be on its way
+        "arrived = [at for _, at in beats]\n"
+        "print(max(b - a for a, b in zip(arrived, arrived[1:])), flush=True)\n"
+        "d.close()\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdin is not None
+        assert parent.stdout is not None
+        assert parent.stdout.readline() == "open\n"
+        time.sleep(0.3)
+        parent.send_signal(signal.SIGSTOP)
+        time.sleep(2.0)
+        parent.send_signal(signal.SIGCONT)
+        parent.stdin.write("\n")
+        parent.stdin.flush()
+        assert float(parent.stdout.readline()) > 1.5
+
+
+def test_a_child_that_does_not_read_holds_its_parent_up_for_no_beat(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(heartbeat, "BEAT_S", 0.001)
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=20.0, name="stopped")
+    pid = int(device.open().serial)
+    os.kill(pid, signal.SIGSTOP)
+    time.sleep(2.0)  # for more beats than a socket holds
+    threading.Timer(1.0, lambda: os.kill(pid, signal.SIGCONT)).start()
+    np.testing.assert_array_equal(device.double(np.ones(1)), [2])
+    device.close()
+
+
+def test_output_of_the_child_goes_to_logging(
+    fake: Fake, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    caplog.set_level(logging.INFO)
+    fake.talk()
+    until(lambda: "vendor chatter on stdout" in caplog.messages, "the vendor's line", 10)
+    until(lambda: "fake: the driver warns" in caplog.messages, "the driver's line", 10)
+    assert {r.levelname for r in caplog.records if r.message == "fake: the driver warns"} == {"WARNING"}
+    out, err = capfd.readouterr()
+    assert "chatter" not in out + err
+
+
+def test_close_closes_the_device_and_ends_the_child(tmp_path: Path) -> None:
+    trace = tmp_path / "trace"
+    device = hosted(Fake, SPEC, FakeConfig(trace=trace), call_timeout_s=5, name="tidy")
+    pid = int(device.open().serial)
+    device.close()
+    assert trace.read_text() == "closed"
+    assert not psutil.pid_exists(pid)
+    device.close()
+    with pytest.raises(DeviceUnavailableError, match="closed"):
+        device.double(np.ones(1))
+
+
+def test_calls_before_open_are_refused() -> None:
+    device = hosted(Fake, SPEC, FakeConfig(), call_timeout_s=5, name="early")
+    with pytest.raises(DeviceUnavailableError, match="not opened yet"):
+        device.report()
+
+
+@pytest.mark.parametrize("spec", ["tests.support.nowhere:DRIVER", "tests.support.rig.host_fake_driver:NOT_A_DRIVER"])
+def test_wrong_spec_is_a_configuration_error(spec: str) -> None:
+    device = hosted(Fake, spec, FakeConfig(), call_timeout_s=5, name="wrong")
+    with pytest.raises(ConfigurationError, match=spec):
+        device.open()
+
+
+def test_child_that_dies_while_opening() -> None:
+    device = hosted(Fake, SPEC, FakeConfig(die_on_open=True), call_timeout_s=5, name="stillborn")
+    with pytest.raises(DeviceUnavailableError, match="exited with status 3"):
+        device.open()
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_child_exits_when_its_parent_is_killed(tmp_path: Path, busy: bool) -> None:
+    trace = tmp_path / "trace"
+    program = (
+        "import sys, threading, time\n"
+        "from pathlib import Path\n"
+        "from drivers.host import hosted\n"
+        "from tests.support.rig.host_fake_driver import Fake, FakeConfig\n"
+        f"d = hosted(Fake, {SPEC!r}, FakeConfig(trace=Path({str(trace)!r})), call_timeout_s=1, name='orphan')\n"
+        "print(d.open().serial, flush=True)\n"
+        f"d.hang(0.8) if {busy} else None\n"
+        "time.sleep(60)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        time.sleep(0.2)
+        parent.kill()
+    until(lambda: not psutil.pid_exists(pid), "the child exits", 10)
+    assert trace.read_text() == "closed", "an orphaned driver must still let go of its device"

@@ -1,0 +1,38 @@
+"""The worker beside a run: when it is killed, it is replaced and the run is told."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import psutil
+
+from service.cli.run.beside import worker_beside
+from service.core.records.events import JobFailed
+from service.store.records import NewJob
+from service.store.store import Store
+from tests.support.record.store import start_run
+
+
+def worker_of(data: Path) -> psutil.Process:
+    (found,) = (child for child in psutil.Process().children() if str(data) in child.cmdline())
+    return found
+
+
+def test_a_worker_that_is_killed_is_replaced_and_the_run_gets_its_answer(tmp_path: Path) -> None:
+    told: list[str] = []
+    with Store.open(tmp_path) as store:
+        run = start_run(store)
+        with worker_beside(tmp_path, told.append):
+            worker = worker_of(tmp_path)
+            worker.kill()
+            job = NewJob("locate_spheres", "capture", 1, "key", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
+            store.enqueue_job(run, job, actor="runner")
+            deadline_s = time.monotonic() + 90
+            while not any(isinstance(event.payload, JobFailed) for event in store.events(run)):
+                assert time.monotonic() < deadline_s, told
+                time.sleep(0.1)
+            another = worker_of(tmp_path)
+        assert another.pid != worker.pid
+        assert not another.is_running()
+    assert told == ["the worker process has ended (status -9); another one is started"]

@@ -1,0 +1,219 @@
+"""What screens show of the robot during a long call of the runner's main loop: the activity, and since when."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Generator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.errors import DeviceUnavailableError
+from drivers.interfaces import RobotArm, RobotSample, SafetyState
+from service.core.run.state import RunState
+from service.monitor.reporter import OpenDevices, Reporter
+from service.monitor.snapshot import STALE_S, Snapshot, read_snapshot, write_snapshot
+from service.store.store import Store
+from service.web.page.run_frame import Banner, robot_banner
+from tests.support.pages.web import web_site
+from tests.support.processes.waiting import until
+from tests.support.rig.bench_rig import BenchArm, BenchLightbox, BenchRig
+from tests.support.runs.bench_run import PROTOCOL, begin_run
+
+RUN = "run"
+
+
+class Bench:
+    """A reporter on a folder, and its output."""
+
+    def __init__(self, folder: Path, robots: Mapping[str, RobotArm]) -> None:
+        self.folder = folder
+        self.reporter = Reporter(folder, RUN, lambda: OpenDevices(robots=robots), BenchRig().camera)
+
+    @property
+    def told(self) -> Snapshot:
+        return read_snapshot(self.folder, RUN)
+
+
+@pytest.fixture
+def arm() -> BenchArm:
+    arm = BenchArm()
+    arm.open()
+    return arm
+
+
+@pytest.fixture
+def bench(tmp_path: Path, arm: BenchArm) -> Generator[Bench]:
+    bench = Bench(tmp_path, {"robot": arm})
+    bench.reporter.begin()
+    yield bench
+    bench.reporter.end()
+
+
+@pytest.fixture
+def active(tmp_path: Path) -> Generator[RunState]:
+    with Store.open(tmp_path / "data") as store:
+        yield begin_run(store, PROTOCOL, tmp_path).state()
+
+
+def banner(state: RunState, **fields: object) -> Banner:
+    """The banner for a snapshot of this moment."""
+    return robot_banner(state, Snapshot.model_validate({"at_utc_s": time.time(), **fields}), driven=True)
+
+
+def test_a_long_call_is_told_while_it_lasts(bench: Bench) -> None:
+    bench.reporter.attend("working", "capture", 1)
+    bench.reporter.show("viewpoints", 12, 54)
+    bench.reporter.busy("taking v1_013 and fetching it from the camera, 61 MP")
+    # This thread is the runner's and does not return to the reporter from here on.
+    until(
+        lambda: bench.told.lasting == "taking v1_013 and fetching it from the camera, 61 MP",
+        lambda: str(bench.told),
+        10,
+    )
+    first = bench.told
+    assert (first.doing, first.robot, first.done, first.total) == ("working", "standing", 12, 54)
+    until(lambda: bench.told.activity_s > first.activity_s + 1, lambda: str(bench.told), 10)
+    assert not bench.told.stale
+    bench.reporter.attend("working", "capture", 1)
+    until(lambda: bench.told.activity == "", lambda: str(bench.told), 10)
+
+
+def test_a_call_of_which_nothing_was_said_is_seen_to_last(bench: Bench) -> None:
+    bench.reporter.attend("working", "capture", 1)
+    until(lambda: bench.told.quiet_s > 2, lambda: str(bench.told), 10)
+    assert bench.told.age_s() < 2
+
+
+def test_the_arm_is_watched_from_beside_the_call(bench: Bench, arm: BenchArm) -> None:
+    bench.reporter.attend("working", "capture", 1)
+    assert bench.told.robot == "standing"
+    target = np.array([0.9, 0.4, 0.5, 0.0, 3.0, 0.0])
+    arm.move_joints(target, speed_rad_s=1.0, acceleration_rad_s2=1.0)
+    arm.dawdle()
+    until(lambda: bench.told.robot == "moving", lambda: str(bench.told), 10)
+    arm.stop()
+    until(lambda: bench.told.robot == "standing", lambda: str(bench.told), 10)
+    arm.safety = SafetyState.EMERGENCY_STOP
+    until(lambda: bench.told.robot == "emergency_stop", lambda: str(bench.told), 10)
+
+
+class HeldUp(BenchArm):
+    """Its process is in a long call of the main loop: other callers wait."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.free = threading.Event()
+
+    def samples(self, start_monotonic_s: float, end_monotonic_s: float) -> tuple[RobotSample, ...]:
+        self.free.wait()
+        return super().samples(start_monotonic_s, end_monotonic_s)
+
+
+def test_an_arm_that_does_not_answer_holds_nothing_up_and_gets_old(tmp_path: Path, active: RunState) -> None:
+    arm = HeldUp()
+    arm.open()
+    bench = Bench(tmp_path, {"robot": arm})
+    bench.reporter.begin()
+    try:
+        bench.reporter.attend("working", "capture", 1)
+        bench.reporter.busy("connecting the robot")
+        until(lambda: bench.told.robot_silent_s > STALE_S, lambda: str(bench.told), 20)
+        shown = robot_banner(active, bench.told, driven=True)
+        assert shown.key == "unknown"
+        assert "not been heard of for" in shown.text
+        assert "connecting the robot, for" in shown.text
+        arm.free.set()
+        until(
+            lambda: bench.told.robot_silent_s < STALE_S and bench.told.robot == "standing",
+            lambda: str(bench.told),
+            10,
+        )
+    finally:
+        arm.free.set()
+        bench.reporter.end()
+    assert bench.told.doing == "ended"
+
+
+def test_an_arm_whose_link_is_dead_is_unknown(bench: Bench, arm: BenchArm, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.reporter.attend("working", "capture", 1)
+
+    def dead(_start_s: float, _end_s: float) -> tuple[RobotSample, ...]:
+        raise DeviceUnavailableError("no link", where="arm")
+
+    monkeypatch.setattr(arm, "samples", dead)
+    until(lambda: bench.told.robot == "unknown", lambda: str(bench.told), 10)
+
+
+def test_the_banner_says_what_goes_on_and_for_how_long(active: RunState) -> None:
+    now_s = time.time()
+    taking = {"activity": "taking v1_013 and fetching it from the camera, 61 MP", "activity_utc_s": now_s - 12}
+    busy = {"doing": "working", "attended_utc_s": now_s - 12, "robot_utc_s": now_s - 1, "robot": "standing", **taking}
+    shown = banner(active, **busy)
+    assert (shown.key, shown.title) == ("standing", "The robot stands still.")
+    assert "taking v1_013 and fetching it from the camera, 61 MP, for 12 s" in shown.text
+    assert "hears no button before that is done" in shown.text
+    hung = banner(active, **{**busy, "activity": "", "what": "looking for the board", "attended_utc_s": now_s - 95})
+    assert "looking for the board, for 95 s" in hung.text
+    assert banner(active, **{**busy, "robot": "emergency_stop"}).key == "emergency_stop"
+    assert banner(active, **{**busy, "robot_utc_s": now_s - 12}).key == "unknown"
+    assert banner(active, **{**busy, "robot": "moving"}).key == "moving"
+    quick = banner(active, **{**busy, "attended_utc_s": now_s, "activity": ""})
+    assert quick.text == "A step is under way. It may move at any moment."
+
+
+def test_a_run_that_has_just_been_started_says_so(tmp_path: Path, active: RunState) -> None:
+    shown = banner(active, doing="starting")
+    assert shown.key == "starting"
+    assert "asks before it does" in shown.text
+    write_snapshot(tmp_path, RUN, Snapshot(at_utc_s=time.time() - 30, doing="starting"))
+    assert read_snapshot(tmp_path, RUN).doing == "starting"
+    write_snapshot(tmp_path, RUN, Snapshot(at_utc_s=time.time() - 300, doing="starting"))
+    silent = read_snapshot(tmp_path, RUN)
+    assert "not told anything for 300 s" in robot_banner(active, silent, driven=True).text
+
+
+def test_a_runner_that_is_started_is_told_of_at_once(tmp_path: Path) -> None:
+    from service.web.launch import Launcher  # noqa: PLC0415 - web_site puts a launcher in its place that starts nothing
+
+    with web_site(tmp_path) as web:
+        run_id = web.begin_run().run_id
+        launcher = Launcher(web.site.data, web.store)
+        launcher.start(run_id)
+        try:
+            assert launcher.driven(run_id)
+            assert read_snapshot(web.site.data, run_id).doing != "unknown"
+        finally:
+            children = vars(launcher)["_children"]
+            children[run_id].terminate()
+            children[run_id].wait(60)
+
+
+def test_the_runner_says_what_it_is_about_to_do(tmp_path: Path) -> None:
+    with Store.open(tmp_path / "data") as store:
+        run = begin_run(store, PROTOCOL, tmp_path)
+        run.run()
+        said = run.operator.busy_with
+    assert said.count("setting the camera") >= 1
+    taken = [what for what in said if what.startswith("taking ")]
+    assert taken[0] == "taking v001 and fetching it from the camera"
+    assert taken[1].startswith("taking v002 and fetching it from the camera, ")
+    assert taken[1].endswith(" MP")
+    assert "signing the record" in said
+
+
+def test_the_signal_tower_shows_how_the_run_stands(tmp_path: Path, arm: BenchArm) -> None:
+    box = BenchLightbox()
+    devices = OpenDevices(robots={"robot": arm}, lightboxes={"box": box})
+    reporter = Reporter(tmp_path, RUN, lambda: devices, BenchRig().camera)
+    reporter.attend("working", "capture", 1)
+    reporter.attend("asking", "capture", 1, asks="recovery", words="Capture: no link")
+    assert read_snapshot(tmp_path, RUN).standing == "stopped"
+    reporter.attend("asking", "spraying", 1, asks="sign", words="Spray: a signature is due")
+    reporter.attend("working", "spraying", 1)
+    arm.safety = SafetyState.PROTECTIVE_STOP
+    reporter.attend("working", "spraying", 2)
+    reporter.end()
+    assert [light.value for light in box.shown] == ["GREEN", "RED", "YELLOW", "GREEN", "RED", "OFF"]

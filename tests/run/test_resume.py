@@ -1,0 +1,103 @@
+"""A run that is killed during the viewpoint capture continues at the next viewpoint."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from tests.support.rig.rig import REPOSITORY, command, orthocapture, simulated_rig, without_calibration_and_ct
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
+
+
+def short_protocol(folder: Path) -> Path:
+    """The capture of station 1 alone, six viewpoints."""
+    protocol = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
+    capture = next(s for s in protocol["steps"] if s["id"] == "viewpoint_capture_1")
+    capture["params"]["viewpoints"][0]["arcs"] = [
+        {"tilt_deg": 25, "azimuth_from_deg": -40, "azimuth_to_deg": 40, "count": 6, "distance_m": 0.62}
+    ]
+    capture["gates"][0]["min"] = 6
+    without_calibration_and_ct(capture)
+    protocol["steps"] = [capture]
+    path = folder / "short.yaml"
+    path.write_text(yaml.safe_dump(protocol))
+    return path
+
+
+def test_sigkill_in_the_capture_loses_and_repeats_nothing(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with simulated_rig(
+        tmp_path, "--scene", "3", "--image-width", "600", "--speed-up", "3", host="127.0.0.31"
+    ) as ready:
+        words = ["run", str(short_protocol(tmp_path)), "--rig", ready["rig"], "--data", str(data), "--auto-confirm"]
+        with (tmp_path / "run.log").open("w") as log:
+            runner = subprocess.Popen(
+                command(*words), cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            )
+        wait_for_captures(data, 2, runner, tmp_path / "run.log")
+        os.kill(runner.pid, signal.SIGKILL)
+        runner.wait(timeout=10)
+        before = captured(data)
+        assert 2 <= len(before) < 6
+
+        with (tmp_path / "resume.log").open("w") as log:
+            again = subprocess.Popen(
+                command("resume", "latest", "--data", str(data), "--screens"),
+                cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            )  # fmt: skip
+        wait_for(lambda: "session_started" in kinds(data)[-2:], again, tmp_path / "resume.log")
+        time.sleep(5)
+        assert captured(data) == before, "the arm moves for nobody"
+        answer = orthocapture("act", "confirm", "--data", str(data), "--operator", "Grace")
+        assert answer.returncode == 0, answer.stdout + answer.stderr
+        assert again.wait(timeout=240) == 0, (tmp_path / "resume.log").read_text()
+    shown = events(data)
+    released = next(e for e in shown if e["kind"] == "operator_action" and e["actor"] == "Grace")
+    assert [e["seq"] > released["seq"] for e in shown if e["kind"] == "viewpoint_captured"].index(True) == len(before)
+    after = captured(data)
+    assert after[: len(before)] == before
+    names = [event["artefacts"][0]["viewpoint"] for event in after]
+    assert names == [f"v1_{i:03d}" for i in range(1, 7)]
+    assert len({event["artefacts"][0]["sha256"] for event in after}) == 6
+    assert orthocapture("audit", "verify", "latest", "--data", str(data)).returncode == 0
+
+
+def wait_for_captures(data: Path, count: int, runner: subprocess.Popen[bytes], log: Path) -> None:
+    wait_for(lambda: len(captured(data)) >= count, runner, log)
+
+
+def wait_for(reached: Callable[[], bool], runner: subprocess.Popen[bytes], log: Path) -> None:
+    deadline_s = time.monotonic() + 180
+    while not reached():
+        assert runner.poll() is None, log.read_text()
+        assert time.monotonic() < deadline_s, log.read_text()
+        time.sleep(0.3)
+
+
+def kinds(data: Path) -> list[str]:
+    return [event["kind"] for event in events(data)]
+
+
+def captured(data: Path) -> list[dict[str, Any]]:
+    """The capture events so far."""
+    return [event for event in events(data) if event["kind"] == "viewpoint_captured"]
+
+
+def events(data: Path) -> list[dict[str, Any]]:
+    """The events so far, as an auditor reads them."""
+    if not (data / "orthocapture.sqlite").exists():
+        return []
+    answer = orthocapture("audit", "show", "latest", "--data", str(data), "--json")
+    if answer.returncode != 0:
+        return []
+    return json.loads(answer.stdout)["events"]

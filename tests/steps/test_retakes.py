@@ -1,0 +1,48 @@
+"""A capture that falls short offers the images that would mend it: only those are retaken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.interfaces import CameraSettings
+from service.core.records.events import StepNote
+from service.store.store import Store
+from tests.support.rig.bench_rig import answer, other_settings
+from tests.support.runs.bench_run import PROTOCOL, Bench, begin_run
+
+
+@pytest.fixture
+def begin(tmp_path: Path) -> Generator[Callable[[str], Bench]]:
+    with Store.open(tmp_path / "data") as store:
+        yield lambda text: begin_run(store, text, tmp_path)
+
+
+def test_images_with_other_settings_are_offered_to_be_taken_again_and_only_those(
+    begin: Callable[[str], Bench],
+) -> None:
+    bench = begin(PROTOCOL)
+    turned = {2}
+
+    def exif(applied: CameraSettings) -> CameraSettings:
+        return other_settings(applied) if bench.rig.shutter.exposures in turned else applied
+
+    bench.rig.shutter.exif = exif
+    asked: list[str] = []
+
+    def confirm(question: Any, _state: Any) -> Any:
+        asked.append(question.text)
+        return answer(question, "confirm")
+
+    bench.script("capture", "recovery", confirm)
+    state = bench.run()
+    assert state.status == "completed"
+    assert len(asked) == 1
+    assert "set the camera as the protocol has it" in asked[0]
+    assert "Confirm to take 1 image again; all others are kept" in asked[0]
+    assert [note.note for note in bench.payloads(StepNote) if note.note == "retakes"] == ["retakes"]
+    assert bench.captured() == ["v001", "v002", "v003", "v004", "v002"]
+    bench.must_verify()

@@ -1,0 +1,185 @@
+"""Crashes and power losses at every point of a record, and a writer killed while it writes."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from service.core.errors import StoreError
+from service.core.records.events import Event
+from service.store.durable_effects import DurableFiles
+from service.store.records import NewArtefact, NewJob
+from service.store.store import Store
+from service.store.verification.verify import AuditReport, verify
+from tests.support.record.store import (
+    CountedIds,
+    Crash,
+    CrashingFiles,
+    SteppedClock,
+    capture,
+    captured,
+    files_of,
+    put_image,
+    start_run,
+)
+
+ROOT_DIR = Path(__file__).parents[2]
+
+
+def record_one(store: Store, run: str) -> list[Event]:
+    ref = put_image(store, "v2")
+    return store.record(
+        run,
+        [captured(ref, "v2")],
+        actor="camera",
+        artefacts=[NewArtefact(ref, "camera")],
+        jobs=[NewJob("registration", "register", 1, "key")],
+    )
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder with a run of one viewpoint."""
+    data = tmp_path_factory.mktemp("crash") / "data"
+    with Store.open(data, SteppedClock(), CountedIds()) as store:
+        capture(store, start_run(store), "v1")
+    return data
+
+
+def leftovers(report: AuditReport) -> list[str]:
+    """Notes on files that a crash left behind."""
+    return [note for note in report.notes if note.startswith("artefacts/")]
+
+
+def sweep(data: Path, crash_at: int | None) -> tuple[CrashingFiles, bool]:
+    """Record one viewpoint with crashing file operations; returns them, and whether `record` returned."""
+    ids = CountedIds()
+    ids.count = 100
+    files = CrashingFiles()
+    with Store.open(data, SteppedClock(), ids, files) as store:
+        run = store.find_run("latest")
+        files.points.clear()
+        files.crash_at = crash_at
+        try:
+            record_one(store, run)
+        except Crash:
+            return files, False
+    return files, True
+
+
+@pytest.mark.parametrize("power_lost", [False, True])
+def test_crash_at_every_point_of_a_record(before: Path, tmp_path: Path, *, power_lost: bool) -> None:
+    shutil.copytree(before, tmp_path / "whole")
+    points = sweep(tmp_path / "whole", None)[0].points
+    assert [point.split()[1] for point in points[::3]] == [
+        "write",
+        "make_directory",
+        "sync_directory",
+        "make_read_only",
+        "sync_file",
+        "rename",
+        "sync_directory",
+        "commit",
+    ]
+    committed_at: list[str] = []
+    for index, point in enumerate(points):
+        data = tmp_path / f"crash {index}"
+        shutil.copytree(before, data)
+        files, returned = sweep(data, index)
+        assert not returned
+        if power_lost:
+            files.lose_power()
+        report = verify(data)
+        assert report.ok, (point, report.first_fault)
+        assert report.events in (2, 4), point
+        if report.events == 4:
+            committed_at.append(point)
+            assert not leftovers(report)
+        with Store.open(data, SteppedClock(), CountedIds()) as store:
+            run = store.find_run("latest")
+            if report.events == 2:
+                assert len(store.artefacts(run)) == 3
+                record_one(store, run)
+            assert [event.payload.kind for event in store.events(run)] == [
+                "run_started",
+                "viewpoint_captured",
+                "viewpoint_captured",
+                "job_enqueued",
+            ]
+        assert verify(data).ok
+    assert committed_at == ["after commit"]
+
+
+def test_a_commit_that_returned_survives_the_loss_of_power(before: Path, tmp_path: Path) -> None:
+    shutil.copytree(before, tmp_path / "data")
+    files, returned = sweep(tmp_path / "data", None)
+    assert returned
+    files.lose_power()
+    report = verify(tmp_path / "data")
+    assert report.ok
+    assert report.events == 4
+
+
+def test_full_disk_is_a_clear_error_and_leaves_nothing(tmp_path: Path) -> None:
+    class FullDisk(DurableFiles):
+        full = False
+
+        def sync_file(self, path: Path) -> None:
+            if self.full:
+                raise OSError(28, "No space left on device", str(path))
+            super().sync_file(path)
+
+    files = FullDisk()
+    with Store.open(tmp_path, files=files) as store:
+        run = start_run(store)
+        files.full = True
+        with pytest.raises(StoreError, match="No space left") as caught:
+            capture(store, run, "v1")
+        assert "free space" in caught.value.remedy
+        files.full = False
+        assert len(list(files_of(tmp_path))) == 2
+        capture(store, run, "v1")
+    assert leftovers(verify(tmp_path)) == []
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from service.store.store import Store
+from tests.support.record.store import capture
+with Store.open(Path(sys.argv[1])) as store:
+    run = store.find_run("latest")
+    index = 0
+    while True:
+        capture(store, run, f"v{index}")
+        print(index, flush=True)
+        index += 1
+"""
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.007, 0.02])
+def test_killed_writer_loses_nothing_that_it_reported(tmp_path: Path, delay_s: float) -> None:
+    with Store.open(tmp_path) as store:
+        run = start_run(store)
+    with subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path)], cwd=ROOT_DIR, stdout=subprocess.PIPE
+    ) as writer:
+        assert writer.stdout is not None
+        for _line in range(5):
+            writer.stdout.readline()
+        time.sleep(delay_s)
+        writer.send_signal(signal.SIGKILL)
+        reported = 5 + len(writer.stdout.read().split())
+    report = verify(tmp_path)
+    assert report.ok
+    assert report.events - 1 in (reported, reported + 1)
+    assert len(leftovers(report)) <= 1
+    with Store.open(tmp_path) as store:
+        capture(store, run, "after")
+    assert verify(tmp_path).events == report.events + 1

@@ -1,0 +1,253 @@
+"""Jobs and run leases: once only, one worker at a time, recovered from dead workers, refused to late ones."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.core.errors import DataError, StoreError
+from service.core.records.events import JobFailed, JobFinished, StepNote
+from service.store.errors import LeaseHeldError, LeaseLostError
+from service.store.queue.leases import RunLease
+from service.store.records import NewArtefact, NewJob
+from service.store.store import Store
+from service.store.verification.verify import verify
+from tests.support.processes.waiting import until
+from tests.support.record.store import CountedIds, SteppedClock, start_run
+
+ROOT_DIR = Path(__file__).parents[2]
+JOB = NewJob("registration", "register", 1, "register-1", {"sigma_px": 0.5, "views": [1, 2]})
+
+
+@pytest.fixture
+def clock() -> SteppedClock:
+    return SteppedClock()
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: SteppedClock) -> Iterator[Store]:
+    with Store.open(tmp_path / "data", clock, CountedIds()) as opened:
+        yield opened
+        assert verify(tmp_path / "data").ok
+
+
+def test_enqueueing_twice_gives_the_first_job_and_appends_nothing(store: Store) -> None:
+    run = start_run(store)
+    first = store.enqueue_job(run, JOB, actor="runner")
+    again = store.enqueue_job(run, NewJob("registration", "register", 1, "register-1", {"other": 1}), actor="runner")
+    assert again == first
+    assert [event.payload.kind for event in store.events(run)] == ["run_started", "job_enqueued"]
+    other_run = start_run(store)
+    assert store.enqueue_job(other_run, JOB, actor="runner").job_id != first.job_id
+
+
+def test_a_job_from_claim_to_finish(store: Store) -> None:
+    run = start_run(store)
+    store.enqueue_job(run, JOB, actor="runner")
+    assert store.claim_job("w", 10, kinds=["evaluation"]) is None
+    job = store.claim_job("w", 10, kinds=["registration", "evaluation"], run_id=run)
+    assert job is not None
+    assert (job.state, job.tries, job.worker, job.arguments) == (
+        "running",
+        1,
+        "w",
+        {"sigma_px": 0.5, "views": [1, 2]},
+    )
+    assert store.claim_job("other", 10) is None
+    ref = store.put_bytes(b"{}", kind="result", media_type="application/json", original_name="result.json")
+    event = store.finish_job(
+        job, measures={"rms_px": 0.4}, duration_s=2.5, artefacts=[NewArtefact(ref, "worker", "register", 1)]
+    )
+    assert isinstance(event.payload, JobFinished)
+    assert event.payload.artefacts == (ref,)
+    (done,) = store.jobs(run)
+    assert (done.state, done.ended_seq) == ("finished", event.seq)
+    with pytest.raises(LeaseLostError, match="no longer"):
+        store.finish_job(job, measures={}, duration_s=1.0)
+    assert store.claim_job("w", 10) is None
+
+
+def test_expired_lease_is_reclaimed_and_the_late_worker_refused(store: Store, clock: SteppedClock) -> None:
+    run = start_run(store)
+    store.enqueue_job(run, JOB, actor="runner")
+    slow = store.claim_job("slow", 10)
+    assert slow is not None
+    clock.passed_s = 9
+    slow = store.renew_job(slow, 10)
+    clock.passed_s = 18
+    assert store.claim_job("quick", 10) is None
+    clock.passed_s = 20
+    quick = store.claim_job("quick", 10)
+    assert quick is not None
+    assert quick.tries == 2
+    before = len(store.events(run))
+    for late in (
+        lambda: store.finish_job(slow, measures={"x": 1.0}, duration_s=1.0),
+        lambda: store.fail_job(slow, DataError("late"), retry=True),
+        lambda: store.renew_job(slow, 10),
+    ):
+        with pytest.raises(LeaseLostError):
+            late()
+    assert len(store.events(run)) == before
+    store.finish_job(quick, measures={}, duration_s=1.0)
+
+
+def test_failure_is_retried_until_the_limit(store: Store) -> None:
+    run = start_run(store)
+    store.enqueue_job(run, JOB, actor="runner")
+    for attempt in (1, 2, 3):
+        job = store.claim_job("w", 10)
+        assert job is not None
+        assert job.tries == attempt
+        (event,) = store.fail_job(job, DataError("too few markers"), retry=True)
+        assert isinstance(event.payload, JobFailed if attempt == 3 else StepNote)
+    assert store.claim_job("w", 10) is None
+    (failed,) = store.jobs(run)
+    assert (failed.state, failed.error) == ("failed", "DataError: too few markers")
+
+
+def test_hopeless_failure_is_final_at_once(store: Store) -> None:
+    run = start_run(store)
+    store.enqueue_job(run, JOB, actor="runner")
+    job = store.claim_job("w", 10)
+    assert job is not None
+    (event,) = store.fail_job(job, DataError("no mesh"), retry=False)
+    assert isinstance(event.payload, JobFailed)
+    assert (event.payload.error, event.payload.message) == ("DataError", "no mesh")
+
+
+def test_a_job_that_kills_its_workers_fails_in_the_end(store: Store, clock: SteppedClock) -> None:
+    run = start_run(store)
+    store.enqueue_job(run, JOB, actor="runner")
+    for _try in range(3):
+        assert store.claim_job("w", 10) is not None
+        clock.passed_s += 11
+    assert store.claim_job("w", 10) is None
+    last = store.events(run)[-1].payload
+    assert isinstance(last, JobFailed)
+    assert last.error == "WorkerLost"
+
+
+CLAIMER = """
+import sys
+from pathlib import Path
+from service.store.store import Store
+with Store.open(Path(sys.argv[1])) as store:
+    while (job := store.claim_job(sys.argv[2], 60)) is not None:
+        store.finish_job(job, measures={}, duration_s=0.0)
+        print(job.job_id)
+"""
+
+
+def test_racing_workers_do_each_job_once(tmp_path: Path) -> None:
+    with Store.open(tmp_path) as store:
+        run = start_run(store)
+        store.record(run, [], actor="runner", jobs=[NewJob("k", "s", 1, f"key {index}") for index in range(30)])
+        workers = [
+            subprocess.Popen(
+                [sys.executable, "-c", CLAIMER, str(tmp_path), f"w{index}"], cwd=ROOT_DIR, stdout=subprocess.PIPE
+            )
+            for index in range(3)
+        ]
+        done = [name for worker in workers for name in worker.communicate(timeout=60)[0].split()]
+        assert sorted(done) == sorted(job.job_id.encode() for job in store.jobs(run))
+        assert [event.payload.kind for event in store.events(run)].count("job_finished") == 30
+    assert verify(tmp_path).ok
+
+
+def test_one_runner_drives_a_run(store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = start_run(store)
+    note = StepNote(step="s", attempt=1, note="n")
+    with monkeypatch.context() as elsewhere:  # on another host only the time is known
+        elsewhere.setattr(socket, "gethostname", lambda: "the other computer")
+        first = store.lease(run, "runner 1", 10)
+    with pytest.raises(LeaseHeldError, match="runner 1"):
+        store.lease(run, "runner 2", 10)
+    clock.passed_s = 9
+    first.renew()
+    clock.passed_s = 18
+    store.record(run, [note], actor="runner", lease=first)
+    clock.passed_s = 19.5
+    with store.lease(run, "runner 2", 10) as second:
+        with pytest.raises(LeaseLostError):
+            first.renew()
+        with pytest.raises(LeaseLostError):
+            store.record(run, [note], actor="runner", lease=first)
+        first.release()
+        store.record(run, [note], actor="runner", lease=second)
+    store.lease(run, "runner 3", 10).release()
+    assert len(store.events(run)) == 3
+    with pytest.raises(StoreError, match="no run"):
+        store.lease("nowhere", "r", 10)
+
+
+def test_a_runner_that_lives_keeps_its_run_whatever_the_clock_says(store: Store, clock: SteppedClock) -> None:
+    run = start_run(store)
+    with store.lease(run, "runner 1", 10) as first:
+        clock.passed_s = 120  # somebody set it, or the runner waits for long
+        assert store.driven(run)
+        with pytest.raises(LeaseHeldError, match="runner 1"):
+            store.lease(run, "runner 2", 10)
+        store.record(run, [StepNote(step="s", attempt=1, note="n")], actor="runner", lease=first)
+    assert not store.driven(run)
+
+
+def test_a_lease_is_renewed_by_itself_also_after_a_store_that_failed(
+    store: Store, clock: SteppedClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = start_run(store)
+    renewals: list[float] = []
+    really = RunLease.renew
+
+    def renew(lease: RunLease) -> None:
+        renewals.append(clock.passed_s)
+        if len(renewals) == 1:
+            raise StoreError("the disk is full")
+        really(lease)
+
+    monkeypatch.setattr(RunLease, "renew", renew)
+    with store.lease(run, "runner", 0.03):
+        until(lambda: len(renewals) > 2, "the lease is not renewed again")
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from service.store.store import Store
+store = Store.open(Path(sys.argv[1]))
+store.lease(store.find_run("latest"), "the killed one", 3600)
+job = store.claim_job("the killed one", 3600)
+print(job.job_id, flush=True)
+time.sleep(100)
+"""
+
+
+def test_leases_of_a_killed_process_are_taken_over_at_once(tmp_path: Path) -> None:
+    with Store.open(tmp_path) as store:
+        run = start_run(store)
+        enqueued = store.enqueue_job(run, JOB, actor="runner")
+        with subprocess.Popen(
+            [sys.executable, "-c", HOLDER, str(tmp_path)], cwd=ROOT_DIR, stdout=subprocess.PIPE
+        ) as holder:
+            assert holder.stdout is not None
+            assert holder.stdout.readline().decode().strip() == enqueued.job_id
+            with pytest.raises(LeaseHeldError, match="the killed one"):
+                store.lease(run, "next", 10)
+            assert store.claim_job("next", 10) is None
+            os.kill(holder.pid, signal.SIGSTOP)  # if continued, it would go on with the arm
+            with pytest.raises(LeaseHeldError, match="the killed one"):
+                store.lease(run, "next", 10)
+            os.kill(holder.pid, signal.SIGKILL)
+        with store.lease(run, "next", 10):
+            job = store.claim_job("next", 10)
+        assert job is not None
+        assert (job.job_id, job.tries) == (enqueued.job_id, 2)
+        store.finish_job(job, measures={}, duration_s=0.1)
+    assert verify(tmp_path).ok

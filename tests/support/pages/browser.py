@@ -1,0 +1,274 @@
+"""Browser tests of the served pages: Chromium, screens, `orthocapture serve` as a process, axe."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+
+from service.people.roles import Role
+from service.people.sessions import People
+from service.store.store import Store
+from tests.support.rig.rig import REPOSITORY, command
+
+TABLET = (1024, 768)
+DESKTOP = (1920, 1080)
+PASSWORD = "correct horse battery"
+PIN = "246810"
+_FAILURES = REPOSITORY / "build" / "browser-failures"  # screenshots of failed tests
+_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# Without the last options a browser looks up its vendor's hosts at every start. SwiftShader draws the 3D view.
+_OPTIONS = (
+    "--no-sandbox",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+_RULES = {
+    "runOnly": {"type": "tag", "values": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]},
+    "resultTypes": ["violations"],  # passes are only counted
+}
+
+
+@contextmanager
+def chromium() -> Generator[Browser]:
+    """The system's Chromium, headless."""
+    path = next((found for name in _NAMES if (found := shutil.which(name))), None)
+    if path is None:
+        pytest.fail(
+            "Chromium is not installed, and the browser tests need it: `sudo apt-get install chromium` on Debian, "
+            "`sudo snap install chromium` on Ubuntu, `brew install --cask chromium` on macOS",
+            pytrace=False,
+        )
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=_OPTIONS)
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+@dataclass
+class Served:
+    """`orthocapture serve` as a process, which can be killed and restarted on the same port."""
+
+    rig: Path
+    data: Path
+    options: tuple[str, ...] = ()
+    url: str = ""
+    set_up: str = ""
+    _process: subprocess.Popen[str] | None = None
+
+    def start(self) -> None:
+        """Start the process and wait until it answers."""
+        port = self.url.rpartition(":")[2] or "0"
+        words = ["serve", "--rig", str(self.rig), "--data", str(self.data), "--port", port, "--json", *self.options]
+        with (self.data.parent / "serve.log").open("a") as log:
+            self._process = subprocess.Popen(
+                command(*words),
+                cwd=REPOSITORY,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        assert line, self.log()
+        ready = json.loads(line)
+        self.url, self.set_up = ready["url"], ready["set_up"]
+
+    def kill(self, how: signal.Signals = signal.SIGKILL) -> None:
+        """Kill the process; the processes that it started continue."""
+        if self._process is not None:
+            self._process.send_signal(how)
+            self._process.wait(timeout=20)
+            assert self._process.stdout is not None
+            self._process.stdout.close()
+            self._process = None
+
+    def log(self) -> str:
+        """The output of the process and its runners."""
+        logs = [self.data.parent / "serve.log", *(self.data / "monitor").glob("*.log")]
+        return "\n".join(f"{path.name}: {path.read_text()}" for path in logs if path.exists())
+
+    def end_runners(self) -> None:
+        """End the processes that drive runs, and wait for them."""
+        for path in (self.data / "monitor").glob("*.json"):
+            pid = json.loads(path.read_text()).get("pid")
+            if pid is None:  # this is a verification's result
+                continue
+            try:
+                os.kill(pid, signal.SIGTERM)
+            except ProcessLookupError:
+                continue
+            deadline_s = time.monotonic() + 20
+            while Path(f"/proc/{pid}/status").exists() and time.monotonic() < deadline_s:
+                if "State:\tZ" in Path(f"/proc/{pid}/status").read_text():
+                    break
+                time.sleep(0.1)
+
+
+class Cable:
+    """A connection from one screen to the server that can be interrupted: no data passes, but nothing is closed."""
+
+    def __init__(self, url: str) -> None:
+        self._target = ("127.0.0.1", int(url.rpartition(":")[2]))
+        self._plugged = threading.Event()
+        self._plugged.set()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.url = f"http://127.0.0.1:{self._listener.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def cut(self) -> None:
+        """Hold back every byte from now on."""
+        self._plugged.clear()
+
+    def plug(self) -> None:
+        """Deliver the bytes held back."""
+        self._plugged.set()
+
+    def close(self) -> None:
+        """Accept no further connection."""
+        self.plug()
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):  # already closed
+            while True:
+                near, _ = self._listener.accept()
+                threading.Thread(target=self._join, args=(near,), daemon=True).start()
+
+    def _join(self, near: socket.socket) -> None:
+        with near, contextlib.suppress(OSError), socket.create_connection(self._target) as far:
+            back = threading.Thread(target=self._copy, args=(far, near), daemon=True)
+            back.start()
+            self._copy(near, far)
+            back.join()
+
+    def _copy(self, source: socket.socket, target: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(1 << 16):
+                self._plugged.wait()
+                target.sendall(data)
+            target.shutdown(socket.SHUT_WR)
+
+
+@contextmanager
+def served(rig: Path, data: Path, *options: str) -> Generator[Served]:
+    """Serve the pages of a data folder until the block ends."""
+    server = Served(rig, data, options)
+    server.start()
+    try:
+        yield server
+    finally:
+        server.end_runners()
+        server.kill(signal.SIGTERM)
+
+
+def add_people(data: Path, people: Sequence[tuple[str, Role]]) -> None:
+    """Create accounts with PASSWORD and PIN as the pages do: an administrator invites, people accept."""
+    with Store.open(data) as store:
+        desk = People(store)
+        desk.accounts.set_up(desk.first_link() or "", "ada", "Ada Example", PASSWORD, PIN)
+        token = desk.sign_in("ada", PASSWORD)
+        administrator = desk.person(token, idle_lock_s=600, deliberate=True)
+        assert administrator is not None
+        for account, role in people:
+            link = desk.accounts.invite(administrator, account, f"{account.title()} Example", role)
+            desk.accounts.accept(link, PASSWORD, PIN)
+        desk.sign_out(administrator)
+
+
+@dataclass
+class Screen:
+    """A tablet or a desktop with one person in front of it."""
+
+    context: BrowserContext
+    page: Page
+    url: str
+
+    def go(self, path: str) -> None:
+        """Open a page, which must load."""
+        response = self.page.goto(self.url + path)
+        assert response is not None, f"{path}: no answer"
+        assert response.ok, f"{path}: {response.status}"
+
+    def sign_in(self, account: str, password: str = PASSWORD) -> None:
+        """Sign in through the page."""
+        self.go("/sign-in")
+        self.page.get_by_label("Account").fill(account)
+        self.page.get_by_label("Password").fill(password)
+        self.page.get_by_role("button", name="Sign in").click()
+        expect(self.page.get_by_role("button", name="Sign out")).to_be_visible()
+
+    def words(self) -> str:
+        """The text of the page."""
+        return self.page.locator("body").inner_text()
+
+    def hold(self, name: str, seconds: float = 1.8) -> None:
+        """Press the button of that name and hold it."""
+        button = self.page.get_by_role("button", name=name)
+        expect(button).to_be_enabled(timeout=20_000)
+        button.scroll_into_view_if_needed()
+        button.hover()
+        self.page.mouse.down()
+        self.page.wait_for_timeout(1000 * seconds)
+        self.page.mouse.up()
+
+
+@contextmanager
+def screen(
+    browser: Browser, url: str, size: tuple[int, int] = TABLET, *, dark: bool = False, touch: bool = False
+) -> Generator[Screen]:
+    """A screen whose page must be free of errors: script errors and blocked content fail the test."""
+    context = browser.new_context(
+        viewport={"width": size[0], "height": size[1]},
+        color_scheme="dark" if dark else "light",
+        has_touch=touch,
+        base_url=url,
+    )
+    complaints: list[str] = []
+    page = context.new_page()
+    page.set_default_timeout(15_000)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on(
+        "console", lambda message: complaints.append(message.text) if "Content Security" in message.text else None
+    )
+    try:
+        yield Screen(context, page, url)
+    except BaseException:
+        _FAILURES.mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=_FAILURES / f"{time.time():.1f}.png", full_page=True)
+        raise
+    finally:
+        context.close()
+    assert not complaints, complaints
+
+
+def accessibility_faults(page: Page) -> list[str]:
+    """What axe reports against WCAG 2.2 AA: the rule and the place."""
+    found: dict[str, Any] = Axe().run(page, options=_RULES).response
+    return [
+        f"{violation['id']}: {violation['help']} at {node['target']}: {node['html'][:120]}"
+        for violation in found["violations"]
+        for node in violation["nodes"]
+    ]

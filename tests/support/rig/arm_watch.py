@@ -1,0 +1,85 @@
+"""Observes a simulated arm over a separate connection: when it moved and came to rest, on the controller's clock."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Generator
+from dataclasses import dataclass
+
+from tests.support.processes.waiting import until
+from tests.support.rig.ur_rtde_protocol import RtdeClient
+
+LONGEST_STEP_S = 0.05  # longest gap that counts; in a longer one the simulator was not scheduled
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """One sample: the controller's time, the speed of the fastest driven joint, whether a program runs."""
+
+    time_s: float
+    speed_rad_s: float
+    joint_rad: float
+    program_runs: bool
+
+
+class ArmWatch:
+    """All samples since the watch began."""
+
+    def __init__(self, host: str) -> None:
+        self._client = RtdeClient(host)
+        self._client.output_setup(["timestamp", "target_qd", "actual_q", "runtime_state"], 125.0)
+        self._client.start()
+        self._seen: list[Seen] = []
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._client.shutdown()
+        self._thread.join(5.0)
+        self._client.close()
+
+    def mark(self) -> int:
+        """Mark the present moment, for the methods that take `since`."""
+        return len(self._seen)
+
+    @property
+    def now(self) -> Seen:
+        return self._seen[-1]
+
+    def wait_moving(self, at_least_rad_s: float) -> None:
+        until(lambda: bool(self._seen) and self.now.speed_rad_s >= at_least_rad_s, "it moves", 20.0, every_s=0.002)
+
+    def wait_resting(self) -> None:
+        until(lambda: self.now.speed_rad_s == 0.0, "it rests", 20.0, every_s=0.01)
+
+    def moved_for_s(self, since: int) -> float:
+        """Time from a mark until the arm was last driven, on the controller's clock; 0 if it never was."""
+        elapsed_s = last_s = 0.0
+        for before, sample in zip(self._seen[since - 1 :], self._seen[since:], strict=False):
+            elapsed_s += min(sample.time_s - before.time_s, LONGEST_STEP_S)
+            if sample.speed_rad_s > 0.0:
+                last_s = elapsed_s
+        return last_s
+
+    def way_rad(self, since: int) -> float:
+        """How far the first joint has moved since a mark."""
+        return abs(self.now.joint_rad - self._seen[since - 1].joint_rad)
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                data = self._client.data()
+                speed_rad_s = max(abs(v) for v in data["target_qd"])
+                runs = data["runtime_state"] == (2,)
+                self._seen.append(Seen(data["timestamp"][0], speed_rad_s, data["actual_q"][0], runs))
+
+
+@contextlib.contextmanager
+def watched_arm(host: str) -> Generator[ArmWatch]:
+    """Observe the arm at this address."""
+    watch = ArmWatch(host)
+    try:
+        yield watch
+    finally:
+        watch.close()

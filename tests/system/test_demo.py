@@ -1,0 +1,143 @@
+"""The demonstration as its user runs it: one command from specimen to registered data set."""
+
+from __future__ import annotations
+
+import csv
+import json
+import socket
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from service.cli.run.demo import free_address
+from tests.support.processes.package import installed_package
+from tests.support.rig.rig import RIG_LOCK, command, orthocapture
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """One run of the demo as it is installed, from an empty folder; shared by the tests of this file."""
+    package = installed_package(tmp_path_factory)
+    with RIG_LOCK:
+        answer = package.run("demo", "--json", cwd=tmp_path_factory.mktemp("demo"), timeout_s=840)
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+    return json.loads(answer.stdout.splitlines()[-1])
+
+
+def test_table_has_the_papers_rows_and_its_reason(demo: dict[str, Any]) -> None:
+    rows = {row["poses"]: row for row in demo["table"]}
+    assert set(rows) == {"robot", "robot_corrected", "triangulated", "colmap", "glomap", "hybrid"}
+    for source in ("robot_corrected", "triangulated", "colmap", "glomap", "hybrid"):
+        assert rows[source]["mean_radial_error_mm"] <= 0.15
+        assert rows[source]["true_error_mm"] <= 0.15
+    # The arm's systematic error, which does not affect structure from motion.
+    assert rows["robot"]["mean_radial_error_mm"] > 2 * rows["colmap"]["mean_radial_error_mm"]
+
+
+def test_evidence_verifies_from_the_command_line(demo: dict[str, Any]) -> None:
+    assert demo["audit_ok"] is True
+    answer = orthocapture("audit", "verify", demo["run"], "--data", demo["data_dir"], "--json")
+    assert answer.returncode == 0, answer.stdout
+    assert json.loads(answer.stdout)["ok"] is True
+
+
+def test_one_altered_byte_is_found(demo: dict[str, Any], tmp_path: Path) -> None:
+    copy = tmp_path / "data"
+    subprocess.run(["cp", "-r", demo["data_dir"], copy], check=True)
+    photograph = max((copy / "artefacts").rglob("*"), key=lambda p: p.stat().st_size if p.is_file() else 0)
+    photograph.chmod(0o644)
+    with photograph.open("r+b") as file:
+        file.seek(1000)
+        byte = file.read(1)
+        file.seek(1000)
+        file.write(bytes([byte[0] ^ 1]))
+    answer = orthocapture("audit", "verify", demo["run"], "--data", str(copy), "--json")
+    assert answer.returncode == 1
+    assert photograph.name in json.dumps(json.loads(answer.stdout)["first_fault"])
+
+
+def test_views_come_from_both_stations_at_the_promised_size(demo: dict[str, Any]) -> None:
+    answer = orthocapture("audit", "show", demo["run"], "--data", demo["data_dir"], "--json")
+    events = json.loads(answer.stdout)["events"]
+    captured = [e for e in events if e["kind"] == "viewpoint_captured"]
+    views = [e for e in captured if any(a["kind"] == "image" for a in e["artefacts"])]
+    assert len(views) >= 16
+    folder = Path(demo["dataset"]) / "images"
+    from PIL import Image  # noqa: PLC0415 - Pillow comes with scikit-image
+
+    with Image.open(next(iter(sorted(folder.iterdir())))) as image:
+        assert image.size[0] >= 1280
+        assert image.size[1] >= 853
+
+
+def test_data_set_is_in_one_frame(demo: dict[str, Any]) -> None:
+    folder = Path(demo["dataset"])
+    with (folder / "poses.csv").open() as file:
+        poses = list(csv.DictReader(file))
+    assert {row["image"] for row in poses} == {p.name for p in (folder / "images").iterdir()}
+    mesh = trimesh.load(folder / "mesh.ply", process=False)
+    assert isinstance(mesh, trimesh.Trimesh)
+    centres = np.array([[float(row[k]) for k in "xyz"] for row in poses])
+    distance_m = np.linalg.norm(centres - mesh.vertices.mean(axis=0), axis=1)
+    assert np.all((distance_m > 0.4) & (distance_m < 1.0))
+    assert json.loads((folder / "dataset.json").read_text())["simulated"] is True
+
+
+def test_report_stands_alone(demo: dict[str, Any]) -> None:
+    html = Path(demo["report"]).read_text()
+    for text in ("Deviations", "colmap", "data:image/jpeg;base64", "plotly", "evidence verified", "simulated rig"):
+        assert text in html
+    assert 'src="http' not in html
+
+
+def test_every_image_was_looked_at_while_the_specimen_was_there(demo: dict[str, Any]) -> None:
+    answer = orthocapture("status", demo["run"], "--data", demo["data_dir"], "--json")
+    steps = json.loads(answer.stdout)["steps"]
+    looked_at: list[float] = []
+    for name in ("viewpoint_capture_1", "control_capture_1", "viewpoint_capture_2", "control_capture_2"):
+        assert {view["viewpoint"] for view in steps[name]["live"]} == set(steps[name]["captured"])
+        assert all(view["spheres_seen"] >= 4 for view in steps[name]["live"])
+        looked_at += [view["predicted_target_error_mm"] for view in steps[name]["live"]]
+    last = steps["control_capture_2"]["measures"]
+    assert 0 < last["predicted_target_error_mm"] <= max(looked_at)
+    assert 0.6 <= last["specimen_coverage"] <= 1
+    events = json.loads(orthocapture("audit", "show", demo["run"], "--data", demo["data_dir"], "--json").stdout)
+    plans = [e for e in events["events"] if "note=motion_plan" in e["summary"]]
+    assert len(plans) == 4, "recorded before the first motion of each capture"
+
+
+def test_truth_never_enters_the_run(demo: dict[str, Any]) -> None:
+    database = Path(demo["database"]).read_bytes()
+    assert b"truth" not in database
+
+
+def test_a_taken_port_moves_the_demo_to_another_address(tmp_path: Path) -> None:
+    with RIG_LOCK, socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        first = free_address()
+        taken.bind((first, 30004))
+        taken.listen()
+        with (
+            (tmp_path / "words").open("w") as words,
+            subprocess.Popen(command("demo", "--out", str(tmp_path / "demo")), stdout=words, stderr=words) as demo,
+        ):
+            try:
+                deadline_s = time.monotonic() + 300
+                while not (found := list(tmp_path.glob("demo/*/rig/rig.yaml"))):
+                    assert demo.poll() is None, (tmp_path / "words").read_text()
+                    assert time.monotonic() < deadline_s
+                    time.sleep(0.2)
+                devices = yaml.safe_load(found[0].read_text())["devices"].values()
+            finally:
+                demo.terminate()
+    (host,) = (device["host"] for device in devices if device["driver"] == "ur")
+    assert host != first
+    assert host.startswith("127.0.0.")

@@ -1,0 +1,436 @@
+"""The documents are correct: every command in them is run, and generated parts are up to date."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.request import urlopen
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from docs.generate.measure_words import MEANINGS
+from docs.generate.pages import REFERENCE, pages
+from docs.generate.steps import all_measures
+from service.compute.poses.files.pose_files import write_camera_json, write_poses_csv
+from service.core.records.events import JobFailed
+from service.store.records import NewJob
+from service.store.store import Store
+from tests.support.runs.bench_run import record_runs
+from tests.support.scenes.sphere_images import RADIUS_M, REGISTRATION_M, render, scene
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+HELP_TEXTS = "commands.md"  # the help of the commands, put together
+SCRIPTS = Path(sys.executable).parent
+SHELLS = ("sh", "bash", "shell", "console")
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_PATH = re.compile(r"`((?:service|drivers|simulators|protocols|bench|tests)/[\w/]*(?:\w|\.(?:py|yaml)|/))`")
+_SPAN = re.compile(r"`((?:orthocapture|make|python3?|pip|\.venv/bin/\S+) [^`]+)`")
+
+
+def commands_of(text: str) -> list[str]:
+    """Every command in a document: the lines of its shell blocks, and commands in backticks."""
+    found: list[str] = []
+    for language, block in _FENCE.findall(text):
+        if language in SHELLS:
+            lines = block.replace("\\\n", " ").splitlines()
+            found += [line.removeprefix("$ ").split(" #")[0].strip() for line in lines if line.strip()]
+    found += [" ".join(span.split()) for span in _SPAN.findall(_FENCE.sub("", text))]
+    return [command for command in found if command and not command.startswith("#")]
+
+
+@dataclass(frozen=True)
+class Site:
+    """A working directory as the documents assume it: a rig file, recorded runs, a data set taken by hand."""
+
+    folder: Path
+    begun: str  # the latest run; it waits for its first confirmation
+
+    def run(self, command: str, *, typed: str = "") -> subprocess.CompletedProcess[str]:
+        """Run the command to its end, as its reader would type it."""
+        words = shlex.split(command)
+        words[0] = str(SCRIPTS / words[0])
+        return subprocess.run(
+            words, cwd=self.folder, input=typed, capture_output=True, text=True, timeout=110, check=False
+        )
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A data folder with a completed run and one that waits, and the name of the latter."""
+    folder = tmp_path_factory.mktemp("recorded")
+    _, begun = record_runs(folder)
+    return folder / "data", begun
+
+
+@pytest.fixture
+def site(tmp_path: Path, recorded: tuple[Path, str]) -> Site:
+    data, begun = recorded
+    shutil.copytree(data, tmp_path / "runs")
+    (tmp_path / "protocols").symlink_to(ROOT / "protocols")
+    (tmp_path / "scans").mkdir()
+    rig = "name: a small site\ndevices:\n  scanner: {driver: scan_folder, folder: scans}\n"
+    (tmp_path / "rig.yaml").write_text(rig)
+    return Site(tmp_path, begun)
+
+
+# --- how each command is run --------------------------------------------------------------------------------
+
+
+def succeeds(site: Site, command: str) -> None:
+    done = site.run(command)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def asks_and_is_aborted(site: Site, command: str) -> None:
+    """A run asks its first question; the typed answer ends it with status 1, since it is not completed."""
+    done = site.run(command, typed="abort only reading the manual\n")
+    assert done.returncode == 1, done.stderr
+    assert "Type one of: confirm" in done.stderr.replace("\n", " ")
+    assert "is aborted" in done.stdout
+
+
+def says_how_to_get_the_data(site: Site, command: str) -> None:
+    """With no data set present; the committed table stays unchanged."""
+    before = sorted(path.name for path in (ROOT / "bench" / "results").glob("real_data*"))
+    words = [sys.executable, *shlex.split(command)[1:-1], str(site.folder)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=110, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert len(lines) > 10
+    assert all(": not run. " in line for line in lines)
+    assert sorted(path.name for path in (ROOT / "bench" / "results").glob("real_data*")) == before
+
+
+def serves_until_terminated(site: Site, command: str) -> None:
+    """The worker takes a job that it must refuse, and ends when told to."""
+    words = shlex.split(command)
+    with Store.open(site.folder / "runs") as store:
+        job = NewJob("locate_spheres", "fixation", 1, "docs", {"mesh": "0" * 64, "radius_m": 0.015, "expected": 10})
+        store.enqueue_job(site.begun, job, actor="test")
+        with subprocess.Popen([SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.DEVNULL) as worker:
+            try:
+                while not any(isinstance(event.payload, JobFailed) for event in store.events(site.begun)):
+                    assert worker.poll() is None
+                    time.sleep(0.1)
+            finally:
+                worker.terminate()
+            assert worker.wait(timeout=20) == 0
+
+
+def registers(site: Site, command: str) -> None:
+    """Photographs, camera, poses and mesh under the names in the command; DIR is the folder of the images."""
+    made = scene(4, 800, seed=11)
+    images = site.folder / "images"
+    images.mkdir()
+    for i in range(4):
+        picture = render(made.camera, made.centres_camera(i, REGISTRATION_M), i, oversample=2)
+        assert cv2.imwrite(str(images / f"view_{i}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    write_camera_json(site.folder / "camera.json", made.camera)
+    write_poses_csv(site.folder / "poses.csv", {f"view_{i}.jpg": T for i, T in enumerate(made.T_world_camera)})
+    spheres = [
+        trimesh.creation.icosphere(subdivisions=3, radius=1e3 * RADIUS_M).apply_translation(1e3 * centre)
+        for centre in REGISTRATION_M
+    ]
+    trimesh.util.concatenate(spheres).export(site.folder / "scan.ply")
+    done = site.run(command.replace(" DIR ", " images ") + " --json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    T = np.array(json.loads((site.folder / "result.json").read_text())["T_world_scan"])
+    assert np.abs(T - made.T_world_scan).max() < 5e-4
+
+
+def serves_pages(site: Site, command: str) -> None:
+    """The web process answers on a free port, and ends when told to."""
+    words = shlex.split(command + " --port 0 --json")
+    with subprocess.Popen(
+        [SCRIPTS / words[0], *words[1:]], cwd=site.folder, stdout=subprocess.PIPE, text=True
+    ) as server:
+        try:
+            assert server.stdout is not None
+            ready = json.loads(server.stdout.readline())
+            assert "/set-up/" in ready["set_up"]
+            with urlopen(ready["url"] + "/sign-in", timeout=20) as page:
+                assert b"Sign in" in page.read()
+        finally:
+            server.terminate()
+        assert server.wait(timeout=20) == 0
+
+
+Check = Callable[[Site, str], None]
+RUN_HERE: dict[str, Check] = {
+    "orthocapture protocol check protocols/exvivo_spine.yaml": succeeds,
+    "orthocapture doctor --rig rig.yaml": succeeds,
+    "orthocapture run protocols/exvivo_spine.yaml --rig rig.yaml --data runs "
+    '--operator "A. Name"': asks_and_is_aborted,
+    "orthocapture resume latest --data runs": asks_and_is_aborted,
+    "orthocapture status latest --data runs": succeeds,
+    "orthocapture plan next latest --data runs": succeeds,
+    "orthocapture act pause --run latest --data runs": succeeds,
+    'orthocapture note "a wire slipped" --run latest --data runs': succeeds,
+    "orthocapture runs --search spine --data runs": succeeds,
+    "orthocapture history --out history.csv --data runs": succeeds,
+    "orthocapture worker --data runs": serves_until_terminated,
+    "orthocapture serve --rig rig.yaml --data runs": serves_pages,
+    "orthocapture audit report latest --pdf report.pdf --data runs": succeeds,
+    "orthocapture audit report latest --pdf report.pdf --html report.html --data runs": succeeds,
+    "orthocapture audit figures latest --out figures --data runs": succeeds,
+    "orthocapture audit export latest bundle.zip --data runs": succeeds,
+    "orthocapture register --images DIR --camera camera.json --poses poses.csv --mesh scan.ply --radius-mm 15 "
+    "--out result.json": registers,
+    "orthocapture audit show latest --data runs": succeeds,
+    "orthocapture store backup BACKUP --data runs": succeeds,
+    "orthocapture audit verify latest --data runs": succeeds,
+    "orthocapture audit verify all --data runs": succeeds,
+    "orthocapture audit verify latest --json --data runs": succeeds,
+    "orthocapture audit keys --data runs": succeeds,
+    "orthocapture store gc --data runs": succeeds,
+    "python -m bench.real_data --data DIR": says_how_to_get_the_data,
+}
+# Commands that take minutes or a whole rig, with the test that runs them.
+RUN_ELSEWHERE = {
+    "orthocapture compare RUN OTHER --data runs": (
+        "tests/audit/test_runs_beside_runs.py::test_two_runs_side_by_side_in_the_terminal"
+    ),
+    "orthocapture replay latest --data runs": "tests/audit/test_replay.py::test_command_says_equal_with_status_0",
+    "orthocapture calibrate intrinsics --images DIR --board 16x23 --square-mm 15 --out camera.json": (
+        "tests/calibration/test_intrinsics_command.py::test_a_folder_of_photographs_becomes_a_camera_that_every_command_reads"
+    ),
+    "orthocapture sfm --images DIR --camera camera.json --out MODEL_DIR": (
+        "tests/poses/test_sfm_command.py::test_robot_poses_of_two_frames_are_noticed_and_not_believed"
+    ),
+    "orthocapture calibrate hand-eye --images DIR --robot-poses poses.csv --joints joints.csv --camera camera.json "
+    "--board 16x23 --square-mm 15 --out hand_eye.json": (
+        "tests/calibration/test_hand_eye_arm.py::test_the_command_calibrates_photographs"
+    ),
+    "orthocapture plan show protocols/exvivo_spine.yaml --rig rig.yaml": (
+        "tests/steps/test_planning.py::test_the_command_plans_from_files_alone"
+    ),
+    "orthocapture spheres --mesh scan.ply --radius-mm 15 --out spheres.json": (
+        "tests/scanner/test_mesh_spheres_hard.py::test_command_reads_clouds_and_writes_spheres"
+    ),
+    "orthocapture layout --spheres spheres.json": "tests/steps/test_layout.py::test_command",
+    "orthocapture demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
+    "make demo": "tests/system/test_demo.py::test_table_has_the_papers_rows_and_its_reason",
+    'python -m pip install ".[fuzz]"': (
+        "tests/system/test_torture_fuzz.py::test_every_parser_refuses_bad_input_as_people_can_understand"
+    ),
+    "make torture-crash": (
+        "tests/store/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
+    ),
+    "python -m bench.torture.crash --sample 100 --random-runs 1": (
+        "tests/store/test_crash_sweep.py::test_a_death_at_every_kind_of_point_leaves_nothing_behind"
+    ),
+    "python -m bench.soak --only large --viewpoints 2000 --gigabytes 5": (
+        "tests/store/test_soak.py::test_each_part_runs_small_and_its_figures_stand_beside_the_others"
+    ),
+    **dict.fromkeys(
+        (
+            "make test",
+            "make test-all",
+            "make lint",
+            "make docs",
+            "make reference",
+            "make lock",
+            "make test-versions",
+            "make torture-audit",
+            "make torture-faults",
+            "make torture-fuzz",
+            "make soak",
+            "make clean",
+        ),
+        "tests/system/test_docs.py::test_make_targets_do_what_the_documents_say",
+    ),
+    "orthocapture import FOLDER --data runs": (
+        "tests/poses/test_import.py::test_an_import_killed_and_begun_again_is_a_run_that_says_so_everywhere"
+    ),
+    "orthocapture simulate rig --scene 7 --dir rig --hand usual": (
+        "tests/steps/test_handheld.py::test_the_evidence_verifies"
+    ),
+    **dict.fromkeys(
+        (
+            "python -m bench.torture.faults --only 'robot/rtde/*'",
+            "python -m bench.torture.faults --sample 40 --seed 7 --minutes 10",
+            "python -m bench.torture.faults --record",
+        ),
+        "tests/system/test_torture_faults.py::test_a_few_cases_of_each_device_go_as_the_table_says",
+    ),
+    **dict.fromkeys(
+        (
+            "orthocapture store restore BACKUP restored",
+            "orthocapture audit verify all --data restored",
+            "orthocapture resume latest --data restored",
+        ),
+        "tests/store/test_backup.py::test_a_run_goes_on_in_the_restored_folder",
+    ),
+    'orthocapture audit rotate-key --lost --reason "disk died" --data restored': (
+        "tests/store/test_backup.py::test_the_signing_key_leaves_only_when_asked_and_a_restored_run_can_be_signed"
+    ),
+    "orthocapture doctor --rig rig.yaml --protocol protocols/exvivo_spine.yaml --data runs": (
+        "tests/run/test_space.py::test_doctor_and_pages_say_it_before_a_run"
+    ),
+    "orthocapture audit verify --signatures FILE": (
+        "tests/audit/test_signature_log.py::test_a_run_keeps_the_copy_that_its_rig_file_names"
+    ),
+    "orthocapture serve --rig rig/rig.yaml --data runs": (
+        "tests/browser/test_browser_run.py::test_a_technician_is_led_through_a_run_and_a_second_person_releases_it"
+    ),
+    "orthocapture register --images DIR --camera camera.json --poses MODEL_DIR --estimate-scale --mesh scan.ply "
+    "--radius-mm 15 --out result.json": (
+        "tests/registration/test_register_command.py::test_scale_of_poses_that_are_not_metric"
+    ),
+    ".venv/bin/python -m pip wheel --no-deps --no-build-isolation --wheel-dir dist .": (
+        "tests/system/test_package.py::test_wheel_and_sdist_hold_every_file_of_the_packages"
+    ),
+    **dict.fromkeys(
+        (
+            ".venv/bin/pytest tests/protocol/test_gate_words.py -n 0",
+            '.venv/bin/pytest -m "not slow" -k gate',
+        ),
+        "tests/system/test_docs.py::test_test_files_and_the_marker_are_there",
+    ),
+    "orthocapture act release": "tests/web/test_web_held.py::test_the_buttons_ask_the_step",
+    "orthocapture simulate rig --scene 7 --dir rig": (
+        "tests/run/test_resume.py::test_sigkill_in_the_capture_loses_and_repeats_nothing"
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", RUN_HERE)
+def test_the_command_works_as_it_is_written(site: Site, command: str) -> None:
+    RUN_HERE[command](site, command)
+
+
+def test_every_command_of_the_documents_is_run_and_none_is_listed_in_vain() -> None:
+    texts = [document.read_text(encoding="utf-8") for document in DOCUMENTS if document.name != HELP_TEXTS]
+    written = {command for text in texts for command in commands_of(text)}
+    listed = {*RUN_HERE, *RUN_ELSEWHERE}
+    assert written - listed == set(), "in the documents, but run by no test"
+    assert listed - written == set(), "listed here, but in no document"
+
+
+@pytest.mark.parametrize(("command", "test"), RUN_ELSEWHERE.items())
+def test_the_test_that_runs_it_exists(command: str, test: str) -> None:
+    file, name = test.split("::")
+    module = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+    assert name in {node.name for node in module.body if isinstance(node, ast.FunctionDef)}, command
+
+
+def test_make_targets_do_what_the_documents_say() -> None:
+    """The last line of each target; tests/system/test_demo.py runs the command of `make demo`."""
+    for target, last in (
+        ("test", '.venv/bin/pytest -m "not slow"'),
+        ("test-all", ".venv/bin/pytest"),
+        ("demo", ".venv/bin/orthocapture demo"),
+        ("lint", ".venv/bin/lint-imports"),
+        ("lock", "sed -i '1i # The same with the tools of tests and lint; made by `make lock`.' constraints-dev.txt"),
+        ("docs", ".venv/bin/sphinx-build --quiet --fail-on-warning --keep-going docs build/docs"),
+        ("reference", ".venv/bin/python -m docs.generate"),
+        ("test-versions", ".ci/versions"),
+        ("torture-audit", ".venv/bin/python -m bench.torture.audit"),
+        ("torture-crash", ".venv/bin/python -m bench.torture.crash"),
+        ("torture-faults", ".venv/bin/python -m bench.torture.faults"),
+        ("torture-fuzz", ".venv/bin/python -m bench.torture.fuzz --seconds-per-target 60 --record"),
+        ("soak", ".venv/bin/python -m bench.soak"),
+        ("clean", "rm -rf .venv build *.egg-info"),
+    ):
+        done = subprocess.run(
+            ["make", "--dry-run", "--no-print-directory", target],
+            cwd=ROOT, capture_output=True, text=True, timeout=30, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.splitlines()[-1] == last
+
+
+def test_commands_are_found_in_blocks_tables_and_text() -> None:
+    text = (
+        "Say `make it so`, not `orthocapture.drivers`.\n```sh\n# a note\n$ ls -l  # all\nfind . \\\n  -name x\n```\n"
+    )
+    text += "```yaml\nmake: no\n```\n| a | `orthocapture status latest` |\n"
+    assert commands_of(text) == ["ls -l", "find .    -name x", "make it so", "orthocapture status latest"]
+
+
+def test_test_files_and_the_marker_are_there() -> None:
+    """What the commands for a part of the tests name; they cannot be run within the tests themselves."""
+    assert (ROOT / "tests" / "protocol" / "test_gate_words.py").is_file()
+    assert '"slow: ' in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+
+
+def test_snippets_of_python_run(site: Site) -> None:
+    snippets = [
+        block
+        for document in DOCUMENTS
+        for language, block in _FENCE.findall(document.read_text(encoding="utf-8"))
+        if language == "python"
+    ]
+    assert snippets
+    for snippet in snippets:
+        done = subprocess.run(
+            [sys.executable, "-c", snippet], cwd=site.folder, capture_output=True, text=True, timeout=60, check=False
+        )
+        assert done.returncode == 0, done.stderr
+    assert "viewpoint,sha256" in (site.folder / "captures.csv").read_text()
+
+
+def test_files_that_the_documents_name_exist() -> None:
+    for document in DOCUMENTS:
+        for path in _PATH.findall(document.read_text(encoding="utf-8")):
+            assert (ROOT / path).exists(), f"{document.name}: {path}"
+
+
+def test_every_page_is_reached_from_the_first() -> None:
+    """Sphinx says so too, but only where it is installed."""
+    listed = set(re.findall(r"^(\w+/\w+)$", (ROOT / "docs" / "index.md").read_text(encoding="utf-8"), re.MULTILINE))
+    pages_there = {
+        path.relative_to(ROOT / "docs").with_suffix("").as_posix()
+        for part in ("tutorial", "howto", "reference", "explanation")
+        for path in (ROOT / "docs" / part).glob("*.md")
+    }
+    assert pages_there == {page for page in listed if not page.startswith("decisions/")}
+
+
+# --- what is generated ------------------------------------------------------------------------------------------
+
+
+def test_the_generated_documents_are_up_to_date() -> None:
+    """`make reference` regenerates them."""
+    for name, text in pages().items():
+        assert (REFERENCE / name).read_text(encoding="utf-8") == text, f"{name}: run `make reference`"
+
+
+def test_every_key_of_a_file_and_every_measure_is_explained() -> None:
+    for name in ("protocol.md", "rig.md"):
+        keys = [
+            line for line in (REFERENCE / name).read_text(encoding="utf-8").splitlines() if line.startswith("| `")
+        ]
+        assert keys
+        assert not [line for line in keys if line.endswith("|  |")], name
+    assert all_measures() == set(MEANINGS)
+
+
+def test_links_of_the_documents_lead_somewhere() -> None:
+    for document in DOCUMENTS:
+        for target in re.findall(r"\]\(([^)#]+)\)", document.read_text(encoding="utf-8")):
+            assert "://" in target or (document.parent / target).exists(), f"{document.name}: {target}"
+
+
+def test_what_the_readme_says_of_a_corrected_arm_is_what_was_measured() -> None:
+    """For errors of the simulated arm's own model, and for an arm with other errors (bench/hand_eye)."""
+    measured = json.loads((ROOT / "bench" / "results" / "hand_eye-2026-11-21.json").read_text())
+    text = " ".join((ROOT / "README.md").read_text().split())
+    for kind, words in (("systematic", "poses good to {} … {} mm once"), ("odd", "{} … {} mm are left")):
+        rows = [row for row in measured[kind] if row["session"].startswith("hand-eye step")]
+        left = [row["error_mm"]["arm corrected"] for row in rows]
+        assert words.format(f"{min(left):.2f}", f"{max(left):.2f}") in text

@@ -1,0 +1,275 @@
+"""The simulated rig as a process: its files, its world, its end; and a rig with two controllers."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+import yaml
+
+from service.core.records.events import ViewpointCaptured
+from service.rig import load_rig
+from service.station import Station
+from service.store.store import Store
+from tests.support.processes.waiting import until
+from tests.support.rig.rig import REPOSITORY, RigLock, orthocapture, simulated_rig, without_calibration_and_ct
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300), pytest.mark.xdist_group("rig")]
+
+SMALL = ("--scene", "3", "--image-width", "480", "--speed-up", "10")
+# These rigs use an address of their own, so that they do not wait for those of other tests.
+OWN_HOST = "127.0.0.61"
+
+
+class Hands:
+    """A client of the world's socket."""
+
+    def __init__(self, address: str) -> None:
+        host, port = address.split(":")
+        self._socket = socket.create_connection((host, int(port)), timeout=60)
+        self._lines = self._socket.makefile("r")
+
+    def __enter__(self) -> Hands:
+        return self
+
+    def __exit__(self, *_exc: object) -> None:
+        self._lines.close()
+        self._socket.close()
+
+    def send(self, line: str) -> dict[str, Any]:
+        self._socket.sendall(line.encode() + b"\n")
+        return json.loads(self._lines.readline())
+
+    def ask(self, op: str, **fields: object) -> dict[str, Any]:
+        return self.send(json.dumps({"op": op, **fields}))
+
+    def act(self, action: str, **fields: object) -> dict[str, Any]:
+        return self.ask("act", action=action, **fields)
+
+
+@contextmanager
+def rig_process(folder: Path) -> Generator[tuple[subprocess.Popen[str], dict[str, Any], list[psutil.Process]]]:
+    """A rig that the test ends itself; yields it with its ready line and all its processes."""
+    with RigLock(OWN_HOST), (folder / "rig.log").open("w") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "simulators", "rig", "--dir", str(folder), "--host", OWN_HOST, *SMALL],
+            cwd=REPOSITORY, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log, text=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        try:
+            line = process.stdout.readline()
+            assert line, (folder / "rig.log").read_text()
+            root = psutil.Process(process.pid)
+            yield process, json.loads(line), [root, *root.children(recursive=True)]
+        finally:
+            process.kill()
+            process.wait(timeout=30)
+            process.stdout.close()
+
+
+def listens(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((host, port)) == 0
+
+
+# --- one rig ----------------------------------------------------------------------------------------------
+
+
+def test_files_world_and_hands(tmp_path: Path) -> None:
+    with simulated_rig(tmp_path, *SMALL, host=OWN_HOST) as ready, Hands(ready["world"]) as hands:
+        # Everything in the ready line exists, and the service can read it.
+        assert ready["ready"] is True
+        assert Path(ready["rig"]) == tmp_path / "rig.yaml"
+        for key in ("rig", "truth", "ct_folder", "scan_folder"):
+            assert Path(ready[key]).exists()
+        for name in ("robot", "camera", "lightbox"):
+            assert (tmp_path / "logs" / f"{name}.log").exists()
+        assert (tmp_path / "lightbox").is_symlink()
+        rig = load_rig(Path(ready["rig"]))
+        assert rig.section.simulated
+        assert rig.section.hands == ready["world"]
+        assert set(rig.section.stations) == {"station_1", "station_2"}
+
+        # The ground truth is only in its own file.
+        truth = json.loads(Path(ready["truth"]).read_text())
+        assert truth["scene"] == 3
+        assert "no operation 'truth'" in hands.ask("truth")["error"]
+        text = Path(ready["rig"]).read_text()
+        for secret in ("T_world", "dh_deltas", "registration_m", "intrinsics", "truth"):
+            assert secret not in text
+        nominal = rig.nominal_T_flange_camera()
+        offset_m = np.linalg.norm(nominal[:3, 3] - np.array(truth["T_flange_camera"])[:3, 3])
+        assert 1e-5 < offset_m < 5e-3
+        for name, section in rig.section.stations.items():
+            T_world_base = np.array(truth["T_world_base"][name])
+            centre = T_world_base[:3, :3] @ np.array(section.scene_centre_m) + T_world_base[:3, 3]
+            assert 0 < np.linalg.norm(centre - [0, 0, 0.05]) < 0.02
+
+        # Bad requests are answered and do not affect the connection.
+        for line in ("{", "[]", "7", '{"op": "fly"}', '{"op": "robot", "arm": "robot"}'):
+            assert hands.send(line)["ok"] is False
+        assert "juggle" in hands.act("juggle")["error"]
+        assert "station_9" in hands.act("move_robot", station="station_9")["error"]
+
+        before = hands.ask("view")
+        assert (before["scene"]["board"], before["scene"]["spray"], before["station"]) == (None, False, "station_1")
+        for action in ("place_board", "spray", "remove_control_spheres", "press_pedal"):
+            assert hands.act(action)["ok"] is True
+        assert hands.act("move_robot", station="station_2")["ok"] is True
+        after = hands.ask("view")
+        assert np.array(after["scene"]["board"]).shape == (4, 4)
+        assert (after["scene"]["spray"], after["scene"]["control_spheres"]) == (True, False)
+        assert (after["station"], after["pedal_presses"]) == ("station_2", 1)
+        # The arm has been moved to the other side of the table.
+        positions = [np.array(v["T_world_camera"])[:3, 3] for v in (before, after)]
+        assert np.linalg.norm(positions[0] - positions[1]) > 0.1
+        first = after["scene"]["board"]
+        hands.act("remove_board")
+        assert hands.ask("view")["scene"]["board"] is None
+        hands.act("place_board")
+        assert hands.ask("view")["scene"]["board"] != first
+
+        # A scan arrives in the scan folder, its ground truth only in the truth file.
+        answer = hands.act("hand_scan")
+        assert answer["ok"] is True
+        assert "truth" not in answer
+        assert (Path(ready["scan_folder"]) / answer["export"]).stat().st_size > 100_000
+        assert len(json.loads(Path(ready["truth"]).read_text())["scans"]) == 1
+
+        station = Station(rig)
+        try:
+            assert station.scanner().report().identity.kind == "scanner"
+            assert station.robot("station_1") is station.robot("station_2")
+        finally:
+            station.close()
+
+
+def test_sigterm_leaves_nothing_behind(tmp_path: Path) -> None:
+    with rig_process(tmp_path) as (process, ready, processes):
+        assert len(processes) >= 4
+        addresses = {
+            (c.laddr.ip, c.laddr.port)
+            for p in processes
+            for c in p.net_connections(kind="tcp")
+            if c.status == psutil.CONN_LISTEN
+        }
+        host, port = ready["world"].split(":")
+        assert {(host, int(port)), (OWN_HOST, 30004)} <= addresses
+        process.terminate()
+        assert process.wait(timeout=20) == 0
+        assert not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in processes)
+        assert not [address for address in addresses if listens(*address)]
+        assert not (tmp_path / "lightbox").exists()
+        assert "Traceback" not in (tmp_path / "rig.log").read_text()
+
+
+def test_a_device_that_dies_ends_the_rig_with_a_reason(tmp_path: Path) -> None:
+    with rig_process(tmp_path) as (process, _, processes):
+        camera = next(p for p in processes if "camera" in p.cmdline())
+        os.kill(camera.pid, signal.SIGKILL)
+        process.wait(timeout=20)
+        until(lambda: not any(p.is_running() for p in processes), "all have ended", 20)
+        log = (tmp_path / "rig.log").read_text()
+        assert "camera ended with status -9" in log
+        assert "Traceback" not in log
+
+
+def test_a_killed_rig_takes_its_devices_with_it(tmp_path: Path) -> None:
+    with rig_process(tmp_path) as (process, _, processes):
+        process.kill()
+        process.wait(timeout=10)
+        until(lambda: not any(p.is_running() for p in processes[1:]), "its devices have ended", 20)
+
+
+# --- two controllers --------------------------------------------------------------------------------------
+
+
+def two_station_protocol(folder: Path) -> Path:
+    """Two viewpoints at each station, with a step between that moves the camera to the other one."""
+    protocol = yaml.safe_load((REPOSITORY / "protocols" / "demo.yaml").read_text())
+    by_id = {step["id"]: step for step in protocol["steps"]}
+    change = {
+        "id": "change",
+        "kind": "checklist",
+        "title": "Move to the other station",
+        "instructions": "Put the camera on the other arm.",
+        "checklist": ["The camera is on the other arm"],
+        "gates": [{"measure": "checklist_items_open", "max": 0, "unit": "items"}],
+        "simulated_hands": [{"action": "move_robot", "station": "station_2"}],
+    }
+    captures = by_id["viewpoint_capture_1"], by_id["viewpoint_capture_2"]
+    for step in captures:
+        step["params"]["viewpoints"][0]["arcs"] = [
+            {"tilt_deg": 25, "azimuth_from_deg": -20, "azimuth_to_deg": 20, "count": 2, "distance_m": 0.64}
+        ]
+        next(gate for gate in step["gates"] if gate["measure"] == "viewpoints_captured")["min"] = 2
+        step.pop("requires", None)
+        without_calibration_and_ct(step)
+    protocol["steps"] = [captures[0], change, captures[1]]
+    path = folder / "two_stations.yaml"
+    path.write_text(yaml.safe_dump(protocol))
+    return path
+
+
+def test_two_controllers_are_found_and_used(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    with simulated_rig(tmp_path, *SMALL, "--arms", "2", host=OWN_HOST) as ready:
+        answer = orthocapture("doctor", "--rig", ready["rig"], "--json")
+        assert answer.returncode == 0, answer.stdout + answer.stderr
+        devices = json.loads(answer.stdout)["devices"]
+        assert devices["robot_1"]["identity"]["address"] != devices["robot_2"]["identity"]["address"]
+        assert all(devices[name]["ok"] for name in ("robot_1", "robot_2", "camera", "lightbox"))
+
+        protocol = two_station_protocol(tmp_path)
+        answer = orthocapture(
+            "run", str(protocol), "--rig", ready["rig"], "--data", str(data), "--auto-confirm", "--no-worker",
+            timeout_s=240,
+        )  # fmt: skip
+        assert answer.returncode == 0, answer.stdout + answer.stderr
+        truth = json.loads(Path(ready["truth"]).read_text())
+        exposures = [
+            json.loads(line) for line in (tmp_path / "truth_exposures.jsonl").read_text().splitlines() if line
+        ]
+    T_world_camera = {exposure["sha256"]: np.array(exposure["T_world_camera"]) for exposure in exposures}
+    with Store.open(data, create=False) as store:
+        events = store.events(store.find_run("latest"))
+    captured = [event.payload for event in events if isinstance(event.payload, ViewpointCaptured)]
+    assert [e.station for e in captured] == ["station_1"] * 2 + ["station_2"] * 2
+    T_flange_camera = np.array(truth["T_flange_camera"])
+    for event in captured:
+        true = T_world_camera[event.artefacts[0].sha256]
+        for station, T_world_base in truth["T_world_base"].items():
+            recorded = np.array(T_world_base) @ np.array(event.T_base_flange) @ T_flange_camera
+            error_m = float(np.linalg.norm(recorded[:3, 3] - true[:3, 3]))
+            # The arm's own error is below 5 mm; from the wrong base the camera would be somewhere else.
+            assert (error_m < 0.005) == (station == event.station), (event.viewpoint, station, error_m)
+
+
+def test_a_device_that_dies_is_switched_on_again_at_its_address(tmp_path: Path) -> None:
+    with simulated_rig(tmp_path, *SMALL, "--revive-after-s", "0.2", host=OWN_HOST) as ready:
+        before = load_rig(Path(ready["rig"])).source
+        port = int(load_rig(Path(ready["rig"])).section.devices["camera"]["port"].rpartition(":")[2])
+        camera = next(
+            process
+            for process in psutil.Process().children(recursive=True)
+            if process.cmdline()[2:4] == ["simulators", "camera"]
+        )
+        camera.kill()
+
+        def answers() -> bool:
+            with socket.socket() as probe:
+                return not camera.is_running() and probe.connect_ex(("127.0.0.1", port)) == 0
+
+        until(answers, "the camera does not answer again")
+        assert Path(ready["rig"]).read_bytes() == before

@@ -1,0 +1,81 @@
+"""`orthocapture serve` as its user meets it: who may reach it, how it starts, how it ends."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import pytest
+
+from service.core.records.events import ServiceStarted
+from service.store.records import SITE
+from service.store.store import Store
+from service.store.verification.verify import verify
+from tests.support.pages.certificates import self_signed
+from tests.support.pages.serving import serving
+from tests.support.rig.rig import orthocapture
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    path = tmp_path / "rig.yaml"
+    path.write_text("name: a small site\nsimulated: true\ndevices: {}\n")
+    return path
+
+
+def test_it_serves_this_machine_records_its_start_and_signs_at_its_end(rig: Path) -> None:
+    with serving(rig) as server:
+        assert server.url.startswith("http://127.0.0.1:")
+        with urlopen(server.url + "/sign-in", timeout=20) as page:
+            assert page.status == 200
+            assert "default-src 'none'" in page.headers["Content-Security-Policy"]
+        # A page whose foreign host name was made to resolve to this machine (DNS rebinding) gets nothing.
+        with pytest.raises(HTTPError) as refused:
+            urlopen(Request(server.url + "/sign-in", headers={"Host": "evil.example"}), timeout=20)
+        assert refused.value.code in (400, 403, 421)
+        again = orthocapture(
+            "serve", "--rig", str(rig), "--data", str(rig.parent / "data"), "--port", server.url[-5:]
+        )
+        assert again.returncode == 1
+        assert "cannot listen" in again.stderr
+    data = rig.parent / "data"
+    with Store.open(data) as store:
+        starts = [e.payload for e in store.events(SITE) if isinstance(e.payload, ServiceStarted)]
+        assert len(starts) == 1  # the second one did not get as far
+        assert starts[0].address == server.url
+        assert store.checkpoints(SITE)[-1].seq == store.head(SITE)
+    report = verify(data, SITE)
+    assert report.ok, report.first_fault
+    assert report.unsigned_events == {SITE: 0}
+
+
+def test_other_machines_are_served_with_tls_or_on_an_explicit_word_only(rig: Path) -> None:
+    data = str(rig.parent / "data")
+    refused = orthocapture("serve", "--rig", str(rig), "--data", data, "--host", "0.0.0.0", "--port", "0", "--json")
+    assert refused.returncode == 1
+    assert "--insecure-lan" in refused.stdout
+    assert not (rig.parent / "data").exists()
+    with serving(rig, "--host", "0.0.0.0", "--insecure-lan") as server:
+        port = server.url.rpartition(":")[2]
+        with urlopen(f"http://127.0.0.1:{port}/sign-in", timeout=20) as page:
+            assert page.status == 200
+
+
+def test_tls(rig: Path) -> None:
+    certificate, key = self_signed(rig.parent)
+    options = ("--host", "0.0.0.0", "--tls-certificate", str(certificate), "--tls-key", str(key))
+    with serving(rig, *options) as server:
+        port = server.url.rpartition(":")[2]
+        assert server.url.startswith("https://")
+        trust = ssl.create_default_context(cafile=str(certificate))
+        with urlopen(f"https://127.0.0.1:{port}/sign-in", timeout=20, context=trust) as page:
+            assert page.status == 200
+        with socket.create_connection(("127.0.0.1", int(port)), timeout=5) as plain:
+            plain.sendall(b"GET /sign-in HTTP/1.0\r\n\r\n")
+            assert b"200" not in plain.recv(64)
+    half = orthocapture("serve", "--rig", str(rig), "--data", str(rig.parent / "data"), "--tls-key", str(key))
+    assert half.returncode == 1
+    assert "certificate and its key" in half.stderr

@@ -1,0 +1,446 @@
+"""Security of the pages: headers, cookies, one-time links, limits, hostile input, errors that reveal nothing."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import httpx
+import pytest
+import schemathesis
+from fastapi.routing import iter_route_contexts
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from schemathesis.checks import not_a_server_error
+from schemathesis.core.result import Ok
+from schemathesis.schemas import APIOperation
+
+from service.people.roles import ROLES, Role, may
+from service.store.records import SITE
+from service.web.security.guards import cookie_name
+from service.web.security.shield import CONTENT_SECURITY_POLICY, SAFETY_HEADERS
+from tests.support.pages.web import HOST, PIN, Browser, WebSite, web_site
+from tests.support.record.store import SteppedClock
+
+HOSTILE = (
+    "..",
+    "../../../../etc/passwd",
+    "..\\..\\windows\\win.ini",
+    "/etc/passwd",
+    "%2e%2e/%2e%2e",
+    "<script>alert(1)</script>",
+    '"><img src=x onerror=alert(1)>',
+    "'; DROP TABLE events; --",
+    "{{ 7 * 7 }}",
+    "\x00",
+    "a\x00.jpg",
+    "\r\nSet-Cookie: a=b",
+    "\u202egnp.exe",
+    "😀" * 20,
+    "A" * 3000,
+    "-1",
+    "9" * 40,
+    "~",
+    "CON",
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Generator[WebSite]:
+    with web_site(tmp_path_factory.mktemp("security")) as site:
+        yield site
+
+
+@pytest.fixture(scope="module")
+def run_id(site: WebSite) -> str:
+    return site.record_run()
+
+
+def must_be_shielded(answer: httpx.Response) -> None:
+    """Check the security headers, and that nothing internal is revealed."""
+    for name in SAFETY_HEADERS:
+        assert name in answer.headers, (answer.url, name)
+    assert "cache-control" in answer.headers, answer.url
+    assert "Traceback" not in answer.text, answer.url
+    assert 'File "' not in answer.text, answer.url
+
+
+# --- headers and cookies -------------------------------------------------------------------------------------
+
+
+def test_headers_on_whatever_is_answered(site: WebSite, run_id: str) -> None:
+    browser, stranger = site.browser("technician"), site.browser()
+    answers = [
+        stranger.get("/sign-in"),
+        stranger.get("/", follow_redirects=False),
+        stranger.get("/nowhere"),
+        stranger.get("/sign-in", headers={"host": "elsewhere.example"}),
+        stranger.post("/sign-in", content=b"x" * 2_000_000),
+        stranger.delete("/sign-in"),
+        stranger.post("/sign-in", data={}),
+        stranger.get("/openapi.json"),
+        stranger.get("/static/orthocapture.css"),
+        stranger.get("/static/nowhere.css"),
+        browser.get("/account"),
+        browser.get("/accounts"),
+        browser.get(f"/runs/{run_id}"),
+        browser.get("/runs/nowhere"),
+        browser.post("/lock", data={"csrf": "wrong"}),
+    ]
+    for answer in answers:
+        must_be_shielded(answer)
+    assert [a.status_code for a in answers] == [
+        200, 303, 404, 421, 413, 405, 422, 404, 200, 404, 200, 403, 200, 404, 403,
+    ]  # fmt: skip
+    assert answers[0].headers["content-security-policy"] == CONTENT_SECURITY_POLICY
+    assert answers[0].headers["cache-control"] == "no-store"
+
+
+def test_the_policy_of_pages_allows_no_inline_script() -> None:
+    assert "'unsafe" not in CONTENT_SECURITY_POLICY
+    assert "default-src 'none'" in CONTENT_SECURITY_POLICY
+    assert "//" not in CONTENT_SECURITY_POLICY  # no other host
+
+
+def test_pages_have_no_inline_script_or_style(site: WebSite, run_id: str) -> None:
+    pages: tuple[tuple[Role, str], ...] = (
+        ("technician", f"/runs/{run_id}"),
+        ("administrator", "/accounts"),
+        ("auditor", "/account"),
+    )
+    for role, address in pages:
+        page = site.browser(role).get(address).text
+        assert re.findall(r"<script(?![^>]*\bsrc=)[^>]*>", page) == []
+        assert re.findall(r"\s(?:style|on[a-z]+)=\"", page) == []
+        assert re.findall(r"(?:src|href)=\"(?:https?:)?//", page) == []
+
+
+def test_the_cookie(site: WebSite) -> None:
+    browser = site.browser()
+    answer = browser.sign_in("grace")
+    (cookie,) = answer.headers.get_list("set-cookie")
+    parts = {part.strip().lower() for part in cookie.split(";")[1:]}
+    assert cookie.startswith("__Host-orthocapture=")
+    assert {"httponly", "secure", "samesite=strict", "path=/"} <= parts
+    assert not any(part.startswith(("domain", "max-age", "expires")) for part in parts)
+
+
+def test_a_sign_in_gets_a_new_token_and_ends_the_old(site: WebSite) -> None:
+    browser, thief = site.browser(), site.browser()
+    planted = "planted-by-somebody-else"
+    browser.cookies.set(cookie_name(site.site), planted, domain="testserver.local", path="/")
+    browser.sign_in("grace")
+    first = browser.token
+    assert first != planted
+    assert len(first) >= 43
+    browser.sign_in("grace")
+    assert browser.token != first
+    thief.cookies.set(cookie_name(site.site), first, domain="testserver.local", path="/")
+    assert thief.get("/account", follow_redirects=False).status_code == 303
+
+
+def test_signing_out_ends_it_on_the_server(site: WebSite) -> None:
+    browser = site.browser("technician")
+    token = browser.token
+    assert browser.send_form("/sign-out").headers["location"].startswith("/sign-in")
+    thief = site.browser()
+    thief.cookies.set(cookie_name(site.site), token, domain="testserver.local", path="/")
+    assert thief.get("/account", follow_redirects=False).status_code == 303
+
+
+@pytest.mark.parametrize(
+    "elsewhere",
+    [
+        "https://elsewhere.example/",
+        "//elsewhere.example",
+        "/\\elsewhere.example",
+        "javascript:alert(1)",
+        "/a\r\nb: c",
+    ],
+)
+def test_nobody_is_sent_elsewhere_after_signing_in(site: WebSite, elsewhere: str) -> None:
+    answer = site.browser().sign_in("grace", next=elsewhere)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/")
+    assert elsewhere not in site.browser().get("/sign-in", params={"next": elsewhere}).text
+
+
+def test_after_signing_in_the_page_that_was_asked_for(site: WebSite, run_id: str) -> None:
+    browser = site.browser()
+    asked = browser.get(f"/runs/{run_id}?step=capture", follow_redirects=False).headers["location"]
+    page = browser.get(asked).text
+    (following,) = re.findall(r'name="next" value="([^"]*)"', page)
+    assert browser.sign_in("grace", next=following).headers["location"] == f"/runs/{run_id}?step=capture"
+
+
+# --- one-time links ------------------------------------------------------------------------------------------
+
+
+def test_an_invitation_is_shown_once_and_works_once(site: WebSite) -> None:
+    administrator, newcomer = site.browser("administrator"), site.browser()
+    page = administrator.send_form("/accounts", account="mary", full_name="Mary <b>Shelley", role="auditor")
+    (link,) = re.findall(r">(https://testserver/set-up/[^<]+)<", page.text)
+    assert "<b>" not in page.text
+    assert link.rsplit("/", 1)[1] not in administrator.get("/accounts/mary").text
+    assert "Mary" in newcomer.get(link).text
+    assert newcomer.get(link).status_code == 200  # a preview of the link does not use it up
+    form = {"password": "a good password", "repeated": "a good password", "pin": PIN}
+    different = newcomer.post(link, data=form | {"repeated": "another password"})
+    assert different.status_code == 422
+    assert newcomer.post(link, data=form, follow_redirects=False).status_code == 303
+    assert newcomer.post(link, data=form, follow_redirects=False).status_code == 404
+    assert newcomer.get(link).status_code == 404
+    assert newcomer.sign_in("mary", "a good password").status_code == 303
+
+
+# --- limits --------------------------------------------------------------------------------------------------
+
+
+def test_an_address_that_fails_too_often_is_not_listened_to(tmp_path: Path) -> None:
+    clock = SteppedClock()
+    with web_site(tmp_path, clock=clock) as site:
+        browser = site.browser()
+        for number in range(20):
+            assert browser.sign_in(f"guess{number}", "wrong").status_code == 401
+        refused = browser.sign_in("grace")
+        assert refused.status_code == 429
+        assert refused.headers["retry-after"] == "300"
+        events = len(site.store.events(SITE))
+        browser.sign_in("grace")
+        assert len(site.store.events(SITE)) == events  # nor does it fill the record
+        clock.passed_s += 300
+        assert browser.sign_in("grace").status_code == 303
+
+
+def test_a_restart_forgives_no_failed_try_and_counts_no_other(tmp_path: Path) -> None:
+    clock = SteppedClock()
+    with web_site(tmp_path, clock=clock) as site:
+        browser = site.browser("technician")
+        for number in range(18):
+            assert browser.sign_in(f"guess{number}", "wrong").status_code == 401
+        clock.passed_s = 100
+        assert browser.sign_in("emmy", "wrong").status_code == 401
+        browser = site.browser("technician")
+        browser.send_form("/account/pin", password="wrong", pin="1111")  # a wrong password, but not a sign-in
+        browser.send_form("/lock")
+        browser.send_form("/unlock", pin="1111")
+    clock.passed_s = 200
+    with web_site(tmp_path, clock=clock) as site:
+        browser = site.browser()
+        assert browser.sign_in("guess", "wrong").status_code == 401  # the twentieth
+        refused = browser.sign_in("emmy")
+        assert (refused.status_code, refused.headers["retry-after"]) == (429, "100")
+    with web_site(tmp_path, clock=clock) as site:
+        assert site.browser().sign_in("emmy").status_code == 429  # the wait is recorded too, but not counted as a try
+        clock.passed_s = 299
+        assert site.browser().sign_in("emmy").status_code == 429
+    clock.passed_s = 301
+    with web_site(tmp_path, clock=clock) as site:
+        assert site.browser().sign_in("emmy").status_code == 303
+
+
+def test_an_idle_screen_locks_by_itself_and_parts_do_not_keep_it_open(tmp_path: Path) -> None:
+    clock = SteppedClock()
+    by_hand = {"sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
+    with web_site(tmp_path, clock=clock, idle_lock_s=600) as site:
+        browser = site.browser("technician")
+        clock.passed_s = 599
+        browser.get("/account", headers=by_hand)
+        clock.passed_s += 599
+        browser.get("/account", headers={"sec-fetch-mode": "cors", "sec-fetch-dest": "empty"})
+        assert browser.send_form("/theme", theme="dark", back="/").status_code == 303  # a deliberate act
+        clock.passed_s += 599
+        browser.get("/account")
+        clock.passed_s += 1
+        page = browser.get("/account", headers=by_hand)
+        assert page.status_code == 200  # the screen stays visible
+        assert "data-locked" in page.text
+        assert browser.send_form("/account/pin", password="x", pin="9999").status_code == 423
+        wrong = browser.post("/unlock", data={"csrf": browser.person.csrf, "pin": "0000"})
+        assert wrong.status_code == 403
+        assert "4 tries are left" in wrong.text
+        assert browser.send_form("/unlock", pin=PIN, back="/account").headers["location"] == "/account"
+        assert "data-locked" not in browser.get("/account").text
+
+
+def test_large_requests_are_refused_however_they_come(site: WebSite) -> None:
+    def chunks() -> Iterator[bytes]:
+        for _ in range(30):
+            yield b"a" * 50_000
+
+    browser = site.browser("technician")
+    form = {"content-type": "application/x-www-form-urlencoded", "x-csrf-token": browser.person.csrf}
+    assert browser.post("/lock", content=chunks(), headers=form).status_code == 413
+    assert browser.post("/lock", content=b"a" * 1_500_000, headers=form).status_code == 413
+    assert not browser.person.locked
+
+
+@pytest.mark.parametrize("host", ["elsewhere.example", "testserver.elsewhere.example", "", "[", "testserver@evil"])
+def test_names_that_this_site_does_not_have(site: WebSite, host: str) -> None:
+    assert site.browser().get("/sign-in", headers={"host": host}).status_code == 421
+
+
+@pytest.mark.parametrize("host", ["testserver", "TESTSERVER:8000", "127.0.0.1:8000", "[::1]:8000"])
+def test_names_and_addresses_that_it_has(site: WebSite, host: str) -> None:
+    assert site.browser().get("/sign-in", headers={"host": host}).status_code == 200
+
+
+# --- hostile input -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_hostile_names_in_addresses(site: WebSite, run_id: str, hostile: str) -> None:
+    browser = site.browser("supervisor")
+    for context in iter_route_contexts(site.app.routes):
+        path = context.path or ""
+        if "{" not in path or "GET" not in (context.methods or ()):
+            continue
+        for name in re.findall(r"{([^}]*)}", path):
+            rest = path.replace(f"{{{name}}}", quote(hostile, safe=""))
+            address = re.sub(r"{[^}]*}", "1", rest.replace("{run_id}", run_id))
+            answer = browser.get(address, follow_redirects=False)
+            must_be_shielded(answer)
+            assert answer.status_code < 500, (address, answer.text)
+            assert "<script>alert" not in answer.text, address
+            assert "<img src=x" not in answer.text, address
+            assert "root:x:" not in answer.text, address
+            assert "set-cookie" not in answer.headers, address
+
+
+@pytest.mark.parametrize("hostile", HOSTILE)
+def test_hostile_words_in_forms_and_queries(site: WebSite, run_id: str, hostile: str) -> None:
+    browser = site.browser("administrator")
+    answers = [
+        browser.post("/sign-in", data={"account": hostile, "password": hostile, "next": hostile}),
+        browser.get("/sign-in", params={"next": hostile, "done": hostile}),
+        browser.send_form("/accounts", account=hostile, full_name=hostile, role="auditor"),
+        browser.send_form("/accounts/grace/role", role=hostile, reason=hostile),
+        browser.send_form("/lock", back=hostile),
+        browser.send_form("/unlock", back=hostile, pin=PIN),
+        browser.get("/unlock", params={"back": hostile}),
+    ]
+    for answer in answers:
+        must_be_shielded(answer)
+        assert answer.status_code < 500
+        assert "<script>alert" not in answer.text
+        assert "<img src=x" not in answer.text
+        assert not answer.headers.get("location", "/").startswith(("//", "http", "/\\"))
+
+
+# --- errors --------------------------------------------------------------------------------------------------
+
+
+def test_a_mistake_of_the_software_tells_a_reference_and_no_more(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken() -> None:
+        raise ZeroDivisionError("inner secret of the software")
+
+    with web_site(tmp_path) as site:
+        site.app.add_api_route("/broken", broken)
+        with caplog.at_level(logging.ERROR, logger="orthocapture.web"):
+            page = site.browser().get("/broken")
+            data = site.browser().get("/broken", headers={"accept": "application/json"})
+    for answer in (page, data):
+        must_be_shielded(answer)
+        assert answer.status_code == 500
+        assert "inner secret" not in answer.text
+        assert "ZeroDivisionError" not in answer.text
+    assert data.json()["reference"] in caplog.text
+    assert "inner secret of the software" in caplog.text
+    assert "safe" in page.text
+
+
+def test_an_expected_error_says_what_where_what_to_do_and_that_the_data_is_safe(site: WebSite) -> None:
+    browser = site.browser("technician")
+    page = browser.get("/runs/nowhere")
+    data = browser.get("/runs/nowhere", headers={"accept": "application/json"}).json()
+    assert page.status_code == data["status"] == 404
+    assert data["what"] == "there is no run 'nowhere'"
+    assert "captured and recorded before is safe" in data["safe"]
+    for words in ("There is no run", "safe", 'href="/"'):
+        assert words in page.text
+
+
+def test_a_refused_form_does_not_repeat_what_was_typed(site: WebSite, caplog: pytest.LogCaptureFixture) -> None:
+    browser = site.browser("technician")
+    secret = "typed secret " * 30
+    answers = [
+        browser.sign_in("grace", secret),
+        browser.sign_in("grace", "another typed secret"),
+        browser.send_form("/account/password", password=secret, new_password=secret, repeated=secret),
+        browser.send_form("/account/pin", password="typed secret", pin="typed secret"),
+        browser.post("/set-up/1", data={"password": secret, "repeated": secret, "pin": "typed secret"}),
+    ]
+    for answer in answers:
+        assert 400 <= answer.status_code < 500
+        assert "typed secret" not in answer.text
+    assert "typed secret" not in caplog.text
+
+
+# --- anything that the interface's own description allows, and what it does not --------------------------------
+
+
+@pytest.mark.parametrize("role", [None, *ROLES])
+def test_generated_requests_never_break_the_server(
+    tmp_path_factory: pytest.TempPathFactory, role: Role | None
+) -> None:
+    with web_site(tmp_path_factory.mktemp("generated")) as site:
+        run_id = site.begin_run().run_id
+        schema = schemathesis.openapi.from_dict(site.app.openapi())
+        operations: list[APIOperation[Any, Any, Any, Any]] = [
+            result.ok() for result in schema.get_all_operations() if isinstance(result, Ok)
+        ]
+        assert len(operations) > 40
+        for operation in operations:
+
+            @seed(7)
+            @settings(
+                max_examples=3,
+                deadline=None,
+                database=None,
+                phases=[Phase.generate],
+                suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large],
+            )
+            @given(case=operation.as_strategy())
+            def one(case: schemathesis.Case[Any]) -> None:
+                if "run_id" in case.path_parameters and case.path not in ("/runs/{run_id}/stream",):
+                    case.path_parameters["run_id"] = run_id
+                answer = _send(site, run_id, role, case)
+                must_be_shielded(answer)
+                case.validate_response(answer, checks=[not_a_server_error])
+
+            one()
+
+
+def _send(site: WebSite, run_id: str, role: Role | None, case: schemathesis.Case[Any]) -> httpx.Response:
+    browser = _screen(site, run_id, role)
+    sent = case.as_transport_kwargs(base_url=HOST)
+    headers = {**(sent.get("headers") or {})}
+    if role is not None:
+        headers["x-csrf-token"] = browser.person.csrf
+    return browser.request(
+        sent["method"],
+        sent["url"],
+        params=sent.get("params"),
+        headers=headers,
+        data=sent.get("data"),
+        json=sent.get("json"),
+        follow_redirects=False,
+    )
+
+
+def _screen(site: WebSite, run_id: str, role: Role | None) -> Browser:
+    """The last screen of the role; a new one if a request has locked it or signed it out."""
+    for browser in reversed(site.browsers):
+        if role is None:
+            return browser
+        person = site.people.person(browser.token, idle_lock_s=1e9, deliberate=False)
+        if person is not None and not person.locked:
+            return browser
+    browser = site.browser(role)
+    if role is not None and may(role, "operate"):
+        site.take_control(run_id, browser)
+    return browser
