@@ -186,7 +186,8 @@ def main() -> None:
 `python -m bench.hard_spheres --label NAME`, rendered by tests/support/scenes/sphere_conditions.py with exact
 outlines, 280 and 600 px wide; {document["machine"]["processor"]}, {document["machine"]["cores"]} cores, shared with
 other work. CPU seconds of one thread an image. Right: place and radius within {RIGHT:.0%} of the radius; ring: at a
-sphere, but of another size; false: where none is. The largest radius is told (0.4 of the width) where spheres are large or glossy.
+sphere, but of another size; false: where none is. The largest radius is told (0.4 of the width)
+where spheres are large or glossy.
 
 {_table(document["hard"], ("right", "ring", "false", "radius_off_px", "cpu_s"))}
 
