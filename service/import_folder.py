@@ -34,6 +34,7 @@ from service.core.records.import_list import (
     LeftOutFile,
     PhotographRole,
 )
+from service.core.units import seconds_of_ns
 from service.rig import Rig, RigSection
 from service.station import Station
 
@@ -325,7 +326,7 @@ def _file(file: ListedFile, places: Places, media_type: str = "application/octet
         path=_shown(file.path, places),
         sha256=file.sha256,
         size_bytes=file.size_bytes,
-        modified_utc=datetime.fromtimestamp(file.modified_ns / 1e9, UTC).isoformat(timespec="seconds"),
+        modified_utc=datetime.fromtimestamp(seconds_of_ns(file.modified_ns), UTC).isoformat(timespec="seconds"),
         media_type=media_type,
     )
 

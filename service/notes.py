@@ -9,6 +9,7 @@ from service.core.errors import DataError, IllegalTransitionError
 from service.core.picture_files import JPEG_BEGINS, PNG_BEGINS, check_jpeg, check_png, picture_size
 from service.core.records.entered import NoteTaken, paragraphs
 from service.core.records.events import Event
+from service.core.units import megabytes
 from service.run_record import RunRecord
 from service.store.records import NewArtefact
 
@@ -75,7 +76,8 @@ def require_size(size_bytes: int, name: str) -> None:
     """Raise DataError if a photograph is too large; called before it is read."""
     if size_bytes > PHOTOGRAPH_BYTES:
         raise DataError(
-            f"the photograph has {size_bytes / 1e6:.1f} MB; at most {PHOTOGRAPH_BYTES / 1e6:.0f} MB are kept",
+            f"the photograph has {megabytes(size_bytes):.1f} MB; "
+            f"at most {megabytes(PHOTOGRAPH_BYTES):.0f} MB are kept",
             where=_plain(name),
             remedy="Take it with fewer pixels",
         )

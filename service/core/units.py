@@ -1,4 +1,4 @@
-"""The one place where units are converted: metres and radians inside, millimetres and degrees in reports."""
+"""The one place where units are converted: metres, radians and seconds inside, other units in files and reports."""
 
 from __future__ import annotations
 
@@ -41,3 +41,43 @@ def mrad(angle_rad: float) -> float:
 def rad_of_mrad(angle_mrad: float) -> float:
     """Radians of an angle in milliradians."""
     return angle_mrad / 1e3
+
+
+def um(length_m: float) -> float:
+    """Micrometres of a length in metres."""
+    return 1e6 * length_m
+
+
+def metres_of_um(length_um: float) -> float:
+    """Metres of a length in micrometres."""
+    return length_um / 1e6
+
+
+def ms(duration_s: float) -> float:
+    """Milliseconds of a duration in seconds."""
+    return 1e3 * duration_s
+
+
+def seconds_of_us(duration_us: float) -> float:
+    """Seconds of a duration in microseconds."""
+    return duration_us / 1e6
+
+
+def seconds_of_ns(duration_ns: float) -> float:
+    """Seconds of a duration in nanoseconds."""
+    return duration_ns / 1e9
+
+
+def megabytes(size_bytes: float) -> float:
+    """Megabytes (10^6 bytes) of a number of bytes."""
+    return size_bytes / 1e6
+
+
+def gigabytes(size_bytes: float) -> float:
+    """Gigabytes (10^9 bytes) of a number of bytes."""
+    return size_bytes / 1e9
+
+
+def megapixels(width_px: int, height_px: int) -> float:
+    """Megapixels of an image of this size."""
+    return width_px * height_px / 1e6

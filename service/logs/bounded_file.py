@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from service.core.equipment.disk_space import LEAST_FREE_BYTES
+from service.core.units import gigabytes
 
 NAME = "orthocapture.jsonl"
 FILE_BYTES = 10_000_000
@@ -50,7 +51,7 @@ class BoundedFile(logging.Handler):
             if full and self._stopped:
                 return
             if full != self._stopped:
-                self._write(self._line(record, _STOPPED.format(LEAST_FREE_BYTES / 1e9) if full else _GOES_ON))
+                self._write(self._line(record, _STOPPED.format(gigabytes(LEAST_FREE_BYTES)) if full else _GOES_ON))
                 self._stopped = full
             if not full:
                 self._write(self._line(record))

@@ -12,6 +12,7 @@ from sqlalchemy import text
 
 from service.core.equipment.disk_space import LEAST_FREE_BYTES
 from service.core.errors import OrthocaptureError
+from service.core.units import gigabytes
 from service.monitor.snapshot import read_snapshot
 from service.monitor.worker_sign import living_workers
 from service.store.store import Store
@@ -53,7 +54,7 @@ def _data_folder(data: Path) -> str:
         return f"it cannot be reached: {error.strerror}"
     if not os.access(data / "artefacts", os.W_OK):
         return "it cannot be written to"
-    return f"{free / 1e9:.2f} GB are free: too little to capture" if free < LEAST_FREE_BYTES else ""
+    return f"{gigabytes(free):.2f} GB are free: too little to capture" if free < LEAST_FREE_BYTES else ""
 
 
 def _worker(data: Path, queued: int) -> str:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 from service.core.records.events import HostClock
+from service.core.units import seconds_of_us
 
 _SYSTEM_TIME = re.compile(r"^System time\s*:\s*([0-9.]+) seconds (fast|slow) of NTP time", re.MULTILINE)
 _LEAP = re.compile(r"^Leap status\s*:\s*(.+?)\s*$", re.MULTILINE)
@@ -69,7 +70,7 @@ def _of_kernel() -> HostClock:
     if ctypes.CDLL(None).adjtimex(ctypes.byref(found)) < 0:
         return nothing
     synchronised = not found.status & _STA_UNSYNC
-    error_s = found.maxerror_us / 1e6
+    error_s = seconds_of_us(found.maxerror_us)
     return HostClock(
         source="kernel",
         synchronised=synchronised,

@@ -30,6 +30,7 @@ from service.cli.common import (
 from service.cli.evidence.audit_figures import figures_command
 from service.cli.evidence.audit_report import report_command
 from service.core.text.counts import counted
+from service.core.units import megabytes
 from service.store.durable_effects import utc_text
 from service.store.records import Artefact
 from service.store.signatures.signing import PublicKey, checkpoint, public_keys, rotate_key
@@ -202,7 +203,7 @@ def export_command(
     if json:
         print_json({**asdict(made), "path": str(made.path)})
         return
-    console.print(f"{escape(str(made.path))}: {made.size_bytes / 1e6:.1f} MB, SHA-256 {made.sha256}")
+    console.print(f"{escape(str(made.path))}: {megabytes(made.size_bytes):.1f} MB, SHA-256 {made.sha256}")
     console.print(f"  signed with key {made.key_id}")
     console.print(f"  To verify it anywhere: python verify.py {escape(made.path.name)} --key {made.key_id}")
 
@@ -265,7 +266,7 @@ def _print_report(report: AuditReport) -> None:
     console.print(
         f"Checked {counted(len(report.runs), 'run')} in {escape(report.data_dir)}: "
         f"{counted(report.events, 'event')}, {counted(report.artefacts, 'recorded file')} "
-        f"({report.bytes_hashed / 1e6:.1f} MB read again), {counted(report.jobs, 'job')}, "
+        f"({megabytes(report.bytes_hashed):.1f} MB read again), {counted(report.jobs, 'job')}, "
         f"{counted(report.checkpoints, 'signature')}."
     )
     for run_id, head in report.heads.items():

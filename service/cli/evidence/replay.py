@@ -27,6 +27,7 @@ from service.cli.common import (
 )
 from service.core.errors import OrthocaptureError
 from service.core.gates.verdict import describe
+from service.core.units import megabytes
 from service.jobs.words import term
 from service.worker.loop import HANDLERS
 
@@ -117,7 +118,8 @@ def _plain(difference: Difference) -> dict[str, Any]:
 def _print(report: ReplayReport) -> None:
     console.print(f"Replay of run {report.run_id}, whose chain ends with {report.head_sha256}")
     console.print(
-        f"Evidence verified first: {report.files_verified} files, {report.bytes_verified / 1e6:.1f} MB read again."
+        f"Evidence verified first: {report.files_verified} files, "
+        f"{megabytes(report.bytes_verified):.1f} MB read again."
     )
     if report.versions:
         console.print(f"{len(report.versions)} installed distributions have other versions than recorded:")

@@ -19,6 +19,7 @@ from service.cli.common import (
     reporting_errors,
 )
 from service.core.text.counts import counted
+from service.core.units import gigabytes
 from service.store.backup.backup import BackupReport, back_up
 from service.store.backup.restore import RestoreReport, restore
 
@@ -100,10 +101,10 @@ def _print_backup(made: BackupReport) -> None:
     state = made.state
     console.print(
         f"Backup {made.name} is in {escape(str(made.folder))}: {counted(len(state.heads), 'chain')}, "
-        f"{counted(state.artefacts, 'file')}, {state.artefact_bytes / 1e9:.2f} GB."
+        f"{counted(state.artefacts, 'file')}, {gigabytes(state.artefact_bytes):.2f} GB."
     )
     console.print(
-        f"  Copied this time and read again: {counted(made.copied, 'file')}, {made.copied_bytes / 1e9:.2f} GB; "
+        f"  Copied this time and read again: {counted(made.copied, 'file')}, {gigabytes(made.copied_bytes):.2f} GB; "
         f"{made.present} were there."
     )
     if not state.with_keys:

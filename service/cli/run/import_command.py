@@ -31,6 +31,7 @@ from service.core.errors import ConfigurationError
 from service.core.protocol.models import LoadedProtocol, Protocol, load_protocol
 from service.core.records.entered import RunAbout, about_run
 from service.core.records.import_list import FileRole, ImportedView, ImportList, PhotographRole
+from service.core.units import megabytes
 from service.dataset.registrations import shared_adjustment_note
 from service.dataset.summary import summarise
 from service.import_folder import find_places, import_rig, list_import
@@ -223,13 +224,13 @@ def _show(listing: ImportList) -> None:
         raws = f" + {found['raw_files']} raw" if found["raw_files"] else ""
         optics = "; ".join(dict.fromkeys([*found["cameras"], *found["lenses"]]))
         dates = _dates(found["first"], found["last"])
-        size = f"{found['bytes'] / 1e6:.1f}"
+        size = f"{megabytes(found['bytes']):.1f}"
         table.add_row(words, f"{found['count']}{raws}", escape(optics), ", ".join(found["sizes"]), dates, size)
     for role, files in listing.files.items():
-        megabytes = f"{sum(file.size_bytes for file in files) / 1e6:.1f}"
+        size = f"{megabytes(sum(file.size_bytes for file in files)):.1f}"
         name = "DICOM series" if role == "ct" else Path(files[0].path).name
         written = f"written {files[0].modified_utc[:16].replace('T', ' ')}"
-        table.add_row(role.replace("_", " "), str(len(files)), escape(name), "", written, megabytes)
+        table.add_row(role.replace("_", " "), str(len(files)), escape(name), "", written, size)
     print_table(table)
     for one in listing.left_out[:_SHOWN]:
         console.print(f"left out: {escape(one.path)}: {escape(one.reason)}")

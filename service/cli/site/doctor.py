@@ -29,6 +29,7 @@ from service.core.equipment.disk_space import Forecast, Usage, forecast
 from service.core.errors import ConfigurationError, OrthocaptureError
 from service.core.protocol.models import Protocol, load_protocol
 from service.core.records.events import HostClock
+from service.core.units import gigabytes
 from service.monitor.host_clock import host_clock
 from service.rig import load_rig
 from service.station import Station
@@ -90,7 +91,7 @@ def doctor_command(
         for name, report in found.items():
             _print(name, report)
         note = "" if free_bytes > _LOW_DISK_BYTES else "  [yellow]little for a full capture[/]"
-        console.print(f"[bold]data folder[/] {escape(str(data))}: {free_bytes / 1e9:.1f} GB free{note}")
+        console.print(f"[bold]data folder[/] {escape(str(data))}: {gigabytes(free_bytes):.1f} GB free{note}")
         console.print(f"[bold]this machine's clock[/] {escape(_clock_words(clock))}")
         if space is not None:
             colour = {"enough": "green", "short": "yellow", "stop": "red"}[space.verdict]
@@ -158,7 +159,7 @@ def _print(name: str, report: DeviceReport | OrthocaptureError) -> None:
     if report.clock_offset_s is not None:
         console.print(f"    {_offset_words(report.clock_offset_s, report.clock, late=late)}")
     if report.free_bytes is not None:
-        console.print(f"    {report.free_bytes / 1e9:.1f} GB free")
+        console.print(f"    {gigabytes(report.free_bytes):.1f} GB free")
     if report.battery_fraction is not None:
         console.print(f"    battery {report.battery_fraction:.0%}")
     for key, value in report.details.items():

@@ -11,6 +11,7 @@ from typing import Literal
 from service.core.protocol.models import Protocol
 from service.core.recovery.ways_on import planned_views
 from service.core.run.state import RunState
+from service.core.units import gigabytes, megabytes
 
 LEAST_FREE_BYTES = 1 << 30
 _VIEWS_UNDER_WAY = 5  # need room above LEAST_FREE_BYTES: in the camera, in transfer or being computed
@@ -58,7 +59,7 @@ class Forecast:
     @property
     def words(self) -> str:
         """The figures and what they mean, in a sentence."""
-        views = f"{self.views_left} views of {self.view_bytes / 1e6:.0f} MB each, from {self.known_from}"
+        views = f"{self.views_left} views of {megabytes(self.view_bytes):.0f} MB each, from {self.known_from}"
         figures = f"{size_words(self.free_bytes)} are free, and the run needs about {size_words(self.needed_bytes)}"
         figures += f" more ({views})" if self.views_left else " more"
         if self.verdict == "enough":
@@ -115,4 +116,4 @@ def views_left(protocol: Protocol, state: RunState | None) -> int:
 
 def size_words(size_bytes: float) -> str:
     """A size in words, such as `850 MB` or `12.3 GB`."""
-    return f"{size_bytes / 1e9:.1f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.0f} MB"
+    return f"{gigabytes(size_bytes):.1f} GB" if size_bytes >= 1e9 else f"{megabytes(size_bytes):.0f} MB"

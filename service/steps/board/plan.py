@@ -24,6 +24,7 @@ from service.compute.calibration.board_poses.knowledge import BoardKnowledge, To
 from service.compute.camera_model import CameraModel
 from service.core.geometry import Array, Transform, inverse
 from service.core.records.events import Record
+from service.core.units import metres
 from service.rig import LensSection
 from service.steps.context import StationLayout
 
@@ -142,7 +143,7 @@ def nominal_board(
 ) -> BoardKnowledge:
     """What protocol and rig file say of the board, the mount and the lens."""
     tolerances = Tolerances(
-        place_m=wanted.place_tolerance_mm / 1e3, turn_rad=float(np.radians(wanted.turn_tolerance_deg)), focal=focal
+        place_m=metres(wanted.place_tolerance_mm), turn_rad=float(np.radians(wanted.turn_tolerance_deg)), focal=focal
     )
     middle = np.array(layout.scene_centre_m) + np.array([0.0, 0.0, wanted.above_scene_m])
     across = wanted.long_side == "across"

@@ -17,6 +17,7 @@ from service.core.jobs.references import Each, Reference, jobs_of, resolve
 from service.core.protocol.models import Gate
 from service.core.records.events import Record, View
 from service.core.run.state import JobState
+from service.core.units import metres, rad_of_mrad
 from service.jobs.calibration import calibrate
 from service.jobs.capture import live_summary, live_view
 from service.jobs.records import Camera, Hash, Limits, Matrix, Mounting, Photograph, Point
@@ -133,7 +134,7 @@ class LiveAnalysis:
             surface=self._surface(),
             views=views,
             station=station,
-            limit_m=limit_mm / 1000,
+            limit_m=metres(limit_mm),
             min_coverage=least,
             candidates=tuple(
                 live_summary.CandidateView(name=v.name, T_base_camera=v.T_base_camera.tolist(), travel_s=travel_s)
@@ -329,17 +330,17 @@ class Shared:
                 remedy="Do that step first",
             )
         best = record.best
-        sigma_m = _rms(best.residuals.held_out_mm.values()) / 1e3
+        sigma_m = metres(_rms(best.residuals.held_out_mm.values()))
         sigma_rad = float(np.radians(_rms(best.residuals.held_out_deg.values())))
         at = "hand_eye" if record.arm_correction is None else "hand_eye/arm_correction"
         return cls(
             camera=calibration.answer.camera,
             mounting=Mounting(T_flange_camera=best.T_flange_camera),
             hand_eye_covariance=best.sigma.covariance,
-            arm_sigma_m=sigma_m if params.arm_sigma_mm is None else params.arm_sigma_mm / 1e3,
-            arm_sigma_rad=sigma_rad if params.arm_sigma_mrad is None else params.arm_sigma_mrad / 1e3,
+            arm_sigma_m=sigma_m if params.arm_sigma_mm is None else metres(params.arm_sigma_mm),
+            arm_sigma_rad=sigma_rad if params.arm_sigma_mrad is None else rad_of_mrad(params.arm_sigma_mrad),
             spheres_m=scan.answer.spheres_m,
-            radius_m=context.protocol.spheres.radius_mm / 1000,
+            radius_m=metres(context.protocol.spheres.radius_mm),
             limits=Limits.model_validate(params.coverage.model_dump()),
             taken={
                 "camera": calibration.reference("camera"),

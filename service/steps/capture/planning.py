@@ -24,6 +24,7 @@ from service.compute.planning.optics import depth_of_field
 from service.core.errors import ConfigurationError
 from service.core.geometry import Array, Transform, apply, inverse, look_at, transform
 from service.core.protocol.models import Motion
+from service.core.units import metres, metres_of_um
 from service.rig import CollisionSection, OpticsSection
 from service.steps.capture.viewpoints import Viewpoint
 from service.steps.context import StationLayout, StepContext
@@ -163,7 +164,7 @@ def situation_of(
     sharp = None
     if optics is not None:
         sharp = depth_of_field(
-            optics.focal_length_mm / 1e3, optics.aperture_f, optics.focus_distance_m, optics.blur_um / 1e6
+            metres(optics.focal_length_mm), optics.aperture_f, optics.focus_distance_m, metres_of_um(optics.blur_um)
         )
     return Situation(
         body=universal_robot_body(model, T_flange_camera, camera),

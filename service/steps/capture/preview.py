@@ -13,6 +13,7 @@ from service.compute.calibration.board_poses.design import Aims
 from service.compute.planning.motion_plan import able_postures
 from service.core.geometry import Array, Transform, apply
 from service.core.protocol.models import Protocol, Step
+from service.core.units import metres
 from service.rig import Rig
 from service.steps.board.plan import (
     Planner,
@@ -48,7 +49,7 @@ def preview_board_poses(
     if not isinstance(step.params, calibration.Params) or step.params.board_poses is None or protocol.board is None:
         return None
     wanted, solve = step.params.board_poses, step.params.solve
-    board = Board(protocol.board.columns, protocol.board.rows, protocol.board.square_mm / 1000)
+    board = Board(protocol.board.columns, protocol.board.rows, metres(protocol.board.square_mm))
     mount, there = rig.nominal_T_flange_camera(), layout(wanted.station)
     known = nominal_board(wanted, board, there, mount, *nominal_camera(rig.section.lens))
     collision = rig.section.collision

@@ -19,6 +19,7 @@ from drivers.errors import (
 from drivers.interfaces import Camera, CameraSettings, CapturedImage, RobotArm, SettleReport
 from service.core.geometry import Array, Transform
 from service.core.records.events import ViewpointFailed
+from service.core.units import megapixels
 from service.logs.where import at
 from service.steps.capture.exposure import (
     Shot,
@@ -162,7 +163,7 @@ class _CaptureLoop:
         """Record the image that is held, if there is one."""
         shot, self._held = self._held, None
         if shot is not None:
-            self._size = f", {shot.image.width * shot.image.height / 1e6:.0f} MP"
+            self._size = f", {megapixels(shot.image.width, shot.image.height):.0f} MP"
             self.context.busy(f"storing {shot.viewpoint.name}{self._size}")
             record_shot(self.context, shot)
             self.on_captured()

@@ -13,6 +13,7 @@ from service.core.errors import ConfigurationError
 from service.core.jobs.references import Reference
 from service.core.protocol.models import MovingParams
 from service.core.records.events import Record
+from service.core.units import metres
 from service.jobs.calibration import calibrate
 from service.jobs.records import Camera
 from service.steps.board.capture import BoardCapture
@@ -89,7 +90,7 @@ def board_of_protocol(context: StepContext) -> Board:
         raise ConfigurationError(
             "the protocol describes no calibration board", where=context.protocol.id, remedy="Add a section `board`"
         )
-    return Board(board.columns, board.rows, board.square_mm / 1000)
+    return Board(board.columns, board.rows, metres(board.square_mm))
 
 
 def _camera(context: StepContext, params: Params) -> Mapping[str, float] | None:

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from drivers.interfaces import CtSource
 from service.core.records.events import ArtefactRef, Record
+from service.core.units import metres, mm
 from service.jobs.surfaces import ct_surface, locate_spheres
 from service.steps.arrivals import keep, keep_array, keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
@@ -32,7 +33,7 @@ class Result(Record):
 def execute(context: StepContext, params: Params) -> StepOutcome:
     """Wait for one sound series (or mesh), keep its files, let the worker make the surface."""
     ct = context.devices.ct()
-    radius_m = context.protocol.spheres.radius_mm / 1000
+    radius_m = metres(context.protocol.spheres.radius_mm)
     measures: dict[str, float] = {}
     kept: tuple[ArtefactRef, ...]
     if params.source == "mesh":
@@ -62,8 +63,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         )
         measures = {
             "slices": float(series.slices),
-            "slice_spacing_mm": round(volume.spacing_m[2] * 1000, 6),  # positions are decimal text of six places
-            "voxel_mm": round(max(volume.spacing_m) * 1000, 6),
+            "slice_spacing_mm": round(mm(volume.spacing_m[2]), 6),  # positions are decimal text of six places
+            "voxel_mm": round(mm(max(volume.spacing_m)), 6),
         }
     (answer,) = context.evidence.run_jobs(request)
     result = Result.model_validate(answer.result)

@@ -11,6 +11,7 @@ from typing import Any
 from service.core.errors import ConfigurationError
 from service.core.jobs.references import Reference
 from service.core.records.events import Record
+from service.core.units import metres
 from service.jobs.registration import evaluate, register
 from service.jobs.surfaces import locate_spheres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
@@ -65,7 +66,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         scan=scan,
         control_scan=spheres["control_scan"],
         ct=spheres["ct"],
-        radius_m=context.protocol.spheres.radius_mm / 1000,
+        radius_m=metres(context.protocol.spheres.radius_mm),
     )
     (answer,) = context.evidence.run_jobs(JobRequest.of(evaluate.KIND, arguments, references))
     result = Result.model_validate(answer.result)

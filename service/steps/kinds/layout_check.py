@@ -12,6 +12,7 @@ from pydantic import Field
 from drivers.errors import ReleasedElsewhereError
 from service.core.gates.verdict import evaluate_gates
 from service.core.records.events import ArtefactRef, GateVerdict, Record
+from service.core.units import metres
 from service.jobs.surfaces import layout
 from service.steps.arrivals import keep
 from service.steps.capture.exposure import wanted_settings
@@ -69,7 +70,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     arguments = layout.Arguments(
         images=tuple(layout.LayoutPhotograph.model_validate(image) for image in images),
         sensor_width_mm=params.sensor_width_mm,
-        radius_m=spheres.radius_mm / 1000,
+        radius_m=metres(spheres.radius_mm),
         expected=spheres.registration + spheres.control,
         control=spheres.control,
     )
@@ -164,7 +165,7 @@ def _move_hand(move: Mapping[str, Any]) -> dict[str, Any]:
         "action": "move_sphere",
         "from": move["from"],
         "to": move["to"],
-        "higher_m": move["higher_mm"] / 1000,
+        "higher_m": metres(move["higher_mm"]),
     }
 
 

@@ -16,6 +16,7 @@ from service.core.jobs.keys import key_stem
 from service.core.jobs.references import Each, Reference, jobs_of, resolve
 from service.core.records.events import Record, ViewHeld
 from service.core.run.state import JobState
+from service.core.units import metres, rad_of_mrad
 from service.jobs.calibration import calibrate
 from service.jobs.capture import hand_board, hand_view
 from service.jobs.records import Point
@@ -147,7 +148,7 @@ def _shared(context: StepContext, params: Params) -> _Shared:
                 where=f"step {context.step.id}",
                 remedy="Add a section `board`",
             )
-        size = {"columns": described.columns, "rows": described.rows, "square_m": described.square_mm / 1000}
+        size = {"columns": described.columns, "rows": described.rows, "square_m": metres(described.square_mm)}
         return _Shared({**shared, **size, "sensor_width_mm": params.sensor_width_mm}, {})
     if params.calibration is None:
         raise ConfigurationError(
@@ -165,10 +166,10 @@ def _shared(context: StepContext, params: Params) -> _Shared:
         "camera": calibration.answer.camera,
         "spheres_m": spheres,
         "rough": rough,
-        "radius_m": context.protocol.spheres.radius_mm / 1000,
-        "pose_sigma_m": params.pose_sigma_mm / 1e3,
-        "pose_sigma_rad": params.pose_sigma_mrad / 1e3,
-        "limit_m": (error.max if error and error.max is not None else 0.35) / 1000,
+        "radius_m": metres(context.protocol.spheres.radius_mm),
+        "pose_sigma_m": metres(params.pose_sigma_mm),
+        "pose_sigma_rad": rad_of_mrad(params.pose_sigma_mrad),
+        "limit_m": metres(error.max if error and error.max is not None else 0.35),
         "min_coverage": covers.min if covers and covers.min is not None else 0.0,
     }
     return _Shared(fields, {"camera": calibration.reference("camera"), "spheres_m": spheres_from})

@@ -14,6 +14,7 @@ from pydantic import field_validator
 from service.core.errors import ComputeError, ConfigurationError
 from service.core.jobs.keys import arguments_name
 from service.core.records.events import Record
+from service.core.units import metres
 from service.jobs.calibration import calibrate
 from service.jobs.records import Mounting, Photograph
 from service.jobs.registration import detect_spheres
@@ -114,7 +115,7 @@ def _search(context: StepContext, params: Params) -> JobRequest:
         camera=calibration.answer.camera,
         spheres_m=scan.answer.spheres_m,
         sphere_covariance_m2=tuple(sphere.covariance_m2 for sphere in scan.answer.details.spheres),
-        radius_m=context.protocol.spheres.radius_mm / 1000,
+        radius_m=metres(context.protocol.spheres.radius_mm),
         detector=params.detector,
     ).model_copy(update={**mounted.mounting.set_fields(), **known})
     references = {

@@ -7,6 +7,7 @@ from typing import Any
 
 from service.core.jobs.references import Reference
 from service.core.records.events import Record
+from service.core.units import metres
 from service.jobs.surfaces import locate_spheres
 from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
@@ -51,7 +52,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         measures["since_application_min"] = (context.monotonic_s() - applied) / 60
     mesh, kept = keep_mesh(context, scan, device="scanner", kind="scan_mesh")
     arguments = locate_spheres.Arguments(
-        mesh=mesh.sha256, radius_m=context.protocol.spheres.radius_mm / 1000, expected=params.spheres
+        mesh=mesh.sha256, radius_m=metres(context.protocol.spheres.radius_mm), expected=params.spheres
     )
     references: dict[str, Reference | None] = {}
     if params.compare_with is not None and params.compare_with not in context.run.skipped:

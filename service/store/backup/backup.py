@@ -17,6 +17,7 @@ from pathlib import Path
 from sqlalchemy import Connection, select
 
 from service.core.errors import IntegrityError, StoreError
+from service.core.units import gigabytes
 from service.store.backup.folder import PART, STATE_FILE, BackupFolder, BackupState, folder_errors
 from service.store.database.engine import DATABASE_NAME, LOOK, open_read_only
 from service.store.database.tables import artefacts, event_index, heads, runs
@@ -228,7 +229,7 @@ class _Backup:
         needed, free = sum(missing.values()) + _SPARE_BYTES, shutil.disk_usage(self.folder.folder).free
         if needed > free:
             raise StoreError(
-                f"the backup needs {needed / 1e9:.1f} GB more, and {free / 1e9:.1f} GB are free",
+                f"the backup needs {gigabytes(needed):.1f} GB more, and {gigabytes(free):.1f} GB are free",
                 where=str(self.folder.folder),
                 remedy="Make room there, or name a folder on a larger disk; what was copied by then is used again",
             )

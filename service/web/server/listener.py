@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import Any
 from weakref import finalize
 
+from service.core.units import ms
 from service.web.server.connections import Connections
 
 _BACKLOG = 128  # connections that wait in the kernel
@@ -61,7 +62,7 @@ class _Accepted(socket.socket):
         if hasattr(socket, "TCP_USER_TIMEOUT"):
             # A tablet out of reach acknowledges nothing: it is given up, and its streams with it.
             with suppress(OSError):  # it may have been reset in the queue
-                self.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * wait_s))
+                self.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(ms(wait_s)))
 
     def at_close(self, hook: Callable[[], object]) -> None:
         """Call this once, when the socket is closed or was forgotten."""

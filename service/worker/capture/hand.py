@@ -34,6 +34,7 @@ from service.compute.planning.information import predicted_information
 from service.compute.planning.next_best_view import Candidate, CurrentInformation, next_best_views
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, inverse
+from service.core.units import mm
 from service.jobs.capture import hand_board as board_job
 from service.jobs.capture import hand_view as view_job
 from service.jobs.capture.hand_view import HeldArguments, PlannedPlace
@@ -111,7 +112,7 @@ def hand_view(context: JobContext[view_job.Arguments]) -> JobAnswer:
         if bundle is not None:
             spheres, pose = bundle.spheres_m, bundle.poses.get(name, pose)
             earlier = [replace(e, T_scene_camera=bundle.poses.get(e.viewpoint, e.T_scene_camera)) for e in earlier]
-            measures["spheres_sigma_mm"] = 1e3 * bundle.sigma_m
+            measures["spheres_sigma_mm"] = mm(bundle.sigma_m)
     eye = np.zeros(3) if pose is None else pose[:3, 3]
     information = np.zeros((6, 6)) if view.information is None else view.information.information
     found = _Seen(
@@ -244,7 +245,7 @@ def _totals(
     present = _present(arguments, good, spheres, surface)
     error_m = present.error_m()
     if np.isfinite(error_m):
-        measures["predicted_target_error_mm"] = 1e3 * error_m
+        measures["predicted_target_error_mm"] = mm(error_m)
     if surface is not None:
         measures["specimen_coverage"] = covered_fraction([e.seen for e in good], present.min_views)
     return measures

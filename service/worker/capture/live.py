@@ -45,6 +45,7 @@ from service.compute.planning.next_best_view import Candidate, CurrentInformatio
 from service.compute.registration.pairing import paired
 from service.core.errors import ComputeError
 from service.core.geometry import Array, Transform, apply, inverse
+from service.core.units import mm
 from service.jobs.capture import live_summary as summary_job
 from service.jobs.capture import live_view as view_job
 from service.jobs.capture.live_view import LiveArguments
@@ -152,9 +153,9 @@ def live_view(context: JobContext[view_job.Arguments]) -> JobAnswer:
         measures["spheres_expected"] = float(len(expected_spheres(T_camera_scan, spheres, radius_m, camera)))
         measures["registration_rms_px"] = float(np.median(own)) if own else float("nan")
         measures["images"] = float(len(station.solved.used))
-        measures["predicted_target_error_mm"] = 1e3 * station.error_m()
-        measures["outline_limited_error_mm"] = 1e3 * station.outline_limited_m()
-        measures["pose_scatter_mm"] = 1e3 * float(np.sqrt(np.trace(station.P[:3, :3])))
+        measures["predicted_target_error_mm"] = mm(station.error_m())
+        measures["outline_limited_error_mm"] = mm(station.outline_limited_m())
+        measures["pose_scatter_mm"] = mm(float(np.sqrt(np.trace(station.P[:3, :3]))))
         if surface is not None:
             visible = _seen(limits, surface, view, T_base_scan, camera)
             masks = [*(r.seen for r in earlier), visible]
@@ -191,8 +192,8 @@ def live_summary(context: JobContext[summary_job.Arguments]) -> JobAnswer:
     measures: dict[str, float] = {"live_images": float(sum(len(s.solved.used) for s in stations.values()))}
     masks = [r.seen for r in records]
     if stations and not reasons:
-        measures["predicted_target_error_mm"] = 1e3 * max(s.error_m() for s in stations.values())
-        measures["outline_limited_error_mm"] = 1e3 * max(s.outline_limited_m() for s in stations.values())
+        measures["predicted_target_error_mm"] = mm(max(s.error_m() for s in stations.values()))
+        measures["outline_limited_error_mm"] = mm(max(s.outline_limited_m() for s in stations.values()))
     if surface is not None:
         measures["specimen_coverage"] = covered_fraction(masks, limits.min_views)
     suggestions: list[summary_job.Suggestion] = []
@@ -214,16 +215,14 @@ def live_summary(context: JobContext[summary_job.Arguments]) -> JobAnswer:
             min_coverage=arguments.min_coverage,
         )
         suggestions = [
-            summary_job.Suggestion(
-                viewpoint=s.name, predicted_error_mm=1e3 * s.predicted_error_m, coverage=s.coverage
-            )
+            summary_job.Suggestion(viewpoint=s.name, predicted_error_mm=mm(s.predicted_error_m), coverage=s.coverage)
             for s in found
         ]
     answer = summary_job.Answer(
         next_best_views=tuple(suggestions),
         reasons=reasons,
         stations={
-            name: summary_job.StationSoFar(predicted_target_error_mm=1e3 * s.error_m(), images=len(s.solved.used))
+            name: summary_job.StationSoFar(predicted_target_error_mm=mm(s.error_m()), images=len(s.solved.used))
             for name, s in stations.items()
         },
     )

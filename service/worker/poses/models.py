@@ -17,6 +17,7 @@ from service.compute.poses.sfm.estimate import SfmModel, reconstruct, reconstruc
 from service.compute.poses.sfm.options import Mapper, SfmOptions
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.geometry import Array
+from service.core.units import mm
 from service.jobs.poses import hybrid as hybrid_job
 from service.jobs.poses import structure_from_motion as sfm_job
 from service.jobs.records import Hash, Photograph
@@ -130,7 +131,7 @@ def hybrid(context: JobContext[hybrid_job.Arguments]) -> JobAnswer:
     )
     measures = {
         "track_sigma_px": answer.sigma_track_px,
-        "robot_sigma_mm": 1e3 * (answer.sigma_robot_m or 0.0),
+        "robot_sigma_mm": mm(answer.sigma_robot_m or 0.0),
         "robot_sigma_deg": float(np.degrees(answer.sigma_robot_rad or 0.0)),
     }
     ref = context.keep_json(_record(answer, names, stations), kind="hybrid_poses", name="hybrid_poses.json")
@@ -149,7 +150,7 @@ def _record(answer: HybridPoses, names: list[str], stations: list[str]) -> dict[
         "T_world_scan": answer.T_world_scan.tolist(),
         "T_world_station": {stations[g]: T.tolist() for g, T in answer.T_world_group.items()},
         "scan_covariance": answer.scan_covariance.tolist(),
-        "predicted_error_mm": 1e3 * answer.sigma_at_m(answer.centre_scan_m),
+        "predicted_error_mm": mm(answer.sigma_at_m(answer.centre_scan_m)),
         "sigma_track_px": answer.sigma_track_px,
         "sphere_factor": answer.sphere_factor,
         "sigma_robot_m": answer.sigma_robot_m,

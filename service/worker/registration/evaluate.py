@@ -34,6 +34,7 @@ from service.compute.surfaces.constellations import match_constellations
 from service.core.errors import ComputeError
 from service.core.geometry import Array, apply, inverse
 from service.core.records.events import ArtefactRef
+from service.core.units import metres, mm
 from service.dataset.registrations import best_row
 from service.jobs.records import Hash, Photograph, SpheresFound
 from service.jobs.registration import evaluate as job
@@ -108,8 +109,8 @@ def _row(registered: _Registered, budget: ErrorBudget, errors: _Errors) -> job.R
         source=registered.record.poses,
         resolution=f"{registered.camera.width} × {registered.camera.height}",
         images=len(registered.images),
-        predicted_error_mm=1e3 * float(np.sqrt(np.sum(np.square(registration)))),
-        control_error_mm=None if control is None else 1e3 * control.observed_m,
+        predicted_error_mm=mm(float(np.sqrt(np.sum(np.square(registration))))),
+        control_error_mm=None if control is None else mm(control.observed_m),
         control_normalised_chi2=None if control is None else control.normalised_chi2,
         mean_radial_error_mm=errors.mean_radial_mm,
         mean_reprojection_error_px=errors.mean_reprojection_px,
@@ -189,7 +190,7 @@ def _control(scan: MeasuredSpheres, control_scan: SpheresFound | None) -> Measur
 
 def _spheres(found: SpheresFound) -> MeasuredSpheres:
     records = found.details.spheres
-    rms_m = [1e-3 * record.rms_mm for record in records]
+    rms_m = [metres(record.rms_mm) for record in records]
     return MeasuredSpheres(
         np.array([record.centre_m for record in records]),
         np.array([record.covariance_m2 for record in records]),

@@ -18,6 +18,7 @@ from service.compute.registration.joint_poses import with_joint_pose_covariance
 from service.compute.registration.result import RegistrationResult
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array, inverse
+from service.core.units import mm
 from service.jobs.records import ParameterCovariance, Photograph
 from service.jobs.registration import register as job
 from service.worker.camera import camera_reduced, camera_used
@@ -96,7 +97,7 @@ def register(context: JobContext[job.Arguments]) -> JobAnswer:
         "markers": float(len(solved.markers)),
         "images": float(answer.n_images),
         "excluded_outlines": float(len(answer.excluded)),
-        "predicted_error_mm": 1e3 * predicted_m,
+        "predicted_error_mm": mm(predicted_m),
     }
     result["leave_one_out"] = left_out = _leave_one_out(answer, refined=source == "robot_corrected")
     if left_out is not None:

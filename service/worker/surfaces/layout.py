@@ -27,6 +27,7 @@ from service.compute.markers.detect import detect_spheres
 from service.compute.markers.records import SphereOutline
 from service.core.errors import ComputeError, DataError
 from service.core.geometry import Array
+from service.core.units import mm
 from service.jobs.surfaces import layout as job
 from service.worker.job import JobAnswer, JobContext
 
@@ -152,7 +153,7 @@ def _move_record(move: ShownMove, camera: CameraModel) -> dict[str, Any]:
         "words": move.words,
         "from": (move.from_px / size).tolist(),
         "to": (move.to_px / size).tolist(),
-        "higher_mm": 1e3 * move.higher_m,
+        "higher_mm": mm(move.higher_m),
     }
 
 

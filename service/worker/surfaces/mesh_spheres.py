@@ -15,6 +15,7 @@ from service.compute.surfaces.loop_closure import LoopClosure, close_loop
 from service.compute.surfaces.mesh_spheres import locate_spheres as find_spheres
 from service.compute.surfaces.sphere_records import sphere_record
 from service.core.geometry import Array
+from service.core.units import mm
 from service.jobs.records import SpheresFound
 from service.jobs.surfaces import ct_surface as ct_job
 from service.jobs.surfaces import locate_spheres as locate_job
@@ -49,9 +50,9 @@ def _search(arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Arra
     layout = check_layout(centres, covariances, radius_m=radius_m) if len(spheres) >= LAYOUT_SUBSET else None
     measures = {
         "spheres_found": float(len(spheres)),
-        "radius_residual_max_mm": 1e3 * max(abs(s.radius_residual_m) for s in spheres),
-        "sphere_rms_max_mm": 1e3 * max(s.rms_m for s in spheres),
-        "sphere_sigma_max_mm": 1e3 * max(float(np.sqrt(np.trace(s.covariance))) for s in spheres),
+        "radius_residual_max_mm": mm(max(abs(s.radius_residual_m) for s in spheres)),
+        "sphere_rms_max_mm": mm(max(s.rms_m for s in spheres)),
+        "sphere_sigma_max_mm": mm(max(float(np.sqrt(np.trace(s.covariance))) for s in spheres)),
     }
     details: dict[str, Any] = {"spheres": [sphere_record(s) for s in spheres]}
     if layout is not None:
@@ -61,8 +62,8 @@ def _search(arguments: ct_job.Arguments | locate_job.Arguments, vertices_m: Arra
         reference = np.array(arguments.reference_m)
         match = match_constellations(reference, centres)
         measures["spheres_compared"] = float(len(match.pairs))
-        measures["sphere_change_rms_mm"] = 1e3 * match.rms_m
-        measures["sphere_change_max_mm"] = 1e3 * float(match.residuals_m.max())
+        measures["sphere_change_rms_mm"] = mm(match.rms_m)
+        measures["sphere_change_max_mm"] = mm(float(match.residuals_m.max()))
         details["T_reference_mesh"] = match.T_a_b.tolist()
         if arguments.reference_covariances_m2 is not None:
             closure = close_loop(reference, np.array(arguments.reference_covariances_m2), centres, covariances, match)
@@ -77,14 +78,14 @@ def _closure_record(closure: LoopClosure) -> dict[str, Any]:
     return {
         "T_reference_mesh": closure.T_a_b.tolist(),
         "chi2_per_dof": closure.chi2_per_dof,
-        "rms_mm": 1e3 * closure.rms_m,
-        "sigma_rms_mm": 1e3 * closure.sigma_rms_m,
+        "rms_mm": mm(closure.rms_m),
+        "sigma_rms_mm": mm(closure.sigma_rms_m),
         "spheres": [
             {
                 "reference": s.pair[0],
                 "sphere": s.pair[1],
-                "difference_mm": (1e3 * s.difference_m).tolist(),
-                "sigma_mm": 1e3 * s.sigma_m,
+                "difference_mm": mm(s.difference_m).tolist(),
+                "sigma_mm": mm(s.sigma_m),
                 "z": s.z,
                 "moved": s.moved,
             }

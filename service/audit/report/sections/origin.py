@@ -14,6 +14,7 @@ from service.core.equipment.camera_bodies import bodies
 from service.core.equipment.clocks import clock_of, clock_readings, offset_told
 from service.core.records.events import DeviceOpened, JobFinished, SessionStarted, ViewpointCaptured
 from service.core.text.counts import counted
+from service.core.units import ms, um
 from service.jobs.words import term
 
 _COMPUTES = ("orthocapture", "numpy", "scipy", "opencv-python-headless", "pycolmap", "trimesh", "scikit-image")
@@ -58,8 +59,8 @@ def devices_section(run: RecordedRun) -> Section:
         sigma_m = max(capture.pose_sigma_m for capture in captures)
         text = (
             f"Over {counted(len(captures), 'capture')} the robot's clock stayed within "
-            f"{1e3 * float(np.ptp(offsets)):.1f} ms of its distance from the host's "
-            f"monotonic clock; the flange stood still within {1e6 * sigma_m:.2f} µm "
+            f"{ms(float(np.ptp(offsets))):.1f} ms of its distance from the host's "
+            f"monotonic clock; the flange stood still within {um(sigma_m):.2f} µm "
             "(1σ) during every exposure."
         )
         blocks.append(Paragraph(text + _environment(captures)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from service.audit.record.run import RecordedRun
 from service.audit.report.blocks import Block, Cell, Column, Facts, Heading, Paragraph, Section, Table
 from service.core.text.counts import counted
+from service.core.units import megabytes
 from service.store.verification.verify import AuditReport
 
 _FAULTS_SHOWN = 20
@@ -21,7 +22,7 @@ def verification_section(run: RecordedRun, audit: AuditReport) -> Section:
             f"{counted(audit.events, 'event')}, {counted(audit.artefacts, 'artefact row')}, "
             f"{counted(audit.jobs, 'job')}",
         ),
-        ("Files hashed again", f"{audit.files}, {audit.bytes_hashed / 1e6:.1f} MB"),
+        ("Files hashed again", f"{audit.files}, {megabytes(audit.bytes_hashed):.1f} MB"),
         (f"Chain head (event {head.seq})", head.sha256),
         ("Signed checkpoints (Ed25519)", str(audit.checkpoints) if audit.checkpoints else Cell("none", "attention")),
         ("Events after the last checkpoint", str(unsigned)),

@@ -16,6 +16,7 @@ import numpy as np
 from service.compute.calibration.hand_eye.closed_form import deviation, robust_start
 from service.core.errors import ComputeError
 from service.core.geometry import Array, inverse
+from service.core.units import metres
 
 Setup = Literal["eye-in-hand", "eye-to-hand"]
 
@@ -59,8 +60,8 @@ def check_setup(hands: Array, boards: Array, point_m: Array, setup: Setup) -> No
         setup: the assumed reading of the poses.
     """
     as_read = _fit(hands, boards, point_m)
-    metres = hands.copy()
-    metres[:, :3, 3] *= 1e-3
+    in_metres = hands.copy()
+    in_metres[:, :3, 3] = metres(hands[:, :3, 3])
     other: Setup = "eye-to-hand" if setup == "eye-in-hand" else "eye-in-hand"
     where = (
         "beside the robot, the board on its flange" if other == "eye-to-hand" else "on the flange, the board still"
@@ -69,13 +70,13 @@ def check_setup(hands: Array, boards: Array, point_m: Array, setup: Setup) -> No
     inverse_way = f"Invert the poses in the file, or give --setup {other}"
     readings = (
         (inverted(hands), inverse_words, inverse_way),
-        (metres, "in millimetres", "Write positions in metres"),
-        (inverted(metres), f"in millimetres and {inverse_words}", f"Write positions in metres. {inverse_way}"),
+        (in_metres, "in millimetres", "Write positions in metres"),
+        (inverted(in_metres), f"in millimetres and {inverse_words}", f"Write positions in metres. {inverse_way}"),
     )
     for poses, words, remedy in readings:
         found = _fit(poses, boards, point_m)
         # Poses in millimetres fit in rotation as they are: only their positions tell.
-        better = found.fits and not as_read.fits if poses is metres else found.beats(as_read)
+        better = found.fits and not as_read.fits if poses is in_metres else found.beats(as_read)
         if better:
             raise ComputeError(
                 f"the robot's poses do not fit the images as they are ({as_read} off in the median), but fit {words} "
