@@ -9,11 +9,10 @@ from typing import Any
 from pydantic import BaseModel
 
 from docs.generate.fields import docstring, field_table, record_sections, records_below
-from docs.generate.measure_words import MEANINGS
 from service.core.protocol.models import Protocol, Step
 from service.steps import step_kinds
 from service.steps.context import StepKind
-from service.steps.measured import Measure
+from service.steps.measures import Measure, RegistrationMeasures
 
 _HEAD = """\
 Made from the code by `make reference`.
@@ -69,18 +68,13 @@ def _examples(protocols: Mapping[str, Protocol], kind: str) -> Iterator[tuple[st
 
 def measures_of_kind(kind: StepKind[Any]) -> dict[str, Measure]:
     """The measures of a kind of step, those of a source of camera poses under the name NAME_…."""
-    named = {f"NAME_{name}": measure for name, measure in kind.measures_of_registrations.items()}
-    return {**kind.measures, **named}
-
-
-def all_measures() -> set[str]:
-    """The names of all measures of all kinds."""
-    return {name for kind in step_kinds().values() for name in measures_of_kind(kind)}
+    if issubclass(kind.measures, RegistrationMeasures):
+        return kind.measures.declared_for(["NAME"])
+    return kind.measures.declared()
 
 
 def _measures(kind: StepKind[Any]) -> Iterator[str]:
     yield "| measure | unit | limits | meaning |"
     yield "|---|---|---|---|"
     for name, measure in measures_of_kind(kind).items():
-        meaning = MEANINGS.get(name, measure.meaning)
-        yield f"| `{name}` | {measure.unit} | {measure.least:g} to {measure.most:g} | {meaning} |"
+        yield f"| `{name}` | {measure.unit} | {measure.least:g} to {measure.most:g} | {measure.meaning} |"

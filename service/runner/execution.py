@@ -86,7 +86,7 @@ class StepExecution:
             StepMeasured(
                 step=step,
                 attempt=attempt,
-                measures={name: float(value) for name, value in outcome.measures.items()},
+                measures=outcome.measures.plain(),
                 artefacts=outcome.artefacts,
                 result=dict(outcome.result),
                 uncertainties=dict(outcome.uncertainties),

@@ -19,7 +19,7 @@ from service.core.run.decide import RunState, StepState
 from service.core.run.state import JobState
 from service.jobs.kind import JobKind, JobRecord
 from service.rig import CollisionSection, LensSection, OpticsSection
-from service.steps.measured import Measure
+from service.steps.measures import MeasureRecord
 from service.store.records import NewArtefact
 
 P = TypeVar("P", bound=Record)
@@ -243,7 +243,7 @@ class StepContext:
 class StepOutcome:
     """The numbers a step measured (gates judge them), what it produced, and its Result."""
 
-    measures: Mapping[str, float]
+    measures: MeasureRecord
     artefacts: tuple[ArtefactRef, ...] = ()
     result: Mapping[str, Any] = field(default_factory=dict[str, Any])
     uncertainties: Mapping[str, Uncertainty] = field(default_factory=dict[str, Uncertainty])  # of some measures
@@ -285,21 +285,20 @@ class StepKind(Generic[P]):
     Attributes:
         name: in the protocol.
         params: its section of the protocol.
+        measures: the numbers that it yields, for gates.
         result: what it leaves to later steps.
         execute: does it.
-        measures: the numbers that it yields, for gates; empty where nobody has described them.
-        measures_of_registrations: those that it yields for each registration, with its name before them.
-        registered_by: the step whose registrations these are; None: this step itself.
+        registered_by: the step whose registrations the measures are of, where they are RegistrationMeasures; None:
+            this step itself.
         words: what a person reads who is about to confirm it.
         drawing: that is shown beside the instructions (service/web/run/drawings), where the protocol names no other.
     """
 
     name: str
     params: type[P]
+    measures: type[MeasureRecord]
     result: type[Record]
     execute: Callable[[StepContext, P], StepOutcome]
-    measures: Mapping[str, Measure] = field(default_factory=dict[str, Measure])
-    measures_of_registrations: Mapping[str, Measure] = field(default_factory=dict[str, Measure])
     registered_by: Callable[[P, Mapping[str, Step]], Step | None] | None = None
     words: Callable[[P, BeforeStep], Announcement] | None = None
     drawing: str = ""

@@ -1,101 +1,196 @@
-"""Whether the gates of a protocol judge numbers that its steps yield, in their units and within credible limits.
-
-A gate on a number that no step of its kind measures fails when the step is done, hours into a run; a limit in another
-unit passes everything. `orthocapture protocol check` holds a protocol's gates against what each step kind declares.
-"""
+"""Measures: the numbers that steps yield for gates, each declared once with unit, credible limits and meaning."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Generic, Self, TypeVar, get_args
 
-from service.core.protocol.models import Gate, LoadedProtocol, Step
-from service.core.text.yaml_tree import FieldPath, Plain, Problem, field_name, parse_yaml
-from service.rig import RigSection
-from service.steps import step_kinds
-from service.steps.measured import Measure
-from service.steps.poses.sources import Wanted
+from pydantic import Field, ValidationError
+from pydantic.fields import FieldInfo
 
-# Sections of the file: field → between what it is plausible, in the field's unit.
-_SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {
-    ("spheres", "radius_mm"): (1.0, 100.0, "mm"),
-    ("board", "square_mm"): (0.5, 1000.0, "mm"),
-    ("camera", "aperture_f"): (0.7, 64.0, ""),
-    ("camera", "iso"): (25.0, 409600.0, ""),
-}
-_ALIAS = {"deg": "°", "1": "", "degrees": "°"}
+from service.core.errors import DataError
+from service.core.records.base import Record
 
 
-def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, Measure] | None:
-    """All that a step of this kind and with these parameters measures; None for a kind that nobody described."""
-    kind = step_kinds().get(step.kind)
-    if kind is None or not kind.measures:
-        return None
-    registering = kind.registered_by(step.params, protocol_steps) if kind.registered_by is not None else step
-    if registering is None:
-        return None
-    if not kind.measures_of_registrations:
-        return kind.measures
-    names = Wanted.of(registering.params).registrations
-    suffixes = kind.measures_of_registrations
-    return {**kind.measures, **{f"{name}_{suffix}": m for name in names for suffix, m in suffixes.items()}}
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """The declaration of a number of a step: its unit, and between what a limit on it is credible."""
+
+    unit: str
+    least: float = 0.0
+    most: float = float("inf")
+    meaning: str = ""  # for the page of the step kinds
 
 
-def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[Problem, ...]:
-    """What cannot be meant of measures, units, limits and, with the rig, stations; in the order of the lines."""
-    tree = parse_yaml(loaded.source, name="the protocol")
-    found: list[tuple[FieldPath, str]] = []
-    data = tree.data if isinstance(tree.data, dict) else {}
-    for (section, field), (least, most, unit) in _SECTIONS.items():
-        part = data.get(section)
-        value = part.get(field) if isinstance(part, dict) else None
-        if isinstance(value, int | float) and not least <= value <= most:
-            found.append(
-                ((section, field), f"{value:g} {unit} is not credible: {least:g} to {most:g} {unit}".strip())
-            )
-    steps = {step.id: step for step in loaded.protocol.steps}
-    for index, step in enumerate(loaded.protocol.steps):
-        known = measures_of(step, steps)
-        for number, gate in enumerate(step.gates) if known is not None else ():
-            assert known is not None
-            found += [(("steps", index, "gates", number, *at), words) for at, words in _gate(gate, step, known)]
-    if rig is not None:
-        found += list(_stations(data, rig))
-    problems = [Problem(tree.line(at), field_name(at), words) for at, words in found]
-    return tuple(sorted(problems, key=lambda p: (p.line, p.field)))
+class MeasureRecord(Record):
+    """Base of the `Measures` of every step kind: each field is a measure that a gate can judge.
+
+    A field is declared as `rms_px: Annotated[Px, "rms reprojection error"] = None`, with one of the types below or
+    with `Annotated[float | None, Measure(…)]`. None means that it was not measured this time; it is not recorded.
+    """
+
+    @classmethod
+    def declared(cls) -> dict[str, Measure]:
+        """The declaration of each measure, by name, in the order of the fields."""
+        found = {name: _declaration(field) for name, field in cls.model_fields.items()}
+        return {name: measure for name, measure in found.items() if measure is not None}
+
+    @classmethod
+    def read(cls, values: Mapping[str, float]) -> Self:
+        """The record of numbers that have the names of measures, such as those of a job.
+
+        Raises:
+            DataError: a name is not declared.
+        """
+        return _validated(cls, dict(values))
+
+    def plain(self) -> dict[str, float]:
+        """The numbers that were measured, by name, as events and gates have them."""
+        values = {name: getattr(self, name) for name in type(self).declared()}
+        return {name: float(value) for name, value in values.items() if value is not None}
 
 
-def _gate(gate: Gate, step: Step, known: Mapping[str, Measure]) -> Iterator[tuple[FieldPath, str]]:
-    measure = known.get(gate.measure)
-    if measure is None:
-        near = difflib.get_close_matches(gate.measure, known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else f"; it measures {', '.join(sorted(known))}"
-        yield ("measure",), f"a step of kind {step.kind} measures no {gate.measure!r}{hint}"
-        return
-    unit = _ALIAS.get(gate.unit, gate.unit)
-    if measure.unit and unit != measure.unit:
-        yield ("unit",), f"{gate.measure} is in {measure.unit}, not in {gate.unit or 'nothing'}"
-    for name, limit in (("min", gate.min), ("max", gate.max)):
-        if limit is not None and limit != 0 and not measure.least <= limit <= measure.most:
-            between = f"{measure.least:g} to {measure.most:g} {measure.unit}".strip()
-            yield (name,), f"a limit of {limit:g} on {gate.measure} is not credible: {between}"
+M = TypeVar("M", bound=MeasureRecord)
 
 
-def _stations(data: Mapping[str, Plain], rig: RigSection) -> Iterator[tuple[FieldPath, str]]:
-    """Stations that the protocol names and the rig file does not have."""
+class RegistrationMeasures(MeasureRecord, Generic[M]):
+    """Base of the `Measures` of a kind that yields the same numbers for each of several registrations.
 
-    def walk(value: Plain, at: FieldPath) -> Iterator[tuple[FieldPath, str]]:
-        if isinstance(value, dict):
-            for key, inner in value.items():
-                if key == "station" and isinstance(inner, str) and inner not in rig.stations:
-                    there = ", ".join(rig.stations) or "none"
-                    near = difflib.get_close_matches(inner, rig.stations, n=1)
-                    hint = f"; did you mean {near[0]!r}?" if near else f"; it has {there}"
-                    yield (*at, key), f"the rig has no station {inner!r}{hint}"
-                else:
-                    yield from walk(inner, (*at, key))
-        elif isinstance(value, list):
-            for number, inner in enumerate(value):
-                yield from walk(inner, (*at, number))
+    In events and gates, the name of the registration stands before the name of the number: `colmap_rms_px`.
+    """
 
-    yield from walk(data.get("steps"), ("steps",))
+    registrations: Mapping[str, M] = Field(default_factory=dict)  # by name
+
+    @classmethod
+    def of_one(cls) -> type[MeasureRecord]:
+        """The record of one registration."""
+        return get_args(cls.model_fields["registrations"].annotation)[1]
+
+    @classmethod
+    def declared_for(cls, registrations: Iterable[str]) -> dict[str, Measure]:
+        """All declarations, with those of the registrations of these names."""
+        one = cls.of_one().declared()
+        return cls.declared() | {f"{name}_{number}": one[number] for name in registrations for number in one}
+
+    @classmethod
+    def read_all(cls, values: Mapping[str, float], registrations: Iterable[str]) -> Self:
+        """The record of numbers as they are recorded. Raises DataError where a name is not declared."""
+        own = {name: value for name, value in values.items() if name in cls.declared()}
+        rest = {name: value for name, value in values.items() if name not in own}
+        numbers = cls.of_one().declared()
+        each: dict[str, dict[str, float]] = {}
+        for name in registrations:
+            mine = {number: rest.pop(f"{name}_{number}") for number in numbers if f"{name}_{number}" in rest}
+            if mine:
+                each[name] = mine
+        return _validated(cls, {**own, **rest, "registrations": each})
+
+    def plain(self) -> dict[str, float]:
+        """The numbers that were measured, by name, with those of every registration."""
+        each = {
+            f"{name}_{number}": value
+            for name, record in self.registrations.items()
+            for number, value in record.plain().items()
+        }
+        return {**MeasureRecord.plain(self), **each}
+
+
+R = TypeVar("R", bound=MeasureRecord)
+
+
+def _validated(record: type[R], values: Mapping[str, Any]) -> R:
+    try:
+        return record.model_validate(values)
+    except ValidationError as error:
+        names = ", ".join(str(part) for found in error.errors() for part in found["loc"])
+        raise DataError(
+            f"the step has measured something that its kind does not declare: {names}",
+            where=record.__module__,
+            remedy="Declare it in the Measures of the step kind",
+        ) from error
+
+
+def _declaration(field: FieldInfo) -> Measure | None:
+    measure = next((part for part in field.metadata if isinstance(part, Measure)), None)
+    meaning = next((part for part in field.metadata if isinstance(part, str)), "")
+    if measure is None or not meaning:
+        return measure
+    return replace(measure, meaning=meaning)
+
+
+# --- types of measures, with limits within which a gate is credible ------------------------------------------------
+
+Count = Annotated[float | None, Measure("", 0, 1e6)]
+Share = Annotated[float | None, Measure("", 0, 1)]
+Ratio = Annotated[float | None, Measure("", 0, 1e4)]
+Mm = Annotated[float | None, Measure("mm", 1e-4, 1000)]
+FineMm = Annotated[float | None, Measure("mm", 1e-4, 50)]
+ErrorMm = Annotated[float | None, Measure("mm", 1e-3, 20)]
+Px = Annotated[float | None, Measure("px", 1e-3, 50)]
+Deg = Annotated[float | None, Measure("°", 0, 360)]
+
+
+# --- measures that several kinds share -----------------------------------------------------------------------------
+
+
+class LayoutMeasures(MeasureRecord):
+    """Of the layout of the spheres: whether one set of spheres could be mistaken for another."""
+
+    layout_margin_mm: Annotated[
+        FineMm, "misfit of the best wrong assignment of four spheres: how far they are from being mistaken"
+    ] = None
+    layout_margin_of_five_mm: Annotated[FineMm, "misfit of the best wrong assignment of five spheres"] = None
+    layout_margin_sigma_mm: Annotated[FineMm, "standard deviation of `layout_margin_mm`"] = None
+    layout_depth_mm: Annotated[Mm, "depth of the layout across its best plane"] = None
+    layout_gap_deg: Annotated[Deg, "largest angle around the centre of the scene without a sphere"] = None
+    layout_problems: Annotated[Count, "findings about the layout that fall short of what is required"] = None
+
+
+class SphereMeasures(LayoutMeasures):
+    """Of the spheres in a mesh, and how they moved since an earlier one."""
+
+    spheres_found: Annotated[Count, "spheres found in the mesh"] = None
+    radius_residual_max_mm: Annotated[
+        float | None, Measure("mm", 1e-3, 5), "largest difference between a fitted radius and the nominal one"
+    ] = None
+    sphere_rms_max_mm: Annotated[
+        float | None, Measure("mm", 1e-3, 5), "largest rms distance of the mesh's vertices from their sphere"
+    ] = None
+    sphere_sigma_max_mm: Annotated[
+        float | None,
+        Measure("mm", 1e-4, 5),
+        "largest standard deviation of a sphere's centre (root of the trace of its covariance)",
+    ] = None
+    sphere_change_max_mm: Annotated[
+        ErrorMm, "largest distance between a sphere here and in the earlier mesh, after a rigid fit"
+    ] = None
+    sphere_change_rms_mm: Annotated[ErrorMm, "rms distance between the spheres here and in the earlier mesh"] = None
+    spheres_compared: Annotated[Count, "spheres found both here and in the earlier mesh"] = None
+    spheres_moved: Annotated[Count, "spheres that moved by more than their uncertainty explains"] = None
+    loop_closure_chi2: Annotated[
+        Ratio,
+        "chi-squared per degree of freedom of the spheres that did not move: near 1 if the covariances are right",
+    ] = None
+
+
+class CaptureMeasures(MeasureRecord):
+    """Of a capture by the robot."""
+
+    viewpoints_planned: Annotated[Count, "viewpoints that the step was to take"] = None
+    viewpoints_captured: Annotated[Count, "viewpoints with a valid image"] = None
+    viewpoints_given_up: Annotated[Count, "viewpoints that could not be taken"] = None
+    settings_departures: Annotated[Count, "images with other settings than the protocol's"] = None
+    moved_during_exposure: Annotated[Count, "images during which the arm did not stand still"] = None
+    optics_departures: Annotated[Count, "images whose zoom, focus or lens differs from the calibrated one"] = None
+
+
+class PredictedMeasures(MeasureRecord):
+    """What a capture predicts of the registration, before it is computed."""
+
+    predicted_target_error_mm: Annotated[
+        ErrorMm, "predicted error of the registration at the worst point of the specimen"
+    ] = None
+    specimen_coverage: Annotated[
+        Share, "share of the specimen's surface that enough images see well (see `coverage` of the step)"
+    ] = None

@@ -9,7 +9,8 @@ import pytest
 
 from service.audit.record.run import read_run
 from service.audit.replay.replay import replay
-from service.core.records.events import JobEnqueued
+from service.core.records.events import JobEnqueued, StepMeasured
+from service.steps.protocol_check import measures_of
 from service.store.verification.verify import verify
 
 RECORDED = Path(__file__).parents[1] / "data" / "recorded"
@@ -36,6 +37,17 @@ def test_it_opens_and_its_events_add_up(data: Path) -> None:
     kinds = {event.payload.job_kind for event in run.events if isinstance(event.payload, JobEnqueued)}
     assert {"calibrate", "live_view", "live_summary", "locate_spheres", "register", "evaluate"} <= kinds
     assert run.summary().best() == "robot_corrected"
+
+
+def test_every_measure_that_it_recorded_is_declared_by_the_kind_of_its_step(data: Path) -> None:
+    run = read_run(data, "latest")
+    steps = {step.id: step for step in run.protocol.steps}
+    measured = [event.payload for event in run.events if isinstance(event.payload, StepMeasured)]
+    assert measured
+    for payload in measured:
+        declared = measures_of(steps[payload.step], steps)
+        assert declared is not None
+        assert set(payload.measures) <= set(declared), payload.step
 
 
 def test_it_verifies(data: Path) -> None:

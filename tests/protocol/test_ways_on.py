@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 from typer.testing import CliRunner
@@ -27,6 +27,7 @@ from service.core.run.state import RunState
 from service.runner.operator import AnswerBy
 from service.steps import step_kinds
 from service.steps.context import StepContext, StepOutcome
+from service.steps.measures import Count, MeasureRecord
 from service.store.store import Store
 from tests.support.record.core import GOOD, Log, toy_protocol
 from tests.support.record.core import TOY as TOY_TEXT
@@ -55,6 +56,12 @@ steps:
 STEPS = ("hands", "layout", "ct", "lens", "views", "coat", "scan", "register", "judge")
 
 
+class Measured(MeasureRecord):
+    """What every step of the protocol above yields."""
+
+    m: Annotated[Count, "any number"] = None
+
+
 @dataclass
 class Fakes:
     """Steps that yield a figure or an error, in place of those that need devices."""
@@ -70,7 +77,7 @@ class Fakes:
         self.executed.append(context.step.id)
         if self.failing and self.error is not None:
             raise self.error
-        return StepOutcome(measures={"m": 9.0 if self.failing else 0.5})
+        return StepOutcome(Measured(m=9.0 if self.failing else 0.5))
 
 
 class Walker(ScriptedOperator):

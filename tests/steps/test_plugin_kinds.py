@@ -15,10 +15,12 @@ from tests.support.rig.rig import REPOSITORY
 PLUGIN = '''
 """Weigh the specimen: a step kind, and the job kind that computes for it."""
 
+from typing import Annotated
+
 from service.core.records.base import Record
 from service.jobs.kind import JobKind, JobRecord
 from service.steps.context import Announcement, JobRequest, StepKind, StepOutcome
-from service.steps.measured import Measure
+from service.steps.measures import Measure, MeasureRecord
 from service.worker.job import JobAnswer
 
 
@@ -52,6 +54,12 @@ class Params(Record):
     times: int = 3
 
 
+class Measures(MeasureRecord):
+    """Of the scales."""
+
+    weight_g: Annotated[float | None, Measure("g", 1, 1e5), "mean of the readings"] = None
+
+
 class Result(Record):
     """The weight."""
 
@@ -62,15 +70,17 @@ def execute(context, params):
     """Weigh the specimen some times."""
     readings = tuple(500.0 + k for k in range(params.times))
     (answer,) = context.evidence.run_jobs(JobRequest.of(WEIGH, Arguments(readings_g=readings)))
-    return StepOutcome(answer.measures, answer.artefacts, Result(**answer.result).model_dump(mode="json"))
+    return StepOutcome(
+        Measures.read(answer.measures), answer.artefacts, Result(**answer.result).model_dump(mode="json")
+    )
 
 
 WEIGHING = StepKind(
     "weighing",
     Params,
+    Measures,
     Result,
     execute,
-    measures={"weight_g": Measure("g", 1, 1e5, "mean of the readings")},
     words=lambda params, _before: Announcement(f"it is weighed {params.times} times"),
     drawing="scales",
 )

@@ -16,7 +16,7 @@ from service.core.protocol.models import load_protocol
 from service.core.text.counts import counted
 from service.rig import load_rig
 from service.steps import params_models
-from service.steps.measures import implausible
+from service.steps.protocol_check import implausible
 
 protocol_app = typer.Typer(name="protocol", help="Check a protocol file before it is used.", no_args_is_help=True)
 

@@ -1,1 +1,1 @@
-"""One file a step kind: its Params, its Result, its execute(). A module with a KIND is a step kind."""
+"""One file for each step kind, with its Params, Measures, Result, execute() and KIND."""

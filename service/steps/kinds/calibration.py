@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import model_validator
@@ -24,7 +24,7 @@ from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.capture.viewpoints import ViewpointSet, plan_viewpoints
 from service.steps.context import ROBOT_MOVES, Announcement, JobRequest, JobResult, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, result_of, taken
-from service.steps.measured import CALIBRATION
+from service.steps.measures import CaptureMeasures, Count, FineMm, Measure, Mm, Px, Share
 
 _FEWEST_KNOWN = 3  # whole boards, before a part of one may count
 
@@ -48,6 +48,61 @@ class Params(MovingParams):
         if self.board_poses is not None and (self.viewpoints or self.images_of is not None):
             raise ValueError("a calibration needs one of board_poses, viewpoints and images_of, not two")
         return self
+
+
+class Measures(CaptureMeasures):
+    """Of the board images, the intrinsics and the hand-eye transform."""
+
+    views: Annotated[Count, "board images that were used"] = None
+    views_without_board: Annotated[Count, "board images in which no board was found"] = None
+    views_partial: Annotated[Count, "board images that show a part of the board"] = None
+    views_excluded: Annotated[Count, "board images left out as outliers"] = None
+    boards_unseen: Annotated[Count, "board images in which the first search found no board"] = None
+    rms_px: Annotated[Px, "rms reprojection error"] = None
+    five_fold_rms_px: Annotated[Px, "rms reprojection error of held-out views (five-fold cross-validation)"] = None
+    leave_one_out_rms_px: Annotated[Px, "rms reprojection error of each view by the calibration without it"] = None
+    corner_sigma_px: Annotated[Px, "noise of the corners, as estimated"] = None
+    coverage: Annotated[Share, "share of the image area in which corners of the board were seen"] = None
+    tilt_deg: Annotated[float | None, Measure("°", 0, 90), "largest tilt of the board against the image plane"] = None
+    uncertainty_px: Annotated[Px, "standard deviation of a projected point, worst in the image"] = None
+    uncertainty_mm: Annotated[
+        float | None, Measure("mm", 1e-4, 10), "`uncertainty_px` as a length at the distance of the board"
+    ] = None
+    uncertainty_centre_mm: Annotated[float | None, Measure("mm", 1e-4, 10), "the same in the centre of the image"] = (
+        None
+    )
+    hand_eye_sigma_mm: Annotated[
+        float | None, Measure("mm", 1e-4, 20), "standard deviation of the camera's position on the flange"
+    ] = None
+    hand_eye_sigma_deg: Annotated[
+        float | None, Measure("°", 1e-5, 10), "standard deviation of the camera's rotation on the flange"
+    ] = None
+    hand_eye_held_out_mm: Annotated[
+        float | None, Measure("mm", 1e-3, 50), "median position error of views held out of the hand-eye calibration"
+    ] = None
+    hand_eye_held_out_deg: Annotated[
+        float | None, Measure("°", 1e-4, 10), "median rotation error of views held out of the hand-eye calibration"
+    ] = None
+    hand_eye_uncorrected_held_out_mm: Annotated[
+        float | None, Measure("mm", 1e-3, 50), "`hand_eye_held_out_mm` without the correction of the arm"
+    ] = None
+    hand_eye_arm_corrected: Annotated[
+        Share, "1 if a correction of the arm was found that reduces the errors, else 0"
+    ] = None
+    hand_eye_excluded: Annotated[Count, "views left out of the hand-eye calibration as outliers"] = None
+    hand_eye_methods_spread_mm: Annotated[Mm, "spread of the camera's position between independent methods"] = None
+    hand_eye_condition: Annotated[float | None, Measure("", 1, 1e6), "condition number of the hand-eye equations"] = (
+        None
+    )
+    rotation_spread_deg: Annotated[float | None, Measure("°", 0, 180), "largest rotation between two views"] = None
+    robot_noise_mm: Annotated[FineMm, "standard deviation of the arm's remaining position error, along each axis"] = (
+        None
+    )
+    robot_noise_deg: Annotated[
+        float | None,
+        Measure("°", 1e-5, 10),
+        "standard deviation of the arm's remaining rotation error, about each axis",
+    ] = None
 
 
 class Result(Record):
@@ -80,7 +135,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     measures |= answer.measures
     if capture is not None:
         mend_calibration(context, capture, measures)
-    return StepOutcome(measures, answer.artefacts, result.model_dump(mode="json"))
+    return StepOutcome(Measures.read(measures), answer.artefacts, result.model_dump(mode="json"))
 
 
 def board_of_protocol(context: StepContext) -> Board:
@@ -163,9 +218,9 @@ def _solve(
 KIND = StepKind(
     "calibration",
     Params,
+    Measures,
     Result,
     execute,
-    measures=CALIBRATION,
     words=lambda _params, before: Announcement(
         f"the robot takes {before.images(' of the board')}{before.at_stations}", ROBOT_MOVES
     ),

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from service.core.records.events import Record
 from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
-from service.steps.measured import COUNT
+from service.steps.measures import Count, MeasureRecord
 
 
 class Params(Record):
     """Nothing to set: the step's checklist says it all."""
+
+
+class Measures(MeasureRecord):
+    """What the operator ticked when confirming."""
+
+    checklist_items_open: Annotated[Count, "items that are not ticked"] = None
+    checklist_items_ticked: Annotated[Count, "items that are ticked"] = None
 
 
 class Result(Record):
@@ -23,17 +32,15 @@ def execute(context: StepContext, _params: Params) -> StepOutcome:
     items = len(context.step.checklist)
     ticked = len(context.state.ticked)
     result = Result(items=items, ticked=ticked)
-    return StepOutcome(
-        measures={"checklist_items_ticked": float(ticked), "checklist_items_open": float(items - ticked)},
-        result=result.model_dump(),
-    )
+    measures = Measures(checklist_items_ticked=float(ticked), checklist_items_open=float(items - ticked))
+    return StepOutcome(measures, result=result.model_dump())
 
 
 KIND = StepKind(
     "checklist",
     Params,
+    Measures,
     Result,
     execute,
-    measures={"checklist_items_open": COUNT, "checklist_items_ticked": COUNT},
     words=lambda _params, _before: Announcement("all of this is done"),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from drivers.interfaces import CtSource
 from service.core.records.events import ArtefactRef, Record
@@ -11,7 +11,7 @@ from service.jobs.surfaces import ct_surface, locate_spheres
 from service.steps.arrivals import keep, keep_array, keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.layouts import layout_uncertainties
-from service.steps.measured import COUNT, SPHERES, Measure
+from service.steps.measures import Count, Measure, SphereMeasures
 
 
 class Params(Record):
@@ -21,6 +21,15 @@ class Params(Record):
     threshold_hu: float = -450.0  # half way between air and soft tissue or plastic: neither grows nor shrinks
     spheres: int  # registration and control spheres in the volume
     wait_s: float = 600.0  # for the series to appear and be complete
+
+
+class Measures(SphereMeasures):
+    """Of the series, and of the spheres in its surface."""
+
+    slices: Annotated[Count, "slices of the series"] = None
+    slice_spacing_mm: Annotated[float | None, Measure("mm", 0.01, 10), "distance between slices"] = None
+    voxel_mm: Annotated[float | None, Measure("mm", 0.01, 10), "longest side of a voxel"] = None
+    surface_faces: Annotated[Count, "faces of the surface computed from the series"] = None
 
 
 class Result(Record):
@@ -70,7 +79,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     result = Result.model_validate(answer.result)
     uncertainties = layout_uncertainties(result.details["layout"]) if "layout" in result.details else {}
     return StepOutcome(
-        {**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"), uncertainties
+        Measures.read({**measures, **answer.measures}),
+        kept + answer.artefacts,
+        result.model_dump(mode="json"),
+        uncertainties,
     )
 
 
@@ -81,16 +93,9 @@ def _sound(ct: CtSource) -> tuple[Any, ...]:
 KIND = StepKind(
     "ct_import",
     Params,
+    Measures,
     Result,
     execute,
-    measures={
-        **SPHERES,
-        "slices": COUNT,
-        "slice_spacing_mm": Measure("mm", 0.01, 10),
-        "voxel_mm": Measure("mm", 0.01, 10),
-        "vertices": COUNT,
-        "faces": COUNT,
-    },
     words=lambda _params, _before: Announcement(
         "import the CT series", "Nothing moves. The software waits for the series."
     ),

@@ -6,7 +6,7 @@ It judges the registrations that are there; one that arrives later is evaluated 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 from service.core.errors import ConfigurationError
 from service.core.jobs.references import Reference
@@ -16,7 +16,7 @@ from service.jobs.registration import evaluate, register
 from service.jobs.surfaces import locate_spheres
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import captured_images, result_of, taken
-from service.steps.measured import COUNT, EVALUATED, Measure
+from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures
 from service.steps.poses.sources import registration_ways
 
 
@@ -28,6 +28,26 @@ class Params(Record):
     scan: str  # the registered scan
     control_scan: str | None = None  # scan or CT that still holds the control spheres; None: spheres left out in turn
     ct: str | None = None  # CT import, for the loop closures of the error budget
+
+
+class EvaluatedRegistration(MeasureRecord):
+    """The paper's errors of one registration."""
+
+    mean_radial_error_mm: Annotated[ErrorMm, "the paper's radial error, mean over the control spheres"] = None
+    mean_reprojection_error_px: Annotated[Px, "the paper's reprojection error, mean over the control spheres"] = None
+
+
+class Measures(RegistrationMeasures[EvaluatedRegistration]):
+    """The errors of every registration, and of the best one."""
+
+    best_mean_radial_error_mm: Annotated[ErrorMm, "`NAME_mean_radial_error_mm` of the registration that is used"] = (
+        None
+    )
+    best_predicted_error_mm: Annotated[ErrorMm, "predicted error of the registration that is used"] = None
+    control_normalised_chi2: Annotated[
+        Ratio, "radial errors against their predicted standard deviations: near 1 if those are right"
+    ] = None
+    control_spheres: Annotated[Count, "control spheres that were seen and measured"] = None
 
 
 class Result(Record):
@@ -70,20 +90,15 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     )
     (answer,) = context.evidence.run_jobs(JobRequest.of(evaluate.KIND, arguments, references))
     result = Result.model_validate(answer.result)
-    return StepOutcome(answer.measures, answer.artefacts, result.model_dump(mode="json"))
+    measures = Measures.read_all(answer.measures, registrations)
+    return StepOutcome(measures, answer.artefacts, result.model_dump(mode="json"))
 
 
 KIND = StepKind(
     "evaluation",
     Params,
+    Measures,
     Result,
     execute,
-    measures={
-        "best_mean_radial_error_mm": Measure("mm", 1e-3, 20),
-        "best_predicted_error_mm": Measure("mm", 1e-3, 20),
-        "control_normalised_chi2": Measure("", 0, 1e4),
-        "control_spheres": COUNT,
-    },
-    measures_of_registrations=EVALUATED,
     registered_by=lambda params, steps: steps.get(params.registration),
 )

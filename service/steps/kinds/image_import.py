@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from service.core.errors import ConfigurationError, DataError
 from service.core.protocol.models import CameraSection
@@ -11,7 +11,7 @@ from service.core.records.events import ArtefactRef, Record, ViewImported
 from service.core.records.import_list import ImportedFile, ImportedView, ImportList, PhotographRole
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.context import StepContext, StepKind, StepOutcome
-from service.steps.measured import COUNT
+from service.steps.measures import Count, MeasureRecord
 from service.store.records import NewArtefact
 
 _KINDS = {"calibration": "board_image", "image": "image", "control_image": "control_image"}
@@ -21,6 +21,16 @@ class Params(Record):
     """Which of the photographs that were brought."""
 
     photographs: PhotographRole  # of which part of the import
+
+
+class Measures(MeasureRecord):
+    """Of the photographs that were imported."""
+
+    images_imported: Annotated[Count, "photographs of the import"] = None
+    raw_files: Annotated[Count, "raw files of the import"] = None
+    settings_departures: Annotated[Count, "images with other settings than the protocol's"] = None
+    settings_not_stated: Annotated[Count, "images that do not state their settings"] = None
+    optics_departures: Annotated[Count, "images whose zoom, focus or lens differs from the calibrated one"] = None
 
 
 class Result(Record):
@@ -48,17 +58,16 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
             _bring_in(context, params, listed, view)
     context.progress("photographs", len(views), len(views))
     imported = context.evidence.captures(context.step.id)
-    measures = {
-        "images_imported": float(len(imported)),
-        "raw_files": float(sum(len(view.artefacts) - 1 for view in imported)),
-        "settings_departures": float(sum(not view.verdicts.get("settings", True) for view in imported)),
-        "settings_not_stated": float(sum("settings" not in view.verdicts for view in imported)),
-    }
     departures = optics_departures(context, against_itself=params.photographs == "calibration")
-    if departures is not None:
-        measures["optics_departures"] = float(departing_images(departures))
+    measures = Measures(
+        images_imported=float(len(imported)),
+        raw_files=float(sum(len(view.artefacts) - 1 for view in imported)),
+        settings_departures=float(sum(not view.verdicts.get("settings", True) for view in imported)),
+        settings_not_stated=float(sum("settings" not in view.verdicts for view in imported)),
+        optics_departures=None if departures is None else float(departing_images(departures)),
+    )
     result = Result(photographs=params.photographs, imported=len(imported))
-    return StepOutcome(measures=measures, result=result.model_dump())
+    return StepOutcome(measures, result=result.model_dump())
 
 
 def _bring_in(context: StepContext, params: Params, listed: ImportList, view: ImportedView) -> None:
@@ -124,13 +133,7 @@ def settings_agree(stated: dict[str, Any], wanted: CameraSection | None) -> bool
 KIND = StepKind(
     "image_import",
     Params,
+    Measures,
     Result,
     execute,
-    measures={
-        "images_imported": COUNT,
-        "raw_files": COUNT,
-        "settings_departures": COUNT,
-        "settings_not_stated": COUNT,
-        "optics_departures": COUNT,
-    },
 )

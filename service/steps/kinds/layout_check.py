@@ -20,7 +20,7 @@ from service.steps.capture.held_camera import awaited_images
 from service.steps.capture.views import photograph
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.layouts import layout_uncertainties
-from service.steps.measured import COUNT, LAYOUT
+from service.steps.measures import Count, LayoutMeasures
 
 PHOTOGRAPH = "layout_photograph"
 PHOTOGRAPH_WANTED = "layout_photograph_wanted"
@@ -43,6 +43,13 @@ class Params(Record):
     between_s: float = 5.0  # for moving the camera
     wait_s: Annotated[float, Field(gt=0)] = 600.0  # for a photograph that comes as a file
     sensor_width_mm: float = 35.7  # with the focal length of the file, a camera that is not calibrated yet
+
+
+class Measures(LayoutMeasures):
+    """Of the layout, and of the photographs that show it."""
+
+    spheres_seen: Annotated[Count, "spheres found in the photographs"] = None
+    photographs_used: Annotated[Count, "photographs that the layout was judged from"] = None
 
 
 class Result(Record):
@@ -81,7 +88,8 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         context.step, context.attempt, answer.measures, context.run.skipped, uncertainties
     ).verdicts
     _advise(context, judged, result.details, images, params)
-    return StepOutcome(answer.measures, (*kept, *answer.artefacts), result.model_dump(mode="json"), uncertainties)
+    measures = Measures.read(answer.measures)
+    return StepOutcome(measures, (*kept, *answer.artefacts), result.model_dump(mode="json"), uncertainties)
 
 
 def _earlier(context: StepContext) -> list[dict[str, Any]]:
@@ -172,9 +180,9 @@ def _move_hand(move: Mapping[str, Any]) -> dict[str, Any]:
 KIND = StepKind(
     "layout_check",
     Params,
+    Measures,
     Result,
     execute,
-    measures={**LAYOUT, "spheres_seen": COUNT, "photographs_used": COUNT},
     words=lambda params, _before: Announcement(
         f"the camera takes {params.photographs} {'photograph' if params.photographs == 1 else 'photographs'}"
     ),

@@ -27,7 +27,7 @@ from service.steps.capture.live_numbers import COVERAGE, ERROR, CoverageRule, se
 from service.steps.capture.optics import departing_images, optics_departures
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import artefact_of, held_views, taken
-from service.steps.measured import COUNT, PREDICTED, SHARE, Measure
+from service.steps.measures import Count, PredictedMeasures, Share
 
 _KINDS = {"dataset": "image", "control": "control_image", "calibration": "board_image"}
 
@@ -85,6 +85,17 @@ def failure_words(job: JobState) -> str:
         f"{job.arguments['image']['viewpoint']} could not be looked at: {why}. It stays in the evidence and is not "
         "used: take it again from the same place"
     )
+
+
+class Measures(PredictedMeasures):
+    """Of the images so far."""
+
+    images_taken: Annotated[Count, "photographs taken"] = None
+    images_used: Annotated[Count, "photographs that can be used"] = None
+    images_not_used: Annotated[Count, "photographs that cannot be used"] = None
+    coverage: Annotated[Share, "share of the image area in which corners of the board were seen"] = None
+    hemisphere_coverage: Annotated[Share, "share of the planned places with a usable image"] = None
+    optics_departures: Annotated[Count, "images whose zoom, focus or lens differs from the calibrated one"] = None
 
 
 class Result(Record):
@@ -279,7 +290,7 @@ class _Guide:
             else:
                 not_used[view.viewpoint] = failed.get(sha256, "not looked at") if look is None else look.why
         result = Result(purpose=self.params.purpose, used=tuple(used), not_used=not_used)
-        return StepOutcome(self._measures(), (), result.model_dump(mode="json"))
+        return StepOutcome(Measures.read(self._measures()), (), result.model_dump(mode="json"))
 
     def _measures(self) -> dict[str, float]:
         done = self._answers()
@@ -387,20 +398,9 @@ class _Guide:
 KIND = StepKind(
     "manual_capture",
     Params,
+    Measures,
     Result,
     execute,
-    measures={
-        **PREDICTED,
-        "images_taken": COUNT,
-        "images_used": COUNT,
-        "images_not_used": COUNT,
-        "coverage": SHARE,
-        "hemisphere_coverage": SHARE,
-        "settings_departures": COUNT,
-        "optics_departures": COUNT,
-        "spheres_sigma_mm": Measure("mm", 1e-3, 20),
-        "images_spoilt": COUNT,
-    },
     words=lambda _params, _before: Announcement(
         "begin to take images by hand", "Nothing moves. The screen says where to hold the camera."
     ),

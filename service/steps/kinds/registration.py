@@ -7,7 +7,7 @@ seconds. All others are computed afterwards, beside whatever the run does next (
 from __future__ import annotations
 
 import re
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import field_validator
 
@@ -22,7 +22,7 @@ from service.jobs.surfaces import locate_spheres
 from service.jobs.words import term
 from service.steps.context import JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import Mounted, captured_images, intrinsics_covariance_of, mounting_of, taken
-from service.steps.measured import COUNT, REGISTERED
+from service.steps.measures import Count, ErrorMm, MeasureRecord, Px, Ratio, RegistrationMeasures
 from service.steps.poses.sources import DEFAULT_SOURCES, PLANNED, Source, Wanted, Ways, decisive, posed, ways
 
 
@@ -55,6 +55,32 @@ class Params(Record):
             if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", size):
                 raise ValueError(f"a resolution reads 1920x1080, not {size!r}")
         return value
+
+
+class OneRegistration(MeasureRecord):
+    """Of one registration."""
+
+    rms_px: Annotated[Px, "rms distance of the outlines' points from the predicted outlines"] = None
+    chi2_reduced: Annotated[
+        Ratio, "chi-squared per degree of freedom: near 1 if the stated covariances are right"
+    ] = None
+    markers: Annotated[Count, "spheres that take part"] = None
+    images: Annotated[Count, "images that take part"] = None
+    excluded_outlines: Annotated[Count, "outlines left out as outliers"] = None
+    predicted_error_mm: Annotated[ErrorMm, "predicted error at the centre of the spheres"] = None
+    leave_one_out_mm: Annotated[ErrorMm, "mean radial error of each registration sphere as the others predict it"] = (
+        None
+    )
+
+
+class Measures(RegistrationMeasures[OneRegistration]):
+    """Of the outlines, and of every registration."""
+
+    outlines: Annotated[Count, "outlines of spheres found in all images"] = None
+    outlines_an_image: Annotated[Count, "outlines found in an image, on average"] = None
+    images_searched_whole: Annotated[Count, "images that were searched whole because no pose said where to look"] = (
+        None
+    )
 
 
 class Result(Record):
@@ -145,9 +171,8 @@ def _outcome(found: Ways) -> StepOutcome:
     """What is there by now; a source that nobody waited for is among it if it has come."""
     done = [(task, task.job) for task in found.tasks if task.job is not None and task.job.status == "finished"]
     outlines = next(job for task, job in done if task.request.kind == "detect_spheres")
-    measures = dict(outlines.measures)
-    for name, job in found.arrived.items():
-        measures |= {f"{name}_{measure}": value for measure, value in job.measures.items()}
+    registrations = {name: OneRegistration.read(job.measures) for name, job in found.arrived.items()}
+    measures = Measures.read(outlines.measures).model_copy(update={"registrations": registrations})
     result = Result(
         outlines_sha256=outlines.artefacts[0].sha256,
         registrations={name: dict(job.result) for name, job in found.arrived.items()},
@@ -159,8 +184,7 @@ def _outcome(found: Ways) -> StepOutcome:
 KIND = StepKind(
     "registration",
     Params,
+    Measures,
     Result,
     execute,
-    measures={"outlines": COUNT, "outlines_an_image": COUNT, "images_searched_whole": COUNT},
-    measures_of_registrations=REGISTERED,
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import Any
+from typing import Annotated, Any
 
 from service.core.jobs.references import Reference
 from service.core.records.events import Record
@@ -13,7 +13,7 @@ from service.steps.arrivals import keep_mesh, wait_for
 from service.steps.context import Announcement, JobRequest, StepContext, StepKind, StepOutcome
 from service.steps.inputs import result_of, taken
 from service.steps.layouts import layout_uncertainties
-from service.steps.measured import COUNT, SCAN, SPHERES, Measure
+from service.steps.measures import Count, Measure, SphereMeasures
 
 
 class Params(Record):
@@ -24,6 +24,26 @@ class Params(Record):
     device: str | None = None  # name of the scanner in rig.yaml; None: the only one
     application: str | None = None  # the step whose coat is still on the specimen
     compare_with: str | None = None  # an earlier ct_import or scan_import: did the spheres move since?
+
+
+class Measures(SphereMeasures):
+    """Of the mesh as it was exported, and of the spheres in it."""
+
+    scan_vertices: Annotated[Count, "vertices of the scan"] = None
+    scan_faces: Annotated[Count, "faces of the scan"] = None
+    scan_holes: Annotated[Count, "closed loops of boundary edges"] = None
+    scan_boundary_edges: Annotated[Count, "edges with one face"] = None
+    scan_non_manifold_edges: Annotated[Count, "edges with more than two faces"] = None
+    scan_components: Annotated[Count, "parts that are not connected"] = None
+    scan_degenerate_faces: Annotated[Count, "faces without an area"] = None
+    scan_unreferenced_vertices: Annotated[Count, "vertices of no face"] = None
+    scan_normals_computed: Annotated[Count, "1 if the scan came without normals and they were computed, else 0"] = (
+        None
+    )
+    faces: Annotated[Count, "faces of the mesh that is used"] = None
+    since_application_min: Annotated[
+        float | None, Measure("min", 0.1, 1e4), "time from the application of the coat to the arrival of the scan"
+    ] = None
 
 
 class Result(Record):
@@ -70,7 +90,10 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
     result = Result.model_validate(answer.result)
     uncertainties = layout_uncertainties(result.details["layout"]) if "layout" in result.details else {}
     return StepOutcome(
-        {**measures, **answer.measures}, kept + answer.artefacts, result.model_dump(mode="json"), uncertainties
+        Measures.read({**measures, **answer.measures}),
+        kept + answer.artefacts,
+        result.model_dump(mode="json"),
+        uncertainties,
     )
 
 
@@ -82,9 +105,9 @@ def _time(text: str) -> datetime:
 KIND = StepKind(
     "scan_import",
     Params,
+    Measures,
     Result,
     execute,
-    measures={**SPHERES, **SCAN, "faces": COUNT, "since_application_min": Measure("min", 0.1, 1e4)},
     words=lambda _params, _before: Announcement(
         "import the scan", "Nothing moves. The software waits for the export."
     ),

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from service.core.records.events import Record
 from service.steps.context import Announcement, StepContext, StepKind, StepOutcome
-from service.steps.measured import COUNT
+from service.steps.measures import Count, MeasureRecord
 
 
 class Params(Record):
@@ -14,6 +16,12 @@ class Params(Record):
     sublimates_after_s: float  # when it is gone
     scan_within_s: float  # latest time for the scan, counted from the application
     settle_s: float = 0.0  # wait this long before the next step
+
+
+class Measures(MeasureRecord):
+    """That the product was applied."""
+
+    applications: Annotated[Count, "times that the product was applied"] = None
 
 
 class Result(Record):
@@ -47,15 +55,15 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         scan_within_s=params.scan_within_s,
         sublimates_after_s=params.sublimates_after_s,
     )
-    return StepOutcome(measures={"applications": 1.0}, result=result.model_dump())
+    return StepOutcome(Measures(applications=1.0), result=result.model_dump())
 
 
 KIND = StepKind(
     "timed_application",
     Params,
+    Measures,
     Result,
     execute,
-    measures={"applications": COUNT},
     words=lambda params, _before: Announcement(f"{params.product} is on, the clock starts"),
     drawing="spray",
 )

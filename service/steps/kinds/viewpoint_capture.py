@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from service.compute.planning.motion_plan import Order
 from service.core.protocol.models import MovingParams
@@ -16,7 +16,7 @@ from service.steps.capture.retakes import advise_retakes, to_take_again
 from service.steps.capture.viewpoints import Viewpoint, ViewpointSet, denser_viewpoints, plan_viewpoints
 from service.steps.capture.views import CaptureTotals, capture_viewpoints
 from service.steps.context import ROBOT_MOVES, Announcement, StepContext, StepKind, StepOutcome
-from service.steps.measured import CAPTURE, COUNT, PREDICTED
+from service.steps.measures import CaptureMeasures, Count, ErrorMm, PredictedMeasures
 from service.steps.poses.front_end import EarlyFeatures
 
 
@@ -27,6 +27,18 @@ class Params(MovingParams):
     viewpoints: tuple[ViewpointSet, ...]  # from where
     order: Order = "as_listed"  # as listed, or the shortest way
     live: Live | None = None  # what is computed of each image while the capture goes on; without it nothing
+
+
+class Measures(PredictedMeasures, CaptureMeasures):
+    """Of the capture, and of what its images are predicted to give."""
+
+    images_spoilt: Annotated[
+        Count, "images that are black, blurred or overexposed, and were so again when they were repeated"
+    ] = None
+    live_images: Annotated[Count, "images that the prediction takes into account"] = None
+    outline_limited_error_mm: Annotated[
+        ErrorMm, "`predicted_target_error_mm` if the camera poses were exact: only the outlines limit it"
+    ] = None
 
 
 class Result(Record):
@@ -105,7 +117,7 @@ def execute(context: StepContext, params: Params) -> StepOutcome:
         candidates = feasible_extra(context, [v for v in extra if v.name not in taken], nominal)
         measures |= live.summary(last.station, candidates, retakes, again if retakes else 0)
     result = Result(purpose=params.purpose, captured=totals.captured)
-    return StepOutcome(measures=measures, result=result.model_dump())
+    return StepOutcome(Measures.read(measures), result=result.model_dump())
 
 
 def _of_images(context: StepContext, viewpoints: Sequence[Viewpoint], images: Collection[str]) -> list[Viewpoint]:
@@ -117,9 +129,9 @@ def _of_images(context: StepContext, viewpoints: Sequence[Viewpoint], images: Co
 KIND = StepKind(
     "viewpoint_capture",
     Params,
+    Measures,
     Result,
     execute,
-    measures={**CAPTURE, **PREDICTED, "images_spoilt": COUNT},
     words=lambda _params, before: Announcement(f"the robot takes {before.images()}{before.at_stations}", ROBOT_MOVES),
     drawing="stations",
 )

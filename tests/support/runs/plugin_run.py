@@ -16,7 +16,7 @@ from service.audit.replay.replay import replay
 from service.core.protocol.models import parse_protocol
 from service.jobs.words import term
 from service.steps import params_models
-from service.steps.measures import implausible
+from service.steps.protocol_check import implausible
 from service.store.signatures.signing import checkpoint
 from service.store.store import Store
 from service.web.page.run_words import drawing_of, will_happen

@@ -1,0 +1,97 @@
+"""Whether the gates of a protocol judge numbers that its steps yield, in their units and within credible limits.
+
+A gate on a number that no step of its kind measures fails when the step is done, hours into a run; a limit in another
+unit passes everything. `orthocapture protocol check` holds a protocol's gates against what each step kind declares.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+
+from service.core.protocol.models import Gate, LoadedProtocol, Step
+from service.core.text.yaml_tree import FieldPath, Plain, Problem, field_name, parse_yaml
+from service.rig import RigSection
+from service.steps import step_kinds
+from service.steps.measures import Measure, RegistrationMeasures
+from service.steps.poses.sources import Wanted
+
+# Sections of the file: field → between what it is plausible, in the field's unit.
+_SECTIONS: Mapping[tuple[str, str], tuple[float, float, str]] = {
+    ("spheres", "radius_mm"): (1.0, 100.0, "mm"),
+    ("board", "square_mm"): (0.5, 1000.0, "mm"),
+    ("camera", "aperture_f"): (0.7, 64.0, ""),
+    ("camera", "iso"): (25.0, 409600.0, ""),
+}
+_ALIAS = {"deg": "°", "1": "", "degrees": "°"}
+
+
+def measures_of(step: Step, protocol_steps: Mapping[str, Step]) -> Mapping[str, Measure] | None:
+    """All that a step of this kind and with these parameters measures; None where that cannot be known."""
+    kind = step_kinds().get(step.kind)
+    if kind is None:
+        return None
+    if not issubclass(kind.measures, RegistrationMeasures):
+        return kind.measures.declared()
+    registering = kind.registered_by(step.params, protocol_steps) if kind.registered_by is not None else step
+    return None if registering is None else kind.measures.declared_for(Wanted.of(registering.params).registrations)
+
+
+def implausible(loaded: LoadedProtocol, rig: RigSection | None = None) -> tuple[Problem, ...]:
+    """What cannot be meant of measures, units, limits and, with the rig, stations; in the order of the lines."""
+    tree = parse_yaml(loaded.source, name="the protocol")
+    found: list[tuple[FieldPath, str]] = []
+    data = tree.data if isinstance(tree.data, dict) else {}
+    for (section, field), (least, most, unit) in _SECTIONS.items():
+        part = data.get(section)
+        value = part.get(field) if isinstance(part, dict) else None
+        if isinstance(value, int | float) and not least <= value <= most:
+            found.append(
+                ((section, field), f"{value:g} {unit} is not credible: {least:g} to {most:g} {unit}".strip())
+            )
+    steps = {step.id: step for step in loaded.protocol.steps}
+    for index, step in enumerate(loaded.protocol.steps):
+        known = measures_of(step, steps)
+        for number, gate in enumerate(step.gates) if known is not None else ():
+            assert known is not None
+            found += [(("steps", index, "gates", number, *at), words) for at, words in _gate(gate, step, known)]
+    if rig is not None:
+        found += list(_stations(data, rig))
+    problems = [Problem(tree.line(at), field_name(at), words) for at, words in found]
+    return tuple(sorted(problems, key=lambda p: (p.line, p.field)))
+
+
+def _gate(gate: Gate, step: Step, known: Mapping[str, Measure]) -> Iterator[tuple[FieldPath, str]]:
+    measure = known.get(gate.measure)
+    if measure is None:
+        near = difflib.get_close_matches(gate.measure, known, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else f"; it measures {', '.join(sorted(known))}"
+        yield ("measure",), f"a step of kind {step.kind} measures no {gate.measure!r}{hint}"
+        return
+    unit = _ALIAS.get(gate.unit, gate.unit)
+    if measure.unit and unit != measure.unit:
+        yield ("unit",), f"{gate.measure} is in {measure.unit}, not in {gate.unit or 'nothing'}"
+    for name, limit in (("min", gate.min), ("max", gate.max)):
+        if limit is not None and limit != 0 and not measure.least <= limit <= measure.most:
+            between = f"{measure.least:g} to {measure.most:g} {measure.unit}".strip()
+            yield (name,), f"a limit of {limit:g} on {gate.measure} is not credible: {between}"
+
+
+def _stations(data: Mapping[str, Plain], rig: RigSection) -> Iterator[tuple[FieldPath, str]]:
+    """Stations that the protocol names and the rig file does not have."""
+
+    def walk(value: Plain, at: FieldPath) -> Iterator[tuple[FieldPath, str]]:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                if key == "station" and isinstance(inner, str) and inner not in rig.stations:
+                    there = ", ".join(rig.stations) or "none"
+                    near = difflib.get_close_matches(inner, rig.stations, n=1)
+                    hint = f"; did you mean {near[0]!r}?" if near else f"; it has {there}"
+                    yield (*at, key), f"the rig has no station {inner!r}{hint}"
+                else:
+                    yield from walk(inner, (*at, key))
+        elif isinstance(value, list):
+            for number, inner in enumerate(value):
+                yield from walk(inner, (*at, number))
+
+    yield from walk(data.get("steps"), ("steps",))
