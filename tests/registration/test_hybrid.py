@@ -83,6 +83,21 @@ def test_noise_is_estimated_and_covariances_are_honest() -> None:
     assert np.mean(alone) < 0.2 * 5e-4
 
 
+@pytest.mark.parametrize("robot", [True, False])
+def test_covariance_is_honest_with_little_texture(robot: bool) -> None:
+    """Far fewer tracks than parameters: 30 points in 40 images, of which each image sees some 21."""
+    ratios: list[float] = []
+    for seed in range(4):
+        made = tracked_scene(
+            seed, images=40, points=30, track_px=0.3, outline_px=0.1, robot_m=5e-4, robot_rad=1e-3, outliers=0.02
+        )
+        answer = adjust(made, **({} if robot else {"T_base_camera": None, "groups": None}))
+        error = pose_errors(answer.T_scan_camera, made.T_scan_camera).ravel()
+        C = answer.covariance[: error.size, : error.size]
+        ratios.append(float(error @ np.linalg.solve(C, error)) / error.size)
+    assert 0.7 < np.mean(ratios) < 1.4
+
+
 def test_covariance_of_world_poses_follows_from_the_joint_one() -> None:
     """Moving the estimate in its parameters moves the world poses as the derivative predicts."""
     answer = adjust(noisy(3))

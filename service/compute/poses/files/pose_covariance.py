@@ -11,8 +11,9 @@ import numpy as np
 
 from service.compute.camera_covariance import CameraCovariance
 from service.compute.camera_model import CameraModel
-from service.compute.poses.hybrid.adjustment import clustered_information, first_guess, robust_rows
+from service.compute.poses.hybrid.adjustment import first_guess, robust_rows
 from service.compute.poses.hybrid.bundle import Data, Rows, Sigmas, State, linearise, normal_equations
+from service.compute.poses.hybrid.stated_covariance import clustered_information
 from service.compute.poses.sfm.tracks import Tracks
 from service.core.errors import ComputeError
 from service.core.geometry import Array
