@@ -47,6 +47,16 @@ def check_jpeg(data: bytes, where: str) -> None:
     )
 
 
+def end_of_jpeg(data: bytes, where: str) -> int:
+    """Length of a JPEG's picture: cameras append previews, with metadata of their own, after it.
+
+    Raises:
+        DataError: as `check_jpeg`.
+    """
+    check_jpeg(data, where)
+    return next(at + 2 for marker, at in _segments(data, where) if marker == _END_OF_IMAGE)
+
+
 def check_png(data: bytes, where: str) -> None:
     """Check that a PNG is complete, by walking its chunks and their checksums to the end.
 

@@ -68,7 +68,8 @@ def pixel_rays(camera: CameraModel) -> PixelRays:
 
 
 def _pinhole(camera: CameraModel) -> PixelRays:
-    rows = np.stack([np.ones(camera.height), (np.arange(camera.height) - camera.cy) / camera.fy], axis=1)
+    rows = np.ones((camera.height, 2))
+    rows[:, 1] = (np.arange(camera.height) - camera.cy) / camera.fy
     columns = np.zeros((2, camera.width, 2))
     columns[0, :, 0] = (np.arange(camera.width) - camera.cx) / camera.fx
     columns[1, :, 1] = 1.0
@@ -76,12 +77,12 @@ def _pinhole(camera: CameraModel) -> PixelRays:
 
 
 def _interpolated(camera: CameraModel, degree: int) -> PixelRays:
-    nodes = chebyshev.chebpts1(degree + 1)
+    nodes = np.asarray(chebyshev.chebpts1(degree + 1), dtype=np.float64)
     u, v = (0.5 * (nodes + 1) * (size - 1) for size in (camera.width, camera.height))
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     values = camera.normalise(grid).reshape(degree + 1, degree + 1, 2)
     # Values at the nodes to coefficients: the discrete orthogonality of the Chebyshev polynomials.
-    to_coefficients = chebyshev.chebvander(nodes, degree).T * (2.0 / (degree + 1))
+    to_coefficients = np.asarray(chebyshev.chebvander(nodes, degree), dtype=np.float64).T * (2.0 / (degree + 1))
     to_coefficients[0] /= 2.0
     coefficients = np.einsum("iv,jw,vwc->ijc", to_coefficients, to_coefficients, values)
     columns = np.einsum("uj,ijc->iuc", _basis(camera.width, degree), coefficients)
@@ -90,7 +91,7 @@ def _interpolated(camera: CameraModel, degree: int) -> PixelRays:
 
 def _basis(size: int, degree: int) -> Array:
     """(size, degree + 1) Chebyshev polynomials at the pixel centres."""
-    return chebyshev.chebvander(np.linspace(-1.0, 1.0, size), degree)
+    return np.asarray(chebyshev.chebvander(np.linspace(-1.0, 1.0, size), degree), dtype=np.float64)
 
 
 def _error_px(rays: PixelRays, camera: CameraModel) -> float:

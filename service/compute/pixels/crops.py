@@ -1,0 +1,91 @@
+"""Crops of an image that show the specimen and no marker, with the cameras that belong to them."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.compute.camera_model import CameraModel
+from service.core.errors import ConfigurationError
+
+FULL_HD = (1920, 1080)
+_CELL_PX = 8  # crops begin at multiples of this
+_LEAST_NEW = 0.05  # share of a further crop that must show parts of the specimen which no earlier crop shows
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Crop:
+    """A part of an image: `x`, `y` is its first pixel."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+    def camera(self, camera: CameraModel) -> CameraModel:
+        """The crop's camera: the principal point is shifted, all else is the same."""
+        return dataclasses.replace(
+            camera, width=self.width, height=self.height, cx=camera.cx - self.x, cy=camera.cy - self.y
+        )
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns, for an array of the whole image."""
+        return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
+
+
+def marker_free_crops(wanted: Mask, forbidden: Mask, size: tuple[int, int] = FULL_HD, most: int = 16) -> list[Crop]:
+    """Crops without a forbidden pixel that show most of the wanted pixels, the best first.
+
+    Each further crop is the one that shows most pixels which no earlier one shows, as long as these are a twentieth
+    of it. Equal ones are chosen from the top left. The answer is empty where no place is free of markers.
+
+    Args:
+        wanted: (H, W) the specimen.
+        forbidden: (H, W) spheres and posts.
+        size: width and height of a crop.
+        most: at most so many crops.
+
+    Raises:
+        ConfigurationError: a crop is larger than the image, or smaller than 8 px.
+    """
+    height, width = wanted.shape
+    if size[0] > width or size[1] > height or min(size) < _CELL_PX:
+        raise ConfigurationError(
+            f"a crop of {size[0]} × {size[1]} px does not fit into an image of {width} × {height} px",
+            remedy=f"Name a size within it, at least {_CELL_PX} px wide and high",
+        )
+    touched = (-(-size[1] // _CELL_PX), -(-size[0] // _CELL_PX))  # cells of which a crop shows any part
+    whole = (size[1] // _CELL_PX, size[0] // _CELL_PX)
+    places = ((height - size[1]) // _CELL_PX + 1, (width - size[0]) // _CELL_PX + 1)
+    free = _window_sums(_pooled(forbidden), touched, places) == 0
+    left, crops = _pooled(wanted), list[Crop]()
+    while len(crops) < most:
+        gain = np.where(free, _window_sums(left, whole, places), -1)
+        row, column = (int(k) for k in np.unravel_index(int(gain.argmax()), gain.shape))
+        if gain[row, column] < max(1, _LEAST_NEW * size[0] * size[1]):
+            break
+        crops.append(Crop(column * _CELL_PX, row * _CELL_PX, *size))
+        left[row : row + whole[0], column : column + whole[1]] = 0
+    return crops
+
+
+def _pooled(mask: Mask) -> NDArray[np.int64]:
+    """Pixels of the mask in each cell; cells at the right and lower edge may be cut."""
+    height, width = (-(-n // _CELL_PX) for n in mask.shape)
+    rows = np.add.reduceat(mask, np.arange(height) * _CELL_PX, axis=0, dtype=np.int64)
+    return np.add.reduceat(rows, np.arange(width) * _CELL_PX, axis=1)
+
+
+def _window_sums(cells: NDArray[np.int64], window: tuple[int, int], places: tuple[int, int]) -> NDArray[np.int64]:
+    """(places) sums over windows of cells that begin at each place."""
+    total = np.zeros((cells.shape[0] + 1, cells.shape[1] + 1), dtype=np.int64)
+    np.cumsum(np.cumsum(cells, axis=0), axis=1, out=total[1:, 1:])
+    (h, w), (rows, columns) = window, places
+    top, bottom = total[:rows], total[h : h + rows]
+    return (bottom[:, w : w + columns] - bottom[:, :columns]) - (top[:, w : w + columns] - top[:, :columns])

@@ -1,0 +1,117 @@
+"""EXIF of exported photographs: kept, carried over to resampled ones, on demand without what names a person or place.
+
+The camera's serial numbers are personal data where one person owns the camera.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from service.core.errors import DataError
+from service.core.picture_files import JPEG_BEGINS, end_of_jpeg, picture_size
+
+exiv2: Any = importlib.import_module("exiv2")  # the library has no types
+
+_PERSONAL_WORDS = ("serial", "owner", "artist", "copyright", "author", "usercomment", "uniqueid", "hostcomputer")
+#: Groups of tags that stay; GPS, makers' notes and previews go. Makers' notes hold serial numbers in many places.
+_KEPT_GROUPS = ("Image", "Photo", "Iop")
+_MAKER_NOTES = ("MakerNote", "MakerNoteSafety", "DNGPrivateData", "XMLPacket", "IPTCNAA", "ImageResources")
+_SHORTEST_SOUGHT = 5  # a shorter value may stand anywhere by chance
+
+
+def without_personal_data(picture: bytes, where: str = "") -> bytes:
+    """The same JPEG or PNG, pixel for pixel, without GPS, owner, author, serial numbers, makers' notes and previews.
+
+    XMP, IPTC and comments are removed as a whole, and whatever follows the picture in the file.
+
+    Raises:
+        DataError: the file is not a picture, or a removed value still stands in it elsewhere.
+    """
+    if picture.startswith(JPEG_BEGINS):
+        picture = picture[: end_of_jpeg(picture, where)]
+    image = _opened(picture, where)
+    exif = image.exifData()
+    removed = _remove_personal(exif)
+    image.clearXmpPacket()
+    image.clearXmpData()
+    image.clearIptcData()
+    image.clearComment()
+    cleaned = _written(image)
+    if any(value in cleaned for value in removed):
+        raise DataError(
+            "the photograph repeats a serial number or a name outside its metadata",
+            where=where,
+            remedy="Remove it with a program for metadata, or export this photograph without removing personal data",
+        )
+    return cleaned
+
+
+def with_metadata_of(original: bytes, resampled: bytes, *, personal: bool, where: str = "") -> bytes:
+    """The resampled picture with the EXIF of the photograph that it was made from, and its own size in it.
+
+    Args:
+        original: JPEG or PNG as the camera wrote it.
+        resampled: JPEG or PNG without metadata.
+        personal: whether GPS, owner and serial numbers are carried over too.
+        where: the file, for messages.
+
+    Raises:
+        DataError: one of them is not a picture.
+    """
+    source = _opened(original, where).exifData()
+    if not personal:
+        _remove_personal(source)
+    _remove_previews(source)
+    width, height = picture_size(resampled, where)
+    for key in ("Exif.Photo.PixelXDimension", "Exif.Image.ImageWidth"):
+        if key in source:
+            source[key] = exiv2.UShortValue(width) if width < 1 << 16 else exiv2.ULongValue(width)
+    for key in ("Exif.Photo.PixelYDimension", "Exif.Image.ImageLength"):
+        if key in source:
+            source[key] = exiv2.UShortValue(height) if height < 1 << 16 else exiv2.ULongValue(height)
+    if "Exif.Image.Orientation" in source:
+        source["Exif.Image.Orientation"] = exiv2.UShortValue(1)  # the pixels stand as the camera model has them
+    image = _opened(resampled, where)
+    image.setExifData(source)
+    return _written(image)
+
+
+def _opened(picture: bytes, where: str) -> Any:
+    try:
+        image = exiv2.ImageFactory.open(picture)
+        image.readMetadata()
+    except exiv2.Exiv2Error as error:
+        raise DataError(
+            f"the photograph's metadata cannot be read: {error}", where=where, remedy="Copy the file again"
+        ) from error
+    return image
+
+
+def _written(image: Any) -> bytes:
+    image.writeMetadata()
+    return bytes(image.io().mmap())
+
+
+def _remove_previews(exif: Any) -> None:
+    exiv2.ExifThumb(exif).erase()
+
+
+def _remove_personal(exif: Any) -> list[bytes]:
+    """Remove tags, and return the texts that they had."""
+    _remove_previews(exif)
+    removed: list[bytes] = []
+    kept = exiv2.ExifData()
+    for tag in exif:
+        name, group = str(tag.tagName()), str(tag.groupName())
+        personal = any(word in name.lower() for word in _PERSONAL_WORDS)
+        if group in _KEPT_GROUPS and name not in (*_MAKER_NOTES, "GPSTag") and not personal:
+            kept.add(tag)
+        elif personal:
+            text = str(tag.toString()).strip("\0 ")
+            if len(text) >= _SHORTEST_SOUGHT:
+                removed.append(text.encode("utf-8", "surrogateescape"))
+    exif.clear()
+    for tag in kept:
+        exif.add(tag)
+    return removed
